@@ -1,0 +1,25 @@
+# Two commands do all: `make reproduce` and `make test`. Both build .venv from the lock of versions first.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: reproduce test lint lock clean
+
+reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
+	$(BIN)/vmri reproduce --quick --out out
+
+test: .venv/installed  ## the whole test suite
+	$(BIN)/python -m pytest -n 2
+
+lint: .venv/installed  ## format, lint and types, as pre-commit runs them
+	$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/pyright
+
+lock: .venv/installed  ## pin the versions that are installed now
+	$(BIN)/python -m pip freeze --exclude-editable > requirements.lock
+
+.venv/installed: pyproject.toml requirements.lock
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv out

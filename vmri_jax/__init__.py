@@ -1,0 +1,42 @@
+"""Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories."""
+
+from vmri_jax import diagnostics, quadrature
+from vmri_jax.discrete_lagrangian import discrete_lagrangian, discrete_legendre
+from vmri_jax.newton import Newton
+from vmri_jax.quadrature import macro, micro
+from vmri_jax.results import Result, SimulationError
+from vmri_jax.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin
+from vmri_jax.simulate import simulate
+from vmri_jax.state import State, initial_state
+from vmri_jax.step import StepInfo, macro_step
+from vmri_jax.system import ConstantMass, Problem, System
+from vmri_jax.trajectory import Trajectory
+
+from vmri_jax import systems  # isort: skip  (written with the names above)
+
+__all__ = [
+    "ConstantMass",
+    "Newton",
+    "Problem",
+    "Result",
+    "Scheme",
+    "SimulationError",
+    "State",
+    "StepInfo",
+    "System",
+    "Trajectory",
+    "diagnostics",
+    "discrete_lagrangian",
+    "discrete_legendre",
+    "explicit_slow",
+    "fully_explicit",
+    "fully_implicit",
+    "galerkin",
+    "initial_state",
+    "macro",
+    "macro_step",
+    "micro",
+    "quadrature",
+    "simulate",
+    "systems",
+]

@@ -1,0 +1,92 @@
+"""Checks at the door: bad input is refused before any compute, with what came, what was expected and what to do."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.system import ConstantMass, System
+
+
+def require_x64() -> None:
+    """Raise unless JAX's 64-bit mode is on."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError(
+            "vmri_jax needs 64-bit floats: Newton and the constraints are solved to round-off. Switch them on at the start "
+            'of the program with jax.config.update("jax_enable_x64", True), or set JAX_ENABLE_X64=1.'
+        )
+
+
+def is_concrete(tree) -> bool:
+    """Whether a pytree holds values rather than tracers of jit, vmap or grad."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def check_arrays(**arrays):
+    """Arrays as float64 vectors; slow and fast velocities shaped like their positions; finite where concrete."""
+    out = {}
+    for name, value in arrays.items():
+        if getattr(value, "dtype", None) in (np.float32, np.float16):
+            raise ValueError(f"{name} has dtype {value.dtype}; give float64, e.g. {name}.astype(float).")
+        array = jnp.asarray(value, dtype=float)
+        if array.ndim != 1:
+            raise ValueError(f"{name} has shape {array.shape}; it must be a vector of coordinates, shape (n,).")
+        if is_concrete(array) and not np.isfinite(array).all():
+            raise ValueError(
+                f"{name} has entries that are not finite at {np.flatnonzero(~np.isfinite(array)).tolist()}."
+            )
+        out[name] = array
+    for a, b in (("q_s", "v_s"), ("q_f", "v_f"), ("q_s", "p_s"), ("q_f", "p_f")):
+        if a in out and b in out and out[a].shape != out[b].shape:
+            raise ValueError(f"{b} has shape {out[b].shape}, {a} has {out[a].shape}; they must be equal.")
+    return tuple(out.values())
+
+
+def check_system(system: System, q_s, q_f) -> None:
+    """Check shapes of masses and of what every user function returns for these positions (without evaluating them)."""
+    if not isinstance(system, System):
+        raise TypeError(f"system is {type(system).__name__}; it must be a vmri_jax.System.")
+    n_s, n_f = q_s.shape[0], q_f.shape[0]
+    if isinstance(system.kinetic, ConstantMass):
+        for name, mass, n in (("slow", system.kinetic.slow, n_s), ("fast", system.kinetic.fast, n_f)):
+            if mass.shape[0] != n:
+                raise ValueError(
+                    f"ConstantMass: {name} is for {mass.shape[0]} coordinates, the state has {n} {name} ones."
+                )
+    scalars = {
+        "kinetic": (system.kinetic, (q_s, q_f, q_s, q_f)),
+        "slow_potential": (system.slow_potential, (q_s, q_f)),
+        "fast_potential": (system.fast_potential, (q_f,)),
+    }
+    for name, (function, args) in scalars.items():
+        if function is not None:
+            shape = _shape(name, function, *args, system.params)
+            if getattr(shape, "shape", None) != ():
+                raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a scalar, shape ().")
+    for name, args in (("constraint", (q_s, q_f)), ("slow_constraint", (q_s,))):
+        function = getattr(system, name)
+        if function is not None:
+            shape = _shape(name, function, *args, system.params)
+            if len(getattr(shape, "shape", ())) != 1:
+                raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a vector, shape (n_g,).")
+    if system.force is not None:
+        shape = _shape("force", system.force, jnp.zeros(()), q_s, q_f, q_s, q_f, system.params)
+        if not isinstance(shape, tuple) or [getattr(s, "shape", None) for s in shape] != [(n_s,), (n_f,)]:
+            raise ValueError(
+                f"System: force returns {_describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
+            )
+
+
+def _shape(name: str, function, *args):
+    try:
+        return jax.eval_shape(function, *args)
+    except Exception as error:
+        raise ValueError(
+            f"System: {name} could not be evaluated on arguments of shapes "
+            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and the params: {type(error).__name__}: {error}"
+        ) from error
+
+
+def _describe(value) -> str:
+    if isinstance(value, tuple):
+        return "(" + ", ".join(_describe(v) for v in value) + ")"
+    return f"shape {value.shape}" if hasattr(value, "shape") else type(value).__name__

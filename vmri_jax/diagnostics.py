@@ -1,0 +1,129 @@
+"""What a discrete trajectory should keep, and how to see whether it does."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.newton import Newton
+from vmri_jax.scheme import Scheme
+from vmri_jax.state import State, project_momentum
+from vmri_jax.step import macro_step
+from vmri_jax.system import System
+
+
+def energy_parts(system: System, q_s, q_f, p_s, p_f) -> dict:
+    """Parts of the Hamiltonian ``p . v - T(q, v) + V + W``: "kinetic", "slow" and "fast"."""
+    _, _, v_s, v_f = project_momentum(system, q_s, q_f, p_s, p_f)
+    kinetic = p_s @ v_s + p_f @ v_f - system.kinetic(q_s, q_f, v_s, v_f, system.params)
+    zero = jnp.zeros(())
+    slow = zero if system.slow_potential is None else system.slow_potential(q_s, q_f, system.params)
+    fast = zero if system.fast_potential is None else system.fast_potential(q_f, system.params)
+    return {"kinetic": kinetic, "slow": slow, "fast": fast}
+
+
+def energy(system: System, q_s, q_f, p_s, p_f):
+    """Hamiltonian ``p . v - T(q, v) + V(q_s, q_f) + W(q_f)`` with v the velocity of p."""
+    parts = energy_parts(system, q_s, q_f, p_s, p_f)
+    return parts["kinetic"] + parts["slow"] + parts["fast"]
+
+
+def oscillatory_energies(omega, q_f, p_f):
+    """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of unit-mass harmonic oscillators, e.g. the stiff FPU springs."""
+    return (p_f**2 + omega**2 * q_f**2) / 2
+
+
+def constraint_residual(system: System, q_s, q_f, p_s, p_f):
+    """Largest ``|g|`` (position level) and largest ``|G v|`` (velocity level), shape (2,)."""
+    values = system.constraints(q_s, q_f)
+    if not values.shape[0]:
+        return jnp.zeros(2)
+    v_s, v_f = velocity(system, q_s, q_f, p_s, p_f)
+    _, rate = jax.jvp(system.constraints, (q_s, q_f), (v_s, v_f))
+    return jnp.stack([jnp.max(jnp.abs(values)), jnp.max(jnp.abs(rate))])
+
+
+def velocity(system: System, q_s, q_f, p_s, p_f):
+    """Velocities ``(v_s, v_f)`` of given momenta (inverse Legendre transform, constraints ignored)."""
+    free = system.replace(constraint=None, slow_constraint=None)
+    return project_momentum(free, q_s, q_f, p_s, p_f)[2:]
+
+
+def momentum_map(generator, q_s, q_f, p_s, p_f):
+    """Momentum map ``p . xi(q)`` of a symmetry with infinitesimal generator ``generator(q_s, q_f) -> (xi_s, xi_f)``."""
+    xi_s, xi_f = generator(q_s, q_f)
+    return p_s @ xi_s + p_f @ xi_f
+
+
+def rotation_about(axis):
+    """Generator of rotations of points in R^3 about an axis through the origin, ``xi(q) = axis x q``."""
+    axis = jnp.asarray(axis, dtype=float)
+
+    def generator(q_s, q_f):
+        return tuple(jnp.cross(axis, q.reshape(-1, 3)).reshape(-1) for q in (q_s, q_f))
+
+    return generator
+
+
+def translation_along(direction):
+    """Generator of translations of points in R^3, ``xi(q) = direction`` for every point."""
+    direction = jnp.asarray(direction, dtype=float)
+
+    def generator(q_s, q_f):
+        return tuple(jnp.tile(direction, q.shape[0] // 3) for q in (q_s, q_f))
+
+    return generator
+
+
+def symplectic_defect(system: System, scheme: Scheme, state: State, macro_dt, newton: Newton | None = None):
+    """Largest entry of ``M^T J M - J`` for the derivative M of one macro step, on the constraint manifold.
+
+    With constraints, the form is compared on tangent vectors of ``{g = 0, G v = 0}`` only, in an orthonormal basis.
+    """
+    n_s, n_f = state.q_s.size, state.q_f.size
+    n = n_s + n_f
+    splits = (n_s, n, n + n_s)
+
+    def step(z):
+        s, _ = macro_step(system, scheme, State(state.t, *jnp.split(z, splits)), macro_dt, newton)
+        return jnp.concatenate([s.q_s, s.q_f, s.p_s, s.p_f])
+
+    def manifold(z):
+        q_s, q_f, p_s, p_f = jnp.split(z, splits)
+        _, rate = jax.jvp(system.constraints, (q_s, q_f), velocity(system, q_s, q_f, p_s, p_f))
+        return jnp.concatenate([system.constraints(q_s, q_f), rate])
+
+    z = jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
+    M = jax.jit(jax.jacfwd(step))(z)
+    J = jnp.block([[jnp.zeros((n, n)), jnp.eye(n)], [-jnp.eye(n), jnp.zeros((n, n))]])
+    normals = jax.jacfwd(manifold)(z)
+    tangents = jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :] if normals.size else jnp.eye(2 * n)
+    return jnp.max(jnp.abs(tangents @ (M.T @ J @ M - J) @ tangents.T))
+
+
+def observed_order(macro_dt, errors, plateau: float = 30.0, floor: float = 0.0) -> float:
+    """Order of convergence: least-squares slope of log error over log step, round-off plateau masked.
+
+    Points within a factor `plateau` of the smallest error, or of `floor` if that is larger, at the small-step end are
+    left out when the errors stop falling there; at least two points stay.
+
+    Args:
+        macro_dt: (k,) step sizes.
+        errors: (k,) errors; non-finite ones are ignored.
+        plateau: how far above the smallest error the plateau reaches.
+        floor: known accuracy of the reference.
+    """
+    h, e = np.asarray(macro_dt, dtype=float), np.asarray(errors, dtype=float)
+    good = np.isfinite(e) & (e > 0)
+    h, e = h[good], e[good]
+    order = np.argsort(-h)
+    h, e = h[order], e[order]
+    if len(h) < 2:
+        raise ValueError(f"observed_order: {len(h)} usable errors of {np.size(errors)}; at least 2 are needed.")
+    keep = e > plateau * floor
+    slopes = np.diff(np.log(e)) / np.diff(np.log(h))
+    flat = np.flatnonzero(slopes < 0.3)  # errors no longer fall: the plateau starts here
+    if flat.size:
+        keep &= e > plateau * e[flat[0] :].max()
+    if keep.sum() < 2:
+        keep[:2] = True
+    return float(np.polyfit(np.log(h[keep]), np.log(e[keep]), 1)[0])

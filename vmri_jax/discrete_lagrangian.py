@@ -1,0 +1,193 @@
+"""The discrete Lagrangian: a weighted sum of the user's functions at quadrature nodes of the path.
+
+    L_d(S, F) = sum over terms, over nodes i of the term's rule:  H w_i term(q(theta_i), qdot(theta_i))
+
+`lagrangian` builds it by combinators, ``kinetic - slow - fast``, each term placed on its own nodes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.path import Nodes, Path, lagrange_derivative, position_nodes, velocity_nodes
+from vmri_jax.scheme import Scheme
+from vmri_jax.system import ConstantMass, System
+
+
+@dataclass(frozen=True)
+class Term:
+    """An integrand on its nodes: ``path -> H sum_i w_i integrand(path at theta_i)``.
+
+    `integrand` takes the arguments it names, e.g. ``("q_s", "q_f")``. Weights at the ends of the macro interval
+    are held apart for terms without velocities (None where there is no such node): those are kicks.
+    """
+
+    integrand: Callable
+    arguments: tuple[str, ...]
+    inside: Nodes
+    start: Any = None
+    end: Any = None
+    sign: float = 1.0
+
+    def __call__(self, path: Path):
+        return self.at_nodes_inside(path) + self.at_ends(path)
+
+    def at_nodes_inside(self, path: Path):
+        """The part of the sum that the unknowns of a step enter."""
+        if not self.inside.groups:
+            return jnp.zeros(())
+        sample = self.inside.sample(path)
+        values = jax.vmap(self.integrand)(*(getattr(sample, a) for a in self.arguments))
+        return self.sign * path.macro_dt * jnp.sum(self.inside.weights * values)
+
+    def at_ends(self, path: Path):
+        """The part of the sum at theta = 0 and theta = 1."""
+        q_s, q_f = path.slow_control_points(), path.control_points()[1]
+        total = jnp.zeros(())
+        for weight, k in ((self.start, 0), (self.end, -1)):
+            if weight is not None:
+                total += weight * self.integrand(*({"q_s": q_s[k], "q_f": q_f[k]}[a] for a in self.arguments))
+        return self.sign * path.macro_dt * total
+
+    def gradient(self, q_s, q_f):
+        """``(d/dq_s, d/dq_f)`` of the signed integrand at one configuration, for kicks."""
+        q = {"q_s": q_s, "q_f": q_f}
+        grads = jax.grad(self.integrand, argnums=tuple(range(len(self.arguments))))(*(q[a] for a in self.arguments))
+        q |= {a: jnp.zeros_like(x) for a, x in q.items()}
+        q |= {a: self.sign * g for a, g in zip(self.arguments, grads, strict=True)}
+        return q["q_s"], q["q_f"]
+
+    def __neg__(self):
+        return replace(self, sign=-self.sign)
+
+    def __add__(self, other):
+        return Sum((self,)) + other
+
+    def __sub__(self, other):
+        return Sum((self,)) - other
+
+
+@dataclass(frozen=True)
+class QuadraticKinetic:
+    """Kinetic energy of constant masses: a quadratic form in the increments, assembled once.
+
+    ``sum_ij k_ij Delta_i^T M Delta_j / (2 dt)`` per interval, with ``k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)`` for the
+    slow increments over the macro interval and for the fast ones over each micro interval.
+    """
+
+    mass: ConstantMass
+    nodes: Nodes
+    start = end = None
+
+    @property
+    def slow_form(self):
+        """(r + 1, r + 1) matrix k of the macro interval."""
+        theta = np.concatenate([self.nodes.theta(g) for g in self.nodes.groups])
+        return self._form(theta, self.nodes.weights)
+
+    @property
+    def fast_form(self):
+        """(r + 1, r + 1) matrix k of a micro interval."""
+        groups = self.nodes.groups
+        return self._form(
+            np.array([g.c for g in groups]), jnp.stack([g.weights[0] for g in groups]) * self.nodes.num_micro
+        )
+
+    def _form(self, at, weights):
+        slopes = lagrange_derivative(self.nodes.degree, at)
+        return jnp.einsum("n,ni,nj->ij", weights, slopes, slopes)
+
+    def __call__(self, path: Path):
+        slow, fast = self.mass.momentum(path.slow, path.fast)
+        slow = jnp.einsum("ij,ia,ja->", self.slow_form[1:, 1:], path.slow, slow)
+        fast = jnp.einsum("ij,mia,mja->", self.fast_form[1:, 1:], path.fast, fast)
+        return (slow + self.nodes.num_micro * fast) / (2 * path.macro_dt)
+
+    at_nodes_inside = __call__
+
+
+@dataclass(frozen=True)
+class Sum:
+    """A sum of terms, itself a function of the path."""
+
+    terms: tuple[Term | QuadraticKinetic, ...]
+
+    def __call__(self, path: Path):
+        return sum((term(path) for term in self.terms), jnp.zeros(()))
+
+    def at_nodes_inside(self, path: Path):
+        """The sum without the nodes at the ends of the macro interval."""
+        return sum((term.at_nodes_inside(path) for term in self.terms), jnp.zeros(()))
+
+    @property
+    def kicks(self) -> tuple[Term, ...]:
+        """The terms that have nodes at the ends of the macro interval."""
+        return tuple(term for term in self.terms if term.start is not None or term.end is not None)
+
+    def __neg__(self):
+        return Sum(tuple(-term for term in self.terms))
+
+    def __add__(self, other):
+        return Sum(self.terms + (other.terms if isinstance(other, Sum) else (other,)))
+
+    def __sub__(self, other):
+        return self + (-other)
+
+
+def lagrangian(system: System, scheme: Scheme) -> Sum:
+    """``T - V - W`` of a system, each term on the nodes the scheme gives it."""
+    kinetic = _kinetic(system, scheme)
+    slow = _on_position_nodes(system.slow_potential, ("q_s", "q_f"), scheme.slow, scheme, system)
+    fast = _on_position_nodes(system.fast_potential, ("q_f",), scheme.fast, scheme, system)
+    return kinetic - slow - fast
+
+
+def _kinetic(system, scheme) -> Sum:
+    nodes = velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
+    if isinstance(system.kinetic, ConstantMass):
+        return Sum((QuadraticKinetic(system.kinetic, nodes),))
+    return Sum((Term(lambda *z: system.kinetic(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes),))
+
+
+def _on_position_nodes(function, arguments, placed, scheme, system) -> Sum:
+    if function is None:
+        return Sum(())
+    start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
+    return Sum((Term(lambda *q: function(*q, system.params), arguments, inside, start, end),))
+
+
+def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
+    """The discrete Lagrangian ``L_d(slow, fast, macro_dt, t=0) -> ()`` as a function of absolute control points.
+
+    Args:
+        slow: (r + 1, n_s) slow control points of the macro interval.
+        fast: (num_micro r + 1, n_f) fast control points, shared ones once.
+        macro_dt: length H of the macro interval.
+
+    Its slot derivatives are ``jax.grad(L_d, argnums=(0, 1))``; the discrete Legendre transforms are the first and
+    last of them, see `discrete_legendre`.
+    """
+    terms = lagrangian(system, scheme)
+
+    def L_d(slow, fast, macro_dt, t=0.0):
+        return terms(Path.from_control_points(slow, fast, t, macro_dt))
+
+    return L_d
+
+
+def discrete_legendre(system: System, scheme: Scheme) -> Callable:
+    """Discrete Legendre transforms ``(slow, fast, macro_dt) -> ((p_s, p_f) at the start, (p_s, p_f) at the end)``.
+
+    ``p = -D_first L_d`` and ``p+ = D_last L_d`` (without constraint forces).
+    """
+    slots = jax.grad(discrete_lagrangian(system, scheme), argnums=(0, 1))
+
+    def transforms(slow, fast, macro_dt, t=0.0):
+        d_slow, d_fast = slots(slow, fast, macro_dt, t)
+        return (-d_slow[0], -d_fast[0]), (d_slow[-1], d_fast[-1])
+
+    return transforms

@@ -1,0 +1,162 @@
+"""The equations of one macro step: stationarity of the augmented discrete action in momentum form.
+
+    A = L_d - sum_j H w_j lambda_j . g(q at node j) - sum_i H w_i nu_i . g_s(S_i)
+
+    p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)           g_s(S_i) = 0  (i = 1..r)
+    p_f + D_{F_0} A = 0      D_{F_j} A = 0  (all but the last)    g = 0 at every micro control node but the first
+
+Everything is multiplied by the micro step h, and the multipliers absorb their weights: the unknowns are
+``mu_j = h H w_j lambda_j`` and ``num_micro h H w_i nu_i``, so that rows and columns stay of the size of the mass
+matrix and the constraint Jacobian for every step size.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.discrete_lagrangian import lagrangian
+from vmri_jax.path import Nodes, Path, control_nodes, lagrange_basis, velocity_nodes
+from vmri_jax.scheme import Scheme
+from vmri_jax.system import System
+
+
+class Unknowns(NamedTuple):
+    """Unknowns of a macro step, and with the same shapes its residual.
+
+    slow (r, n_s): increments of S_1..S_r          | slow equations at S_0..S_{r-1}
+    slow_multiplier (r, n_gs): scaled, at S_0..     | g_s at S_1..S_r
+    fast (num_micro, r, n_f): increments per micro interval | fast equations at its nodes 0..r-1
+    multiplier (num_micro, r, n_g): scaled, at its nodes 0..r-1 | g at its nodes 1..r
+    """
+
+    slow: Any
+    slow_multiplier: Any
+    fast: Any
+    multiplier: Any
+
+
+class StepEquations(eqx.Module):
+    """The nonlinear equations of one macro step from given positions and (kicked) momenta."""
+
+    system: System
+    scheme: Scheme
+    t: Any
+    q_s: Any
+    q_f: Any
+    p_s: Any
+    p_f: Any
+    macro_dt: Any
+
+    @property
+    def micro_dt(self):
+        return self.macro_dt / self.scheme.num_micro
+
+    def path(self, x: Unknowns) -> Path:
+        """The path of the unknowns: fast starts are running sums of the increments over whole intervals."""
+        starts = self.q_f + jnp.concatenate([jnp.zeros_like(x.fast[:1, -1]), jnp.cumsum(x.fast[:-1, -1], axis=0)])
+        return Path(self.t, self.macro_dt, self.q_s, x.slow, starts, x.fast)
+
+    def action(self, path: Path, at: Path, x: Unknowns):
+        """Augmented action times h; forces act on the virtual displacement of `path`, evaluated along `at`."""
+        discrete_lagrangian = lagrangian(self.system, self.scheme).at_nodes_inside(path)
+        return self.micro_dt * (discrete_lagrangian + self.virtual_work(path, at)) - self.constraint_work(path, x)
+
+    def virtual_work(self, path: Path, at: Path):
+        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, forces along `at`."""
+        if self.system.force is None:
+            return 0.0
+        nodes = self.force_nodes()
+        z, q = nodes.sample(at), nodes.sample(path)
+        f_s, f_f = jax.vmap(self.force)(z.t, z.q_s, z.q_f, z.v_s, z.v_f)
+        return self.macro_dt * jnp.sum(nodes.weights * (jnp.sum(f_s * q.q_s, axis=1) + jnp.sum(f_f * q.q_f, axis=1)))
+
+    def force(self, *z):
+        return self.system.force(*z, self.system.params)
+
+    def force_nodes(self) -> Nodes:
+        return velocity_nodes(self.scheme.force, self.scheme.num_micro, self.scheme.degree)
+
+    def constraint_work(self, path: Path, x: Unknowns):
+        """``sum mu . g + sum nu . g_s / num_micro`` at all control nodes but the last."""
+        work = 0.0
+        if self.system.constraint is not None:
+            q_s, q_f = path.control_points()
+            g = jax.vmap(self.constraint)(q_s[:-1], q_f[:-1])
+            work += jnp.sum(x.multiplier.reshape(g.shape) * g)
+        if self.system.slow_constraint is not None:
+            g = jax.vmap(self.slow_constraint)(path.slow_control_points()[:-1])
+            work += jnp.sum(x.slow_multiplier * g) / self.scheme.num_micro
+        return work
+
+    def constraint(self, q_s, q_f):
+        return self.system.constraint(q_s, q_f, self.system.params)
+
+    def slow_constraint(self, q_s):
+        return self.system.slow_constraint(q_s, self.system.params)
+
+    def slots(self, x: Unknowns):
+        """``h D_{S_i} A`` (r + 1, n_s) and, per micro interval, ``h D_{F_j} A`` (num_micro, r + 1, n_f)."""
+        path = self.path(x)
+        d = jax.grad(self.action)(path, path, x)
+        slow = jnp.concatenate([(d.slow_start - d.slow.sum(0))[None], d.slow])
+        fast = jnp.concatenate([(d.fast_start - d.fast.sum(1))[:, None], d.fast], axis=1)
+        return slow, fast
+
+    def residual(self, x: Unknowns) -> Unknowns:
+        """Left-hand sides of the equations above, times h in the momentum rows."""
+        slow, fast = self.slots(x)
+        incoming = jnp.concatenate([self.micro_dt * self.p_f[None], fast[:-1, -1]])
+        path = self.path(x)
+        g, g_slow = x.multiplier, x.slow_multiplier
+        if self.system.constraint is not None:
+            q_s, q_f = path.control_points()
+            g = jax.vmap(self.constraint)(q_s[1:], q_f[1:]).reshape(g.shape)
+        if self.system.slow_constraint is not None:
+            g_slow = jax.vmap(self.slow_constraint)(path.slow_control_points()[1:])
+        return Unknowns(
+            slow=slow[:-1].at[0].add(self.micro_dt * self.p_s),
+            slow_multiplier=g_slow,
+            fast=fast[:, :-1].at[:, 0].add(incoming),
+            multiplier=g,
+        )
+
+    def end(self, x: Unknowns):
+        """Positions and momenta at the end of the step, ``p+ = D_last A``: (q_s, q_f, p_s, p_f)."""
+        slow, fast = self.slots(x)
+        path = self.path(x)
+        q_f = path.fast_start[-1] + path.fast[-1, -1]
+        return self.q_s + x.slow[-1], q_f, slow[-1] / self.micro_dt, fast[-1, -1] / self.micro_dt
+
+    def guess(self, v_s, v_f, multiplier, slow_multiplier) -> Unknowns:
+        """Straight motion at the given velocities, with the given (physical) multipliers throughout."""
+        n, c = self.scheme.num_micro, control_nodes(self.scheme.degree)[1:, None]
+        scale, slow_scale = multiplier_scales(self.scheme, self.macro_dt)
+        return Unknowns(
+            slow=c * (self.macro_dt * v_s),
+            slow_multiplier=slow_scale * slow_multiplier,
+            fast=jnp.broadcast_to(c * (self.micro_dt * v_f), (n, len(c), v_f.shape[0])),
+            multiplier=scale * multiplier,
+        )
+
+
+def multiplier_scales(scheme: Scheme, macro_dt):
+    """What turns multipliers into unknowns: ``h H w_j`` (num_micro, r, 1) and ``num_micro h H w_i`` (r, 1)."""
+    n, h = scheme.num_micro, macro_dt / scheme.num_micro
+    w, w_slow = scheme.constraint.rule.weights, scheme.slow_constraint.rule.weights
+    shared = jnp.tile(w[:-1], (n, 1)).at[1:, 0].add(w[-1])  # intervals share their end nodes
+    return h**2 * shared[..., None], macro_dt**2 * w_slow[:-1, None]
+
+
+def physical_multipliers(scheme: Scheme, macro_dt, multiplier, slow_multiplier):
+    """Multipliers lambda (num_micro, r, n_g) and nu (r, n_gs) of ``g`` and ``g_s`` from the scaled unknowns."""
+    scale, slow_scale = multiplier_scales(scheme, macro_dt)
+    return multiplier / scale, slow_multiplier / slow_scale
+
+
+def slow_basis_at_control_nodes(num_micro: int, degree: int) -> np.ndarray:
+    """``l_i(theta_{m,j})`` of the slow path at every micro control node, shape (num_micro, r + 1, r + 1)."""
+    theta = (np.arange(num_micro)[:, None] + control_nodes(degree)[None]) / num_micro
+    return lagrange_basis(degree, theta)

@@ -1,0 +1,64 @@
+"""Outcome of a step: a status code whose message tells the user what happened and what to change."""
+
+from enum import IntEnum
+
+
+class Result(IntEnum):
+    """Status of a macro step. `CONVERGED` and `CONVERGED_AT_ROUNDOFF` are successes."""
+
+    CONVERGED = 0
+    CONVERGED_AT_ROUNDOFF = 1
+    STAGNATED = 2
+    DIVERGED = 3
+    NON_FINITE = 4
+
+    @property
+    def success(self) -> bool:
+        return self <= Result.CONVERGED_AT_ROUNDOFF
+
+    @property
+    def message(self) -> str:
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Result.CONVERGED: "the step converged to the Newton tolerance.",
+    Result.CONVERGED_AT_ROUNDOFF: (
+        "the step converged to the round-off floor of its own numbers, which lies above the Newton tolerance."
+    ),
+    Result.STAGNATED: (
+        "Newton's iteration used up its iterations while still improving slowly. Likely causes: the step is too large for "
+        "the fast forces, or the constraints are nearly dependent. Try a smaller macro_dt or a larger num_micro, or raise "
+        "Newton(max_iterations=...)."
+    ),
+    Result.DIVERGED: (
+        "Newton's iteration moved away from a solution. Likely causes: the step is too large for the curvature of the "
+        "potentials or constraints, or the state is far from them. Try a smaller macro_dt."
+    ),
+    Result.NON_FINITE: (
+        "a NaN or infinity appeared. Likely causes: an explicit scheme beyond its stability limit (omega h < 2), a function "
+        "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number), or dependent constraints "
+        "that make the Newton matrix singular. Try a smaller macro_dt, or look at the state just before the failure."
+    ),
+}
+
+
+class SimulationError(RuntimeError):
+    """A run failed at some macro step; what was computed before is in `.trajectory`.
+
+    Attributes:
+        result: the `Result` of the failing step.
+        step: index of the failing macro step (0 = the first).
+        time: time at the start of that step.
+        iterations, residual: of its last Newton iteration.
+        trajectory: the `Trajectory` up to the failure (NaN after it).
+    """
+
+    def __init__(self, result: Result, step: int, time: float, iterations: int, residual: float, trajectory):
+        self.result, self.step, self.time = result, step, time
+        self.iterations, self.residual, self.trajectory = iterations, residual, trajectory
+        super().__init__(
+            f"macro step {step} at t = {time:.6g} failed ({result.name}) after {iterations} Newton iterations with residual "
+            f"{residual:.2e}: {result.message} The trajectory up to there is in this exception's .trajectory; "
+            "throw=False returns it instead of raising."
+        )

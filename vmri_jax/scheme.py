@@ -1,0 +1,145 @@
+"""Schemes: which quadrature rule carries which term of the Lagrangian.
+
+A scheme is data. The reference schemes and the Galerkin family are points in one space:
+
+| scheme | V | W | explicit | order |
+|---|---|---|---|---|
+| `fully_implicit(num_micro)` | micro(midpoint) | micro(midpoint) | no | 2 |
+| `explicit_slow(num_micro, alpha)` | macro(affine(alpha)) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
+| `fully_explicit(num_micro, alpha)` | macro(affine(alpha)) | micro(affine(alpha)) | yes | 2 at alpha = 1/2, else 1 |
+| `galerkin(num_micro, degree, rule)` | micro(rule) | micro(rule) | no | min(2 degree, rule order) |
+"""
+
+import equinox as eqx
+import numpy as np
+
+from vmri_jax.checks import is_concrete
+from vmri_jax.path import control_nodes
+from vmri_jax.quadrature import (
+    NODE_TOLERANCE,
+    PlacedRule,
+    Rule,
+    affine,
+    gauss,
+    lobatto,
+    macro,
+    micro,
+    midpoint,
+)
+
+
+class Scheme(eqx.Module):
+    """Variational multirate scheme: the degree of the path and the rule of every term.
+
+    Every scheme is symplectic, conserves the momentum maps its discrete Lagrangian inherits, and has order
+    ``min(2 degree, order of its rules)`` (Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991). It is
+    symmetric (time-reversible) exactly when all its rules are.
+
+    Args:
+        num_micro: micro intervals per macro interval.
+        degree: polynomial degree r of the path, on r + 1 Gauss-Lobatto control points.
+        kinetic, slow, fast, force: placed rules (``macro(...)`` or ``micro(...)``) of T, V, W and the forces;
+            `kinetic` must be placed with micro, `force` defaults to the rule of `kinetic`.
+        constraint: where g holds: micro(rule) whose nodes are the control nodes; default micro(lobatto(degree + 1)).
+        slow_constraint: where g_s holds: macro(rule) on the same nodes; default macro(lobatto(degree + 1)).
+
+    Raises:
+        TypeError: num_micro or degree not an integer, or a rule that was not placed with macro or micro.
+        ValueError: num_micro or degree below 1, weights that do not sum to 1, or constraint nodes that are not the
+            control nodes.
+    """
+
+    num_micro: int = eqx.field(static=True)
+    degree: int = eqx.field(static=True)
+    kinetic: PlacedRule
+    slow: PlacedRule
+    fast: PlacedRule
+    constraint: PlacedRule
+    slow_constraint: PlacedRule
+    force: PlacedRule
+
+    def __init__(self, num_micro, degree=1, *, kinetic, slow, fast, constraint=None, slow_constraint=None, force=None):
+        self.num_micro = _positive_integer("num_micro", num_micro)
+        self.degree = _positive_integer("degree", degree)
+        self.kinetic, self.slow, self.fast = kinetic, slow, fast
+        self.force = kinetic if force is None else force
+        self.constraint = micro(lobatto(degree + 1)) if constraint is None else constraint
+        self.slow_constraint = macro(lobatto(degree + 1)) if slow_constraint is None else slow_constraint
+        for name in ("kinetic", "slow", "fast", "force", "constraint", "slow_constraint"):
+            _check_placed(name, getattr(self, name))
+        if self.kinetic.grid != "micro":
+            raise ValueError(
+                "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
+            )
+        for name, grid in (("constraint", "micro"), ("slow_constraint", "macro")):
+            placed = getattr(self, name)
+            nodes, needed = np.array(placed.rule.nodes), control_nodes(self.degree)
+            if placed.grid != grid or nodes.shape != needed.shape or np.abs(nodes - needed).max() > NODE_TOLERANCE:
+                raise ValueError(
+                    f"Scheme: {name} must be held at the control nodes {needed.tolist()} of degree {degree}; "
+                    f"give {grid}(lobatto({degree + 1})), got {placed.grid} rule with nodes {nodes.tolist()}."
+                )
+
+    @property
+    def order(self) -> int:
+        """Order of convergence, ``min(2 degree, order of the rules of T, V and W)``; needs concrete weights."""
+        return min(2 * self.degree, *(placed.rule.order for placed in (self.kinetic, self.slow, self.fast)))
+
+
+def _positive_integer(name: str, value) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"Scheme: {name} is {value!r}; it must be an integer of at least 1.")
+    if value < 1:
+        raise ValueError(f"Scheme: {name} is {value}; it must be at least 1.")
+    return int(value)
+
+
+def _check_placed(name: str, placed) -> None:
+    if isinstance(placed, Rule):
+        raise TypeError(f"Scheme: {name} is a bare rule; say on which grid it lives, macro(rule) or micro(rule).")
+    if not isinstance(placed, PlacedRule):
+        raise TypeError(f"Scheme: {name} is {placed!r}; give macro(rule) or micro(rule).")
+    if is_concrete(placed):
+        total = float(placed.rule.weights.sum())
+        if not abs(total - 1) < 1e-10:
+            raise ValueError(f"Scheme: the weights of the {name} rule sum to {total:.15g}; they must sum to 1.")
+
+
+def fully_implicit(num_micro: int) -> Scheme:
+    """V and W at the midpoint of every micro interval. Order 2, symmetric, implicit.
+
+    Evaluations per macro step and Newton iteration: V num_micro, W num_micro.
+    """
+    return Scheme(num_micro, kinetic=micro(midpoint), slow=micro(midpoint), fast=micro(midpoint))
+
+
+def explicit_slow(num_micro: int, alpha=0.5) -> Scheme:
+    """V as a kick at the macro nodes, W at the micro midpoints. Order 2 and symmetric at alpha = 1/2, else order 1.
+
+    Evaluations per macro step: V once (the right node of a step is the left node of the next), W num_micro per
+    Newton iteration. Unstable near the impulse resonances omega H = k pi.
+    """
+    return Scheme(num_micro, kinetic=micro(midpoint), slow=macro(affine(alpha)), fast=micro(midpoint))
+
+
+def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
+    """V as a kick at the macro nodes, W as kicks at the micro nodes (impulse method, r-RESPA at alpha = 1/2).
+
+    Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints: V once and
+    W num_micro times per macro step, no Newton. Stable only for omega h < 2.
+    """
+    return Scheme(num_micro, kinetic=micro(midpoint), slow=macro(affine(alpha)), fast=micro(affine(alpha)))
+
+
+def galerkin(num_micro: int, degree: int, rule: Rule | str = "gauss") -> Scheme:
+    """One rule on every term of a degree-r path: order 2r with ``"gauss"`` (r nodes) or ``"lobatto"`` (r + 1 nodes).
+
+    Symmetric for symmetric rules, implicit, also with constraints. Evaluations of V and W per macro step and Newton
+    iteration: num_micro times the number of nodes (lobatto shares the nodes where micro intervals meet).
+    """
+    degree = _positive_integer("degree", degree)
+    if isinstance(rule, str):
+        if rule not in ("gauss", "lobatto"):
+            raise ValueError(f"galerkin: rule is {rule!r}; it must be 'gauss', 'lobatto' or a Rule.")
+        rule = gauss(degree) if rule == "gauss" else lobatto(degree + 1)
+    return Scheme(num_micro, degree, kinetic=micro(rule), slow=micro(rule), fast=micro(rule))

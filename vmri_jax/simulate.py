@@ -1,0 +1,194 @@
+"""Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax import diagnostics
+from vmri_jax.checks import check_arrays, check_system, is_concrete, require_x64
+from vmri_jax.newton import Newton
+from vmri_jax.results import Result, SimulationError
+from vmri_jax.scheme import Scheme
+from vmri_jax.state import State, check_fast_constraint
+from vmri_jax.step import advance, start_memory
+from vmri_jax.system import System
+from vmri_jax.trajectory import Trajectory, join
+
+
+def simulate(
+    system: System,
+    scheme: Scheme,
+    state: State,
+    *,
+    macro_dt=None,
+    micro_dt=None,
+    num_steps: int,
+    save_every: int = 1,
+    save_micro: bool = False,
+    newton: Newton | None = None,
+    throw: bool = True,
+    progress: bool = False,
+) -> Trajectory:
+    """Simulate `num_steps` macro steps and save every `save_every`-th macro node.
+
+    Compiled once per system structure, scheme structure and number of saved nodes: step sizes, parameters, rule
+    weights, initial states and `save_every` may vary without compiling again. Works under ``jax.vmap`` over state,
+    params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised.
+
+    Args:
+        system, scheme: what moves, and how.
+        state: start, from `initial_state` or a former run.
+        macro_dt, micro_dt: step size, exactly one of them (``macro_dt = num_micro * micro_dt``).
+        num_steps: macro steps, a multiple of `save_every`.
+        save_every: macro steps from one saved node to the next.
+        save_micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
+        newton: how implicit equations are solved.
+        throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
+            NaN from the failure on.
+        progress: show a progress bar; the run is then compiled for a part of its saved nodes.
+
+    Returns:
+        The `Trajectory`, with ``num_steps / save_every + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
+        the step number k, never accumulated.
+
+    Raises:
+        ValueError, TypeError: bad arguments, before anything is computed.
+        SimulationError: a step failed.
+    """
+    macro_dt = _check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every)
+    num_saves = num_steps // save_every
+    state = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
+    inputs = (system, scheme, state, jnp.asarray(macro_dt, dtype=float), newton or Newton())
+    if not is_concrete(inputs):  # under a transformation: a static trip count keeps reverse mode possible
+        memory = start_memory(system, scheme, state)
+        return _run(*inputs, memory, 0, num_saves, save_every, save_micro)[0]
+
+    pieces, first_step, memory = [], 0, _start_memory(system, scheme, state)
+    for saves in _chunks(num_saves, progress):
+        piece, memory = _compiled_run(
+            *inputs[:2], state, *inputs[3:], memory, first_step, saves, save_every, save_micro, inputs[2].t
+        )
+        pieces.append(piece)
+        state, first_step = piece.final_state, first_step + saves * save_every
+    trajectory = pieces[0] if len(pieces) == 1 else join(pieces)
+    if throw and int(trajectory.failed_at) >= 0:
+        raise _error(trajectory, scheme, macro_dt, save_every)
+    return trajectory
+
+
+def _run(
+    system, scheme, state, macro_dt, newton, memory, first_step, num_saves, save_every, save_micro, t_start=None
+) -> tuple[Trajectory, Any]:
+    """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one."""
+    t_start = state.t if t_start is None else t_start
+    n = scheme.num_micro
+
+    def step(_, carry):
+        state, memory, k, status, worst, _ = carry
+        state, info, memory = advance(system, scheme, state, macro_dt, newton, memory)
+        failed = (info.result > Result.CONVERGED_AT_ROUNDOFF) & (status[1] < 0)
+        ok = (status[1] < 0) & ~failed
+        status = (
+            jnp.where(status[1] < 0, jnp.maximum(status[0], info.result), status[0]),
+            jnp.where(failed, k, status[1]),
+        )
+        worst = (jnp.maximum(worst[0], info.iterations), jnp.fmax(worst[1], info.residual))
+        state = jax.tree.map(lambda a: jnp.where(ok, a, jnp.nan), state)
+        state = State(t_start + (k + 1) * macro_dt, state.q_s, state.q_f, state.p_s, state.p_f)
+        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
+        return state, memory, k + 1, status, worst, micro
+
+    def save(carry, _):
+        state, memory, k, status = carry
+        worst = (jnp.asarray(0), jnp.zeros(()))
+        micro = jnp.zeros((n, state.q_f.shape[0])) if save_micro else None
+        carry = (state, memory, k, status, worst, micro)
+        state, memory, k, status, worst, micro = jax.lax.fori_loop(0, save_every, step, carry)
+        return (state, memory, k, status), (state, worst, micro)
+
+    status = (jnp.asarray(int(Result.CONVERGED)), jnp.asarray(-1))
+    carry = (state, memory, jnp.asarray(first_step), status)
+    (_, memory, _, status), (states, worst, micro) = jax.lax.scan(save, carry, length=num_saves)
+    nodes = jax.tree.map(lambda first, later: jnp.concatenate([first[None], later]), state, states)
+    phase = (nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f)
+    trajectory = Trajectory(
+        nodes.t,
+        *phase,
+        energy=jax.vmap(partial(diagnostics.energy, system))(*phase),
+        constraint_residual=jax.vmap(partial(diagnostics.constraint_residual, system))(*phase),
+        iterations=worst[0],
+        residual=worst[1],
+        result=status[0],
+        failed_at=status[1],
+        t_micro=nodes.t[1:, None] - macro_dt * (1 - np.arange(1, n + 1) / n) if save_micro else None,
+        q_f_micro=micro,
+    )
+    return trajectory, memory
+
+
+_compiled_run = jax.jit(_run, static_argnames=("num_saves", "save_micro"))
+_start_memory = jax.jit(start_memory)
+
+
+def _chunks(num_saves: int, progress: bool):
+    """Numbers of saved nodes per compiled call; one call, or about 50 equal ones with a progress bar around them."""
+    if not progress:
+        yield num_saves
+        return
+    from rich.progress import track
+
+    size = -(-num_saves // 50)
+    sizes = [size] * (num_saves // size) + ([num_saves % size] if num_saves % size else [])
+    yield from track(sizes, description="simulating", transient=True)
+
+
+def _vectors(state: State) -> dict:
+    return {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
+
+
+def _check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every):
+    """Refuse bad arguments of `simulate`; returns macro_dt."""
+    require_x64()
+    if not isinstance(scheme, Scheme):
+        raise TypeError(
+            f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
+        )
+    if not isinstance(state, State):
+        raise TypeError(f"simulate: state is {type(state).__name__}; give a State, e.g. from initial_state(...).")
+    if (macro_dt is None) == (micro_dt is None):
+        got = "neither" if macro_dt is None else "both"
+        raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")
+    name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
+    if is_concrete(dt) and not (np.ndim(dt) == 0 and np.isfinite(dt) and dt > 0):
+        raise ValueError(f"simulate: {name} is {dt}; it must be a positive number.")
+    for name, value in (("num_steps", num_steps), ("save_every", save_every)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"simulate: {name} is {value!r}; it must be an integer of at least 1.")
+    if num_steps % save_every:
+        raise ValueError(
+            f"simulate: num_steps = {num_steps} is not a multiple of save_every = {save_every}; the last saved node would "
+            "not be the end."
+        )
+    vectors = _vectors(state)
+    if is_concrete(vectors):
+        check_arrays(**vectors)
+    check_system(system, vectors["q_s"], vectors["q_f"])
+    if system.constraint is not None and is_concrete((system, state)):
+        check_fast_constraint(system, state.q_s, state.q_f)
+    return dt if micro_dt is None else scheme.num_micro * micro_dt
+
+
+def _error(trajectory: Trajectory, scheme: Scheme, macro_dt, save_every: int) -> SimulationError:
+    step = int(trajectory.failed_at)
+    interval = step // save_every
+    return SimulationError(
+        Result(int(trajectory.result)),
+        step,
+        float(trajectory.t[0] + step * macro_dt),
+        int(trajectory.iterations[interval]),
+        float(trajectory.residual[interval]),
+        trajectory,
+    )

@@ -1,0 +1,273 @@
+"""One macro step: momenta in, momenta out, by the cheapest route that the rules and the system allow.
+
+The route is chosen statically, by `split` and `is_explicit`:
+
+* *kicks*: potentials at the ends of the interval only shift momenta, before and after everything else;
+* *split*: if, kicks aside, the slow equations do not see the fast unknowns, the slow variables make one step over the
+  macro interval and the fast ones num_micro steps over the micro intervals, each a problem of the same kind;
+* *explicit*: an interval on which nothing but constant-mass kinetic energy is left is a straight drift, no Newton;
+* *coupled*: everything else is solved at once by Newton's iteration.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.discrete_lagrangian import lagrangian
+from vmri_jax.equations import StepEquations, physical_multipliers
+from vmri_jax.newton import Newton, solve
+from vmri_jax.quadrature import micro, midpoint
+from vmri_jax.results import Result
+from vmri_jax.scheme import Scheme
+from vmri_jax.state import State, project_momentum
+from vmri_jax.system import ConstantMass, System, depends_on
+
+
+class StepInfo(eqx.Module):
+    """What a macro step did.
+
+    result: status code, see `Result`.
+    iterations: Newton iterations (the most that any of its solves took; 0 for explicit steps).
+    residual: largest residual left, relative to the momentum, and of the constraints.
+    q_f_micro: (num_micro, n_f) fast positions at the micro nodes, the start excluded.
+    multiplier, slow_multiplier: (num_micro, r, n_g) and (r, n_gs) Lagrange multipliers at the control nodes.
+    """
+
+    result: Any
+    iterations: Any
+    residual: Any
+    q_f_micro: Any
+    multiplier: Any
+    slow_multiplier: Any
+
+
+class Memory(eqx.Module):
+    """What a step hands to the next: gradients of the kicks at the node they share, and what Newton starts from."""
+
+    kicks: Any
+    velocity: Any
+    multiplier: Any
+    slow_multiplier: Any
+    parts: Any = None
+
+
+class Split(NamedTuple):
+    """A system taken apart: kicks that stay outside, a slow system for one step, a fast one for num_micro steps.
+
+    Each part is a system of fast variables alone on a single micro interval.
+    """
+
+    kicks: System
+    slow: System
+    slow_scheme: Scheme
+    fast: System
+    fast_scheme: Scheme
+
+
+def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
+    """The parts of a macro step whose slow equations, kicks aside, do not see the fast unknowns, else None."""
+    n_s, n_f = q_s.shape[0], q_f.shape[0]
+    params = system.params
+    if not n_s or scheme.degree > 1 or system.force is not None or not isinstance(system.kinetic, ConstantMass):
+        return None
+    slow_potential, fast_potential, constraint = system.slow_potential, system.fast_potential, system.constraint
+    kicked = {}
+    if slow_potential is not None and scheme.slow.grid == "macro" and scheme.slow.only_ends:
+        kicked["slow_potential"], slow_potential = slow_potential, None
+    if fast_potential is not None and scheme.fast.grid == "macro" and scheme.fast.only_ends:
+        kicked["fast_potential"], fast_potential = fast_potential, None
+
+    coupled_slow = slow_potential is not None and (
+        scheme.slow.grid == "micro" or depends_on(lambda q: slow_potential(q_s, q, params), q_f)[0]
+    )
+    coupled_fast = fast_potential is not None and scheme.fast.grid == "macro"
+    coupled_constraint = constraint is not None and depends_on(lambda q: constraint(q, q_f, params), q_s)[0]
+    if coupled_slow or coupled_fast or coupled_constraint:
+        return None
+
+    def on_slow(function):  # V(q_s, -) and g_s(q_s), with the slow variables in the place of the fast ones
+        return None if function is None else lambda q, params: function(q, jnp.zeros(n_f), params)
+
+    def slow_constraint(_, q, params):
+        return system.slow_constraint(q, params)
+
+    def fast_constraint(_, q, params):
+        return constraint(jnp.zeros(n_s), q, params)
+
+    none, drift = jnp.zeros(0), micro(midpoint)
+    return Split(
+        kicks=System(system.kinetic, **kicked, params=params),
+        slow=System(
+            ConstantMass(none, system.kinetic.slow),
+            fast_potential=on_slow(slow_potential),
+            constraint=None if system.slow_constraint is None else slow_constraint,
+            params=params,
+        ),
+        slow_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.slow),
+        fast=System(
+            ConstantMass(none, system.kinetic.fast),
+            fast_potential=fast_potential,
+            constraint=None if constraint is None else fast_constraint,
+            params=params,
+        ),
+        fast_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast),
+    )
+
+
+def is_explicit(system: System, scheme: Scheme) -> bool:
+    """Whether a single micro interval is a straight drift between kicks."""
+    terms = lagrangian(system, scheme).terms
+    return (
+        scheme.num_micro == scheme.degree == 1
+        and isinstance(system.kinetic, ConstantMass)
+        and system.constraint is system.slow_constraint is system.force is None
+        and not any(term.inside.groups for term in terms[1:])
+    )
+
+
+def macro_step(
+    system: System, scheme: Scheme, state: State, macro_dt, newton: Newton | None = None
+) -> tuple[State, StepInfo]:
+    """One macro step, ``(state, info) = macro_step(system, scheme, state, macro_dt)``; pure and not compiled.
+
+    The momenta returned are projected onto the hidden constraints, ``G M^-1 p = 0``. `simulate` takes many steps faster:
+    it reuses gradients and starts Newton from the step before.
+
+    Args:
+        system, scheme: what moves, and how.
+        state: a consistent state, from `initial_state` or a former step.
+        macro_dt: length H of the macro step, positive.
+        newton: how implicit equations are solved.
+    """
+    state, info, _ = advance(system, scheme, state, macro_dt, newton or Newton(), start_memory(system, scheme, state))
+    return state, info
+
+
+def start_memory(system: System, scheme: Scheme, state: State) -> Memory:
+    """Memory of a first step: gradients evaluated, velocity from the momentum, multipliers zero."""
+    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    velocity = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f)[2:]
+    parts = split(system, scheme, state.q_s, state.q_f)
+    own = system if parts is None else parts.kicks
+    memories = None
+    if parts is not None:
+        slow, fast = _slow_and_fast(state)
+        memories = start_memory(parts.slow, parts.slow_scheme, slow), start_memory(parts.fast, parts.fast_scheme, fast)
+    kicks = _kick_gradients(own, scheme, state.q_s, state.q_f)
+    return Memory(kicks, velocity, jnp.zeros(n_g), jnp.zeros(n_gs), memories)
+
+
+def advance(system: System, scheme: Scheme, state: State, macro_dt, newton: Newton, memory: Memory):
+    """`macro_step` that takes and hands on a `Memory`: (state, info, memory)."""
+    state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
+    p_s, p_f, v_s, v_f = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    state = State(state.t, state.q_s, state.q_f, p_s, p_f)
+    finite = jnp.all(jnp.isfinite(jnp.concatenate([state.q_s, state.q_f, p_s, p_f])))
+    multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, info.multiplier, info.slow_multiplier)
+    info = eqx.tree_at(
+        lambda i: (i.result, i.multiplier, i.slow_multiplier),
+        info,
+        (jnp.where(finite, info.result, Result.NON_FINITE), multiplier, slow_multiplier),
+    )
+    return state, info, eqx.tree_at(lambda m: m.velocity, memory, (v_s, v_f))
+
+
+def _interval(system, scheme, state, macro_dt, newton, memory):
+    """Kick, move, kick. Multipliers in the info are scaled; momenta are not projected."""
+    parts = split(system, scheme, state.q_s, state.q_f)
+    own = system if parts is None else parts.kicks
+    state = _kick(own, scheme, state, macro_dt, memory.kicks, "start")
+    if parts is not None:
+        state, info, memory = _move_parts(parts, scheme.num_micro, state, macro_dt, newton, memory)
+    elif is_explicit(system, scheme):
+        state, info = _drift(system, state, macro_dt)
+    else:
+        state, info, memory = _move_coupled(system, scheme, state, macro_dt, newton, memory)
+    kicks = _kick_gradients(own, scheme, state.q_s, state.q_f)
+    state = _kick(own, scheme, state, macro_dt, kicks, "end")
+    return state, info, Memory(kicks, memory.velocity, memory.multiplier, memory.slow_multiplier, memory.parts)
+
+
+def _kick_gradients(system, scheme, q_s, q_f):
+    return tuple(term.gradient(q_s, q_f) for term in lagrangian(system, scheme).kicks)
+
+
+def _kick(system, scheme, state, macro_dt, gradients, end: str) -> State:
+    """``p + H w dL/dq`` for the weight w that each kicked term has at this end of the interval."""
+    p_s, p_f = state.p_s, state.p_f
+    for term, (d_s, d_f) in zip(lagrangian(system, scheme).kicks, gradients, strict=True):
+        weight = getattr(term, end)
+        if weight is not None:
+            p_s, p_f = p_s + macro_dt * weight * d_s, p_f + macro_dt * weight * d_f
+    return State(state.t, state.q_s, state.q_f, p_s, p_f)
+
+
+def _drift(system, state, macro_dt):
+    """Straight motion at constant momentum."""
+    v_s, v_f = system.kinetic.velocity(state.p_s, state.p_f)
+    q_s, q_f = state.q_s + macro_dt * v_s, state.q_f + macro_dt * v_f
+    info = StepInfo(
+        jnp.asarray(int(Result.CONVERGED)),
+        jnp.asarray(0),
+        jnp.zeros(()),
+        q_f[None],
+        jnp.zeros((1, 1, 0)),
+        jnp.zeros((1, 0)),
+    )
+    return State(state.t + macro_dt, q_s, q_f, state.p_s, state.p_f), info
+
+
+def _slow_and_fast(state: State) -> tuple[State, State]:
+    """The slow and the fast variables as states of fast variables alone."""
+    none = jnp.zeros(0)
+    return State(state.t, none, state.q_s, none, state.p_s), State(state.t, none, state.q_f, none, state.p_f)
+
+
+def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
+    """The slow variables make one step, the fast ones num_micro steps."""
+    slow, fast = _slow_and_fast(state)
+    slow_memory, fast_memory = memory.parts
+    slow, slow_info, slow_memory = _interval(parts.slow, parts.slow_scheme, slow, macro_dt, newton, slow_memory)
+
+    def micro_step(carry, _):
+        fast, memory = carry
+        fast, info, memory = _interval(parts.fast, parts.fast_scheme, fast, macro_dt / num_micro, newton, memory)
+        return (fast, memory), info
+
+    (fast, fast_memory), infos = jax.lax.scan(micro_step, (fast, fast_memory), length=num_micro)
+    info = StepInfo(
+        result=jnp.maximum(slow_info.result, infos.result.max()),
+        iterations=jnp.maximum(slow_info.iterations, infos.iterations.max()),
+        residual=jnp.maximum(slow_info.residual, infos.residual.max()),
+        q_f_micro=infos.q_f_micro[:, 0],
+        multiplier=infos.multiplier[:, 0],
+        slow_multiplier=slow_info.multiplier[0],
+    )
+    memory = Memory(
+        memory.kicks, memory.velocity, memory.multiplier, memory.slow_multiplier, (slow_memory, fast_memory)
+    )
+    return State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f), info, memory
+
+
+def _move_coupled(system, scheme, state, macro_dt, newton, memory):
+    """All unknowns of the macro step at once, by Newton's iteration."""
+    equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
+    v_s, v_f = memory.velocity
+    if isinstance(system.kinetic, ConstantMass):  # the momentum is at hand, kicks included
+        v_s, v_f = system.kinetic.velocity(state.p_s, state.p_f)
+    x, outcome = solve(equations, equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier), newton)
+    q_s, q_f, p_s, p_f = equations.end(x)
+    path = equations.path(x)
+    multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, x.multiplier, x.slow_multiplier)
+    memory = Memory(memory.kicks, memory.velocity, multiplier[-1, -1], slow_multiplier[-1], memory.parts)
+    info = StepInfo(
+        outcome.result,
+        outcome.iterations,
+        outcome.residual,
+        path.fast_start + path.fast[:, -1],
+        x.multiplier,
+        x.slow_multiplier,
+    )
+    return State(state.t + macro_dt, q_s, q_f, p_s, p_f), info, memory

@@ -1,0 +1,184 @@
+"""The physics: what a user writes, as plain JAX functions of slow and fast variables."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class ConstantMass(eqx.Module):
+    """Kinetic energy ``T = v_s^T M_s v_s / 2 + v_f^T M_f v_f / 2`` with constant masses.
+
+    Args:
+        slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix.
+
+    Raises:
+        ValueError: a mass that is not positive, or a matrix that is not symmetric positive definite.
+    """
+
+    slow: Any
+    fast: Any
+
+    def __init__(self, slow, fast):
+        self.slow, self.fast = _mass("slow", slow), _mass("fast", fast)
+
+    def __call__(self, q_s, q_f, v_s, v_f, params):
+        return (v_s @ _times(self.slow, v_s) + v_f @ _times(self.fast, v_f)) / 2
+
+    def momentum(self, v_s, v_f):
+        """``(M_s v_s, M_f v_f)``, over any leading axes."""
+        return _times(self.slow, v_s), _times(self.fast, v_f)
+
+    def velocity(self, p_s, p_f):
+        """``(M_s^-1 p_s, M_f^-1 p_f)``, over any leading axes."""
+        return _solve(self.slow, p_s), _solve(self.fast, p_f)
+
+
+def _times(mass, v):
+    return mass * v if mass.ndim == 1 else v @ mass
+
+
+def _solve(mass, p):
+    return p / mass if mass.ndim == 1 else jnp.linalg.solve(mass, p[..., None])[..., 0]
+
+
+def _mass(name: str, mass):
+    if isinstance(mass, jax.core.Tracer):
+        return mass
+    mass = np.asarray(mass, dtype=float) if not isinstance(mass, jax.Array) else mass
+    if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
+        raise ValueError(f"ConstantMass: {name} has shape {mass.shape}; give (n,) masses or an (n, n) mass matrix.")
+    values = np.asarray(mass)
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"ConstantMass: {name} = {values} is not finite.")
+    if mass.ndim == 1 and np.any(values <= 0):
+        raise ValueError(f"ConstantMass: {name} = {values}; every mass must be positive.")
+    if mass.ndim == 2 and (not np.allclose(values, values.T) or np.any(np.linalg.eigvalsh(values) <= 0)):
+        raise ValueError(f"ConstantMass: {name} must be a symmetric positive definite matrix.")
+    return mass
+
+
+class KineticFunction(eqx.Module):
+    """Kinetic energy given by a function ``kinetic(q_s, q_f, v_s, v_f, params) -> ()``."""
+
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, q_s, q_f, v_s, v_f, params):
+        return self.function(q_s, q_f, v_s, v_f, params)
+
+
+class System(eqx.Module):
+    """Mechanical system with Lagrangian ``L = T - V - W``, constraints ``g = 0`` and forces ``F``.
+
+    Args:
+        kinetic: `ConstantMass`, or ``kinetic(q_s, q_f, v_s, v_f, params) -> ()``, regular in the velocities.
+        slow_potential: ``V(q_s, q_f, params) -> ()``.
+        fast_potential: ``W(q_f, params) -> ()``.
+        constraint: ``g(q_s, q_f, params) -> (n_g,)``, holonomic, involving fast variables.
+        slow_constraint: ``g_s(q_s, params) -> (n_gs,)``, holonomic, of slow variables alone.
+        force: ``F(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)``, not derived from a potential.
+        params: any pytree of arrays, handed to every function; traced, so that sweeps and gradients over it
+            never recompile.
+
+    Functions are compared by identity: define them at module level (not inside a loop) and pass what varies
+    through `params`, and everything is compiled once.
+    """
+
+    kinetic: ConstantMass | KineticFunction
+    slow_potential: Callable | None = eqx.field(static=True, default=None)
+    fast_potential: Callable | None = eqx.field(static=True, default=None)
+    constraint: Callable | None = eqx.field(static=True, default=None)
+    slow_constraint: Callable | None = eqx.field(static=True, default=None)
+    force: Callable | None = eqx.field(static=True, default=None)
+    params: Any = None
+
+    def __init__(
+        self,
+        kinetic,
+        slow_potential=None,
+        fast_potential=None,
+        constraint=None,
+        slow_constraint=None,
+        force=None,
+        params=None,
+    ):
+        functions = {
+            "slow_potential": slow_potential,
+            "fast_potential": fast_potential,
+            "constraint": constraint,
+            "slow_constraint": slow_constraint,
+            "force": force,
+        }
+        for name, function in functions.items():
+            if function is not None and not callable(function):
+                raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
+            setattr(self, name, function)
+        if not isinstance(kinetic, ConstantMass | KineticFunction):
+            if not callable(kinetic):
+                raise TypeError(
+                    f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function "
+                    "kinetic(q_s, q_f, v_s, v_f, params)."
+                )
+            kinetic = KineticFunction(kinetic)
+        self.kinetic = kinetic
+        self.params = params
+
+    def replace(self, **changes) -> "System":
+        """The same system with some fields changed, e.g. ``system.replace(params=new)``."""
+        return dataclasses.replace(self, **changes)
+
+    def constraints(self, q_s, q_f):
+        """All constraint values at one configuration, ``(g, g_s)`` joined, shape (n_g + n_gs,)."""
+        parts = []
+        if self.constraint is not None:
+            parts.append(self.constraint(q_s, q_f, self.params))
+        if self.slow_constraint is not None:
+            parts.append(self.slow_constraint(q_s, self.params))
+        return jnp.concatenate(parts) if parts else jnp.zeros(0)
+
+    def num_constraints(self, q_s, q_f) -> tuple[int, int]:
+        """``(n_g, n_gs)`` for configurations of these shapes."""
+        n_g = n_gs = 0
+        if self.constraint is not None:
+            n_g = jax.eval_shape(self.constraint, q_s, q_f, self.params).shape[0]
+        if self.slow_constraint is not None:
+            n_gs = jax.eval_shape(self.slow_constraint, q_s, self.params).shape[0]
+        return n_g, n_gs
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """A system with initial positions and velocities."""
+
+    system: System
+    q_s: Any
+    q_f: Any
+    v_s: Any
+    v_f: Any
+    t: float = 0.0
+
+    def state(self, project: bool = False):
+        """The consistent initial `State` (see `initial_state`)."""
+        from vmri_jax.state import initial_state
+
+        return initial_state(self.system, self.q_s, self.q_f, self.v_s, self.v_f, self.t, project=project)
+
+
+def depends_on(function: Callable, *args) -> tuple[bool, ...]:
+    """Whether the outputs of ``function(*args)`` can depend on each argument, read off its jaxpr.
+
+    Structural and conservative: True may be wrong (``0 * x`` counts), False never is.
+    """
+    jaxpr = jax.make_jaxpr(function)(*args).jaxpr
+    needed = {id(v) for v in jaxpr.outvars}
+    for eqn in reversed(jaxpr.eqns):
+        if any(id(v) in needed for v in eqn.outvars):
+            needed.update(id(v) for v in eqn.invars)
+    leaves = [jax.tree.structure(a).num_leaves for a in args]
+    stops = np.cumsum(leaves)
+    used = [id(v) in needed for v in jaxpr.invars]
+    return tuple(any(used[stop - n : stop]) for n, stop in zip(leaves, stops, strict=True))

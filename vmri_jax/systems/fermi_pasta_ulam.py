@@ -1,0 +1,41 @@
+"""The Fermi-Pasta-Ulam chain: stiff linear springs alternating with soft quartic ones.
+
+Slow variables are the (scaled) centres of the stiff springs, fast ones their (scaled) elongations:
+Hairer, Lubich, Wanner, *Geometric Numerical Integration*, I.5.1.
+"""
+
+import jax.numpy as jnp
+
+from vmri_jax import ConstantMass, Problem, System
+
+
+def soft_springs(q_s, q_f, params):
+    """``V = 1/4 [(s_1 - f_1)^4 + sum_i (s_{i+1} - f_{i+1} - s_i - f_i)^4 + (s_l + f_l)^4]``."""
+    inner = q_s[1:] - q_f[1:] - q_s[:-1] - q_f[:-1]
+    return ((q_s[0] - q_f[0]) ** 4 + jnp.sum(inner**4) + (q_s[-1] + q_f[-1]) ** 4) / 4
+
+
+def stiff_springs(q_f, params):
+    """``W = omega^2 / 2 |f|^2``."""
+    return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
+
+
+def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
+    """FPU chain of `num_springs` stiff springs of frequency `omega`, unit masses, started as in HLW.
+
+    ``s_1 = 1, f_1 = 1 / omega``, unit velocities in both, all else at rest.
+
+    Args:
+        num_springs: l, number of stiff springs = slow variables = fast variables.
+        omega: frequency of the stiff springs.
+    """
+    if num_springs < 1:
+        raise ValueError(f"fermi_pasta_ulam: num_springs is {num_springs}; there must be at least 1.")
+    ones, first = jnp.ones(num_springs), jnp.zeros(num_springs).at[0].set(1.0)
+    system = System(
+        kinetic=ConstantMass(ones, ones),
+        slow_potential=soft_springs,
+        fast_potential=stiff_springs,
+        params={"omega": jnp.asarray(omega)},
+    )
+    return Problem(system, q_s=first, q_f=first / omega, v_s=first, v_f=first)

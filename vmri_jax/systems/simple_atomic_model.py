@@ -1,0 +1,81 @@
+"""A simple atomic model: two heavy atoms (slow) and four light ones (fast) joined by springs and rigid bonds."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax import ConstantMass, Problem, System
+
+TETRAHEDRON = np.sqrt(np.array([1 / 3, 1 / 12, 2 / 3]))  # for unit edges: radius, inradius of a face; height
+
+
+def distance(a, b):
+    return jnp.linalg.norm(a - b)
+
+
+def slow_forces(q_s, q_f, params):
+    """Gravity on all atoms and the soft springs 1-2 and 2-3, ``k/2 (|q_i - q_j| - l)^2``."""
+    q = jnp.concatenate([q_s, q_f]).reshape(6, 3)
+    k, length = params["stiffness"], params["length"]
+    springs = k[0] * (distance(q[1], q[0]) - length) ** 2 + k[1] * (distance(q[2], q[1]) - length) ** 2
+    return springs / 2 + params["gravity"] * jnp.sum(params["masses"] * q[:, 2])
+
+
+def stiff_springs(q_f, params):
+    """The stiff triangle 3-4-5, ``k/2 sum (|q_i - q_j| - l)^2``."""
+    q_3, q_4, q_5, _ = q_f.reshape(4, 3)
+    edges = jnp.array([distance(q_4, q_3), distance(q_5, q_4), distance(q_3, q_5)])
+    return params["stiffness"][2] / 2 * jnp.sum((edges - params["length"]) ** 2)
+
+
+def slow_bond(q_s, params):
+    """Rigid bond of atom 1 to the origin, ``(|q_1|^2 - l^2) / 2``."""
+    return (jnp.sum(q_s[:3] ** 2, keepdims=True) - params["length"] ** 2) / 2
+
+
+def bonds(q_s, q_f, params):
+    """Rigid bonds 2-4, 2-5 and 3-6, ``(|q_i - q_j|^2 - l^2) / 2``."""
+    q_2, (q_3, q_4, q_5, q_6) = q_s[3:], q_f.reshape(4, 3)
+    bond = jnp.stack([q_4 - q_2, q_5 - q_2, q_6 - q_3])
+    return (jnp.sum(bond**2, axis=1) - params["length"] ** 2) / 2
+
+
+def simple_atomic_model(
+    masses=(100.0, 40.0, 1.0, 1.0, 1.0, 1.0), stiffness=(10.0, 1.0, 4000.0), length=10.0, gravity=9.81
+) -> Problem:
+    """Simple atomic model in R^3: (q_1, q_2) slow, (q_3, ..., q_6) fast; hanging, atoms 2 to 5 a regular tetrahedron.
+
+    The initial velocities are given before projection onto the bonds; ``.state()`` projects them.
+
+    Args:
+        masses: of the six atoms.
+        stiffness: of the springs 1-2 (soft), 2-3 (soft) and of the triangle 3-4-5 (stiff).
+        length: of all rigid bonds, and of all springs at rest.
+        gravity: acceleration along -z.
+    """
+    radius, inradius, height = length * TETRAHEDRON
+    top = -2 * length - height  # of the face 3-4-5 below atom 2
+    q_s = np.array([0.0, 0.0, -length, 0.0, 0.0, -2 * length])
+    q_f = np.array(
+        [
+            [radius, 0.0, top],
+            [-inradius, length / 2, top],
+            [-inradius, -length / 2, top],
+            [radius, 0.0, top - length],
+        ]
+    )
+    system = System(
+        kinetic=ConstantMass(jnp.repeat(jnp.asarray(masses[:2]), 3), jnp.repeat(jnp.asarray(masses[2:]), 3)),
+        slow_potential=slow_forces,
+        fast_potential=stiff_springs,
+        constraint=bonds,
+        slow_constraint=slow_bond,
+        params={
+            "masses": jnp.asarray(masses),
+            "stiffness": jnp.asarray(stiffness),
+            "length": jnp.asarray(length),
+            "gravity": jnp.asarray(gravity),
+        },
+    )
+    v_s = np.array([[0.0, 0.5, 0.0], [0.3, 0.2, 0.1]])
+    v_f = np.array([[0.0, 0.4, 0.2], [-0.5, 0.2, 0.3], [0.2, -0.6, 0.4], [0.7, 0.1, 0.2]])
+    return Problem(system, *(jnp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f)))

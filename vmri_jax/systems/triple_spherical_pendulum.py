@@ -1,0 +1,69 @@
+"""The triple spherical pendulum: a heavy bob on a rod (slow), two light ones on a rod and a stiff spring (fast)."""
+
+import jax.numpy as jnp
+
+from vmri_jax import ConstantMass, Problem, System
+
+
+def weight(q_s, q_f, params):
+    """``V = g sum_i m_i z_i``."""
+    heights = jnp.concatenate([q_s, q_f])[2::3]
+    return params["gravity"] * jnp.sum(params["masses"] * heights)
+
+
+def spring(q_f, params):
+    """``W = k/2 (|q_3 - q_2| - l_3)^2``."""
+    stretch = jnp.linalg.norm(q_f[3:] - q_f[:3]) - params["lengths"][2]
+    return params["stiffness"] / 2 * stretch**2
+
+
+def quartic_spring(q_f, params):
+    """``W = k/2 (|q_3 - q_2|^2 - l_3^2)^2``."""
+    stretch = jnp.sum((q_f[3:] - q_f[:3]) ** 2) - params["lengths"][2] ** 2
+    return params["stiffness"] / 2 * stretch**2
+
+
+def first_rod(q_s, params):
+    """``g_s = (|q_1|^2 - l_1^2) / 2``."""
+    return (jnp.sum(q_s**2, keepdims=True) - params["lengths"][0] ** 2) / 2
+
+
+def second_rod(q_s, q_f, params):
+    """``g = (|q_2 - q_1|^2 - l_2^2) / 2``."""
+    return (jnp.sum((q_f[:3] - q_s) ** 2, keepdims=True) - params["lengths"][1] ** 2) / 2
+
+
+def triple_spherical_pendulum(
+    masses=(100.0, 1.0, 1.0), stiffness=5000.0, lengths=(10.0, 2.0, 3.0), gravity=9.81, quartic=False
+) -> Problem:
+    """Triple spherical pendulum in R^3: q_1 slow, (q_2, q_3) fast; started stretched out sideways.
+
+    Args:
+        masses: of the three bobs.
+        stiffness: k of the spring between the second and the third bob.
+        lengths: of the first rod, the second rod, and the spring at rest.
+        gravity: acceleration along -z.
+        quartic: take ``k/2 (|q_3 - q_2|^2 - l_3^2)^2`` for the spring (the reference study may have meant it).
+    """
+    m_1, m_2, m_3 = masses
+    l_1, l_2, l_3 = lengths
+    system = System(
+        kinetic=ConstantMass(slow=jnp.full(3, m_1), fast=jnp.repeat(jnp.array([m_2, m_3]), 3)),
+        slow_potential=weight,
+        fast_potential=quartic_spring if quartic else spring,
+        constraint=second_rod,
+        slow_constraint=first_rod,
+        params={
+            "masses": jnp.asarray(masses),
+            "stiffness": jnp.asarray(stiffness),
+            "lengths": jnp.asarray(lengths),
+            "gravity": jnp.asarray(gravity),
+        },
+    )
+    return Problem(
+        system,
+        q_s=jnp.array([l_1, 0.0, 0.0]),
+        q_f=jnp.array([l_1, l_2, 0.0, l_1, l_2, l_3]),
+        v_s=jnp.array([0.0, 1.0, 0.0]),
+        v_f=jnp.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.5]),
+    )

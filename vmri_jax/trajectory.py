@@ -1,0 +1,120 @@
+"""What a run returns: saved nodes, what the solver did, conserved quantities, and where it stopped."""
+
+from pathlib import Path as FilePath
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.results import Result
+
+FORMAT = "vmri_jax trajectory 1"
+
+
+class Trajectory(eqx.Module):
+    """Trajectory at the saved macro nodes; every leading axis is the saved node, the first one the start.
+
+    Attributes:
+        t: (k,) times.
+        q_s, q_f, p_s, p_f: (k, n) positions and momenta; NaN after a failure.
+        energy: (k,) Hamiltonian.
+        constraint_residual: (k, 2) largest |g| and largest |G v|.
+        iterations, residual: (k - 1,) most Newton iterations and largest residual of a step since the node before.
+        t_micro, q_f_micro: (k - 1, num_micro) and (k - 1, num_micro, n_f), the micro nodes of the macro step that ends
+            at each saved node (its start excluded); None unless asked for.
+        result: status of the run, a `Result`; the first that was no success.
+        failed_at: index of the macro step that failed, -1 if none did.
+    """
+
+    t: Any
+    q_s: Any
+    q_f: Any
+    p_s: Any
+    p_f: Any
+    energy: Any
+    constraint_residual: Any
+    iterations: Any
+    residual: Any
+    result: Any
+    failed_at: Any
+    t_micro: Any = None
+    q_f_micro: Any = None
+
+    @property
+    def success(self):
+        return self.result <= Result.CONVERGED_AT_ROUNDOFF
+
+    @property
+    def final_state(self):
+        """`State` at the last saved node."""
+        from vmri_jax.state import State
+
+        return State(self.t[-1], self.q_s[-1], self.q_f[-1], self.p_s[-1], self.p_f[-1])
+
+    def save(self, path) -> None:
+        """Write all arrays to a .npz file (no pickled objects)."""
+        arrays = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+        np.savez_compressed(path, format=FORMAT, **arrays)
+
+    @classmethod
+    def load(cls, path) -> "Trajectory":
+        """Read a trajectory written by `save`.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: a file that is damaged or not a trajectory.
+        """
+        path = FilePath(path)
+        if not path.exists():
+            raise FileNotFoundError(f"{path} does not exist; give the .npz file of a saved trajectory.")
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = dict(data)
+        except Exception as error:
+            raise ValueError(
+                f"{path} cannot be read as a .npz file ({error}); it is damaged or something else."
+            ) from error
+        if str(arrays.pop("format", "")) != FORMAT:
+            raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
+        return cls(**{name: jnp.asarray(value) for name, value in arrays.items()})
+
+    def to_xarray(self):
+        """The trajectory as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``)."""
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError("to_xarray needs xarray; install it with pip install 'vmri_jax[xarray]'.") from error
+        t = np.asarray(self.t)
+        data = {
+            "q_s": (("t", "slow"), self.q_s),
+            "q_f": (("t", "fast"), self.q_f),
+            "p_s": (("t", "slow"), self.p_s),
+            "p_f": (("t", "fast"), self.p_f),
+            "energy": ("t", self.energy),
+            "constraint_residual": (("t", "level"), self.constraint_residual),
+            "iterations": ("t_end", self.iterations),
+            "residual": ("t_end", self.residual),
+        }
+        if self.q_f_micro is not None:
+            data["t_micro"] = (("t_end", "micro"), self.t_micro)
+            data["q_f_micro"] = (("t_end", "micro", "fast"), self.q_f_micro)
+        data = {k: (dims, np.asarray(v)) for k, (dims, v) in data.items()}
+        coords = {"t": t, "t_end": t[1:], "level": ["position", "velocity"]}
+        attributes = {"result": Result(int(self.result)).name, "failed_at": int(self.failed_at)}
+        return xarray.Dataset(data, coords=coords, attrs=attributes)
+
+
+def join(pieces: list[Trajectory]) -> Trajectory:
+    """Consecutive trajectories, each starting where the one before ends, as one."""
+    first, rest = pieces[0], pieces[1:]
+    nodes = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
+
+    def joined(name):
+        values = [getattr(first, name)] + [getattr(p, name)[1:] if name in nodes else getattr(p, name) for p in rest]
+        return None if values[0] is None else jnp.concatenate(values)
+
+    failed = next((p for p in pieces if int(p.failed_at) >= 0), pieces[-1])
+    arrays = {name: joined(name) for name in vars(first) if name not in ("result", "failed_at")}
+    return jax.tree.map(jnp.asarray, Trajectory(**arrays, result=failed.result, failed_at=failed.failed_at))
