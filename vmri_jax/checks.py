@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.quadrature import is_concrete
 from vmri_jax.system import ConstantMass, System
 
 
@@ -14,11 +15,6 @@ def require_x64() -> None:
             "vmri_jax needs 64-bit floats: Newton and the constraints are solved to round-off. Switch them on at the start "
             'of the program with jax.config.update("jax_enable_x64", True), or set JAX_ENABLE_X64=1.'
         )
-
-
-def is_concrete(tree) -> bool:
-    """Whether a pytree holds values rather than tracers of jit, vmap or grad."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def check_arrays(**arrays):

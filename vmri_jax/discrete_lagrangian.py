@@ -41,7 +41,7 @@ class Term:
         if not self.inside.groups:
             return jnp.zeros(())
         sample = self.inside.sample(path)
-        values = jax.vmap(self.integrand)(*(getattr(sample, a) for a in self.arguments))
+        values = jax.vmap(self.integrand)(*sample.arguments(self.arguments).values())
         return self.sign * path.macro_dt * jnp.sum(self.inside.weights * values)
 
     def at_ends(self, path: Path):
@@ -114,7 +114,7 @@ class QuadraticKinetic:
 class Sum:
     """A sum of terms, itself a function of the path."""
 
-    terms: tuple[Term | QuadraticKinetic, ...]
+    terms: tuple[Any, ...]  # of Term and QuadraticKinetic
 
     def __call__(self, path: Path):
         return sum((term(path) for term in self.terms), jnp.zeros(()))

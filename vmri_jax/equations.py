@@ -26,10 +26,12 @@ from vmri_jax.system import System
 class Unknowns(NamedTuple):
     """Unknowns of a macro step, and with the same shapes its residual.
 
-    slow (r, n_s): increments of S_1..S_r          | slow equations at S_0..S_{r-1}
-    slow_multiplier (r, n_gs): scaled, at S_0..     | g_s at S_1..S_r
-    fast (num_micro, r, n_f): increments per micro interval | fast equations at its nodes 0..r-1
-    multiplier (num_micro, r, n_g): scaled, at its nodes 0..r-1 | g at its nodes 1..r
+    | field | unknown | residual |
+    |---|---|---|
+    | slow (r, n_s) | increments of S_1..S_r | slow equations at S_0..S_{r-1} |
+    | slow_multiplier (r, n_gs) | scaled, at S_0..S_{r-1} | g_s at S_1..S_r |
+    | fast (num_micro, r, n_f) | increments in each micro interval | fast equations at its nodes 0..r-1 |
+    | multiplier (num_micro, r, n_g) | scaled, at its nodes 0..r-1 | g at its nodes 1..r |
     """
 
     slow: Any
@@ -54,10 +56,13 @@ class StepEquations(eqx.Module):
     def micro_dt(self):
         return self.macro_dt / self.scheme.num_micro
 
+    @property
+    def force_nodes(self) -> Nodes:
+        return velocity_nodes(self.scheme.force, self.scheme.num_micro, self.scheme.degree)
+
     def path(self, x: Unknowns) -> Path:
         """The path of the unknowns: fast starts are running sums of the increments over whole intervals."""
-        starts = self.q_f + jnp.concatenate([jnp.zeros_like(x.fast[:1, -1]), jnp.cumsum(x.fast[:-1, -1], axis=0)])
-        return Path(self.t, self.macro_dt, self.q_s, x.slow, starts, x.fast)
+        return Path(self.t, self.macro_dt, self.q_s, x.slow, self.q_f + sum_before(x.fast[:, -1]), x.fast)
 
     def action(self, path: Path, at: Path, x: Unknowns):
         """Augmented action times h; forces act on the virtual displacement of `path`, evaluated along `at`."""
@@ -65,37 +70,20 @@ class StepEquations(eqx.Module):
         return self.micro_dt * (discrete_lagrangian + self.virtual_work(path, at)) - self.constraint_work(path, x)
 
     def virtual_work(self, path: Path, at: Path):
-        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, forces along `at`."""
+        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, with the forces along `at`."""
         if self.system.force is None:
             return 0.0
-        nodes = self.force_nodes()
+        nodes = self.force_nodes
         z, q = nodes.sample(at), nodes.sample(path)
-        f_s, f_f = jax.vmap(self.force)(z.t, z.q_s, z.q_f, z.v_s, z.v_f)
+        f_s, f_f = jax.vmap(self.system.forces)(z.t, z.q_s, z.q_f, z.v_s, z.v_f)
         return self.macro_dt * jnp.sum(nodes.weights * (jnp.sum(f_s * q.q_s, axis=1) + jnp.sum(f_f * q.q_f, axis=1)))
-
-    def force(self, *z):
-        return self.system.force(*z, self.system.params)
-
-    def force_nodes(self) -> Nodes:
-        return velocity_nodes(self.scheme.force, self.scheme.num_micro, self.scheme.degree)
 
     def constraint_work(self, path: Path, x: Unknowns):
         """``sum mu . g + sum nu . g_s / num_micro`` at all control nodes but the last."""
-        work = 0.0
-        if self.system.constraint is not None:
-            q_s, q_f = path.control_points()
-            g = jax.vmap(self.constraint)(q_s[:-1], q_f[:-1])
-            work += jnp.sum(x.multiplier.reshape(g.shape) * g)
-        if self.system.slow_constraint is not None:
-            g = jax.vmap(self.slow_constraint)(path.slow_control_points()[:-1])
-            work += jnp.sum(x.slow_multiplier * g) / self.scheme.num_micro
-        return work
-
-    def constraint(self, q_s, q_f):
-        return self.system.constraint(q_s, q_f, self.system.params)
-
-    def slow_constraint(self, q_s):
-        return self.system.slow_constraint(q_s, self.system.params)
+        q_s, q_f = path.control_points()
+        g = jax.vmap(self.system.g)(q_s[:-1], q_f[:-1])
+        g_slow = jax.vmap(self.system.g_slow)(path.slow_control_points()[:-1])
+        return jnp.sum(x.multiplier.reshape(g.shape) * g) + jnp.sum(x.slow_multiplier * g_slow) / self.scheme.num_micro
 
     def slots(self, x: Unknowns):
         """``h D_{S_i} A`` (r + 1, n_s) and, per micro interval, ``h D_{F_j} A`` (num_micro, r + 1, n_f)."""
@@ -105,30 +93,23 @@ class StepEquations(eqx.Module):
         fast = jnp.concatenate([(d.fast_start - d.fast.sum(1))[:, None], d.fast], axis=1)
         return slow, fast
 
-    def residual(self, x: Unknowns) -> Unknowns:
-        """Left-hand sides of the equations above, times h in the momentum rows."""
+    def evaluate(self, x: Unknowns):
+        """Residual of the equations (times h in the momentum rows), and momenta ``D_last A`` at the end of the step."""
         slow, fast = self.slots(x)
+        path = self.path(x)
+        q_s, q_f = path.control_points()
         incoming = jnp.concatenate([self.micro_dt * self.p_f[None], fast[:-1, -1]])
-        path = self.path(x)
-        g, g_slow = x.multiplier, x.slow_multiplier
-        if self.system.constraint is not None:
-            q_s, q_f = path.control_points()
-            g = jax.vmap(self.constraint)(q_s[1:], q_f[1:]).reshape(g.shape)
-        if self.system.slow_constraint is not None:
-            g_slow = jax.vmap(self.slow_constraint)(path.slow_control_points()[1:])
-        return Unknowns(
+        residual = Unknowns(
             slow=slow[:-1].at[0].add(self.micro_dt * self.p_s),
-            slow_multiplier=g_slow,
+            slow_multiplier=jax.vmap(self.system.g_slow)(path.slow_control_points()[1:]),
             fast=fast[:, :-1].at[:, 0].add(incoming),
-            multiplier=g,
+            multiplier=jax.vmap(self.system.g)(q_s[1:], q_f[1:]).reshape(x.multiplier.shape),
         )
+        return residual, (slow[-1] / self.micro_dt, fast[-1, -1] / self.micro_dt)
 
-    def end(self, x: Unknowns):
-        """Positions and momenta at the end of the step, ``p+ = D_last A``: (q_s, q_f, p_s, p_f)."""
-        slow, fast = self.slots(x)
-        path = self.path(x)
-        q_f = path.fast_start[-1] + path.fast[-1, -1]
-        return self.q_s + x.slow[-1], q_f, slow[-1] / self.micro_dt, fast[-1, -1] / self.micro_dt
+    def residual(self, x: Unknowns) -> Unknowns:
+        """Left-hand sides of the equations at x."""
+        return self.evaluate(x)[0]
 
     def guess(self, v_s, v_f, multiplier, slow_multiplier) -> Unknowns:
         """Straight motion at the given velocities, with the given (physical) multipliers throughout."""
@@ -142,10 +123,15 @@ class StepEquations(eqx.Module):
         )
 
 
+def sum_before(increments):
+    """Running sum of increments over the intervals before each one."""
+    return jnp.concatenate([jnp.zeros_like(increments[:1]), jnp.cumsum(increments[:-1], axis=0)])
+
+
 def multiplier_scales(scheme: Scheme, macro_dt):
     """What turns multipliers into unknowns: ``h H w_j`` (num_micro, r, 1) and ``num_micro h H w_i`` (r, 1)."""
     n, h = scheme.num_micro, macro_dt / scheme.num_micro
-    w, w_slow = scheme.constraint.rule.weights, scheme.slow_constraint.rule.weights
+    w, w_slow = jnp.asarray(scheme.constraint.rule.weights), scheme.slow_constraint.rule.weights
     shared = jnp.tile(w[:-1], (n, 1)).at[1:, 0].add(w[-1])  # intervals share their end nodes
     return h**2 * shared[..., None], macro_dt**2 * w_slow[:-1, None]
 

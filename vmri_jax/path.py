@@ -102,6 +102,10 @@ class Sample(eqx.Module):
     v_s: Any
     v_f: Any
 
+    def arguments(self, names: tuple[str, ...]) -> dict:
+        """Some of the fields, by name."""
+        return {name: getattr(self, name) for name in names}
+
 
 @dataclass(frozen=True)
 class NodeGroup:

@@ -23,6 +23,11 @@ NODE_TOLERANCE = 1e-12
 """Nodes closer than this are the same node."""
 
 
+def is_concrete(tree) -> bool:
+    """Whether a pytree holds values, rather than tracers of jit, vmap or grad."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))  # pyright: ignore
+
+
 class Rule(eqx.Module):
     """Quadrature rule ``sum_i w_i f(theta_i)`` on [0, 1].
 
@@ -87,7 +92,7 @@ class Rule(eqx.Module):
         A rule of order p integrates polynomials of degree p - 1 exactly; its error on a smooth
         function over an interval of length h is O(h^(p+1)).
         """
-        if isinstance(self.weights, jax.core.Tracer):
+        if not is_concrete(self.weights):
             raise ValueError("Rule.order needs concrete weights; ask for it outside jit, vmap and grad.")
         x, w = 2 * np.array(self.nodes) - 1, np.asarray(self.weights)
         for k in range(2 * len(x) + 1):  # in Legendre polynomials, whose moments are well scaled

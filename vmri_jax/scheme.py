@@ -13,7 +13,6 @@ A scheme is data. The reference schemes and the Galerkin family are points in on
 import equinox as eqx
 import numpy as np
 
-from vmri_jax.checks import is_concrete
 from vmri_jax.path import control_nodes
 from vmri_jax.quadrature import (
     NODE_TOLERANCE,
@@ -21,6 +20,7 @@ from vmri_jax.quadrature import (
     Rule,
     affine,
     gauss,
+    is_concrete,
     lobatto,
     macro,
     micro,

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import diagnostics
-from vmri_jax.checks import check_arrays, check_system, is_concrete, require_x64
+from vmri_jax.checks import check_arrays, check_system, require_x64
 from vmri_jax.newton import Newton
+from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Result, SimulationError
 from vmri_jax.scheme import Scheme
-from vmri_jax.state import State, check_fast_constraint
+from vmri_jax.state import State, check_constraints
 from vmri_jax.step import advance, start_memory
 from vmri_jax.system import System
 from vmri_jax.trajectory import Trajectory, join
@@ -64,7 +65,7 @@ def simulate(
     inputs = (system, scheme, state, jnp.asarray(macro_dt, dtype=float), newton or Newton())
     if not is_concrete(inputs):  # under a transformation: a static trip count keeps reverse mode possible
         memory = start_memory(system, scheme, state)
-        return _run(*inputs, memory, 0, num_saves, save_every, save_micro)[0]
+        return _differentiable_run(*inputs, memory, 0, num_saves, save_every, save_micro)[0]
 
     pieces, first_step, memory = [], 0, _start_memory(system, scheme, state)
     for saves in _chunks(num_saves, progress):
@@ -130,6 +131,7 @@ def _run(
 
 
 _compiled_run = jax.jit(_run, static_argnames=("num_saves", "save_micro"))
+_differentiable_run = jax.jit(_run, static_argnames=("num_saves", "save_micro", "save_every"))
 _start_memory = jax.jit(start_memory)
 
 
@@ -176,8 +178,8 @@ def _check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every):
     if is_concrete(vectors):
         check_arrays(**vectors)
     check_system(system, vectors["q_s"], vectors["q_f"])
-    if system.constraint is not None and is_concrete((system, state)):
-        check_fast_constraint(system, state.q_s, state.q_f)
+    if is_concrete((system, state)):
+        check_constraints(system, state.q_s, state.q_f)
     return dt if micro_dt is None else scheme.num_micro * micro_dt
 
 

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.checks import check_arrays, check_system, is_concrete, require_x64
-from vmri_jax.system import ConstantMass, System, depends_on
+from vmri_jax.checks import check_arrays, check_system, require_x64
+from vmri_jax.quadrature import is_concrete
+from vmri_jax.system import ConstantMass, System
 
 
 class State(eqx.Module):
@@ -101,72 +102,79 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     check_system(system, q_s, q_f)
     if project:
-        q_s, q_f = project_positions(system, q_s, q_f)
-    if is_concrete((system, q_s, q_f, v_s, v_f)):
-        _check_constraints(system, q_s, q_f, project, tolerance)
-    p_s, p_f = legendre(system, q_s, q_f, v_s, v_f)
-    p_s, p_f, _, _ = project_momentum(system, q_s, q_f, p_s, p_f)
-    if is_concrete((system, q_s, q_f, v_s, v_f)) and not all(np.isfinite(p).all() for p in (p_s, p_f)):
-        raise ValueError(
-            "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is singular at "
-            "the initial positions, or a function returned NaN there."
-        )
+        q_s, q_f = _projected_positions(system, q_s, q_f)
+    values, p_s, p_f = _momenta(system, q_s, q_f, v_s, v_f)
+    if is_concrete((values, p_s, p_f)):
+        _check_constraint_values(np.asarray(values), project, tolerance)
+        check_constraints(system, q_s, q_f)
+        if not all(np.isfinite(p).all() for p in (p_s, p_f)):
+            raise ValueError(
+                "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
+                "singular at the initial positions, or a function returned NaN there."
+            )
     return State(jnp.asarray(t, dtype=float), q_s, q_f, p_s, p_f)
 
 
-def _check_constraints(system: System, q_s, q_f, projected: bool, tolerance: float) -> None:
-    """Refuse positions off the constraints and constraints that cannot be kept on the micro grid."""
-    values = np.asarray(system.constraints(q_s, q_f))
+@jax.jit
+def _momenta(system, q_s, q_f, v_s, v_f):
+    """Constraint values and consistent momenta."""
+    momenta = project_momentum(system, q_s, q_f, *legendre(system, q_s, q_f, v_s, v_f))[:2]
+    return system.constraints(q_s, q_f), *momenta
+
+
+_projected_positions = jax.jit(project_positions)
+
+
+@jax.jit
+def _constraint_jacobians(system, q_s, q_f):
+    return jax.jacrev(system.g, argnums=(0, 1))(q_s, q_f)
+
+
+def _check_constraint_values(values, projected: bool, tolerance: float) -> None:
+    """Refuse positions off the constraints."""
     if not np.isfinite(values).all():
-        raise ValueError(
-            f"initial_state: the constraints are {values} at the initial positions; they must be finite there."
-        )
+        raise ValueError(f"initial_state: the constraints are {values} at the initial positions, which is not finite.")
     worst = np.abs(values).max(initial=0.0)
     if worst > tolerance:
-        i = int(np.abs(values).argmax())
         advice = (
             "projection did not reach the constraints; start closer to them."
             if projected
             else "correct the positions, or pass project=True to move them onto the constraints."
         )
         raise ValueError(
-            f"initial_state: the initial positions violate the constraints by {worst:.3e} (row {i} of {values.size}, "
-            f"tolerance {tolerance:.0e}); {advice}"
+            f"initial_state: the initial positions violate the constraints by {worst:.3e} (row {np.abs(values).argmax()} "
+            f"of {values.size}, tolerance {tolerance:.0e}); {advice}"
         )
-    if system.constraint is not None:
-        check_fast_constraint(system, q_s, q_f)
+
+
+def check_constraints(system: System, q_s, q_f) -> None:
+    """Refuse constraints that cannot be kept where they are held, with the reason and the fix."""
     n_g, n_gs = system.num_constraints(q_s, q_f)
-    if n_gs > q_s.size:
+    n_s, n_f = q_s.size, q_f.size
+    if n_gs > n_s:
         raise ValueError(
-            f"System: slow_constraint returns {n_gs} values for {q_s.size} slow variables; at most {q_s.size} can be satisfied."
+            f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
         )
-
-
-def check_fast_constraint(system: System, q_s, q_f) -> None:
-    """Refuse constraints that the fast variables cannot satisfy at every micro node, with the reason and the fix."""
-
-    def g(q_f):
-        return system.constraint(q_s, q_f, system.params)
-
+    if not n_g:
+        return
     fix = (
-        "A constraint held on the micro grid must be satisfiable by the fast variables: the slow ones have one value per "
-        "macro step, so a slow-only constraint held at every micro node is over-determined (rank deficit num_micro - 1)."
+        "A constraint held on the micro grid must be satisfiable by the fast variables: the slow ones have one value "
+        "per macro step, so that a slow-only constraint held at every micro node is over-determined (rank deficit "
+        "num_micro - 1)."
     )
-    jacobian = np.asarray(jax.jacrev(g)(q_f))
-    slow_jacobian = np.asarray(jax.jacrev(system.constraint)(q_s, q_f, system.params))
-    scale = np.linalg.norm(np.concatenate([jacobian, slow_jacobian], axis=1), axis=1)
-    rows = np.flatnonzero(np.linalg.norm(jacobian, axis=1) <= 1e-12 * np.where(scale > 0, scale, 1))
-    if not depends_on(g, q_f)[0] or rows.size:
-        which = "constraint" if not depends_on(g, q_f)[0] else f"row(s) {rows.tolist()} of constraint"
-        raise ValueError(
-            f"System: {which} do(es) not depend on the fast variables q_f. {fix} "
-            "Pass it as slow_constraint(q_s, params), which is held at the macro nodes."
-        )
-    n_g, n_f = jacobian.shape
     if n_g > n_f:
         raise ValueError(f"System: constraint returns {n_g} values for {n_f} fast variables. {fix} Remove rows.")
-    normalised = jacobian / np.linalg.norm(jacobian, axis=1, keepdims=True)
-    rank = np.linalg.matrix_rank(normalised, tol=1e-8)
+    slow, fast = (np.asarray(d) for d in _constraint_jacobians(system, q_s, q_f))
+    if not (np.isfinite(slow).all() and np.isfinite(fast).all()):
+        raise ValueError("System: the Jacobian of constraint is not finite at these positions (a norm at zero?).")
+    size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
+    slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= 1e-12 * size)
+    if slow_only.size:
+        raise ValueError(
+            f"System: row(s) {slow_only.tolist()} of constraint do not depend on the fast variables q_f. {fix} "
+            "Pass them as slow_constraint(q_s, params), which is held at the macro nodes."
+        )
+    rank = np.linalg.matrix_rank(fast / np.linalg.norm(fast, axis=1, keepdims=True), tol=1e-8)
     if rank < n_g:
         raise ValueError(
             f"System: the {n_g} constraint rows have rank {rank} in the fast variables at the initial positions. {fix} "

@@ -9,15 +9,16 @@ The route is chosen statically, by `split` and `is_explicit`:
 * *coupled*: everything else is solved at once by Newton's iteration.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.discrete_lagrangian import lagrangian
+from vmri_jax.discrete_lagrangian import Term, lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
-from vmri_jax.newton import Newton, solve
+from vmri_jax.newton import Newton, relative_residual, solve
 from vmri_jax.quadrature import micro, midpoint
 from vmri_jax.results import Result
 from vmri_jax.scheme import Scheme
@@ -43,7 +44,7 @@ class StepInfo(eqx.Module):
     slow_multiplier: Any
 
 
-class Memory(eqx.Module):
+class Memory(NamedTuple):
     """What a step hands to the next: gradients of the kicks at the node they share, and what Newton starts from."""
 
     kicks: Any
@@ -87,29 +88,29 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
     if coupled_slow or coupled_fast or coupled_constraint:
         return None
 
-    def on_slow(function):  # V(q_s, -) and g_s(q_s), with the slow variables in the place of the fast ones
-        return None if function is None else lambda q, params: function(q, jnp.zeros(n_f), params)
+    def potential_of_slow(q, params):
+        return slow_potential(q, jnp.zeros(n_f), params)  # pyright: ignore[reportOptionalCall]
 
-    def slow_constraint(_, q, params):
-        return system.slow_constraint(q, params)
+    def constraint_of_slow(_, q, params):
+        return system.replace(params=params).g_slow(q)
 
-    def fast_constraint(_, q, params):
-        return constraint(jnp.zeros(n_s), q, params)
+    def constraint_of_fast(_, q, params):
+        return system.replace(params=params).g(jnp.zeros(n_s), q)
 
     none, drift = jnp.zeros(0), micro(midpoint)
     return Split(
         kicks=System(system.kinetic, **kicked, params=params),
         slow=System(
             ConstantMass(none, system.kinetic.slow),
-            fast_potential=on_slow(slow_potential),
-            constraint=None if system.slow_constraint is None else slow_constraint,
+            fast_potential=None if slow_potential is None else potential_of_slow,
+            constraint=None if system.slow_constraint is None else constraint_of_slow,
             params=params,
         ),
         slow_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.slow),
         fast=System(
             ConstantMass(none, system.kinetic.fast),
             fast_potential=fast_potential,
-            constraint=None if constraint is None else fast_constraint,
+            constraint=None if constraint is None else constraint_of_fast,
             params=params,
         ),
         fast_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast),
@@ -123,7 +124,7 @@ def is_explicit(system: System, scheme: Scheme) -> bool:
         scheme.num_micro == scheme.degree == 1
         and isinstance(system.kinetic, ConstantMass)
         and system.constraint is system.slow_constraint is system.force is None
-        and not any(term.inside.groups for term in terms[1:])
+        and not any(term.inside.groups for term in terms if isinstance(term, Term))
     )
 
 
@@ -166,12 +167,13 @@ def advance(system: System, scheme: Scheme, state: State, macro_dt, newton: Newt
     state = State(state.t, state.q_s, state.q_f, p_s, p_f)
     finite = jnp.all(jnp.isfinite(jnp.concatenate([state.q_s, state.q_f, p_s, p_f])))
     multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, info.multiplier, info.slow_multiplier)
-    info = eqx.tree_at(
-        lambda i: (i.result, i.multiplier, i.slow_multiplier),
+    info = dataclasses.replace(
         info,
-        (jnp.where(finite, info.result, Result.NON_FINITE), multiplier, slow_multiplier),
+        result=jnp.where(finite, info.result, Result.NON_FINITE),
+        multiplier=multiplier,
+        slow_multiplier=slow_multiplier,
     )
-    return state, info, eqx.tree_at(lambda m: m.velocity, memory, (v_s, v_f))
+    return state, info, memory._replace(velocity=(v_s, v_f))
 
 
 def _interval(system, scheme, state, macro_dt, newton, memory):
@@ -187,7 +189,7 @@ def _interval(system, scheme, state, macro_dt, newton, memory):
         state, info, memory = _move_coupled(system, scheme, state, macro_dt, newton, memory)
     kicks = _kick_gradients(own, scheme, state.q_s, state.q_f)
     state = _kick(own, scheme, state, macro_dt, kicks, "end")
-    return state, info, Memory(kicks, memory.velocity, memory.multiplier, memory.slow_multiplier, memory.parts)
+    return state, info, memory._replace(kicks=kicks)
 
 
 def _kick_gradients(system, scheme, q_s, q_f):
@@ -257,17 +259,19 @@ def _move_coupled(system, scheme, state, macro_dt, newton, memory):
     v_s, v_f = memory.velocity
     if isinstance(system.kinetic, ConstantMass):  # the momentum is at hand, kicks included
         v_s, v_f = system.kinetic.velocity(state.p_s, state.p_f)
-    x, outcome = solve(equations, equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier), newton)
-    q_s, q_f, p_s, p_f = equations.end(x)
-    path = equations.path(x)
-    multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, x.multiplier, x.slow_multiplier)
-    memory = Memory(memory.kicks, memory.velocity, multiplier[-1, -1], slow_multiplier[-1], memory.parts)
-    info = StepInfo(
-        outcome.result,
-        outcome.iterations,
-        outcome.residual,
-        path.fast_start + path.fast[:, -1],
-        x.multiplier,
-        x.slow_multiplier,
+    x, result, iterations = solve(
+        equations, equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier), newton
     )
-    return State(state.t + macro_dt, q_s, q_f, p_s, p_f), info, memory
+    residual, (p_s, p_f) = equations.evaluate(x)
+    multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, x.multiplier, x.slow_multiplier)
+    memory = memory._replace(multiplier=multiplier[-1, -1], slow_multiplier=slow_multiplier[-1])
+    info = StepInfo(
+        result,
+        iterations,
+        relative_residual(equations, residual),
+        q_f_micro=equations.path(x).fast_start + x.fast[:, -1],
+        multiplier=x.multiplier,
+        slow_multiplier=x.slow_multiplier,
+    )
+    end = State(state.t + macro_dt, state.q_s + x.slow[-1], info.q_f_micro[-1], p_s, p_f)
+    return end, info, memory

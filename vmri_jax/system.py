@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.quadrature import is_concrete
+
 
 class ConstantMass(eqx.Module):
     """Kinetic energy ``T = v_s^T M_s v_s / 2 + v_f^T M_f v_f / 2`` with constant masses.
@@ -47,9 +49,9 @@ def _solve(mass, p):
 
 
 def _mass(name: str, mass):
-    if isinstance(mass, jax.core.Tracer):
+    if not is_concrete(mass):
         return mass
-    mass = np.asarray(mass, dtype=float) if not isinstance(mass, jax.Array) else mass
+    mass = mass if isinstance(mass, jax.Array) else np.asarray(mass, dtype=float)
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
         raise ValueError(f"ConstantMass: {name} has shape {mass.shape}; give (n,) masses or an (n, n) mass matrix.")
     values = np.asarray(mass)
@@ -131,23 +133,27 @@ class System(eqx.Module):
         """The same system with some fields changed, e.g. ``system.replace(params=new)``."""
         return dataclasses.replace(self, **changes)
 
+    def g(self, q_s, q_f):
+        """Values of `constraint`, shape (n_g,); n_g = 0 where there is none."""
+        return jnp.zeros(0) if self.constraint is None else self.constraint(q_s, q_f, self.params)
+
+    def g_slow(self, q_s):
+        """Values of `slow_constraint`, shape (n_gs,); n_gs = 0 where there is none."""
+        return jnp.zeros(0) if self.slow_constraint is None else self.slow_constraint(q_s, self.params)
+
+    def forces(self, t, q_s, q_f, v_s, v_f):
+        """Values of `force`, ``(F_s, F_f)``; zero where there is none."""
+        if self.force is None:
+            return jnp.zeros_like(q_s), jnp.zeros_like(q_f)
+        return self.force(t, q_s, q_f, v_s, v_f, self.params)
+
     def constraints(self, q_s, q_f):
-        """All constraint values at one configuration, ``(g, g_s)`` joined, shape (n_g + n_gs,)."""
-        parts = []
-        if self.constraint is not None:
-            parts.append(self.constraint(q_s, q_f, self.params))
-        if self.slow_constraint is not None:
-            parts.append(self.slow_constraint(q_s, self.params))
-        return jnp.concatenate(parts) if parts else jnp.zeros(0)
+        """All constraint values at one configuration, ``(g, g_slow)`` joined, shape (n_g + n_gs,)."""
+        return jnp.concatenate([self.g(q_s, q_f), self.g_slow(q_s)])
 
     def num_constraints(self, q_s, q_f) -> tuple[int, int]:
         """``(n_g, n_gs)`` for configurations of these shapes."""
-        n_g = n_gs = 0
-        if self.constraint is not None:
-            n_g = jax.eval_shape(self.constraint, q_s, q_f, self.params).shape[0]
-        if self.slow_constraint is not None:
-            n_gs = jax.eval_shape(self.slow_constraint, q_s, self.params).shape[0]
-        return n_g, n_gs
+        return jax.eval_shape(self.g, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, q_s).shape[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +165,7 @@ class Problem:
     q_f: Any
     v_s: Any
     v_f: Any
-    t: float = 0.0
+    t: Any = 0.0
 
     def state(self, project: bool = False):
         """The consistent initial `State` (see `initial_state`)."""

@@ -56,7 +56,7 @@ class Trajectory(eqx.Module):
     def save(self, path) -> None:
         """Write all arrays to a .npz file (no pickled objects)."""
         arrays = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
-        np.savez_compressed(path, format=FORMAT, **arrays)
+        np.savez_compressed(path, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def load(cls, path) -> "Trajectory":

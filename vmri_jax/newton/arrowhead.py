@@ -3,9 +3,11 @@
 Unknowns are ordered as border (slow increments and slow multipliers) and chain (one block per micro interval:
 its fast increments and multipliers). The rows of micro interval m see the border, its own unknowns and, through
 the position where it starts and the momentum that arrives there, everything before it and nothing after: the chain
-is block lower triangular. So one forward march expresses position and momentum at every micro node as affine
-functions of the slow increments; inserted into the slow equations they leave a small border system.
+is block lower triangular. So a forward march gives the response of the chain to the residual, and another one its
+response to each slow increment; inserted into the slow equations they leave a small border system.
 """
+
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,74 +16,93 @@ from vmri_jax.equations import Unknowns
 from vmri_jax.linearization import Blocks
 
 
-def solve(blocks: Blocks, residual: Unknowns) -> Unknowns:
-    """The direction ``-matrix^-1 residual`` by forward march, border solve and back substitution."""
-    n, r, n_f = residual.fast.shape
-    n_g, n_s = residual.multiplier.shape[2], residual.slow.shape[1]
+class Factors(NamedTuple):
+    """What does not depend on the residual.
+
+    chain (num_micro, k, k): inverse of each chain block, k = r (n_f + n_g)
+    response (num_micro, k, r n_s): of the chain unknowns to the slow increments
+    border: LU factors of the slow equations once the chain is eliminated
+    """
+
+    blocks: Blocks
+    chain: Any
+    response: Any
+    border: Any
+
+
+def factor(blocks: Blocks, like: Unknowns) -> Factors:
+    """Eliminate the chain; `like` gives the shapes of the unknowns."""
+    n, r, n_f = like.fast.shape
+    n_s, n_gs, n_g = like.slow.shape[1], like.slow_multiplier.shape[1], like.multiplier.shape[2]
     border = r * n_s
-
-    def affine(constant, linear):
-        """Affine function of the slow increments as an array with columns [constant, one per increment]."""
-        return jnp.concatenate([constant[..., None], linear], axis=-1)
-
-    def chain_matrix(ff, g_f):
-        """Rows [fast slots 0..r-1, g at nodes 1..r] against [increments 1..r, multipliers 0..r-1] of one interval."""
-        nodes = jnp.eye(r)
-        top_right = -jnp.einsum("jga,ji->jaig", g_f[:-1], nodes).reshape(r * n_f, r * n_g)
-        bottom_left = jnp.einsum("jga,ji->jgia", g_f[1:], nodes).reshape(r * n_g, r * n_f)
-        top_left = ff[:-1, :, 1:].reshape(r * n_f, r * n_f)
-        return jnp.block([[top_left, top_right], [bottom_left, jnp.zeros((r * n_g, r * n_g))]])
-
-    inverse = jnp.linalg.inv(jax.vmap(chain_matrix)(blocks.ff, blocks.g_f))
-
-    def march(carry, interval):
-        start, incoming, slow_rows = carry  # affine: position and momentum arriving here, slow equations so far
-        b, inverse, res = interval
-        slots = jnp.einsum("iab,bk->iak", b.ff[:, :, 0], start) + affine(
-            jnp.zeros((r + 1, n_f)), b.fs.reshape(r + 1, n_f, border)
-        )
-        rows = slots[:-1].at[0].add(incoming).at[..., 0].add(res.fast)
-        slow_at = jnp.einsum("ji,ab->jaib", b.basis[1:, 1:], jnp.eye(n_s)).reshape(r, n_s, border)
-        g_rows = jnp.einsum("jga,ak->jgk", b.g_f[1:], start) + affine(res.multiplier, b.g_s[1:] @ slow_at)
-        solution = -inverse @ jnp.concatenate([rows.reshape(r * n_f, 1 + border), g_rows.reshape(r * n_g, 1 + border)])
-        fast = solution[: r * n_f].reshape(r, n_f, 1 + border)
-        multiplier = solution[r * n_f :].reshape(r, n_g, 1 + border)
-
-        outgoing = slots[-1] + jnp.einsum("ajb,jbk->ak", b.ff[-1, :, 1:], fast)
-        slow_rows += jnp.einsum("iab,bk->iak", b.sf[:-1, :, 0], start)
-        slow_rows += jnp.einsum("iajb,jbk->iak", b.sf[:-1, :, 1:], fast)
-        slow_rows -= jnp.einsum("ji,jga,jgk->iak", b.basis[:-1, :-1], b.g_s[:-1], multiplier)
-        return (start + fast[-1], outgoing, slow_rows), solution
-
-    ss = blocks.ss[:-1].reshape(r, n_s, border)
-    zero = jnp.zeros((n_f, 1 + border))
-    per_interval = Blocks(blocks.ff, blocks.fs, blocks.sf, None, blocks.g_s, blocks.g_f, None, blocks.basis)
-    chain_residual = Unknowns(None, None, residual.fast, residual.multiplier)
-    (_, _, slow_rows), solutions = jax.lax.scan(
-        march, (zero, zero, affine(residual.slow, ss)), (per_interval, inverse, chain_residual)
-    )
-
-    d_slow, d_slow_multiplier = _solve_border(blocks, slow_rows, residual.slow_multiplier, n)
-    columns = jnp.concatenate([jnp.ones(1), d_slow.reshape(-1)])
-    chain = solutions @ columns
-    return Unknowns(
-        slow=d_slow,
-        slow_multiplier=d_slow_multiplier,
-        fast=chain[:, : r * n_f].reshape(n, r, n_f),
-        multiplier=chain[:, r * n_f :].reshape(n, r, n_g),
-    )
-
-
-def _solve_border(blocks: Blocks, slow_rows, g_slow_residual, num_micro: int):
-    """Slow increments and multipliers from the slow equations, affine in the increments, and g_s."""
-    r, n_s, _ = slow_rows.shape
-    n_gs = g_slow_residual.shape[1]
-    if n_s == 0:
-        return jnp.zeros((r, 0)), jnp.zeros((r, n_gs))
     nodes = jnp.eye(r)
-    force = -jnp.einsum("iga,ij->iajg", blocks.g_slow[:-1], nodes).reshape(r * n_s, r * n_gs) / num_micro
-    jacobian = jnp.einsum("iga,ij->igja", blocks.g_slow[1:], nodes).reshape(r * n_gs, r * n_s)
-    rows = slow_rows.reshape(r * n_s, 1 + r * n_s)
-    matrix = jnp.block([[rows[:, 1:], force], [jacobian, jnp.zeros((r * n_gs, r * n_gs))]])
-    solution = jnp.linalg.solve(matrix, -jnp.concatenate([rows[:, 0], g_slow_residual.reshape(-1)]))
-    return solution[: r * n_s].reshape(r, n_s), solution[r * n_s :].reshape(r, n_gs)
+
+    top_right = -jnp.einsum("mjga,ji->mjaig", blocks.g_f[:, :-1], nodes).reshape(n, r * n_f, r * n_g)
+    bottom_left = jnp.einsum("mjga,ji->mjgia", blocks.g_f[:, 1:], nodes).reshape(n, r * n_g, r * n_f)
+    top_left = blocks.ff[:, :-1, :, 1:].reshape(n, r * n_f, r * n_f)
+    zero = jnp.zeros((n, r * n_g, r * n_g))
+    chain = jnp.linalg.inv(jnp.block([[top_left, top_right], [bottom_left, zero]]))
+
+    slots = blocks.fs.reshape(n, r + 1, n_f, border)
+    g = jnp.einsum("mji,mjgb->mjgib", blocks.basis[:, 1:, 1:], blocks.g_s[:, 1:]).reshape(n, r, n_g, border)
+    response, slow_rows = _march(blocks, chain, slots, g)
+
+    force = -jnp.einsum("iga,ij->iajg", blocks.g_slow[:-1], nodes).reshape(border, r * n_gs) / n
+    jacobian = jnp.einsum("iga,ij->igja", blocks.g_slow[1:], nodes).reshape(r * n_gs, border)
+    slow = (slow_rows + blocks.ss[:-1].reshape(r, n_s, border)).reshape(border, border)
+    matrix = jnp.block([[slow, force], [jacobian, jnp.zeros((r * n_gs, r * n_gs))]])
+    return Factors(blocks, chain, response, jax.scipy.linalg.lu_factor(matrix) if matrix.size else None)
+
+
+def solve(factors: Factors, residual: Unknowns) -> Unknowns:
+    """The direction ``-matrix^-1 residual``."""
+    blocks, chain, response, border = factors
+    slots = jnp.pad(residual.fast, [(0, 0), (0, 1), (0, 0)])[..., None]
+    own, slow_rows = _march(blocks, chain, slots, residual.multiplier[..., None])
+    slow_rows = residual.slow + slow_rows[..., 0]
+    rows = jnp.concatenate([slow_rows.reshape(-1), residual.slow_multiplier.reshape(-1)])
+    slow = -jax.scipy.linalg.lu_solve(border, rows) if border is not None else rows
+    d_slow, d_slow_multiplier = jnp.split(slow, [residual.slow.size])
+    d_chain = own[..., 0] + response @ d_slow
+    d_fast, d_multiplier = jnp.split(d_chain, [residual.fast[0].size], axis=1)
+    return Unknowns(
+        d_slow.reshape(residual.slow.shape),
+        d_slow_multiplier.reshape(residual.slow_multiplier.shape),
+        d_fast.reshape(residual.fast.shape),
+        d_multiplier.reshape(residual.multiplier.shape),
+    )
+
+
+def _march(blocks: Blocks, chain, slots, g):
+    """Chain unknowns that cancel given changes of the fast slots and of g, interval after interval.
+
+    Args:
+        slots: (num_micro, r + 1, n_f, c) changes of the fast slots, one column each.
+        g: (num_micro, r, n_g, c) changes of the constraints at nodes 1..r.
+
+    Returns:
+        The chain unknowns (num_micro, r (n_f + n_g), c) and the change (r, n_s, c) they cause in the slow equations.
+    """
+    _, r, n_g, c = g.shape
+    n_f, n_s = slots.shape[2], blocks.sf.shape[2]
+
+    def interval(carry, at):
+        start, incoming, slow_rows = carry  # changes of the position and momentum that arrive at this interval
+        b, chain, slots, g = at
+        slots = slots + jnp.einsum("iab,bc->iac", b.ff[:, :, 0], start)
+        rows = slots[:-1].at[0].add(incoming).reshape(r * n_f, c)
+        g_rows = (g + jnp.einsum("jga,ac->jgc", b.g_f[1:], start)).reshape(r * n_g, c)
+        unknowns = -chain @ jnp.concatenate([rows, g_rows])
+        fast, multiplier = unknowns[: r * n_f].reshape(r, n_f, c), unknowns[r * n_f :].reshape(r, n_g, c)
+
+        outgoing = slots[-1] + jnp.einsum("ajb,jbc->ac", b.ff[-1, :, 1:], fast)
+        slow_rows += jnp.einsum("iab,bc->iac", b.sf[:-1, :, 0], start)
+        slow_rows += jnp.einsum("iajb,jbc->iac", b.sf[:-1, :, 1:], fast)
+        slow_rows -= jnp.einsum("ji,jga,jgc->iac", b.basis[:-1, :-1], b.g_s[:-1], multiplier)
+        return (start + fast[-1], outgoing, slow_rows), unknowns
+
+    per_interval = blocks._replace(fs=None, ss=None, g_slow=None)
+    zero = jnp.zeros((n_f, c))
+    carry = (zero, zero, jnp.zeros((r, n_s, c)))
+    (_, _, slow_rows), unknowns = jax.lax.scan(interval, carry, (per_interval, chain, slots, g))
+    return unknowns, slow_rows

@@ -1,7 +1,7 @@
 """Newton's iteration with a convergence test aware of round-off, differentiable by the implicit function theorem."""
 
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ from vmri_jax.linearization import linearize
 from vmri_jax.newton import arrowhead, dense
 from vmri_jax.results import Result
 
-LINEAR_SOLVERS = {"arrowhead": arrowhead.solve, "dense": dense.solve}
+LINEAR_SOLVERS = {"arrowhead": arrowhead, "dense": dense}
 ROUNDOFF_FLOOR = 100.0
 """Updates below this many units of round-off of the positions that no longer shrink are at the floor."""
 
@@ -45,17 +45,8 @@ class Newton(eqx.Module):
                 raise ValueError(f"Newton: {name} is {value}; it must be positive.")
 
 
-class NewtonInfo(eqx.Module):
-    """What a solve did: status (`Result`), iterations, and the largest residual left in the momentum equations
-    (relative to the momentum) and in the constraints."""
-
-    result: Any
-    iterations: Any
-    residual: Any
-
-
-def solve(equations: StepEquations, guess: Unknowns, newton: Newton) -> tuple[Unknowns, NewtonInfo]:
-    """Solve ``equations.residual(x) = 0`` from a guess.
+def solve(equations: StepEquations, guess: Unknowns, newton: Newton):
+    """Solve ``equations.residual(x) = 0`` from a guess; returns (x, `Result` code, iterations).
 
     Converged when the error predicted from the observed contraction, ``|d_k| theta / (1 - theta)`` with
     ``theta = |d_k| / |d_(k-1)|``, is below ``tolerance`` times the increments, or round-off of the positions.
@@ -63,12 +54,10 @@ def solve(equations: StepEquations, guess: Unknowns, newton: Newton) -> tuple[Un
     """
     fixed = jax.lax.stop_gradient(equations)
     x, result, iterations = _iterate(fixed, jax.lax.stop_gradient(guess), newton)
-    x = _differentiable(newton.linear_solver, equations, x)
-    return x, NewtonInfo(result, iterations, _relative_residual(fixed, jax.lax.stop_gradient(x)))
+    return _differentiable(newton.linear_solver, equations, x), result, iterations
 
 
 def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton):
-    linear_solve = LINEAR_SOLVERS[newton.linear_solver]
     eps = jnp.finfo(jnp.result_type(float)).eps
     floor = (eps * _largest(equations.q_s), eps * _largest(equations.q_f))
 
@@ -82,7 +71,7 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton):
 
     def iterate(carry):
         x, previous, k, _ = carry
-        d = linear_solve(linearize(equations, x), equations.residual(x))
+        d = _direction(newton.linear_solver, equations, x, equations.residual(x))
         x = jax.tree.map(jnp.add, x, d)
         update = size(d, x, newton.tolerance)
         contraction = update / previous
@@ -104,12 +93,18 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton):
 _RUNNING = -1
 
 
+def _direction(linear_solver: str, equations: StepEquations, x: Unknowns, residual: Unknowns) -> Unknowns:
+    """``-(dR/dx)^-1 residual`` with the matrix at x."""
+    solver = LINEAR_SOLVERS[linear_solver]
+    return solver.solve(solver.factor(linearize(equations, x), x), residual)
+
+
 def _largest(a):
     return jnp.max(jnp.abs(a), initial=0.0)
 
 
-def _relative_residual(equations: StepEquations, x: Unknowns):
-    residual = equations.residual(x)
+def relative_residual(equations: StepEquations, residual: Unknowns):
+    """Largest residual left: of the momentum equations relative to the momentum, of the constraints in their unit."""
     momentum = jnp.maximum(_largest(equations.p_s), _largest(equations.p_f)) * equations.micro_dt
     equation = jnp.maximum(_largest(residual.slow), _largest(residual.fast)) / jnp.where(momentum > 0, momentum, 1.0)
     return jnp.maximum(equation, jnp.maximum(_largest(residual.multiplier), _largest(residual.slow_multiplier)))
@@ -125,4 +120,4 @@ def _differentiable(linear_solver: str, equations: StepEquations, x: Unknowns) -
 def _implicit_derivative(linear_solver, primals, tangents):
     equations, x = primals
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
-    return x, LINEAR_SOLVERS[linear_solver](linearize(equations, x), change)
+    return x, _direction(linear_solver, equations, x, change)
