@@ -247,10 +247,8 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
         multiplier=infos.multiplier[:, 0],
         slow_multiplier=slow_info.multiplier[0],
     )
-    memory = Memory(
-        memory.kicks, memory.velocity, memory.multiplier, memory.slow_multiplier, (slow_memory, fast_memory)
-    )
-    return State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f), info, memory
+    end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
+    return end, info, memory._replace(parts=(slow_memory, fast_memory))
 
 
 def _move_coupled(system, scheme, state, macro_dt, newton, memory):
