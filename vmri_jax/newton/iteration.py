@@ -13,6 +13,8 @@ from vmri_jax.newton import arrowhead, dense
 from vmri_jax.results import Result
 
 LINEAR_SOLVERS = {"arrowhead": arrowhead, "dense": dense}
+SAFETY = 100.0
+"""Margin on the quadratic convergence that is expected of Newton's iteration."""
 ROUNDOFF_FLOOR = 100.0
 """Updates below this many units of round-off of the positions that no longer shrink are at the floor."""
 
@@ -48,8 +50,9 @@ class Newton(eqx.Module):
 def solve(equations: StepEquations, guess: Unknowns, newton: Newton):
     """Solve ``equations.residual(x) = 0`` from a guess; returns (x, `Result` code, iterations).
 
-    Converged when the error predicted from the observed contraction, ``|d_k| theta / (1 - theta)`` with
-    ``theta = |d_k| / |d_(k-1)|``, is below ``tolerance`` times the increments, or round-off of the positions.
+    Converged when the predicted size of all further updates is below ``tolerance`` times the increments, or round-off
+    of the positions. With the contraction ``theta = |d_k| / |d_(k-1)|`` the next update is expected to be
+    ``|d_k| theta min(1, SAFETY theta)``: quadratic convergence with a margin, linear convergence at worst.
     The solution is differentiable in both modes with respect to everything in `equations`.
     """
     fixed = jax.lax.stop_gradient(equations)
@@ -75,7 +78,8 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton):
         x = jax.tree.map(jnp.add, x, d)
         update = size(d, x, newton.tolerance)
         contraction = update / previous
-        error = jnp.where(contraction < 1, update * contraction / (1 - contraction), jnp.inf)
+        shrink = contraction * jnp.minimum(1.0, SAFETY * contraction)  # of the next update: quadratic convergence
+        error = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
         error = jnp.where(k == 0, update, error)
         at_floor = (contraction > 0.5) & (size(d, x, ROUNDOFF_FLOOR * eps) <= ROUNDOFF_FLOOR)
         last = jnp.where(update > previous, Result.DIVERGED, Result.STAGNATED)
