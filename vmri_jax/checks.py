@@ -39,8 +39,6 @@ def check_arrays(**arrays):
 
 def check_system(system: System, q_s, q_f) -> None:
     """Check shapes of masses and of what every user function returns for these positions (without evaluating them)."""
-    if not isinstance(system, System):
-        raise TypeError(f"system is {type(system).__name__}; it must be a vmri_jax.System.")
     n_s, n_f = q_s.shape[0], q_f.shape[0]
     if isinstance(system.kinetic, ConstantMass):
         for name, mass, n in (("slow", system.kinetic.slow, n_s), ("fast", system.kinetic.fast, n_f)):

@@ -1,7 +1,6 @@
 """Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,7 @@ from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Result, SimulationError
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
-from vmri_jax.step import advance, start_memory
+from vmri_jax.step import Memory, advance, start_memory
 from vmri_jax.system import System
 from vmri_jax.trajectory import Trajectory, join
 
@@ -59,19 +58,19 @@ def simulate(
         ValueError, TypeError: bad arguments, before anything is computed.
         SimulationError: a step failed.
     """
-    macro_dt = _check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every)
-    num_saves = num_steps // save_every
-    state = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
-    inputs = (system, scheme, state, jnp.asarray(macro_dt, dtype=float), newton or Newton())
-    if not is_concrete(inputs):  # under a transformation: a static trip count keeps reverse mode possible
-        memory = start_memory(system, scheme, state)
-        return _differentiable_run(*inputs, memory, 0, num_saves, save_every, save_micro)[0]
+    macro_dt = jnp.asarray(_check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every), dtype=float)
+    start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
+    newton, num_saves = newton or Newton(), num_steps // save_every
+    memory = _checked_memory(system, scheme, start)
+    if not is_concrete((system, scheme, start, macro_dt, newton)):
+        run = partial(_run_static, system, scheme, newton, macro_dt, start.t)
+        return run(start, memory, 0, num_saves, save_every, save_micro)[0]
 
-    pieces, first_step, memory = [], 0, _start_memory(system, scheme, state)
+    check_constraints(system, start.q_s, start.q_f)
+    pieces, state, first_step = [], start, 0
     for saves in _chunks(num_saves, progress):
-        piece, memory = _compiled_run(
-            *inputs[:2], state, *inputs[3:], memory, first_step, saves, save_every, save_micro, inputs[2].t
-        )
+        run = partial(_run_traced, system, scheme, newton, macro_dt, start.t)
+        piece, memory = run(state, memory, first_step, saves, save_every, save_micro)
         pieces.append(piece)
         state, first_step = piece.final_state, first_step + saves * save_every
     trajectory = pieces[0] if len(pieces) == 1 else join(pieces)
@@ -81,10 +80,9 @@ def simulate(
 
 
 def _run(
-    system, scheme, state, macro_dt, newton, memory, first_step, num_saves, save_every, save_micro, t_start=None
-) -> tuple[Trajectory, Any]:
+    system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro
+) -> tuple[Trajectory, Memory]:
     """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one."""
-    t_start = state.t if t_start is None else t_start
     n = scheme.num_micro
 
     def step(_, carry):
@@ -130,9 +128,17 @@ def _run(
     return trajectory, memory
 
 
-_compiled_run = jax.jit(_run, static_argnames=("num_saves", "save_micro"))
-_differentiable_run = jax.jit(_run, static_argnames=("num_saves", "save_micro", "save_every"))
-_start_memory = jax.jit(start_memory)
+# A traced save_every lets a sweep over step sizes compile once; under a transformation it is static instead, so that
+# the trip count of the loop is known and reverse mode works.
+_run_traced = jax.jit(_run, static_argnames=("num_saves", "save_micro"))
+_run_static = jax.jit(_run, static_argnames=("num_saves", "save_micro", "save_every"))
+
+
+@jax.jit
+def _checked_memory(system, scheme, state):
+    """`start_memory`; what the user's functions return is checked while tracing."""
+    check_system(system, state.q_s, state.q_f)
+    return start_memory(system, scheme, state)
 
 
 def _chunks(num_saves: int, progress: bool):
@@ -177,9 +183,8 @@ def _check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every):
     vectors = _vectors(state)
     if is_concrete(vectors):
         check_arrays(**vectors)
-    check_system(system, vectors["q_s"], vectors["q_f"])
-    if is_concrete((system, state)):
-        check_constraints(system, state.q_s, state.q_f)
+    if not isinstance(system, System):
+        raise TypeError(f"simulate: system is {type(system).__name__}; it must be a vmri_jax.System.")
     return dt if micro_dt is None else scheme.num_micro * micro_dt
 
 

@@ -100,7 +100,6 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
     """
     require_x64()
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
-    check_system(system, q_s, q_f)
     if project:
         q_s, q_f = _projected_positions(system, q_s, q_f)
     values, p_s, p_f = _momenta(system, q_s, q_f, v_s, v_f)
@@ -117,7 +116,8 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
 
 @jax.jit
 def _momenta(system, q_s, q_f, v_s, v_f):
-    """Constraint values and consistent momenta."""
+    """Constraint values and consistent momenta; what the user's functions return is checked while tracing."""
+    check_system(system, q_s, q_f)
     momenta = project_momentum(system, q_s, q_f, *legendre(system, q_s, q_f, v_s, v_f))[:2]
     return system.constraints(q_s, q_f), *momenta
 
@@ -127,7 +127,7 @@ _projected_positions = jax.jit(project_positions)
 
 @jax.jit
 def _constraint_jacobians(system, q_s, q_f):
-    return jax.jacrev(system.g, argnums=(0, 1))(q_s, q_f)
+    return *jax.jacrev(system.g, argnums=(0, 1))(q_s, q_f), jax.jacrev(system.g_slow)(q_s)
 
 
 def _check_constraint_values(values, projected: bool, tolerance: float) -> None:
@@ -149,8 +149,10 @@ def _check_constraint_values(values, projected: bool, tolerance: float) -> None:
 
 def check_constraints(system: System, q_s, q_f) -> None:
     """Refuse constraints that cannot be kept where they are held, with the reason and the fix."""
-    n_g, n_gs = system.num_constraints(q_s, q_f)
-    n_s, n_f = q_s.size, q_f.size
+    if system.constraint is system.slow_constraint is None:
+        return
+    slow, fast, alone = (np.asarray(d) for d in _constraint_jacobians(system, q_s, q_f))
+    (n_g, n_s), (_, n_f), n_gs = slow.shape, fast.shape, len(alone)
     if n_gs > n_s:
         raise ValueError(
             f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
@@ -164,7 +166,6 @@ def check_constraints(system: System, q_s, q_f) -> None:
     )
     if n_g > n_f:
         raise ValueError(f"System: constraint returns {n_g} values for {n_f} fast variables. {fix} Remove rows.")
-    slow, fast = (np.asarray(d) for d in _constraint_jacobians(system, q_s, q_f))
     if not (np.isfinite(slow).all() and np.isfinite(fast).all()):
         raise ValueError("System: the Jacobian of constraint is not finite at these positions (a norm at zero?).")
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
