@@ -8,7 +8,7 @@ reproduce: .venv/installed  ## the quick reference study: figures, tables and ou
 	$(BIN)/vmri reproduce --quick --out out
 
 test: .venv/installed  ## the whole test suite
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: .venv/installed  ## format, lint and types, as pre-commit runs them
 	$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/pyright

@@ -96,30 +96,29 @@ def symplectic_defect(system: System, scheme: Scheme, state: State, macro_dt, ne
     return jnp.max(jnp.abs(tangents @ (M.T @ J @ M - J) @ tangents.T))
 
 
-def observed_order(macro_dt, errors, plateau: float = 30.0, floor: float = 0.0) -> float:
+def observed_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> float:
     """Order of convergence: least-squares slope of log error over log step, round-off plateau masked.
 
-    Points within a factor `plateau` of the smallest error, or of `floor` if that is larger, at the small-step end are
-    left out when the errors stop falling there; at least two points stay.
+    The plateau is where errors stop falling with the step: from the first interval, towards smaller steps, whose slope
+    is less than half the steepest one. Errors within a factor `plateau` of it, or of `floor`, are left out; at least the
+    two largest steps stay.
 
     Args:
         macro_dt: (k,) step sizes.
-        errors: (k,) errors; non-finite ones are ignored.
-        plateau: how far above the smallest error the plateau reaches.
-        floor: known accuracy of the reference.
+        errors: (k,) errors; those that are not finite or zero are ignored.
+        plateau: how far above the round-off plateau an error must lie to count.
+        floor: known error of the reference.
     """
     h, e = np.asarray(macro_dt, dtype=float), np.asarray(errors, dtype=float)
     good = np.isfinite(e) & (e > 0)
-    h, e = h[good], e[good]
-    order = np.argsort(-h)
-    h, e = h[order], e[order]
-    if len(h) < 2:
-        raise ValueError(f"observed_order: {len(h)} usable errors of {np.size(errors)}; at least 2 are needed.")
-    keep = e > plateau * floor
+    if good.sum() < 2:
+        raise ValueError(f"observed_order: {good.sum()} usable errors of {np.size(errors)}; at least 2 are needed.")
+    order = np.argsort(-h[good])
+    h, e = h[good][order], e[good][order]
     slopes = np.diff(np.log(e)) / np.diff(np.log(h))
-    flat = np.flatnonzero(slopes < 0.3)  # errors no longer fall: the plateau starts here
-    if flat.size:
-        keep &= e > plateau * e[flat[0] :].max()
-    if keep.sum() < 2:
-        keep[:2] = True
+    flat = np.flatnonzero(slopes < slopes.max() / 2)
+    flat = flat[flat > slopes.argmax()]
+    level = max(floor, e[flat[0] + 1 :].max() if flat.size else 0.0)
+    keep = e > plateau * level
+    keep[:2] = True
     return float(np.polyfit(np.log(h[keep]), np.log(e[keep]), 1)[0])

@@ -113,10 +113,19 @@ def _run(
     (_, memory, _, status), (states, worst, micro) = jax.lax.scan(save, carry, length=num_saves)
     nodes = jax.tree.map(lambda first, later: jnp.concatenate([first[None], later]), state, states)
     phase = (nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f)
+    energy = jax.vmap(partial(diagnostics.energy, system))(*phase)
+
+    # A potential may be NaN where its gradient is not (a logarithm beyond its pole): such nodes are no result either.
+    broken = jnp.cumsum(~jnp.isfinite(energy)) > 0
+    at_node = first_step + jnp.argmax(broken) * save_every - 1
+    newly = broken.any() & (status[1] < 0)
+    status = (jnp.where(newly, Result.NON_FINITE, status[0]), jnp.where(newly, jnp.maximum(at_node, 0), status[1]))
+    phase = tuple(jnp.where(broken[:, None], jnp.nan, a) for a in phase)
+
     trajectory = Trajectory(
         nodes.t,
         *phase,
-        energy=jax.vmap(partial(diagnostics.energy, system))(*phase),
+        energy=energy,
         constraint_residual=jax.vmap(partial(diagnostics.constraint_residual, system))(*phase),
         iterations=worst[0],
         residual=worst[1],

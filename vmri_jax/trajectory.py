@@ -1,5 +1,6 @@
 """What a run returns: saved nodes, what the solver did, conserved quantities, and where it stopped."""
 
+import dataclasses
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -70,7 +71,7 @@ class Trajectory(eqx.Module):
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist; give the .npz file of a saved trajectory.")
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 arrays = dict(data)
         except Exception as error:
             raise ValueError(
@@ -78,6 +79,12 @@ class Trajectory(eqx.Module):
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
+        fields = {field.name for field in dataclasses.fields(cls)}
+        missing = fields - set(arrays) - {"t_micro", "q_f_micro"}
+        if missing or set(arrays) - fields:
+            raise ValueError(
+                f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
+            )
         return cls(**{name: jnp.asarray(value) for name, value in arrays.items()})
 
     def to_xarray(self):

@@ -1,0 +1,128 @@
+"""Convergence studies: orders, rows, failures, and what is refused."""
+
+import csv
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.study import ReferenceSolution, convergence_study, reference_solution
+
+OMEGA = 20.0
+
+
+def stiff_spring(q_f, params):
+    return params**2 / 2 * jnp.sum(q_f**2)
+
+
+def soft_spring(q_s, q_f, params):
+    return jnp.sum((q_s - q_f) ** 4) / 4
+
+
+ONE = jnp.ones(1)
+PROBLEM = vm.Problem(
+    vm.System(vm.ConstantMass(ONE, ONE), soft_spring, stiff_spring, params=jnp.asarray(OMEGA)),
+    q_s=ONE,
+    q_f=ONE / OMEGA,
+    v_s=ONE,
+    v_f=ONE,
+)
+STEPS = (0.02, 0.01, 0.005)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return reference_solution(PROBLEM, 1.0, num_saves=5, num_steps=200, degree=3)
+
+
+@pytest.fixture(scope="module")
+def study(reference):
+    schemes = {"first order": vm.fully_explicit(4, alpha=0.0), "second order": vm.fully_explicit(4)}
+    return convergence_study(PROBLEM, schemes, STEPS, 1.0, num_saves=5, reference=reference)
+
+
+def test_the_reference_knows_its_own_error(reference):
+    assert reference.q.shape == reference.p.shape == (6, 2)
+    assert 0 < reference.error_q < 8e-11  # measured 8e-12
+    assert 0 < reference.error_p < 2.5e-9  # measured 2.5e-10
+
+
+@pytest.mark.parametrize(("scheme", "order"), [("first order", 1), ("second order", 2)])
+@pytest.mark.parametrize("quantity", ["q", "p"])
+def test_orders(study, scheme, order, quantity):
+    assert study.order(scheme, quantity) == pytest.approx(order, abs=0.1)
+
+
+def test_errors_are_the_largest_over_nodes_and_coordinates(study, reference):
+    trajectory = vm.simulate(
+        PROBLEM.system, vm.fully_explicit(4), PROBLEM.state(), macro_dt=0.01, num_steps=100, save_every=20
+    )
+    q = np.concatenate([trajectory.q_s, trajectory.q_f], axis=1)
+    (row,) = [row for row in study.rows if row.scheme == "second order" and row.macro_dt == 0.01]
+    assert row.error_q == np.abs(q - reference.q).max()
+    assert row.num_micro == 4
+    assert row.result == "CONVERGED"
+    assert row.energy_error == pytest.approx(float(jnp.abs(trajectory.energy - trajectory.energy[0]).max()), rel=1e-12)
+
+
+def test_csv_has_a_line_for_every_run(study, tmp_path):
+    study.to_csv(tmp_path / "study.csv")
+    with open(tmp_path / "study.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [(line["scheme"], float(line["macro_dt"])) for line in lines] == [
+        (scheme, dt) for scheme in ("first order", "second order") for dt in STEPS
+    ]
+    assert float(lines[0]["error_q"]) == study.rows[0].error_q
+
+
+def test_a_run_that_fails_is_a_row_of_nan(reference):
+    stiff = dataclasses.replace(PROBLEM, system=PROBLEM.system.replace(params=jnp.asarray(1e9)))
+    study = convergence_study(stiff, {"unstable": vm.fully_explicit(4)}, STEPS, 1.0, num_saves=5, reference=reference)
+    assert {row.result for row in study.rows} == {"NON_FINITE"}
+    assert all(np.isnan(row.error_q) and np.isnan(row.error_p) for row in study.rows)
+    assert np.isnan(study.order("unstable"))
+
+
+def test_errors_near_the_reference_are_not_fitted(study):
+    macro_dt, errors = study.errors("second order")
+    coarse = dataclasses.replace(study, reference=dataclasses.replace(study.reference, error_q=errors[-1] / 50))
+    assert coarse.usable("second order")[0].tolist() == macro_dt[:2].tolist()
+
+
+def test_progress_hears_of_every_run(reference):
+    heard = []
+    convergence_study(
+        PROBLEM,
+        {"explicit": vm.fully_explicit(4)},
+        STEPS,
+        1.0,
+        num_saves=5,
+        reference=reference,
+        progress=lambda *news: heard.append(news),
+    )
+    assert heard[0] == ("explicit, H = 0.02", 0, 3)
+    assert heard[-1] == ("done", 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schemes": {}}, "schemes is empty"),
+        ({"macro_dt": ()}, "macro_dt is empty"),
+        ({"macro_dt": (0.03,)}, "macro_dt = 0.03 makes 33.3333 steps"),
+        ({"macro_dt": (-0.1,)}, "macro_dt = -0.1"),
+        ({"macro_dt": (0.25,)}, "multiple of num_saves = 5"),
+        ({"reference": ReferenceSolution(np.zeros((3, 2)), np.zeros((3, 2)))}, r"both must be \(6, 2\)"),
+    ],
+)
+def test_bad_input(reference, changes, message):
+    arguments = {"schemes": {"explicit": vm.fully_explicit(4)}, "macro_dt": STEPS, "reference": reference} | changes
+    with pytest.raises(ValueError, match=message):
+        convergence_study(PROBLEM, t_end=1.0, num_saves=5, **arguments)
+
+
+def test_asking_for_a_scheme_that_was_not_run(study):
+    with pytest.raises(ValueError, match=r"no scheme 'third order'.*first order, second order"):
+        study.order("third order")

@@ -1,0 +1,76 @@
+"""Cost studies: rows, normalisation, and what is refused."""
+
+import csv
+
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.study import cost_study
+
+
+@pytest.fixture(scope="module")
+def study():
+    return cost_study(
+        vm.systems.fermi_pasta_ulam(2),
+        vm.explicit_slow,
+        (1, 3),
+        micro_dt=0.01,
+        t_end=2.0,
+        repeats=3,
+        min_seconds=0.02,
+        label="chain",
+    )
+
+
+def test_rows(study):
+    assert [(row.linear_solver, row.num_micro) for row in study.rows] == [
+        ("dense", 1),
+        ("dense", 3),
+        ("arrowhead", 1),
+        ("arrowhead", 3),
+    ]
+    assert [row.num_unknowns for row in study.rows] == [4, 8, 4, 8]
+    assert all(row.result == "CONVERGED" and row.iterations >= 1 for row in study.rows)
+    assert [row.num_steps for row in study.rows] == [200, 67, 200, 67]
+
+
+def test_times_are_per_simulated_unit_and_per_micro_step(study):
+    for row in study.rows:
+        assert 0.01 < row.us_per_micro_step < 1e4
+        assert row.seconds_per_unit == pytest.approx(row.us_per_micro_step * 1e-6 / 0.01)
+        assert row.first_call_seconds > 0
+
+
+def test_curves_and_sums(study):
+    num_micro, cost = study.curve("chain", "dense")
+    assert num_micro.tolist() == [1, 3]
+    assert cost.tolist() == [row.us_per_micro_step for row in study.rows[:2]]
+    assert (study + study).rows == study.rows * 2
+    with pytest.raises(ValueError, match=r"no .*'chain', 'sparse'"):
+        study.curve("chain", "sparse")
+
+
+def test_csv(study, tmp_path):
+    study.to_csv(tmp_path / "cost.csv")
+    with open(tmp_path / "cost.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [int(line["num_unknowns"]) for line in lines] == [4, 8, 4, 8]
+    assert float(lines[-1]["us_per_micro_step"]) == study.rows[-1].us_per_micro_step
+
+
+def test_a_run_that_fails_has_no_time():
+    problem = vm.systems.fermi_pasta_ulam(2, omega=1e9)
+    study = cost_study(
+        problem, vm.fully_explicit, (2,), micro_dt=1.0, t_end=40.0, linear_solvers=("arrowhead",), repeats=1
+    )
+    (row,) = study.rows
+    assert row.result == "NON_FINITE"
+    assert np.isnan(row.us_per_micro_step)
+
+
+@pytest.mark.parametrize("bad", [{"num_micro": ()}, {"linear_solvers": ()}, {"repeats": 0}, {"t_end": 0.0}])
+def test_bad_input(bad):
+    arguments = {"num_micro": (1,), "micro_dt": 0.01, "t_end": 1.0} | bad
+    with pytest.raises(ValueError, match="cost_study: num_micro"):
+        cost_study(vm.systems.fermi_pasta_ulam(), vm.fully_implicit, **arguments)

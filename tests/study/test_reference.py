@@ -1,0 +1,154 @@
+"""The reference study end to end on its smallest figures, and its report."""
+
+import base64
+import csv
+import re
+
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.study import Check, ConvergenceFigure, CostFigure, CostPanel, choose_figures, reference_figures, reproduce
+from vmri_jax.study import report as report_module
+
+ALL = ["fig4", "fig5", "fig6", "fig7", "fig8", "fpu-half", "fpu-degree", "fig9", "fig10", "tsp-half", "tsp-degree"]
+
+
+def tiny_convergence(name="tiny", orders=2, factory=vm.systems.fermi_pasta_ulam):
+    schemes = {"5 micro steps": vm.fully_explicit(5)}
+    return ConvergenceFigure(
+        name,
+        "A tiny sweep",
+        "order 2 & nothing else.",
+        factory,
+        schemes,
+        dict.fromkeys(schemes, orders),
+        "paper",
+        (0.01, 0.005, 0.002),
+    )
+
+
+def tiny_cost():
+    chain = vm.systems.fermi_pasta_ulam
+    panel = CostPanel("FPU", chain, chain, vm.fully_explicit, 60, (1, 2), (1, 2), 0.01, 0.1, 0.1, repeats=1)
+    return CostFigure("cost", "A tiny cost", "a minimum at 60.", (panel,))
+
+
+def broken():
+    raise RuntimeError("no such <chain>")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A report of one good, one wrong, one failing and one cost figure."""
+    out = tmp_path_factory.mktemp("study")
+    figures = (tiny_convergence(), tiny_convergence("wrong", 3), tiny_convergence("broken", 2, broken), tiny_cost())
+    heard = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report_module, "reference_figures", lambda size: figures)
+        report = reproduce(out, progress=lambda *news: heard.append(news))
+    return report, (out / "report.html").read_text(), heard
+
+
+@pytest.mark.parametrize("size", ["quick", "full"])
+def test_the_study_has_all_figures(size):
+    figures = reference_figures(size)
+    assert [figure.name for figure in figures] == ALL
+    for figure in figures:
+        if isinstance(figure, ConvergenceFigure):
+            assert set(figure.orders) == set(figure.schemes)
+            assert all(abs(1 / dt - round(1 / dt)) < 1e-9 and round(1 / dt) % 10 == 0 for dt in figure.macro_dt)
+    expected = {figure.name: set(figure.orders.values()) for figure in figures if isinstance(figure, ConvergenceFigure)}
+    assert expected["fig6"] == expected["fig7"] == expected["fig10"] == {1}
+    assert expected["fig8"] == expected["fig9"] == {2}
+    assert expected["fpu-degree"] == expected["tsp-degree"] == {4, 6}
+
+
+def test_the_full_study_marks_the_minima_of_the_paper():
+    (chains,) = [figure for figure in reference_figures("full") if figure.name == "fig5"]
+    minima = {panel.title: panel.paper_minimum for panel in chains.panels}  # pyright: ignore[reportAttributeAccessIssue]
+    assert minima["fully implicit, l = 70"] == 12
+    assert minima["explicit slow, l = 150"] == 8
+    assert minima["fully explicit, l = 200"] == 4
+    assert minima["fully explicit, l = 10"] is None
+
+
+def test_choosing_figures():
+    figures = reference_figures()
+    assert [figure.name for figure in choose_figures(figures, ["fig9", "fig6"])] == ["fig6", "fig9"]
+    with pytest.raises(ValueError, match=r"no figure 'fig11'; there are fig4, .*tsp-degree"):
+        choose_figures(figures, ["fig11"])
+
+
+def test_an_unknown_size():
+    with pytest.raises(ValueError, match=r"'medium'.*quick, full"):
+        reference_figures("medium")
+
+
+def test_checks_compare_what_was_measured(made):
+    report, _, _ = made
+    right, wrong, _, cost = report.figures
+    assert all(check.agrees for check in right.checks)
+    assert not any(check.agrees for check in wrong.checks)
+    assert right.checks[0] == Check("order of positions, 5 micro steps", "2", "paper", right.checks[0].seen, True)
+    assert float(right.checks[0].seen) == pytest.approx(2.0, abs=0.1)
+    assert [check.quantity for check in cost.checks] == [
+        "FPU, dense: cost turns up again",
+        "FPU, dense: cheapest number of micro steps",
+        "FPU, arrowhead: cost at 2 micro steps over that at 2",
+    ]
+
+
+def test_what_was_seen_is_made_from_the_numbers(made):
+    report, _, _ = made
+    assert re.fullmatch(
+        r"orders of positions / momenta, 5 micro steps: \d\.\d\d / \d\.\d\d; reference good to .*\.",
+        report.figures[0].seen,
+    )
+    assert re.search(r"dense cheapest at \d \(.* µs\) and .* × that at 2", report.figures[3].seen)
+
+
+def test_every_figure_has_its_files(made):
+    report, _, _ = made
+    for name in ("tiny", "wrong", "cost"):
+        for ending in ("png", "svg", "csv"):
+            assert (report.path.parent / f"{name}.{ending}").stat().st_size > 100
+    with open(report.path.parent / "tiny.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["macro_dt"]) for line in lines] == [0.01, 0.005, 0.002]
+
+
+def test_a_figure_that_fails_leaves_the_others(made):
+    report, html, _ = made
+    assert [figure.name for figure in report.failed] == ["broken"]
+    assert "This figure failed. RuntimeError: no such &lt;chain&gt;" in html
+    assert "in broken" in report.failed[0].traceback
+    assert "1\n    of 4 figures failed" in html
+
+
+def test_the_report_stands_alone(made):
+    report, html, _ = made
+    pictures = re.findall(r'"data:image/svg\+xml;base64,([^"]+)"', html)
+    assert len(pictures) == 2 * 3
+    assert all(b"<svg" in base64.b64decode(picture) for picture in pictures)
+    assert not re.findall(r'(?:src|srcset|href)="(?!data:|#|[\w-]+\.(?:csv|png|svg)")', html)
+    assert "prefers-color-scheme: dark" in html
+    for figure in report.figures:
+        if not figure.error:
+            assert figure.seen in html
+    assert "order 2 &amp; nothing else." in html
+    assert html.count("✓ agrees") + html.count("≠ differs") == sum(len(figure.checks) for figure in report.figures)
+    assert f"vmri_jax {vm_version()}" in html
+
+
+def vm_version() -> str:
+    from importlib.metadata import version
+
+    return version("vmri_jax")
+
+
+def test_progress_runs_over_all_figures(made):
+    _, _, heard = made
+    done, total = [news[1] for news in heard], {news[2] for news in heard}
+    assert total == {4000}
+    assert done == sorted(done)
+    assert done[-1] == 4000

@@ -1,0 +1,59 @@
+"""Data files and measures that tests share."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from vmri_jax import macro_step, simulate, systems
+
+DATA = Path(__file__).parent / "data"
+PROBLEMS = {
+    "fpu": systems.fermi_pasta_ulam,
+    "tsp": systems.triple_spherical_pendulum,
+    "sam": systems.simple_atomic_model,
+}
+
+
+compiled_step = jax.jit(macro_step)
+"""``(system, scheme, state, macro_dt, newton) -> (state, info)``, compiled once per structure."""
+
+
+def relative_difference(value, expected) -> float:
+    """Largest difference over the largest size of what is expected."""
+    return float(np.max(np.abs(np.asarray(value) - expected)) / np.max(np.abs(expected)))
+
+
+def largest_difference(a, b) -> float:
+    """Largest absolute difference."""
+    return float(np.max(np.abs(np.asarray(a) - np.asarray(b))))
+
+
+def ground_truth(name: str) -> dict:
+    """Times t, positions q and velocities v (slow first, then fast), energy: of the continuous equations."""
+    with np.load(DATA / "ground_truth" / f"{name}.npz") as file:
+        return dict(file)
+
+
+def masses(problem) -> np.ndarray:
+    """Masses per coordinate, slow first, then fast."""
+    kinetic = problem.system.kinetic
+    return np.concatenate([np.asarray(kinetic.slow), np.asarray(kinetic.fast)])
+
+
+def convergence(problem, scheme, truth: dict, steps, num_saves: int):
+    """Step sizes, and sup over the saved nodes of the largest error of the positions and of the momenta.
+
+    `steps` are numbers of macro steps up to the end of the truth, multiples of `num_saves`, which divides 100.
+    """
+    every = 100 // num_saves
+    length = truth["t"][-1]
+    q_true, p_true = truth["q"][::every], masses(problem) * truth["v"][::every]
+    errors = []
+    for n in steps:
+        run = simulate(
+            problem.system, scheme, problem.state(), macro_dt=length / n, num_steps=n, save_every=n // num_saves
+        )
+        q, p = np.concatenate([run.q_s, run.q_f], axis=1), np.concatenate([run.p_s, run.p_f], axis=1)
+        errors.append((np.abs(q - q_true).max(), np.abs(p - p_true).max()))
+    return length / np.asarray(steps), *np.transpose(errors)

@@ -1,0 +1,231 @@
+"""Bad input is refused at the door: the message names the argument, says what came and what to do."""
+
+import os
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vmri_jax import (
+    ConstantMass,
+    Scheme,
+    SimulationError,
+    State,
+    System,
+    explicit_slow,
+    fully_implicit,
+    galerkin,
+    initial_state,
+    macro,
+    micro,
+    quadrature,
+    simulate,
+    systems,
+)
+
+
+def start(problem, **changes):
+    vectors = {"q_s": problem.q_s, "q_f": problem.q_f, "v_s": problem.v_s, "v_f": problem.v_f} | changes
+    return initial_state(problem.system, **vectors)
+
+
+def test_float32_data(fpu):
+    with pytest.raises(ValueError, match=r"q_s has dtype float32; give float64"):
+        start(fpu, q_s=jnp.asarray(fpu.q_s, dtype=jnp.float32))
+    state = fpu.state()
+    with pytest.raises(ValueError, match=r"p_f has dtype float32; give float64"):
+        simulate(
+            fpu.system,
+            fully_implicit(2),
+            State(0.0, state.q_s, state.q_f, state.p_s, state.p_f.astype(jnp.float32)),
+            macro_dt=0.1,
+            num_steps=1,
+        )
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "vmri_jax.systems.fermi_pasta_ulam().state()",
+        "vmri_jax.simulate(p.system, vmri_jax.fully_implicit(2), None, macro_dt=0.1, num_steps=1)",
+    ],
+)
+def test_64_bit_mode_off(call):
+    program = f"""
+import vmri_jax
+p = vmri_jax.systems.fermi_pasta_ulam()
+try:
+    {call}
+except ValueError as error:
+    print(error)
+"""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True)
+    assert "needs 64-bit floats" in done.stdout
+    assert 'jax.config.update("jax_enable_x64", True)' in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"q_s": jnp.zeros((3, 1))}, r"q_s has shape \(3, 1\); it must be a vector"),
+        ({"v_s": jnp.zeros(2)}, r"v_s has shape \(2,\), q_s has \(3,\); they must be equal"),
+        ({"v_f": jnp.zeros(4)}, r"v_f has shape \(4,\), q_f has \(3,\)"),
+        ({"q_f": jnp.zeros(4), "v_f": jnp.zeros(4)}, r"ConstantMass: fast is for 3 coordinates, the state has 4"),
+        ({"q_f": jnp.array([0.0, jnp.nan, 0.0])}, r"q_f has entries that are not finite at \[1\]"),
+        ({"v_s": jnp.array([jnp.inf, 0.0, 0.0])}, r"v_s has entries that are not finite at \[0\]"),
+    ],
+)
+def test_bad_vectors(fpu, changes, message):
+    with pytest.raises(ValueError, match=message):
+        start(fpu, **changes)
+
+
+def vector_potential(q_s, q_f, params):
+    return q_s**2
+
+
+def vector_fast_potential(q_f, params):
+    return q_f**2
+
+
+def scalar_constraint(q_s, q_f, params):
+    return jnp.sum(q_f)
+
+
+def one_force(t, q_s, q_f, v_s, v_f, params):
+    return -v_s
+
+
+def swapped_forces(t, q_s, q_f, v_s, v_f, params):
+    return -v_f[:2], -v_s
+
+
+def failing_potential(q_s, q_f, params):
+    return params["no such entry"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"slow_potential": vector_potential}, r"slow_potential returns shape \(3,\); it must return a scalar"),
+        ({"fast_potential": vector_fast_potential}, r"fast_potential returns shape \(3,\); it must return a scalar"),
+        ({"constraint": scalar_constraint}, r"constraint returns shape \(\); it must return a vector"),
+        ({"force": one_force}, r"force returns shape \(3,\); it must return \(F_s, F_f\)"),
+        ({"force": swapped_forces}, r"force returns \(shape \(2,\), shape \(3,\)\); it must return \(F_s, F_f\)"),
+        ({"slow_potential": failing_potential}, r"slow_potential could not be evaluated .*KeyError.*no such entry"),
+    ],
+)
+def test_user_functions_of_the_wrong_shape(fpu, changes, message):
+    system = fpu.system.replace(**changes)
+    with pytest.raises(ValueError, match=message):
+        initial_state(system, fpu.q_s, fpu.q_f, fpu.v_s, fpu.v_f)
+    with pytest.raises(ValueError, match=message):
+        simulate(system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=1)
+
+
+@pytest.mark.parametrize(
+    ("slow", "message"),
+    [
+        ([1.0, 0.0], r"slow = \[1. 0.\]; every mass must be positive"),
+        ([1.0, -2.0], "every mass must be positive"),
+        ([1.0, np.nan], "is not finite"),
+        (1.0, r"slow has shape \(\); give \(n,\) masses"),
+        (np.diag([1.0, -1.0]), "slow must be a symmetric positive definite matrix"),
+        (np.array([[1.0, 0.5], [0.0, 1.0]]), "slow must be a symmetric positive definite matrix"),
+    ],
+)
+def test_bad_masses(slow, message):
+    with pytest.raises(ValueError, match=message):
+        ConstantMass(slow, [1.0])
+
+
+def test_system_fields_of_the_wrong_type():
+    with pytest.raises(TypeError, match=r"kinetic is 3.0; give ConstantMass"):
+        System(3.0)
+    with pytest.raises(TypeError, match="slow_potential is 2; it must be a function or None"):
+        System(ConstantMass([1.0], [1.0]), slow_potential=2)
+
+
+@pytest.mark.parametrize("make", [fully_implicit, explicit_slow, lambda n: galerkin(n, 2)])
+def test_bad_num_micro(make):
+    for bad in (0, -3):
+        with pytest.raises(ValueError, match=f"num_micro is {bad}; it must be at least 1"):
+            make(bad)
+    for bad in (2.0, "5", True, None):
+        with pytest.raises(TypeError, match=f"num_micro is {bad!r}; it must be an integer"):
+            make(bad)
+
+
+HALF = micro(quadrature.midpoint)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"degree": 0}, ValueError, "degree is 0; it must be at least 1"),
+        ({"degree": 1.5}, TypeError, "degree is 1.5; it must be an integer"),
+        ({"slow": macro(2 * quadrature.left)}, ValueError, "weights of the slow rule sum to 2; they must sum to 1"),
+        ({"fast": quadrature.left}, TypeError, r"fast is a bare rule; say on which grid .* macro\(rule\) or micro"),
+        ({"fast": "midpoint"}, TypeError, r"fast is 'midpoint'; give macro\(rule\) or micro\(rule\)"),
+        ({"kinetic": macro(quadrature.midpoint)}, ValueError, r"kinetic rule must be placed with micro"),
+        (
+            {"constraint": micro(quadrature.gauss(2))},
+            ValueError,
+            r"constraint must be held .* give micro\(lobatto\(2\)",
+        ),
+        ({"slow_constraint": micro(quadrature.trapezoidal)}, ValueError, r"give macro\(lobatto\(2\)\), got micro"),
+    ],
+)
+def test_bad_schemes(changes, error, message):
+    fields = {"num_micro": 3, "kinetic": HALF, "slow": HALF, "fast": HALF} | changes
+    with pytest.raises(error, match=message):
+        Scheme(**fields)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({}, ValueError, "got neither of macro_dt and micro_dt; give exactly one"),
+        ({"macro_dt": 0.1, "micro_dt": 0.01}, ValueError, "got both of macro_dt and micro_dt; give exactly one"),
+        ({"macro_dt": 0.0}, ValueError, "macro_dt is 0.0; it must be a positive number"),
+        ({"micro_dt": -0.1}, ValueError, "micro_dt is -0.1; it must be a positive number"),
+        ({"macro_dt": float("nan")}, ValueError, "macro_dt is nan; it must be a positive number"),
+        ({"macro_dt": 0.1, "num_steps": 0}, ValueError, "num_steps is 0; it must be an integer of at least 1"),
+        ({"macro_dt": 0.1, "num_steps": -4}, ValueError, "num_steps is -4"),
+        ({"macro_dt": 0.1, "num_steps": 10.0}, ValueError, "num_steps is 10.0; it must be an integer"),
+        ({"macro_dt": 0.1, "save_every": 0}, ValueError, "save_every is 0; it must be an integer of at least 1"),
+        ({"macro_dt": 0.1, "save_every": 3}, ValueError, "num_steps = 10 is not a multiple of save_every = 3"),
+        ({"macro_dt": 0.1, "scheme": "fully_implicit"}, TypeError, "scheme is str; give a Scheme"),
+        ({"macro_dt": 0.1, "state": None}, TypeError, r"state is NoneType; give a State, e.g. from initial_state"),
+    ],
+)
+def test_bad_arguments_of_simulate(fpu, changes, error, message):
+    arguments = {"scheme": fully_implicit(2), "state": fpu.state(), "num_steps": 10} | changes
+    with pytest.raises(error, match=message):
+        simulate(fpu.system, **arguments)
+
+
+def nan_potential(q_f, params):
+    return jnp.sum(jnp.sqrt(-1.0 - q_f**2))
+
+
+def test_nan_from_a_user_function(fpu):
+    system = fpu.system.replace(fast_potential=nan_potential)
+    with pytest.raises(SimulationError, match=r"a NaN or infinity appeared.*outside its domain") as caught:
+        simulate(system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=3)
+    assert caught.value.step == 0
+
+
+def test_nan_in_a_state(fpu):
+    state = fpu.state()
+    bad = State(0.0, state.q_s, state.q_f, state.p_s * jnp.nan, state.p_f)
+    with pytest.raises(ValueError, match=r"p_s has entries that are not finite at \[0, 1, 2\]"):
+        simulate(fpu.system, fully_implicit(2), bad, macro_dt=0.1, num_steps=1)
+
+
+def test_bad_number_of_springs():
+    with pytest.raises(ValueError, match="num_springs is 0; there must be at least 1"):
+        systems.fermi_pasta_ulam(num_springs=0)

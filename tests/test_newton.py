@@ -1,0 +1,90 @@
+"""Newton's iteration: how it ends, and how many iterations hard steps take."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from tests.support import compiled_step, largest_difference
+from vmri_jax import Newton, Result, State, fully_implicit, simulate
+
+
+def step(problem, scheme, macro_dt, newton=None, state=None):
+    state = problem.state() if state is None else state
+    state, info = compiled_step(problem.system, scheme, state, macro_dt, newton or Newton())
+    return state, info, Result(int(info.result))
+
+
+def test_a_plain_step_converges(fpu):
+    _, info, result = step(fpu, fully_implicit(5), 0.05)
+    assert result is Result.CONVERGED
+    assert result.success
+    assert 1 <= int(info.iterations) <= 4
+    assert float(info.residual) < 1e-13
+
+
+def test_too_few_iterations_stagnate(fpu):
+    _, info, result = step(fpu, fully_implicit(5), 0.05, Newton(max_iterations=1))
+    assert result is Result.STAGNATED
+    assert not result.success
+    assert int(info.iterations) == 1
+    assert "max_iterations" in result.message
+
+
+def test_nan_is_reported(fpu):
+    start = fpu.state()
+    _, _, result = step(
+        fpu, fully_implicit(5), 0.05, state=State(start.t, start.q_s, start.q_f * jnp.nan, 0.0 * start.p_s, start.p_f)
+    )
+    assert result is Result.NON_FINITE
+
+
+def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
+    _, info, result = step(fpu, fully_implicit(5), 0.05, Newton(tolerance=1e-30))
+    assert result is Result.CONVERGED_AT_ROUNDOFF or result is Result.CONVERGED
+    assert int(info.iterations) < 10
+    assert float(info.residual) < 1e-13
+
+
+@pytest.mark.parametrize(("macro_dt", "most"), [(0.01, 3), (0.05, 4)])
+def test_iterations_of_the_pendulum(tsp, macro_dt, most):
+    run = simulate(tsp.system, fully_implicit(5), tsp.state(), macro_dt=macro_dt, num_steps=100)
+    assert int(run.iterations.max()) <= most
+
+
+def test_iterations_of_a_large_macro_step(fpu):
+    run = simulate(fpu.system, fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=20)
+    assert int(run.iterations.max()) <= 8  # measured 6
+
+
+def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(fpu):
+    scheme = fully_implicit(20)
+    exact, info, _ = step(fpu, scheme, 0.5)
+    loose, loose_info, result = step(fpu, scheme, 0.5, Newton(tolerance=1e-4))
+    assert result is Result.CONVERGED
+    assert int(loose_info.iterations) < int(info.iterations)
+    assert 1e-15 < largest_difference(loose.q_s, exact.q_s) < 1e-4
+
+
+def test_solution_does_not_depend_on_the_linear_solver(tsp):
+    scheme = fully_implicit(5)
+    ends = [step(tsp, scheme, 0.05, Newton(linear_solver=s))[0] for s in ("arrowhead", "dense")]
+    for a, b in zip(jax.tree.leaves(ends[0]), jax.tree.leaves(ends[1]), strict=True):
+        assert largest_difference(a, b) < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"linear_solver": "sparse"}, "linear_solver is 'sparse'; it must be one of arrowhead, dense"),
+        ({"tolerance": 0.0}, "tolerance is 0.0; it must be positive"),
+        ({"max_iterations": 0}, "max_iterations is 0; it must be positive"),
+    ],
+)
+def test_bad_options_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Newton(**arguments)
+
+
+def test_every_status_has_a_message():
+    assert all(len(result.message) > 40 and result.message.endswith(".") for result in Result)
+    assert [result.success for result in Result] == [True, True, False, False, False]

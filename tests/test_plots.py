@@ -1,0 +1,147 @@
+"""Figures: what is drawn, and that nothing outside the figure is touched."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax import plots
+from vmri_jax.study import ConvergenceRow, ConvergenceStudy, CostRow, CostStudy, ReferenceSolution
+
+
+def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
+    """A trajectory without a simulation."""
+    t = np.linspace(0.0, 1.0, num_nodes)
+
+    def wave(n):
+        return np.sin(t[:, None] * np.arange(1, n + 1))
+
+    return vm.Trajectory(
+        t,
+        q_s=wave(n_s),
+        q_f=wave(n_f),
+        p_s=wave(n_s),
+        p_f=wave(n_f),
+        energy=2.0 + 1e-3 * np.sin(t),
+        constraint_residual=np.full((num_nodes, 2), 1e-14 if constrained else 0.0),
+        iterations=np.ones(num_nodes - 1),
+        residual=np.zeros(num_nodes - 1),
+        result=0,
+        failed_at=-1,
+    )
+
+
+def study(orders=(1, 2)):
+    """A convergence study of exact orders."""
+    rows = [
+        ConvergenceRow(f"order {order}", 5, dt, dt**order, 10 * dt**order, 0.0, 0.0, 2, "CONVERGED")
+        for order in orders
+        for dt in (0.1, 0.01, 0.001)
+    ]
+    return ConvergenceStudy(tuple(rows), ReferenceSolution(np.zeros((2, 1)), np.zeros((2, 1))))
+
+
+def cost(costs=(9.0, 3.0, 6.0), solver="dense"):
+    rows = [
+        CostRow("FPU", solver, n, 3 * n, 10, 1.0, value, 1.0, 2, "CONVERGED")
+        for n, value in zip((1, 10, 100), costs, strict=True)
+    ]
+    return CostStudy(tuple(rows))
+
+
+def labels(axes):
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def y_data(line):
+    return np.asarray(line.get_ydata(), dtype=float)
+
+
+def test_a_trajectory_has_a_panel_for_everything_it_carries():
+    free, held = plots.plot_trajectory(run()), plots.plot_trajectory(run(constrained=True))
+    assert [len(figure.axes) for figure in (free, held)] == [3, 4]
+    assert labels(free.axes[0]) == ["$s_{1}$", "$s_{2}$"]
+    assert "E_0" in free.axes[2].get_ylabel()
+    np.testing.assert_allclose(y_data(free.axes[2].lines[0]), 0.5e-3 * np.sin(run().t), atol=1e-15)
+
+
+def test_a_trajectory_cut_short_by_a_failure_is_drawn_up_to_there():
+    whole = run(constrained=True)
+    cut = dataclasses.replace(whole, q_s=jnp.asarray(whole.q_s).at[5:].set(jnp.nan))
+    drawn = y_data(plots.plot_trajectory(cut).axes[0].lines[0])
+    assert np.isfinite(drawn).sum() == 5
+
+
+def test_many_coordinates_are_counted_instead_of_named():
+    axes = plots.plot_trajectory(run(n_f=40)).axes[1]
+    assert axes.get_legend() is None
+    assert [text.get_text() for text in axes.texts] == ["40 coordinates"]
+    assert len(axes.lines) == 40
+
+
+def test_oscillatory_energies_and_their_sum():
+    trajectory = run()
+    lines = plots.plot_oscillatory_energies(trajectory, omega=3.0).axes[0].lines
+    energies = (np.asarray(trajectory.p_f) ** 2 + 9.0 * np.asarray(trajectory.q_f) ** 2) / 2
+    np.testing.assert_allclose(y_data(lines[0]), energies.sum(1))
+    np.testing.assert_allclose([y_data(line) for line in lines[1:]], energies.T)
+
+
+def test_convergence_names_the_orders_and_draws_guides_only_where_asked():
+    figure = plots.plot_convergence(study(), orders=(2,))
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["positions", "momenta"]
+    assert labels(figure.axes[0]) == ["order 1   order 1.00", "order 2   order 2.00"]
+    assert [len(axes.patches) for axes in figure.axes] == [1, 1]
+    corners = np.asarray(figure.axes[0].patches[0].get_path().vertices, dtype=float)
+    slope = np.log(corners[2, 1] / corners[1, 1]) / np.log(corners[1, 0] / corners[0, 0])
+    assert slope == pytest.approx(2.0, abs=1e-12)
+
+
+def test_convergence_says_when_a_scheme_failed():
+    rows = [dataclasses.replace(row, error_q=np.nan, error_p=np.nan) for row in study((1,)).rows]
+    figure = plots.plot_convergence(dataclasses.replace(study(), rows=tuple(rows)), orders=(1,))
+    assert labels(figure.axes[0]) == ["order 1   failed"]
+
+
+def test_cost_circles_the_minimum_and_marks_the_paper():
+    figure = plots.plot_cost({"FPU": cost() + cost((5.0, 4.0, 3.0), "arrowhead")}, {"FPU": 60})
+    lines = figure.axes[0].lines
+    circled = [np.asarray(line.get_xydata()).tolist() for line in lines if line.get_markersize() == 11]
+    assert circled == [[[10.0, 3.0]], [[100.0, 3.0]]]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["dense", "arrowhead", "minimum in the paper"]
+    assert np.asarray(lines[-1].get_xdata()).tolist() == [60, 60]
+
+
+def test_cost_leaves_failed_runs_out():
+    figure = plots.plot_cost({"FPU": cost((np.nan, np.nan, np.nan))})
+    assert len(figure.axes[0].lines) == 1
+
+
+@pytest.mark.parametrize("ending", ["png", "svg", "pdf"])
+def test_figures_are_saved_in_their_own_colours(tmp_path, ending):
+    path = tmp_path / f"figure.{ending}"
+    plots.save(plots.plot_trajectory(run(), "title", plots.DARK), path, plots.DARK)
+    assert path.stat().st_size > 1000
+    if ending == "svg":
+        assert plots.DARK.paper in path.read_text()
+
+
+def test_notebooks_show_figures():
+    assert plots.plot_trajectory(run())._repr_png_().startswith(b"\x89PNG")
+
+
+def test_short_sweeps_have_readable_steps():
+    rows = [row for row in study().rows if row.macro_dt > 0.005]
+    short = plots.plot_convergence(dataclasses.replace(study(), rows=tuple(rows)))
+    short.canvas.draw()
+    ticks = [text.get_text() for text in short.axes[0].get_xticklabels()]
+    assert {"0.01", "0.02", "0.05", "0.1"} <= set(ticks)
+
+
+def test_global_settings_stay_as_they_were():
+    before = dict(matplotlib.rcParams)
+    plots.plot_convergence(study())
+    assert dict(matplotlib.rcParams) == before

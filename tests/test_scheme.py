@@ -1,0 +1,76 @@
+"""Schemes as data: names, rules, orders."""
+
+import jax
+import numpy as np
+import pytest
+
+from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, quadrature
+
+
+@pytest.mark.parametrize(
+    ("scheme", "slow", "fast"),
+    [
+        (fully_implicit(5), ("micro", (0.5,)), ("micro", (0.5,))),
+        (explicit_slow(5, 0.3), ("macro", (0.0, 1.0)), ("micro", (0.5,))),
+        (fully_explicit(5, 0.3), ("macro", (0.0, 1.0)), ("micro", (0.0, 1.0))),
+    ],
+    ids=["fully implicit", "explicit slow", "fully explicit"],
+)
+def test_reference_schemes(scheme, slow, fast):
+    assert (scheme.num_micro, scheme.degree) == (5, 1)
+    assert (scheme.slow.grid, scheme.slow.rule.nodes) == slow
+    assert (scheme.fast.grid, scheme.fast.rule.nodes) == fast
+    assert (scheme.constraint.grid, scheme.slow_constraint.grid) == ("micro", "macro")
+    assert np.allclose(scheme.constraint.rule.weights, [0.5, 0.5])
+    if slow[0] == "macro":
+        assert np.allclose(scheme.slow.rule.weights, [0.3, 0.7])
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+@pytest.mark.parametrize("rule", ["gauss", "lobatto"])
+def test_galerkin_schemes(degree, rule):
+    scheme = galerkin(2, degree, rule)
+    assert scheme.order == 2 * degree
+    assert len(scheme.slow.rule.nodes) == degree + (rule == "lobatto")
+    assert len(scheme.constraint.rule.nodes) == degree + 1
+
+
+@pytest.mark.parametrize(
+    ("scheme", "order"),
+    [
+        (fully_implicit(3), 2),
+        (explicit_slow(3), 2),
+        (explicit_slow(3, 0.4), 1),
+        (fully_explicit(3, 1.0), 1),
+        (galerkin(2, 1, quadrature.gauss(3)), 2),
+        (galerkin(2, 3, quadrature.gauss(2)), 4),
+        (galerkin(2, 2, quadrature.radau(2)), 3),
+    ],
+)
+def test_order_is_the_least_of_path_and_rules(scheme, order):
+    assert scheme.order == order
+
+
+def test_forces_take_the_rule_of_the_kinetic_energy_unless_told():
+    rule = micro(quadrature.gauss(2))
+    scheme = Scheme(2, 2, kinetic=rule, slow=rule, fast=rule)
+    assert scheme.force.rule.nodes == rule.rule.nodes
+    other = Scheme(2, 2, kinetic=rule, slow=rule, fast=rule, force=micro(quadrature.simpson))
+    assert other.force.rule.nodes == quadrature.simpson.nodes
+
+
+def test_schemes_of_one_structure_are_one_pytree_structure():
+    assert jax.tree.structure(explicit_slow(5, 0.1)) == jax.tree.structure(explicit_slow(5, 0.9))
+    assert jax.tree.structure(explicit_slow(5)) != jax.tree.structure(explicit_slow(6))
+    assert jax.tree.structure(fully_implicit(5)) != jax.tree.structure(explicit_slow(5))
+
+
+def test_macro_rules_on_the_border_of_two_micro_intervals_are_kept_for_positions():
+    rule = macro(quadrature.midpoint)
+    scheme = Scheme(2, kinetic=micro(quadrature.midpoint), slow=rule, fast=rule)
+    assert scheme.order == 2
+
+
+def test_unknown_rule_name_is_refused():
+    with pytest.raises(ValueError, match="rule is 'simpson'; it must be 'gauss', 'lobatto' or a Rule"):
+        galerkin(2, 2, "simpson")

@@ -1,0 +1,240 @@
+"""simulate: times, saving, resuming, failures, compilation."""
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.support import largest_difference
+from vmri_jax import (
+    ConstantMass,
+    Newton,
+    Problem,
+    Result,
+    SimulationError,
+    State,
+    System,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    galerkin,
+    initial_state,
+    macro_step,
+    simulate,
+)
+
+SCHEME = explicit_slow(3)
+H = 0.03
+
+
+def run(problem, scheme=SCHEME, **changes):
+    arguments = {"state": problem.state(), "macro_dt": H, "num_steps": 20, "save_every": 2} | changes
+    return simulate(problem.system, scheme, **arguments)
+
+
+@pytest.fixture(scope="module")
+def every_step(fpu):
+    return run(fpu, save_every=1, save_micro=True)
+
+
+def assert_equal(a, b, tolerance=0.0):
+    for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy"):
+        assert largest_difference(getattr(a, name), getattr(b, name)) <= tolerance, name
+
+
+def test_times_are_computed_from_the_step_number(fpu):
+    start = fpu.state()
+    state = State(jnp.asarray(0.1), start.q_s, start.q_f, start.p_s, start.p_f)
+    trajectory = run(fpu, state=state, num_steps=2000, save_every=100)
+    exact = 0.1 + 100 * np.arange(21) * H
+    accumulated = 0.1 + np.concatenate([[0.0], np.cumsum(np.full(2000, H))])[::100]
+    assert np.abs(accumulated - exact).max() > 1e-13
+    assert np.abs(np.asarray(trajectory.t) - exact).max() < 1.5e-14  # two units of round-off of 60
+
+
+def test_shapes_of_a_run(fpu, every_step):
+    assert every_step.q_s.shape == every_step.p_f.shape == (21, 3)
+    assert every_step.energy.shape == (21,)
+    assert every_step.constraint_residual.shape == (21, 2)
+    assert every_step.iterations.shape == every_step.residual.shape == (20,)
+    assert every_step.q_f_micro.shape == (20, 3, 3)
+    assert every_step.t_micro.shape == (20, 3)
+    assert every_step.success
+    assert int(every_step.failed_at) == -1
+    assert run(fpu).q_f_micro is None
+
+
+def test_first_node_is_the_start(fpu, every_step):
+    start = fpu.state()
+    for name in ("q_s", "q_f", "p_s", "p_f"):
+        assert np.array_equal(getattr(every_step, name)[0], getattr(start, name))
+
+
+def test_micro_nodes(every_step):
+    """They end where the step ends, and lie at equal distances in time."""
+    assert np.array_equal(every_step.q_f_micro[:, -1], every_step.q_f[1:])
+    expected = np.asarray(every_step.t)[:-1, None] + H * np.array([1, 2, 3]) / 3
+    assert largest_difference(every_step.t_micro, expected) < 1e-15
+
+
+def test_save_every_keeps_a_part_of_the_same_run(fpu, every_step):
+    sparse = run(fpu, save_every=4, save_micro=True)
+    for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy"):
+        assert largest_difference(getattr(sparse, name), getattr(every_step, name)[::4]) < 1e-14
+    assert np.allclose(sparse.q_f_micro, every_step.q_f_micro[3::4], rtol=0, atol=1e-14)
+    assert np.array_equal(sparse.iterations, np.max(np.reshape(every_step.iterations, (5, 4)), axis=1))
+
+
+def test_micro_dt_is_macro_dt_over_num_micro(fpu, every_step):
+    assert_equal(run(fpu, save_every=1, save_micro=True, macro_dt=None, micro_dt=H / 3), every_step, 1e-13)
+
+
+def test_a_run_is_a_chain_of_macro_steps(fpu, every_step):
+    step = jax.jit(lambda state: macro_step(fpu.system, SCHEME, state, H)[0])
+    state = fpu.state()
+    for k in range(1, 6):
+        state = step(state)
+        assert largest_difference(state.q_f, every_step.q_f[k]) < 1e-14
+        assert largest_difference(state.p_s, every_step.p_s[k]) < 1e-13
+    assert float(state.t) == pytest.approx(float(every_step.t[5]), abs=1e-15)
+
+
+def test_progress_changes_nothing(fpu, every_step, capsys):
+    assert_equal(run(fpu, save_every=1, save_micro=True, progress=True), every_step, 1e-14)
+    with_progress = run(fpu, save_every=1, save_micro=True, progress=True, num_steps=60)
+    without = run(fpu, save_every=1, save_micro=True, num_steps=60)  # two saved nodes per part
+    assert_equal(with_progress, without, 1e-13)
+    assert np.array_equal(with_progress.iterations, without.iterations)
+    assert np.array_equal(with_progress.t_micro, without.t_micro)
+
+
+@pytest.mark.parametrize("scheme", [SCHEME, fully_explicit(3), galerkin(2, 2)], ids=["slow", "explicit", "gauss"])
+def test_a_run_is_resumed_from_its_final_state(fpu, scheme):
+    whole = run(fpu, scheme)
+    first = run(fpu, scheme, num_steps=10)
+    second = run(fpu, scheme, num_steps=10, state=first.final_state)
+    assert float(second.t[-1]) == pytest.approx(float(whole.t[-1]), abs=1e-14)
+    assert largest_difference(second.q_f, whole.q_f[5:]) < 1e-12  # measured 1e-15
+    assert largest_difference(second.p_f, whole.p_f[5:]) < 1e-12
+
+
+def test_jit_of_simulate_is_simulate(fpu):
+    inside = jax.jit(lambda state, dt: simulate(fpu.system, SCHEME, state, macro_dt=dt, num_steps=20, save_every=2))
+    assert_equal(inside(fpu.state(), H), run(fpu), 1e-13)
+
+
+# --- failures ------------------------------------------------------------------------------------------------------
+def walled(q_s, q_f, params):
+    """A potential that is not a number beyond a wall."""
+    return -jnp.sum(jnp.sqrt(1.2 - q_s)) + jnp.sum(q_f**2) / 2
+
+
+@pytest.fixture(scope="module")
+def hits_the_wall(fpu):
+    """Runs into the wall at q_s = 1.2 after a few steps at unit velocity from 1."""
+    return Problem(fpu.system.replace(slow_potential=walled), fpu.q_s, fpu.q_f, fpu.v_s, fpu.v_f)
+
+
+def test_failure_is_raised_with_all_there_is_to_know(hits_the_wall):
+    with pytest.raises(SimulationError, match=r"macro step \d+ at t = .* failed \(NON_FINITE\)") as caught:
+        run(hits_the_wall, fully_explicit(3), save_every=1, save_micro=True)
+    error = caught.value
+    trajectory, k = error.trajectory, error.step
+    assert error.result is Result.NON_FINITE
+    assert 2 < k < 10
+    assert error.time == pytest.approx(k * H)
+    assert int(trajectory.failed_at) == k
+    assert int(trajectory.result) == Result.NON_FINITE
+    assert not trajectory.success
+    for name in ("q_s", "q_f", "p_s", "p_f", "energy"):
+        values = np.asarray(getattr(trajectory, name)).reshape(21, -1)
+        assert np.isfinite(values[: k + 1]).all()
+        assert np.isnan(values[k + 1 :]).all()
+    assert np.isfinite(trajectory.q_f_micro[:k]).all()
+    assert np.isnan(trajectory.q_f_micro[k:]).all()
+    assert np.isfinite(trajectory.t).all()
+    assert str(k) in str(error)
+    assert "throw=False" in str(error)
+
+
+def test_failure_is_returned_on_request(hits_the_wall):
+    trajectory = run(hits_the_wall, fully_explicit(3), save_every=1, save_micro=True, throw=False)
+    assert not trajectory.success
+    assert Result(int(trajectory.result)) is Result.NON_FINITE
+    sparse = run(hits_the_wall, fully_explicit(3), save_every=4, throw=False)
+    assert int(sparse.failed_at) == int(trajectory.failed_at)
+    parts = run(hits_the_wall, fully_explicit(3), save_every=1, save_micro=True, throw=False, progress=True)
+    assert int(parts.failed_at) == int(trajectory.failed_at)
+    assert np.array_equal(parts.q_f, trajectory.q_f, equal_nan=True)
+
+
+def test_too_few_iterations_fail_the_run(fpu):
+    with pytest.raises(
+        SimulationError, match=r"step 0 .*STAGNATED.* after 1 Newton iterations.*max_iterations"
+    ) as caught:
+        run(fpu, fully_implicit(3), newton=Newton(max_iterations=1))
+    assert caught.value.iterations == 1
+    assert caught.value.residual > 1e-12
+
+
+def test_an_unstable_explicit_step_fails_cleanly(fpu):
+    """omega h = 2.1 is beyond the limit 2: it grows until it overflows."""
+    trajectory = run(fpu, fully_explicit(3), macro_dt=3 * 2.1 / 50, num_steps=3000, save_every=300, throw=False)
+    assert Result(int(trajectory.result)) is Result.NON_FINITE
+    assert np.isnan(trajectory.q_f[-1]).all()
+    stable = run(fpu, fully_explicit(3), macro_dt=3 * 1.9 / 50, num_steps=3000, save_every=300, throw=False)
+    assert stable.success
+
+
+# --- compilation -----------------------------------------------------------------------------------------------------
+CALLS = Counter()
+
+
+def watched_slow(q_s, q_f, params):
+    CALLS.update(["V"])
+    return params["kappa"] / 2 * jnp.sum((q_s - q_f) ** 2)
+
+
+def watched_fast(q_f, params):
+    CALLS.update(["W"])
+    return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
+
+
+@pytest.mark.parametrize("make", [explicit_slow, fully_explicit])
+def test_sweeps_trace_the_users_functions_once(fpu, make):
+    def swept(kappa=25.0, alpha=0.5, macro_dt=0.01, save_every=1):
+        params = {"kappa": jnp.asarray(kappa), "omega": jnp.asarray(50.0)}
+        system = fpu.system.replace(slow_potential=watched_slow, fast_potential=watched_fast, params=params)
+        return simulate(
+            system, make(2, alpha), fpu.state(), macro_dt=macro_dt, num_steps=4 * save_every, save_every=save_every
+        )
+
+    first = swept()
+    CALLS.clear()
+    others = [
+        swept(kappa=30.0),
+        swept(alpha=0.2),
+        swept(macro_dt=0.02),
+        swept(save_every=5),
+        swept(25.0, 1.0, 0.015, 3),
+    ]
+    assert Counter() == CALLS
+    assert all(largest_difference(first.q_f[-1], other.q_f[-1]) > 1e-6 for other in others)
+
+
+def wall_potential(q_s, q_f, params):
+    """Its value is NaN beyond the wall, its gradient is not."""
+    return -params["strength"] * jnp.log(1.0 - q_s[0])
+
+
+def test_potential_that_is_nan_where_its_gradient_is_not():
+    system = System(ConstantMass([1.0], [1.0]), wall_potential, params={"strength": jnp.array(1e-3)})
+    state = initial_state(system, [0.0], [0.0], [10.0], [0.0])
+    with pytest.raises(SimulationError, match="NON_FINITE") as failure:
+        simulate(system, fully_explicit(1), state, macro_dt=0.03, num_steps=10)
+    trajectory = failure.value.trajectory
+    assert failure.value.step == 3  # 4 steps of 0.3 pass the wall at 1
+    assert np.isfinite(trajectory.q_s[:4]).all()
+    assert np.isnan(trajectory.q_s[4:]).all()

@@ -1,0 +1,82 @@
+"""Systems as users write them: plain functions of slow and fast variables."""
+
+import jax.numpy as jnp
+
+from vmri_jax import ConstantMass, Problem, System
+
+
+# --- one slow and one fast oscillator, coupled by a soft spring ------------------------------------------------------
+def soft_coupling(q_s, q_f, params):
+    return params["kappa"] / 2 * jnp.sum((q_s - q_f) ** 2)
+
+
+def stiff_spring(q_f, params):
+    return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
+
+
+def two_oscillators(kappa=25.0, omega=50.0) -> Problem:
+    system = System(
+        ConstantMass([1.0], [1.0]),
+        slow_potential=soft_coupling,
+        fast_potential=stiff_spring,
+        params={"kappa": jnp.asarray(kappa), "omega": jnp.asarray(omega)},
+    )
+    one = jnp.ones(1)
+    return Problem(system, one, one / omega, 0 * one, one)
+
+
+# --- double pendulum in angles: heavy long arm slow, light short arm fast --------------------------------------------
+def arms_kinetic(q_s, q_f, v_s, v_f, params):
+    (m_1, m_2), (l_1, l_2) = params["masses"], params["lengths"]
+    coupling = m_2 * l_1 * l_2 * v_s[0] * v_f[0] * jnp.cos(q_s[0] - q_f[0])
+    return (m_1 + m_2) / 2 * l_1**2 * v_s[0] ** 2 + m_2 / 2 * l_2**2 * v_f[0] ** 2 + coupling
+
+
+def arms_weight(q_s, q_f, params):
+    (m_1, m_2), (l_1, l_2) = params["masses"], params["lengths"]
+    return -params["gravity"] * ((m_1 + m_2) * l_1 * jnp.cos(q_s[0]) + m_2 * l_2 * jnp.cos(q_f[0]))
+
+
+def double_pendulum() -> Problem:
+    params = {"masses": jnp.array([10.0, 0.1]), "lengths": jnp.array([1.0, 0.02]), "gravity": jnp.asarray(9.81)}
+    system = System(arms_kinetic, slow_potential=arms_weight, params=params)
+    return Problem(system, jnp.array([1.0]), jnp.array([1.3]), jnp.array([0.0]), jnp.array([2.0]))
+
+
+# --- everything at once ----------------------------------------------------------------------------------------------
+def bent_kinetic(q_s, q_f, v_s, v_f, params):
+    coupling = params["b"] * v_s[0] * v_f[1] * jnp.cos(q_s[1] - q_f[0])
+    return jnp.sum(v_s**2 * (1 + 0.3 * q_s**2)) / 2 + jnp.sum(v_f**2 * (1 + 0.1 * jnp.sin(q_f))) / 4 + coupling
+
+
+def bent_slow(q_s, q_f, params):
+    return jnp.sum(jnp.cosh(q_s - q_f)) + q_s[0] ** 2 * q_f[2]
+
+
+def bent_fast(q_f, params):
+    return params["k"] / 2 * (jnp.linalg.norm(q_f) - 1.2) ** 2
+
+
+def bent_constraint(q_s, q_f, params):
+    return jnp.stack([jnp.sum((q_f - q_s) ** 2) - params["length"], q_f[0] * q_f[1] - 0.1 * q_s[2] ** 2])
+
+
+def bent_slow_constraint(q_s, params):
+    return jnp.sum(q_s**2, keepdims=True) - 1.0
+
+
+def bent_force(t, q_s, q_f, v_s, v_f, params):
+    return -0.2 * v_s + jnp.sin(t) * q_f, -0.3 * v_f * jnp.sum(q_s**2) - 0.1 * v_s
+
+
+def bent_system() -> System:
+    """Configuration-dependent kinetic energy, coupling and slow constraints, and a force, all nonlinear."""
+    return System(
+        bent_kinetic,
+        slow_potential=bent_slow,
+        fast_potential=bent_fast,
+        constraint=bent_constraint,
+        slow_constraint=bent_slow_constraint,
+        force=bent_force,
+        params={"k": jnp.asarray(40.0), "b": jnp.asarray(0.1), "length": jnp.asarray(2.0)},
+    )
