@@ -1,0 +1,153 @@
+"""Built-in systems and schemes by name, and problems from a user's own file: what the command line accepts."""
+
+import difflib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import vmri_jax as vm
+
+
+@dataclass(frozen=True)
+class NamedSystem:
+    """A built-in system: its factory and what its variables are."""
+
+    factory: Callable[..., vm.Problem]
+    title: str
+    slow: str
+    fast: str
+
+
+@dataclass(frozen=True)
+class NamedScheme:
+    """A built-in scheme: its factory, which options it takes besides num_micro, and its order."""
+
+    factory: Callable[..., vm.Scheme]
+    options: tuple[str, ...]
+    order: str
+    title: str
+
+
+SYSTEMS = {
+    "fpu": NamedSystem(
+        vm.systems.fermi_pasta_ulam,
+        "Fermi-Pasta-Ulam chain",
+        "centres of the stiff springs",
+        "elongations of the stiff springs",
+    ),
+    "tsp": NamedSystem(
+        vm.systems.triple_spherical_pendulum,
+        "triple spherical pendulum",
+        "the heavy bob, on a rod",
+        "two light bobs, on a rod and a stiff spring",
+    ),
+    "sam": NamedSystem(
+        vm.systems.simple_atomic_model,
+        "simple atomic model",
+        "two heavy atoms",
+        "four light atoms with rigid bonds and stiff springs",
+    ),
+}
+
+SCHEMES = {
+    "fully-implicit": NamedScheme(vm.fully_implicit, (), "2", "V and W at the micro midpoints"),
+    "explicit-slow": NamedScheme(
+        vm.explicit_slow, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at micro midpoints"
+    ),
+    "fully-explicit": NamedScheme(
+        vm.fully_explicit, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at the micro nodes"
+    ),
+    "galerkin": NamedScheme(
+        vm.galerkin, ("degree", "rule"), "2 x degree", "one rule (gauss or lobatto) on every term, any degree"
+    ),
+}
+
+
+def find_problem(name: str) -> vm.Problem:
+    """A built-in problem by name, or ``my_file.py:my_problem``, a `Problem` or a function without arguments making one.
+
+    Raises:
+        ValueError: an unknown name; a file that does not exist, fails to run, or has no such name; no Problem there.
+    """
+    if name in SYSTEMS:
+        return SYSTEMS[name].factory()
+    file_name, colon, attribute = name.partition(":")
+    if not colon and not file_name.endswith(".py"):
+        raise ValueError(f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem.")
+    path = Path(file_name)
+    if not path.is_file():
+        raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
+    if not attribute:
+        raise ValueError(f"{name}: say which problem in that file, e.g. {file_name}:my_problem.")
+    return _problem_in(_run_file(path), path, attribute)
+
+
+def find_scheme(name: str, num_micro: int, **options) -> vm.Scheme:
+    """A built-in scheme by name; options that are None keep their defaults.
+
+    Raises:
+        ValueError: an unknown name, or an option the scheme does not have.
+        TypeError: an option that is needed.
+    """
+    if name not in SCHEMES:
+        raise ValueError(_unknown("scheme", name, SCHEMES))
+    scheme = SCHEMES[name]
+    given = {key: value for key, value in options.items() if value is not None}
+    for key in given:
+        if key not in scheme.options:
+            takers = [other for other, entry in SCHEMES.items() if key in entry.options]
+            raise ValueError(f"the scheme {name} has no {key}; leave --{key} out or use {' or '.join(takers)}.")
+    if name == "galerkin" and "degree" not in given:
+        raise ValueError("the scheme galerkin needs the degree of its path; give e.g. --degree 2.")
+    return scheme.factory(num_micro, **given)
+
+
+def _unknown(kind: str, name: str, known: Iterable[str]) -> str:
+    known = list(known)
+    near = difflib.get_close_matches(name.lower().replace("_", "-"), known, n=1)
+    hint = f" Did you mean {near[0]}?" if near else ""
+    return f"there is no {kind} {name!r}.{hint} There are {', '.join(known)}."
+
+
+def _run_file(path: Path):
+    name = f"vmri_user_{path.stem}"  # not the bare stem, which may be the name of a module
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} is not a Python file; give my_file.py:my_problem.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and equinox modules look themselves up there
+    sys.path.insert(0, str(path.resolve().parent))
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name == path.name]
+        where = f"line {lines[-1]} of {path}" if lines else f"{path}"
+        raise ValueError(f"{where} failed: {type(error).__name__}: {error}") from error
+    finally:
+        sys.path.pop(0)
+    return module
+
+
+def _problem_in(module, path: Path, attribute: str) -> vm.Problem:
+    found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
+    if attribute not in found:
+        problems = [name for name, value in found.items() if isinstance(value, vm.Problem)]
+        near = difflib.get_close_matches(attribute, found, n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        listed = f" Problems in it: {', '.join(problems)}." if problems else ""
+        raise ValueError(f"{path} has no name {attribute!r}.{hint}{listed}")
+    problem = found[attribute]
+    if callable(problem) and not isinstance(problem, vm.Problem):
+        try:
+            problem = problem()
+        except Exception as error:
+            raise ValueError(f"{attribute}() in {path} failed: {type(error).__name__}: {error}") from error
+    if not isinstance(problem, vm.Problem):
+        raise ValueError(
+            f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem, or a function without "
+            "arguments that returns one."
+        )
+    return problem

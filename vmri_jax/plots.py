@@ -1,0 +1,306 @@
+"""Figures in one style: trajectories, conserved quantities, convergence and computing time.
+
+Every function returns a matplotlib `Figure` made without pyplot: no window opens, no global setting is touched, and a
+notebook shows it when it is the value of a cell. Colours follow Okabe and Ito, told apart by the colour-blind.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
+
+import vmri_jax as vm
+
+if TYPE_CHECKING:
+    from vmri_jax.study import ConvergenceStudy, CostStudy
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours of a figure: paper, text, faint lines, and the cycle of the curves."""
+
+    paper: str
+    ink: str
+    faint: str
+    curves: tuple[str, ...]
+
+
+LIGHT = Theme("#ffffff", "#1f2428", "#d9dde1", ("#0072b2", "#d55e00", "#009e73", "#a3508a", "#b98700", "#3d8fc4"))
+DARK = Theme("#15191d", "#e3e6e8", "#384048", ("#62b5e8", "#f08a4b", "#3cc79b", "#dd92c4", "#e3b341", "#9ad0f0"))
+MARKERS = ("o", "s", "^", "D", "v", "P")
+MAX_NAMED = 6
+"""More curves than this in one panel are drawn alike and not named one by one."""
+
+
+class NotebookFigure(Figure):
+    """A figure that notebooks show without pyplot and its global state."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = BytesIO()
+        self.savefig(buffer, format="png", dpi=110)
+        return buffer.getvalue()
+
+
+def style(theme: Theme = LIGHT):
+    """Context in which figures are made and saved: ``with style(theme): ...``."""
+    return matplotlib.rc_context(
+        {
+            "figure.facecolor": theme.paper,
+            "savefig.facecolor": theme.paper,
+            "savefig.dpi": 200,
+            "figure.constrained_layout.use": True,
+            "font.family": "sans-serif",
+            "font.size": 9.5,
+            "mathtext.fontset": "dejavusans",
+            "axes.facecolor": theme.paper,
+            "axes.edgecolor": theme.ink,
+            "axes.labelcolor": theme.ink,
+            "axes.linewidth": 0.7,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.titlesize": 10.5,
+            "axes.titlecolor": theme.ink,
+            "axes.titlelocation": "left",
+            "axes.prop_cycle": matplotlib.cycler(color=theme.curves),  # pyright: ignore[reportAttributeAccessIssue]
+            "axes.grid": True,
+            "axes.axisbelow": True,
+            "grid.color": theme.faint,
+            "grid.linewidth": 0.6,
+            "text.color": theme.ink,
+            "xtick.color": theme.ink,
+            "ytick.color": theme.ink,
+            "xtick.major.width": 0.7,
+            "ytick.major.width": 0.7,
+            "lines.linewidth": 1.3,
+            "lines.markersize": 5.0,
+            "legend.frameon": False,
+            "legend.fontsize": 9,
+            "svg.fonttype": "path",
+            "svg.hashsalt": "vmri_jax",
+        }
+    )
+
+
+def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
+    """Write a figure in the format of the file's ending, with the colours it was made in."""
+    with style(theme):
+        figure.savefig(path)
+
+
+def plot_trajectory(trajectory: vm.Trajectory, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+    """Slow and fast positions, energy error and, where there are constraints, their residual, against time.
+
+    Args:
+        trajectory: a run; nodes after a failure are left out by matplotlib since they are NaN.
+        title: over the figure.
+        theme: colours.
+    """
+    t = np.asarray(trajectory.t)
+    residual = np.asarray(trajectory.constraint_residual)
+    constrained = bool(np.nanmax(residual) > 0)
+    with style(theme):
+        figure = NotebookFigure(figsize=(7.2, 7.6 if constrained else 6.0))
+        axes = figure.subplots(3 + constrained, sharex=True)
+        _coordinates(axes[0], t, np.asarray(trajectory.q_s), "s", theme)
+        axes[0].set(ylabel=r"slow positions $q_s$")
+        _coordinates(axes[1], t, np.asarray(trajectory.q_f), "f", theme)
+        axes[1].set(ylabel=r"fast positions $q_f$")
+        error, label = _energy_error(np.asarray(trajectory.energy))
+        axes[2].plot(t, error, color=theme.curves[0], linewidth=_thin(t))
+        axes[2].set(ylabel=label)
+        if constrained:
+            shown = np.where(residual > 0, residual, np.nan)
+            for values, name, linestyle, color in zip(
+                shown.T, ("position $|g|$", "velocity $|G v|$"), ("-", "--"), theme.curves, strict=False
+            ):
+                axes[3].semilogy(t, values, linestyle, color=color, linewidth=_thin(t), label=name)
+            axes[3].set(ylabel="constraint residual")
+            _legend_beside(axes[3])
+        axes[-1].set(xlabel="time $t$", xlim=(t[0], t[-1]))
+        figure.align_ylabels()
+        figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+def plot_oscillatory_energies(
+    trajectory: vm.Trajectory, omega, title: str = "", theme: Theme = LIGHT
+) -> NotebookFigure:
+    """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of the stiff springs and their sum, the adiabatic invariant.
+
+    Args:
+        trajectory: a run of a system whose fast variables are oscillators of unit mass.
+        omega: their frequency.
+        title: over the figure.
+        theme: colours.
+    """
+    t = np.asarray(trajectory.t)
+    energies = np.asarray(vm.diagnostics.oscillatory_energies(omega, trajectory.q_f, trajectory.p_f))
+    with style(theme):
+        figure = NotebookFigure(figsize=(7.2, 3.4))
+        axes = figure.subplots()
+        axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
+        _coordinates(axes, t, energies, "I", theme)
+        axes.set(xlabel="time $t$", ylabel="oscillatory energy", xlim=(t[0], t[-1]))
+        axes.set_ylim(bottom=0)
+        figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+def plot_convergence(
+    study: "ConvergenceStudy", orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT
+) -> NotebookFigure:
+    """Errors of positions and of momenta against the macro step, with guide triangles of the given slopes.
+
+    Args:
+        study: from `vmri_jax.study.convergence_study`.
+        orders: slopes to draw for comparison.
+        title: over the figure.
+        theme: colours.
+    """
+    with style(theme):
+        figure = NotebookFigure(figsize=(7.6, 3.7))
+        panels = figure.subplots(1, 2, sharex=True)
+        for axes, quantity, name in zip(panels, ("q", "p"), ("positions", "momenta"), strict=True):
+            for i, scheme in enumerate(study.schemes):
+                macro_dt, errors = study.errors(scheme, quantity)
+                order = study.order(scheme, quantity)
+                axes.loglog(
+                    macro_dt,
+                    errors,
+                    marker=MARKERS[i % len(MARKERS)],
+                    color=theme.curves[i % len(theme.curves)],
+                    markerfacecolor=theme.paper,
+                    label=f"{scheme}   order {order:.2f}" if np.isfinite(order) else f"{scheme}   failed",
+                )
+            for order in orders:
+                _guide_triangle(axes, study, quantity, order, theme)
+            axes.set(title=name, xlabel="macro step $H$")
+            axes.set(ylabel=rf"largest error $|{quantity} - {quantity}_{{\mathrm{{ref}}}}|$")
+            _log_ticks(axes.xaxis, [row.macro_dt for row in study.rows])
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=1, handlelength=2.4)
+        figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+def plot_cost(
+    studies: Mapping[str, "CostStudy"],
+    paper_minima: Mapping[str, int] | None = None,
+    title: str = "",
+    theme: Theme = LIGHT,
+) -> NotebookFigure:
+    """Computing time per micro step against num_micro, one panel per study, the cheapest point of each curve circled.
+
+    Args:
+        studies: cost studies by the title of their panel.
+        paper_minima: num_micro to mark, by the title of the panel.
+        title: over the figure.
+        theme: colours.
+    """
+    columns = 2 if len(studies) == 4 else min(3, len(studies))
+    lines = -(-len(studies) // columns)
+    with style(theme):
+        figure = NotebookFigure(figsize=(max(5.2, 0.6 + 3.0 * columns), 0.6 + 2.7 * lines))
+        panels = figure.subplots(lines, columns, squeeze=False).reshape(-1)
+        handles: dict = {}
+        for axes, (name, study) in zip(panels, studies.items(), strict=False):
+            _cost_panel(axes, study, (paper_minima or {}).get(name), theme)
+            axes.set(title=name)
+            shown = zip(*axes.get_legend_handles_labels(), strict=True)
+            handles.update({label: handle for handle, label in shown})
+        for axes in panels[len(studies) :]:
+            axes.set_axis_off()
+        for axes in panels[max(0, len(studies) - columns) : len(studies)]:
+            axes.set(xlabel="micro steps per macro step")
+        for axes in panels[::columns]:
+            axes.set(ylabel="µs per micro step")
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, len(handles)))
+        figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+def _cost_panel(axes: Axes, study: "CostStudy", paper_minimum: int | None, theme: Theme) -> None:
+    one_label = len({label for label, _ in study.curves}) == 1
+    for i, (label, linear_solver) in enumerate(study.curves):
+        num_micro, cost = study.curve(label, linear_solver)
+        name = linear_solver if one_label else f"{label}, {linear_solver}"
+        color = theme.curves[i % len(theme.curves)]
+        axes.loglog(num_micro, cost, marker=MARKERS[i], markersize=4, color=color, label=name)
+        if np.isfinite(cost).any():
+            best = np.nanargmin(cost)
+            axes.plot(num_micro[best], cost[best], "o", markersize=11, markerfacecolor="none", color=color)
+    if paper_minimum is not None:
+        axes.axvline(paper_minimum, color=theme.ink, linestyle=":", linewidth=1.1, label="minimum in the paper")
+    ticks = np.unique([row.num_micro for row in study.rows])
+    if len(ticks) > 7:
+        ticks = np.array([1, 4, 12, 40, 100])
+    axes.xaxis.set_major_locator(FixedLocator(ticks.tolist()))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter("{x:.0f}")
+    _log_ticks(axes.yaxis, [row.us_per_micro_step for row in study.rows])
+
+
+def _coordinates(axes: Axes, t, values, letter: str, theme: Theme) -> None:
+    """One line per coordinate; named beside the panel if they are few."""
+    n = values.shape[1]
+    if n <= MAX_NAMED:
+        for i in range(n):
+            axes.plot(t, values[:, i], color=theme.curves[i], linewidth=_thin(t), label=f"${letter}_{{{i + 1}}}$")
+        if n:
+            _legend_beside(axes)
+        return
+    axes.plot(t, values, color=theme.curves[0], linewidth=0.7, alpha=max(0.15, 4 / n))
+    axes.text(1.01, 0.5, f"{n} coordinates", transform=axes.transAxes, rotation=90, va="center", fontsize=8.5)
+
+
+def _thin(t) -> float:
+    """Line width for so many nodes: oscillations must not run into a solid band."""
+    return 1.2 if len(t) <= 300 else 0.7
+
+
+def _legend_beside(axes: Axes) -> None:
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
+
+
+def _energy_error(energy) -> tuple[np.ndarray, str]:
+    """Relative to the start, or absolute if the start is zero."""
+    error = energy - energy[0]
+    if abs(energy[0]) > 1e-12:
+        return error / abs(energy[0]), r"energy error $\Delta E / |E_0|$"
+    return error, r"energy error $\Delta E$"
+
+
+def _log_ticks(axis: Axis, values: Sequence[float]) -> None:
+    """Labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them."""
+    finite = [value for value in values if np.isfinite(value)]
+    axis.set_minor_formatter(NullFormatter())
+    if finite and max(finite) < 30 * min(finite):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
+
+
+def _guide_triangle(axes: Axes, study: "ConvergenceStudy", quantity: str, order: int, theme: Theme) -> None:
+    """Triangle of slope `order` right below the most accurate curve of about that order."""
+    lowest = None
+    for scheme in study.schemes:
+        macro_dt, errors = study.usable(scheme, quantity)
+        if len(errors) > 1 and abs(study.order(scheme, quantity) - order) < 0.5:
+            middle = (len(errors) - 1) // 2
+            value = errors[middle] / macro_dt[middle] ** order
+            if lowest is None or value < lowest[0]:
+                lowest = value, macro_dt[middle], errors[middle]
+    if lowest is None:
+        return
+    _, right, top = lowest
+    left, top = right / 2, top / 2.5
+    bottom = top / 2**order
+    axes.fill([left, right, right], [bottom, bottom, top], facecolor=theme.faint, edgecolor="none", zorder=1)
+    axes.annotate(
+        f"{order}", (right, (bottom * top) ** 0.5), (4, 0), textcoords="offset points", va="center", fontsize=8.5
+    )

@@ -1,0 +1,226 @@
+"""Kinds of figures of a study: what is run, what is expected, and how it is judged and drawn."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import vmri_jax as vm
+from vmri_jax import plots
+from vmri_jax.study.convergence import ConvergenceStudy, ReferenceSolution, convergence_study, reference_solution
+from vmri_jax.study.cost import CostStudy, cost_study
+from vmri_jax.study.table import Progress, part, write_csv
+
+ORDER_TOLERANCE = 0.2
+UPTURN = 1.5
+"""A cost that grows by more than this turns up again; smaller changes may be the machine's."""
+SETTLED = 10
+"""From about so many micro steps on, the structured solve should cost the same per micro step."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One number held against what is expected of it.
+
+    source: who expects it, e.g. "paper" or "theory".
+    """
+
+    quantity: str
+    expected: str
+    source: str
+    seen: str
+    agrees: bool
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What measuring a figure gave.
+
+    seen: one line, made from the numbers.
+    checks: numbers against expectations.
+    draw: ``draw(title, theme)`` makes the figure.
+    rows: the numbers, one dataclass per CSV row.
+    """
+
+    seen: str
+    checks: tuple[Check, ...]
+    draw: Callable[[str, plots.Theme], Figure]
+    rows: tuple
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the numbers to a CSV file."""
+        write_csv(path, self.rows)
+
+
+@dataclass(frozen=True)
+class ConvergenceFigure:
+    """Errors against the macro step.
+
+    name, title: on the command line and in the report.
+    paper: what the paper saw, one line.
+    problem: makes the problem; figures with the same function share its reference solution.
+    schemes: schemes by label.
+    orders: expected order by label.
+    source: who expects them.
+    macro_dt, t_end: as in `convergence_study`.
+    """
+
+    name: str
+    title: str
+    paper: str
+    problem: Callable[[], vm.Problem]
+    schemes: Mapping[str, vm.Scheme]
+    orders: Mapping[str, int]
+    source: str
+    macro_dt: tuple[float, ...]
+    t_end: float = 1.0
+
+    def measure(self, progress: Progress, references: dict) -> Findings:
+        """Run it; `references` keeps reference solutions from figure to figure."""
+        problem = self.problem()
+        if self.problem not in references:
+            progress("reference solution", 0, 1)
+            references[self.problem] = reference_solution(problem, self.t_end)
+        reference: ReferenceSolution = references[self.problem]
+        study = convergence_study(
+            problem, self.schemes, self.macro_dt, self.t_end, reference=reference, progress=progress
+        )
+        orders = sorted(set(self.orders.values()))
+        return Findings(
+            seen=self._seen(study),
+            checks=self._checks(study),
+            draw=lambda title, theme: plots.plot_convergence(study, orders, title, theme),
+            rows=study.rows,
+        )
+
+    def _seen(self, study: ConvergenceStudy) -> str:
+        orders = [f"{label}: {study.order(label, 'q'):.2f} / {study.order(label, 'p'):.2f}" for label in study.schemes]
+        reference = f"reference good to {study.reference.error_q:.0e} / {study.reference.error_p:.0e}"
+        failed = sum(row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for row in study.rows)
+        failures = [f"{failed} of {len(study.rows)} runs failed"] if failed else []
+        return "; ".join(["orders of positions / momenta, " + orders[0], *orders[1:], reference, *failures]) + "."
+
+    def _checks(self, study: ConvergenceStudy) -> tuple[Check, ...]:
+        checks = []
+        for label, expected in self.orders.items():
+            for quantity, name in (("q", "positions"), ("p", "momenta")):
+                order = study.order(label, quantity)
+                agrees = abs(order - expected) <= ORDER_TOLERANCE
+                checks.append(Check(f"order of {name}, {label}", f"{expected}", self.source, f"{order:.2f}", agrees))
+        return tuple(checks)
+
+
+@dataclass(frozen=True)
+class CostPanel:
+    """Computing time of one scheme on one system, by the dense and by the structured solve.
+
+    dense: makes the problem that the dense solver gets; one that leaves no structure to exploit solves the whole macro
+        step at once for every scheme, as the paper does.
+    structured: makes the problem for the default solver.
+    paper_minimum: the num_micro that was cheapest in the paper, None if it does not say.
+    dense_num_micro, num_micro: the values run with each.
+    dense_t_end, t_end: simulated times of a timed run of each.
+    """
+
+    title: str
+    dense: Callable[[], vm.Problem]
+    structured: Callable[[], vm.Problem]
+    scheme: Callable[[int], vm.Scheme]
+    paper_minimum: int | None
+    dense_num_micro: tuple[int, ...]
+    num_micro: tuple[int, ...]
+    micro_dt: float
+    dense_t_end: float
+    t_end: float
+    repeats: int
+
+    def measure(self, progress: Progress) -> CostStudy:
+        """Time both solvers."""
+        runs = [("arrowhead", self.structured, self.num_micro, self.t_end)]
+        if self.dense_num_micro:
+            runs.insert(0, ("dense", self.dense, self.dense_num_micro, self.dense_t_end))
+        studies = [
+            cost_study(
+                problem(),
+                self.scheme,
+                num_micro,
+                micro_dt=self.micro_dt,
+                t_end=t_end,
+                linear_solvers=(solver,),
+                repeats=self.repeats,
+                label=self.title,
+                progress=part(progress, i, len(runs)),
+            )
+            for i, (solver, problem, num_micro, t_end) in enumerate(runs)
+        ]
+        return sum(studies[1:], studies[0])
+
+
+@dataclass(frozen=True)
+class CostFigure:
+    """Computing time against num_micro, in one or several panels."""
+
+    name: str
+    title: str
+    paper: str
+    panels: tuple[CostPanel, ...]
+
+    def measure(self, progress: Progress, references: dict) -> Findings:
+        """Run all panels."""
+        studies = {
+            panel.title: panel.measure(part(progress, i, len(self.panels))) for i, panel in enumerate(self.panels)
+        }
+        minima = {panel.title: panel.paper_minimum for panel in self.panels if panel.paper_minimum is not None}
+        return Findings(
+            seen="; ".join(_seen_cost(panel, studies[panel.title]) for panel in self.panels) + ".",
+            checks=tuple(check for panel in self.panels for check in _cost_checks(panel, studies[panel.title])),
+            draw=lambda title, theme: plots.plot_cost(studies, minima, title, theme),
+            rows=tuple(row for study in studies.values() for row in study.rows),
+        )
+
+
+def _summary(study: CostStudy, label: str, solver: str) -> tuple[int, float, int, float]:
+    """Cheapest num_micro and its cost, largest num_micro that ran and how many times as much that costs."""
+    num_micro, cost = study.curve(label, solver)
+    ran = np.isfinite(cost)
+    if not ran.any():
+        return 0, float("nan"), 0, float("nan")
+    num_micro, cost = num_micro[ran], cost[ran]
+    best = int(np.argmin(cost))
+    return int(num_micro[best]), cost[best], int(num_micro[-1]), cost[-1] / cost[best]
+
+
+def _seen_cost(panel: CostPanel, study: CostStudy) -> str:
+    parts = []
+    for label, solver in study.curves:
+        best, least, last, ratio = _summary(study, label, solver)
+        parts.append(
+            f"{solver} cheapest at {best} ({least:.{0 if least > 100 else 2}f} µs) and {ratio:.1f} × that at {last}"
+        )
+    return f"{panel.title}: " + ", ".join(parts)
+
+
+def _cost_checks(panel: CostPanel, study: CostStudy) -> list[Check]:
+    checks = []
+    if panel.dense_num_micro:
+        best, _, last, ratio = _summary(study, panel.title, "dense")
+        seen = f"{ratio:.1f} × its minimum at {last}"
+        checks.append(Check(f"{panel.title}, dense: cost turns up again", "yes", "paper", seen, bool(ratio > UPTURN)))
+        if panel.paper_minimum is not None:
+            checks.append(
+                Check(
+                    f"{panel.title}, dense: cheapest number of micro steps",
+                    f"{panel.paper_minimum}",
+                    "paper",
+                    f"{best}",
+                    panel.paper_minimum / 2 <= best <= 2 * panel.paper_minimum,
+                )
+            )
+    num_micro, cost = study.curve(panel.title, "arrowhead")
+    settled = int(np.argmin(np.abs(num_micro - SETTLED)))
+    ratio = cost[-1] / cost[settled]
+    quantity = f"{panel.title}, arrowhead: cost at {num_micro[-1]} micro steps over that at {num_micro[settled]}"
+    checks.append(Check(quantity, f"at most {UPTURN:g}", "theory", f"{ratio:.2f}", bool(ratio <= UPTURN)))
+    return checks

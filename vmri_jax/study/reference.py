@@ -1,0 +1,224 @@
+"""The reference study as data: which figures there are, what they run, and what was seen when they were first drawn.
+
+Gail, Leyendecker, Ober-Bloebaum (2014), "On the role of quadrature rules and system dimensions in variational multirate
+integrators"; orders of higher degree from Ober-Bloebaum, Wenger, Gail, Leyendecker (2024), arXiv:2406.12991. The explicit
+schemes of the paper have order 1, hence alpha != 1/2; alpha = 0 stands for them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import vmri_jax as vm
+from vmri_jax.study.figures import ConvergenceFigure, CostFigure, CostPanel
+
+PAPER_STEPS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
+PAPER_NUM_MICRO = (1, 4, *range(8, 101, 4))
+PAPER_MINIMA = {  # cheapest num_micro by scheme: (smallest l, largest l, num_micro)
+    "fully implicit": ((70, 80, 12), (90, 100, 8), (110, 200, 1)),
+    "explicit slow": ((70, 110, 12), (120, 180, 8), (190, 200, 1)),
+    "fully explicit": ((70, 130, 8), (140, 200, 4)),
+}
+SCHEMES = {
+    "fully implicit": vm.fully_implicit,
+    "explicit slow": partial(vm.explicit_slow, alpha=0.0),
+    "fully explicit": partial(vm.fully_explicit, alpha=0.0),
+}
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is run.
+
+    fpu_steps, tsp_steps: macro steps of the convergence figures.
+    fpu_num_micro, sam_num_micro: micro steps per macro step in Fig. 4.
+    chain_lengths, chain_num_micro: l by scheme, and micro steps per macro step, in Fig. 5.
+    largest_dense: most unknowns for which the dense solve is run.
+    repeats: timed runs of each program, of which the median counts.
+    degree_num_micro: micro steps per macro step in the figures of degree 2 and 3.
+    """
+
+    fpu_steps: tuple[float, ...]
+    tsp_steps: tuple[float, ...]
+    fpu_num_micro: tuple[int, ...]
+    sam_num_micro: tuple[int, ...]
+    chain_lengths: Mapping[str, tuple[int, ...]]
+    chain_num_micro: tuple[int, ...]
+    largest_dense: int
+    repeats: int
+    degree_num_micro: tuple[int, ...]
+
+
+SIZES = {
+    "quick": Size(
+        fpu_steps=PAPER_STEPS[:-1],
+        tsp_steps=PAPER_STEPS[1:-2],
+        fpu_num_micro=(1, 10, 40, 100),
+        sam_num_micro=(1, 10, 40),
+        chain_lengths={"fully implicit": (10, 30), "explicit slow": (30,), "fully explicit": (30,)},
+        chain_num_micro=(1, 8, 20),
+        largest_dense=1000,
+        repeats=3,
+        degree_num_micro=(5,),
+    ),
+    "full": Size(
+        fpu_steps=PAPER_STEPS,
+        tsp_steps=PAPER_STEPS[1:],
+        fpu_num_micro=PAPER_NUM_MICRO,
+        sam_num_micro=(1, 4, 8, 12, 16, 20, 24, 32, 40, 60, 80, 100),
+        chain_lengths=dict.fromkeys(SCHEMES, (10, 40, 70, 100, 150, 200)),
+        chain_num_micro=(1, 4, 8, 12, 16, 20, 40, 60, 100),
+        largest_dense=2500,
+        repeats=5,
+        degree_num_micro=(5, 10),
+    ),
+}
+
+
+def reference_figures(size: str = "quick") -> tuple[ConvergenceFigure | CostFigure, ...]:
+    """The figures of the reference study in the order of the report.
+
+    Args:
+        size: "quick" (few values of num_micro and l) or "full" (the lists of the paper, may take an hour).
+
+    Raises:
+        ValueError: another size.
+    """
+    if size not in SIZES:
+        raise ValueError(f"reference_figures: size is {size!r}; it must be one of {', '.join(SIZES)}.")
+    chosen = SIZES[size]
+    return (*_cost_figures(chosen), *_fpu_figures(chosen), *_tsp_figures(chosen))
+
+
+def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
+    small = CostPanel(
+        title="FPU, l = 3",
+        dense=vm.systems.fermi_pasta_ulam,
+        structured=vm.systems.fermi_pasta_ulam,
+        scheme=vm.fully_implicit,
+        paper_minimum=60,
+        dense_num_micro=size.fpu_num_micro,
+        num_micro=size.fpu_num_micro,
+        micro_dt=0.01,
+        dense_t_end=20.0,
+        t_end=20.0,
+        repeats=size.repeats,
+    )
+    atoms = replace(
+        small,
+        title="SAM",
+        dense=vm.systems.simple_atomic_model,
+        structured=vm.systems.simple_atomic_model,
+        paper_minimum=20,
+        dense_num_micro=size.sam_num_micro,
+        num_micro=size.sam_num_micro,
+        micro_dt=0.001,
+        dense_t_end=0.2,
+        t_end=1.0,
+    )
+    chains = tuple(_chain_panel(size, name, length) for name in SCHEMES for length in size.chain_lengths[name])
+    return (
+        CostFigure(
+            "fig4",
+            "Computing time against micro steps",
+            "FPU with l = 3 is cheapest at 60 micro steps per macro step (183 unknowns), the simple atomic model at 20 "
+            "(307 unknowns); then the dense solve makes the curves turn up again.",
+            (small, atoms),
+        ),
+        CostFigure(
+            "fig5",
+            "Computing time of longer chains",
+            "The cheapest number of micro steps falls with the number of springs: fully implicit from 12 at l = 70 to 1, "
+            "no gain, from l = 110; explicit slow from 12 to 8 (l = 120); fully explicit from 8 to 4 (l = 140).",
+            chains,
+        ),
+    )
+
+
+def _chain_panel(size: Size, scheme: str, num_springs: int) -> CostPanel:
+    minima = [n for low, high, n in PAPER_MINIMA[scheme] if low <= num_springs <= high]
+    chain = partial(vm.systems.fermi_pasta_ulam, num_springs)
+    feasible = tuple(n for n in size.chain_num_micro if num_springs * (n + 1) <= size.largest_dense)
+    return CostPanel(
+        title=f"{scheme}, l = {num_springs}",
+        dense=chain if scheme == "fully implicit" else partial(unstructured_chain, num_springs),
+        structured=chain,
+        scheme=SCHEMES[scheme],
+        paper_minimum=minima[0] if minima else None,
+        dense_num_micro=feasible,
+        num_micro=size.chain_num_micro,
+        micro_dt=0.01,
+        dense_t_end=0.5,
+        t_end=10.0 if scheme == "fully explicit" else min(10.0, max(0.5, 4000 / num_springs**2)),  # solves cost l^3
+        repeats=size.repeats,
+    )
+
+
+def kinetic_energy(q_s, q_f, v_s, v_f, params):
+    """Unit masses as a function, so that nothing is known of the structure of T."""
+    return (v_s @ v_s + v_f @ v_f) / 2
+
+
+def unstructured_chain(num_springs: int) -> vm.Problem:
+    """The FPU chain with T as a plain function: every scheme then solves for all unknowns of a macro step at once."""
+    problem = vm.systems.fermi_pasta_ulam(num_springs)
+    return replace(problem, system=problem.system.replace(kinetic=kinetic_energy))
+
+
+def _both(scheme, **arguments) -> dict[str, vm.Scheme]:
+    return {f"{n} micro steps": scheme(n, **arguments) for n in (5, 10)}
+
+
+def _fpu_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
+    def figure(name: str, title: str, paper: str, schemes: dict, orders, source: str = "paper") -> ConvergenceFigure:
+        orders = orders if isinstance(orders, dict) else dict.fromkeys(schemes, orders)
+        problem = vm.systems.fermi_pasta_ulam
+        return ConvergenceFigure(name, title, paper, problem, schemes, orders, source, size.fpu_steps)
+
+    saw = "order {} in positions and momenta, with 5 and with 10 micro steps."
+    half = {
+        f"{name}, {label}": scheme
+        for name, family in (("explicit slow", vm.explicit_slow), ("fully explicit", vm.fully_explicit))
+        for label, scheme in _both(family, alpha=0.5).items()
+    }
+    return (
+        figure("fig6", "FPU, fully explicit", saw.format(1), _both(vm.fully_explicit, alpha=0.0), 1),
+        figure("fig7", "FPU, explicit slow", saw.format(1), _both(vm.explicit_slow, alpha=0.0), 1),
+        figure("fig8", "FPU, fully implicit", saw.format(2), _both(vm.fully_implicit), 2),
+        figure("fpu-half", "FPU, explicit schemes with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
+        figure("fpu-degree", "FPU, degree 2 and 3", _NOT_IN_PAPER, *_degrees(size.degree_num_micro), "theory"),
+    )
+
+
+def _tsp_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
+    def figure(name: str, title: str, paper: str, schemes: dict, orders, source: str = "paper") -> ConvergenceFigure:
+        orders = orders if isinstance(orders, dict) else dict.fromkeys(schemes, orders)
+        problem = vm.systems.triple_spherical_pendulum
+        return ConvergenceFigure(name, title, paper, problem, schemes, orders, source, size.tsp_steps)
+
+    half = _both(vm.fully_explicit, alpha=0.5)
+    return (
+        figure("fig9", "Triple spherical pendulum, fully implicit", "order 2.", _both(vm.fully_implicit), 2),
+        figure(
+            "fig10", "Triple spherical pendulum, fully explicit", "order 1.", _both(vm.fully_explicit, alpha=0.0), 1
+        ),
+        figure("tsp-half", "Triple spherical pendulum, fully explicit with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
+        figure(
+            "tsp-degree",
+            "Triple spherical pendulum, degree 2 and 3",
+            _NOT_IN_PAPER,
+            *_degrees(size.degree_num_micro),
+            "theory",
+        ),
+    )
+
+
+_NOT_IN_PAPER = "not in the paper; the theory says order min(2 × degree, order of the quadrature)."
+
+
+def _degrees(num_micro: tuple[int, ...]) -> tuple[dict[str, vm.Scheme], dict[str, int]]:
+    """Galerkin schemes of degree 2 and 3 with Gauss quadrature, and their orders 4 and 6."""
+    schemes = {
+        f"degree {degree}, {n} micro steps": vm.galerkin(n, degree, "gauss") for degree in (2, 3) for n in num_micro
+    }
+    return schemes, {label: scheme.order for label, scheme in schemes.items()}

@@ -1,0 +1,153 @@
+"""Runs the reference study and writes it down: figures, tables and one self-contained HTML report."""
+
+import base64
+import os
+import platform
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.metadata import version
+from io import BytesIO
+from pathlib import Path
+
+import jax
+import jinja2
+
+from vmri_jax import plots
+from vmri_jax.study.figures import Check, ConvergenceFigure, CostFigure
+from vmri_jax.study.reference import reference_figures
+from vmri_jax.study.table import Progress, part, silent
+
+
+@dataclass(frozen=True)
+class FigureResult:
+    """One figure of the report: its line of the paper, its line of today, its checks and files, or why it failed."""
+
+    name: str
+    title: str
+    paper: str
+    seen: str
+    checks: tuple[Check, ...]
+    seconds: float
+    image: str = ""
+    image_dark: str = ""
+    error: str = ""
+    traceback: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The results of a study and where its report lies."""
+
+    path: Path
+    figures: tuple[FigureResult, ...]
+
+    @property
+    def failed(self) -> list[FigureResult]:
+        """Figures that could not be made."""
+        return [figure for figure in self.figures if figure.error]
+
+
+def reproduce(
+    out: str | Path = "out",
+    size: str = "quick",
+    only: Sequence[str] = (),
+    progress: Progress = silent,
+    figure_done: Callable[[FigureResult], None] | None = None,
+) -> Report:
+    """Run the reference study and write figures (PNG, SVG), tables (CSV) and ``report.html`` into `out`.
+
+    A figure that fails is reported as failed; the others are kept. The report is rewritten after every figure.
+
+    Args:
+        out: folder, made if it does not exist.
+        size: "quick" or "full", see `reference_figures`.
+        only: names of the figures to run, all if empty.
+        progress: told what is running.
+        figure_done: called with every result.
+
+    Raises:
+        ValueError: an unknown size or figure name.
+    """
+    chosen = choose_figures(reference_figures(size), only)
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    references: dict = {}
+    results: list[FigureResult] = []
+    start = time.perf_counter()
+    for i, figure in enumerate(chosen):
+        results.append(_run_figure(figure, out, references, part(progress, i, len(chosen), f"{figure.name}: ")))
+        _write_html(out / "report.html", results, size, time.perf_counter() - start)
+        if figure_done is not None:
+            figure_done(results[-1])
+    return Report(out / "report.html", tuple(results))
+
+
+def choose_figures(
+    figures: Sequence[ConvergenceFigure | CostFigure], only: Sequence[str]
+) -> list[ConvergenceFigure | CostFigure]:
+    """The figures with the given names, in the order of the study; all for no names."""
+    names = [figure.name for figure in figures]
+    unknown = [name for name in only if name not in names]
+    if unknown:
+        raise ValueError(f"reproduce: no figure {', '.join(map(repr, unknown))}; there are {', '.join(names)}.")
+    return [figure for figure in figures if not only or figure.name in only]
+
+
+def _run_figure(figure, out: Path, references: dict, progress: Progress) -> FigureResult:
+    start = time.perf_counter()
+    try:
+        findings = figure.measure(progress, references)
+        findings.to_csv(out / f"{figure.name}.csv")
+        plots.save(findings.draw(figure.title, plots.LIGHT), out / f"{figure.name}.png")
+        images = [_svg(findings.draw("", theme), theme) for theme in (plots.LIGHT, plots.DARK)]
+        (out / f"{figure.name}.svg").write_bytes(images[0])
+    except Exception as error:  # whatever it is, the other figures are worth having
+        seconds, message = time.perf_counter() - start, f"{type(error).__name__}: {error}"
+        details = "".join(traceback.format_exception(error))
+        return FigureResult(figure.name, figure.title, figure.paper, "", (), seconds, error=message, traceback=details)
+    seconds = time.perf_counter() - start
+    embedded = [f"data:image/svg+xml;base64,{base64.b64encode(image).decode()}" for image in images]
+    return FigureResult(figure.name, figure.title, figure.paper, findings.seen, findings.checks, seconds, *embedded)
+
+
+def _svg(figure, theme: plots.Theme) -> bytes:
+    buffer = BytesIO()
+    with plots.style(theme):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def _write_html(path: Path, results: list[FigureResult], size: str, seconds: float) -> None:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("vmri_jax.study", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    checks = [check for figure in results for check in figure.checks]
+    path.write_text(
+        environment.get_template("report.html.j2").render(
+            figures=results,
+            agreeing=sum(check.agrees for check in checks),
+            num_checks=len(checks),
+            size=size,
+            minutes=seconds / 60,
+            date=datetime.now().strftime("%-d %B %Y, %H:%M"),
+            machine=_machine(),
+            versions=f"vmri_jax {version('vmri_jax')}, JAX {jax.__version__}, Python {platform.python_version()}",
+        ),
+        encoding="utf-8",
+    )
+
+
+def _machine() -> str:
+    processor = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():  # Linux, where platform knows only the architecture
+        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
+        processor = names[0] if names else processor
+    threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
+    return (
+        f"{processor}, {os.cpu_count()} cores, {platform.system()}, JAX on {jax.default_backend()}, linear algebra on "
+        f"{threads} {'thread' if threads == '1' else 'threads'}"
+    )
