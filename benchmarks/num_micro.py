@@ -25,7 +25,7 @@ def measure(repeats: int) -> list[dict]:
     for name, problem, micro_dt, micro_steps in track(CASES, description="num_micro"):
         p = problem()
         runs = {n: _run(p, n, micro_dt, micro_steps) for n in NUM_MICRO}
-        iterations = {n: float(jnp.mean(run().iterations)) for n, run in runs.items()}
+        iterations = {n: float(jnp.mean(run().info.iterations)) for n, run in runs.items()}
         seconds = {n: [] for n in NUM_MICRO}
         for _ in range(repeats):
             for n, run in runs.items():
@@ -59,7 +59,7 @@ def temporary_bytes(problem, n: int, micro_dt: float) -> int:
     """Temporary memory of one compiled macro step."""
     step = jax.jit(vm.macro_step)
     compiled = step.lower(problem.system, vm.fully_implicit(n), problem.state(), n * micro_dt).compile()
-    return compiled.memory_analysis().temp_size_in_bytes
+    return compiled.memory_analysis().temp_size_in_bytes  # pyright: ignore[reportOptionalMemberAccess]
 
 
 def machine() -> dict:

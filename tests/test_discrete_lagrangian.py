@@ -179,7 +179,7 @@ def test_explicit_chain_evaluates_v_once_and_w_num_micro_times_per_macro_step(fp
         counts.append(EVALUATIONS.copy())
     assert counts[1]["V"] - counts[0]["V"] == 15
     assert counts[1]["W"] - counts[0]["W"] == 15 * num_micro
-    assert int(jnp.max(run.iterations)) == 0
+    assert int(jnp.max(run.info.iterations)) == 0
 
 
 @pytest.mark.parametrize(

@@ -48,12 +48,12 @@ def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
 @pytest.mark.parametrize(("macro_dt", "most"), [(0.01, 3), (0.05, 4)])
 def test_iterations_of_the_pendulum(tsp, macro_dt, most):
     run = simulate(tsp.system, fully_implicit(5), tsp.state(), macro_dt=macro_dt, num_steps=100)
-    assert int(run.iterations.max()) <= most
+    assert int(run.info.iterations.max()) <= most
 
 
 def test_iterations_of_a_large_macro_step(fpu):
     run = simulate(fpu.system, fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=20)
-    assert int(run.iterations.max()) <= 8  # measured 6
+    assert int(run.info.iterations.max()) <= 8  # measured 6
 
 
 def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(fpu):

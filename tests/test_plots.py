@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from vmri_jax.trajectory import RunInfo
 from vmri_jax import plots
 from vmri_jax.study import ConvergenceRow, ConvergenceStudy, CostRow, CostStudy, ReferenceSolution
 
@@ -27,8 +28,7 @@ def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
         p_f=wave(n_f),
         energy=2.0 + 1e-3 * np.sin(t),
         constraint_residual=np.full((num_nodes, 2), 1e-14 if constrained else 0.0),
-        iterations=np.ones(num_nodes - 1),
-        residual=np.zeros(num_nodes - 1),
+        info=RunInfo(iterations=np.ones(num_nodes - 1), residual=np.zeros(num_nodes - 1)),
         result=0,
         failed_at=-1,
     )

@@ -15,7 +15,7 @@ from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
 from vmri_jax.step import Memory, advance, start_memory
 from vmri_jax.system import System
-from vmri_jax.trajectory import Trajectory, join
+from vmri_jax.trajectory import RunInfo, Trajectory, join
 
 
 def simulate(
@@ -127,8 +127,7 @@ def _run(
         *phase,
         energy=energy,
         constraint_residual=jax.vmap(partial(diagnostics.constraint_residual, system))(*phase),
-        iterations=worst[0],
-        residual=worst[1],
+        info=RunInfo(*worst),
         result=status[0],
         failed_at=status[1],
         t_micro=nodes.t[1:, None] - macro_dt * (1 - np.arange(1, n + 1) / n) if save_micro else None,
@@ -204,7 +203,7 @@ def _error(trajectory: Trajectory, scheme: Scheme, macro_dt, save_every: int) ->
         Result(int(trajectory.result)),
         step,
         float(trajectory.t[0] + step * macro_dt),
-        int(trajectory.iterations[interval]),
-        float(trajectory.residual[interval]),
+        int(trajectory.info.iterations[interval]),
+        float(trajectory.info.residual[interval]),
         trajectory,
     )

@@ -2,16 +2,22 @@
 
 import dataclasses
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.results import Result
 
 FORMAT = "vmri_jax trajectory 1"
+
+
+class RunInfo(NamedTuple):
+    """What the solver did between saved nodes: most iterations and largest residual of a step, as in `StepInfo`."""
+
+    iterations: Any
+    residual: Any
 
 
 class Trajectory(eqx.Module):
@@ -22,7 +28,7 @@ class Trajectory(eqx.Module):
         q_s, q_f, p_s, p_f: (k, n) positions and momenta; NaN after a failure.
         energy: (k,) Hamiltonian.
         constraint_residual: (k, 2) largest |g| and largest |G v|.
-        iterations, residual: (k - 1,) most Newton iterations and largest residual of a step since the node before.
+        info: `RunInfo`, the most Newton iterations and the largest residual of a step since the node before, (k - 1,).
         t_micro, q_f_micro: (k - 1, num_micro) and (k - 1, num_micro, n_f), the micro nodes of the macro step that ends
             at each saved node (its start excluded); None unless asked for.
         result: status of the run, a `Result`; the first that was no success.
@@ -36,8 +42,7 @@ class Trajectory(eqx.Module):
     p_f: Any
     energy: Any
     constraint_residual: Any
-    iterations: Any
-    residual: Any
+    info: RunInfo
     result: Any
     failed_at: Any
     t_micro: Any = None
@@ -56,7 +61,7 @@ class Trajectory(eqx.Module):
 
     def save(self, path) -> None:
         """Write all arrays to a .npz file (no pickled objects)."""
-        arrays = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+        arrays = {name: np.asarray(value) for name, value in _flat(self).items() if value is not None}
         np.savez_compressed(path, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
     @classmethod
@@ -79,13 +84,13 @@ class Trajectory(eqx.Module):
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
-        fields = {field.name for field in dataclasses.fields(cls)}
+        fields = {field.name for field in dataclasses.fields(cls)} - {"info"} | set(RunInfo._fields)
         missing = fields - set(arrays) - {"t_micro", "q_f_micro"}
         if missing or set(arrays) - fields:
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
-        return cls(**{name: jnp.asarray(value) for name, value in arrays.items()})
+        return _from_flat({name: jnp.asarray(value) for name, value in arrays.items()})
 
     def to_xarray(self):
         """The trajectory as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``)."""
@@ -101,8 +106,8 @@ class Trajectory(eqx.Module):
             "p_f": (("t", "fast"), self.p_f),
             "energy": ("t", self.energy),
             "constraint_residual": (("t", "level"), self.constraint_residual),
-            "iterations": ("t_end", self.iterations),
-            "residual": ("t_end", self.residual),
+            "iterations": ("t_end", self.info.iterations),
+            "residual": ("t_end", self.info.residual),
         }
         if self.q_f_micro is not None:
             data["t_micro"] = (("t_end", "micro"), self.t_micro)
@@ -115,13 +120,27 @@ class Trajectory(eqx.Module):
 
 def join(pieces: list[Trajectory]) -> Trajectory:
     """Consecutive trajectories, each starting where the one before ends, as one."""
-    first, rest = pieces[0], pieces[1:]
     nodes = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
+    flat = [_flat(piece) for piece in pieces]
+    failed = next((f for f in flat if int(f["failed_at"]) >= 0), flat[-1])
 
-    def joined(name):
-        values = [getattr(first, name)] + [getattr(p, name)[1:] if name in nodes else getattr(p, name) for p in rest]
-        return None if values[0] is None else jnp.concatenate(values)
+    def joined(name, first):
+        if first is None:
+            return None
+        if name in ("result", "failed_at"):
+            return jnp.asarray(failed[name])
+        skip = 1 if name in nodes else 0  # a piece starts with the last node of the one before
+        return jnp.concatenate([first] + [f[name][skip:] for f in flat[1:]])
 
-    failed = next((p for p in pieces if int(p.failed_at) >= 0), pieces[-1])
-    arrays = {name: joined(name) for name in vars(first) if name not in ("result", "failed_at")}
-    return jax.tree.map(jnp.asarray, Trajectory(**arrays, result=failed.result, failed_at=failed.failed_at))
+    return _from_flat({name: joined(name, first) for name, first in flat[0].items()})
+
+
+def _flat(trajectory: Trajectory) -> dict:
+    """All arrays of a trajectory by name."""
+    fields = dict(vars(trajectory))
+    return fields | fields.pop("info")._asdict()
+
+
+def _from_flat(arrays: dict) -> Trajectory:
+    info = RunInfo(**{name: arrays.pop(name) for name in RunInfo._fields})
+    return Trajectory(**arrays, info=info)

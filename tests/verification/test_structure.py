@@ -67,7 +67,7 @@ def test_step_is_symplectic_for_every_alpha(name, scheme):
 
 def test_step_is_symplectic_for_rules_that_are_not_symmetric():
     worst = defect(PROBLEMS["fpu"]().system, galerkin(3, 2, quadrature.radau(2)), generic_state("fpu"), 0.05)
-    assert worst < 1e-11  # measured 1e-14
+    assert worst < 1e-11  # measured 3e-15
 
 
 def test_a_step_that_is_not_symplectic_is_seen():

@@ -210,6 +210,6 @@ def _row(label, scheme, macro_dt, trajectory: vm.Trajectory, reference: Referenc
         error_p=float(np.abs(p - reference.p).max()),
         energy_error=float(np.abs(trajectory.energy - trajectory.energy[0]).max()),
         constraint_residual=float(np.max(trajectory.constraint_residual)),
-        iterations=int(np.max(trajectory.iterations)),
+        iterations=int(np.max(trajectory.info.iterations)),
         result=vm.Result(int(trajectory.result)).name,
     )

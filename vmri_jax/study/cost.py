@@ -128,7 +128,7 @@ def cost_study(
                     seconds_per_unit=float("nan"),
                     us_per_micro_step=float("nan"),
                     first_call_seconds=first_call,
-                    iterations=int(np.max(trajectory.iterations)),
+                    iterations=int(np.max(trajectory.info.iterations)),
                     result=vm.Result(int(trajectory.result)).name,
                 )
             )
