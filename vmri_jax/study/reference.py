@@ -169,12 +169,15 @@ def _both(scheme, **arguments) -> dict[str, vm.Scheme]:
     return {f"{n} micro steps": scheme(n, **arguments) for n in (5, 10)}
 
 
-def _fpu_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
-    def figure(name: str, title: str, paper: str, schemes: dict, orders, source: str = "paper") -> ConvergenceFigure:
-        orders = orders if isinstance(orders, dict) else dict.fromkeys(schemes, orders)
-        problem = vm.systems.fermi_pasta_ulam
-        return ConvergenceFigure(name, title, paper, problem, schemes, orders, source, size.fpu_steps)
+def _convergence_figure(
+    problem, macro_dt, name: str, title: str, paper: str, schemes: dict, orders: dict[str, int] | int, source="paper"
+) -> ConvergenceFigure:
+    orders = orders if isinstance(orders, dict) else dict.fromkeys(schemes, orders)
+    return ConvergenceFigure(name, title, paper, problem, schemes, orders, source, macro_dt)
 
+
+def _fpu_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
+    figure = partial(_convergence_figure, vm.systems.fermi_pasta_ulam, size.fpu_steps)
     saw = "order {} in positions and momenta, with 5 and with 10 micro steps."
     half = {
         f"{name}, {label}": scheme
@@ -191,25 +194,14 @@ def _fpu_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
 
 
 def _tsp_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
-    def figure(name: str, title: str, paper: str, schemes: dict, orders, source: str = "paper") -> ConvergenceFigure:
-        orders = orders if isinstance(orders, dict) else dict.fromkeys(schemes, orders)
-        problem = vm.systems.triple_spherical_pendulum
-        return ConvergenceFigure(name, title, paper, problem, schemes, orders, source, size.tsp_steps)
-
+    figure = partial(_convergence_figure, vm.systems.triple_spherical_pendulum, size.tsp_steps)
+    tsp = "Triple spherical pendulum"
     half = _both(vm.fully_explicit, alpha=0.5)
     return (
-        figure("fig9", "Triple spherical pendulum, fully implicit", "order 2.", _both(vm.fully_implicit), 2),
-        figure(
-            "fig10", "Triple spherical pendulum, fully explicit", "order 1.", _both(vm.fully_explicit, alpha=0.0), 1
-        ),
-        figure("tsp-half", "Triple spherical pendulum, fully explicit with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
-        figure(
-            "tsp-degree",
-            "Triple spherical pendulum, degree 2 and 3",
-            _NOT_IN_PAPER,
-            *_degrees(size.degree_num_micro),
-            "theory",
-        ),
+        figure("fig9", f"{tsp}, fully implicit", "order 2.", _both(vm.fully_implicit), 2),
+        figure("fig10", f"{tsp}, fully explicit", "order 1.", _both(vm.fully_explicit, alpha=0.0), 1),
+        figure("tsp-half", f"{tsp}, fully explicit with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
+        figure("tsp-degree", f"{tsp}, degree 2 and 3", _NOT_IN_PAPER, *_degrees(size.degree_num_micro), "theory"),
     )
 
 

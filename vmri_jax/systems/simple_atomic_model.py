@@ -9,6 +9,7 @@ TETRAHEDRON = np.sqrt(np.array([1 / 3, 1 / 12, 2 / 3]))  # for unit edges: radiu
 
 
 def distance(a, b):
+    """Euclidean distance of two atoms."""
     return jnp.linalg.norm(a - b)
 
 
