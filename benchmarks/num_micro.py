@@ -39,12 +39,12 @@ def measure(repeats: int) -> list[dict]:
                     "system": name,
                     "micro_dt": micro_dt,
                     "num_micro": n,
-                    "us per micro step": us[n],
-                    "ratio to 10": us[n] / us[10],
-                    "Newton iterations": iterations[n],
-                    "ratio per iteration": us[n] / us[10] * iterations[10] / iterations[n],
+                    "us/micro step": us[n],
+                    "to 10": us[n] / us[10],
+                    "iterations": iterations[n],
+                    "to 10 per iteration": us[n] / us[10] * iterations[10] / iterations[n],
                     "spread": (max(seconds[n]) - min(seconds[n])) / statistics.median(seconds[n]),
-                    "temporary bytes": temporary_bytes(p, n, micro_dt),
+                    "bytes": temporary_bytes(p, n, micro_dt),
                 }
             )
     return rows
