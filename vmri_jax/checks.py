@@ -23,6 +23,8 @@ def check_arrays(**arrays):
     for name, value in arrays.items():
         if getattr(value, "dtype", None) in (np.float32, np.float16):
             raise ValueError(f"{name} has dtype {value.dtype}; give float64, e.g. {name}.astype(float).")
+        if np.iscomplexobj(value):
+            raise ValueError(f"{name} is complex; coordinates and momenta are real.")
         array = jnp.asarray(value, dtype=float)
         if array.ndim != 1:
             raise ValueError(f"{name} has shape {array.shape}; it must be a vector of coordinates, shape (n,).")

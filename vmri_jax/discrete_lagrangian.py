@@ -173,8 +173,14 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
     """
     terms = lagrangian(system, scheme)
 
-    def L_d(slow, fast, macro_dt, t=0.0):
-        return terms(Path.from_control_points(slow, fast, t, macro_dt))
+    def L_d(slow, fast, macro_dt):
+        expected = (scheme.degree + 1, scheme.num_micro * scheme.degree + 1)
+        if (slow.shape[0], fast.shape[0]) != expected:
+            raise ValueError(
+                f"L_d: got {slow.shape[0]} slow and {fast.shape[0]} fast control points; this scheme has {expected[0]} "
+                f"and {expected[1]}."
+            )
+        return terms(Path.from_control_points(slow, fast, 0.0, macro_dt))
 
     return L_d
 
@@ -186,8 +192,8 @@ def discrete_legendre(system: System, scheme: Scheme) -> Callable:
     """
     slots = jax.grad(discrete_lagrangian(system, scheme), argnums=(0, 1))
 
-    def transforms(slow, fast, macro_dt, t=0.0):
-        d_slow, d_fast = slots(slow, fast, macro_dt, t)
+    def transforms(slow, fast, macro_dt):
+        d_slow, d_fast = slots(slow, fast, macro_dt)
         return (-d_slow[0], -d_fast[0]), (d_slow[-1], d_fast[-1])
 
     return transforms

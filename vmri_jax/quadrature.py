@@ -45,7 +45,8 @@ class Rule(eqx.Module):
 
     def __init__(self, nodes, weights):
         self.nodes = tuple(float(node) for node in nodes)
-        self.weights = weights if isinstance(weights, jax.Array) else np.asarray(weights, dtype=float)
+        traced = isinstance(weights, jax.Array) or not is_concrete(weights)
+        self.weights = jnp.asarray(weights, dtype=float) if traced else np.asarray(weights, dtype=float)
         if self.weights.shape != (len(self.nodes),):
             raise ValueError(
                 f"Rule: got {len(self.nodes)} nodes and weights of shape {self.weights.shape}; give one weight per node."
@@ -82,6 +83,7 @@ class Rule(eqx.Module):
 
     def repeat(self, count: int) -> "Rule":
         """Composite rule: this one on each of ``count`` equal subintervals, shared end nodes merged."""
+        _check_count("repeat", count, 1)
         nodes = tuple((m + node) / count for m in range(count) for node in self.nodes)
         return _merge(nodes, [self.weights / count] * count)
 
@@ -166,7 +168,7 @@ def affine(alpha) -> Rule:
 
 def _check_count(name: str, n: int, least: int) -> None:
     if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < least:
-        raise ValueError(f"{name}: the number of nodes is {n!r}; it must be an integer of at least {least}.")
+        raise ValueError(f"{name}: the number is {n!r}; it must be an integer of at least {least}.")
 
 
 left = Rule((0.0,), (1.0,))

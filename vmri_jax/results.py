@@ -50,7 +50,7 @@ class SimulationError(RuntimeError):
         result: the `Result` of the failing step.
         step: index of the failing macro step (0 = the first).
         time: time at the start of that step.
-        iterations, residual: of its last Newton iteration.
+        iterations, residual: the most Newton iterations and the largest residual of a step since the saved node before.
         trajectory: the `Trajectory` up to the failure (NaN after it).
     """
 
@@ -62,3 +62,6 @@ class SimulationError(RuntimeError):
             f"{residual:.2e}: {result.message} The trajectory up to there is in this exception's .trajectory; "
             "throw=False returns it instead of raising."
         )
+
+    def __reduce__(self):
+        return type(self), (self.result, self.step, self.time, self.iterations, self.residual, self.trajectory)

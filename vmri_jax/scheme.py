@@ -13,7 +13,7 @@ A scheme is data. The reference schemes and the Galerkin family are points in on
 import equinox as eqx
 import numpy as np
 
-from vmri_jax.path import control_nodes
+from vmri_jax.path import control_nodes, lagrange_derivative
 from vmri_jax.quadrature import (
     NODE_TOLERANCE,
     PlacedRule,
@@ -71,6 +71,7 @@ class Scheme(eqx.Module):
             raise ValueError(
                 "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
             )
+        _check_kinetic(self.kinetic.rule, self.degree)
         for name, grid in (("constraint", "micro"), ("slow_constraint", "macro")):
             placed = getattr(self, name)
             nodes, needed = np.array(placed.rule.nodes), control_nodes(self.degree)
@@ -79,6 +80,8 @@ class Scheme(eqx.Module):
                     f"Scheme: {name} must be held at the control nodes {needed.tolist()} of degree {degree}; "
                     f"give {grid}(lobatto({degree + 1})), got {placed.grid} rule with nodes {nodes.tolist()}."
                 )
+            if is_concrete(placed) and np.any(np.asarray(placed.rule.weights) == 0):
+                raise ValueError(f"Scheme: a weight of the {name} rule is zero; its multiplier would be undefined.")
 
     @property
     def order(self) -> int:
@@ -92,6 +95,17 @@ def _positive_integer(name: str, value) -> int:
     if value < 1:
         raise ValueError(f"Scheme: {name} is {value}; it must be at least 1.")
     return int(value)
+
+
+def _check_kinetic(rule: Rule, degree: int) -> None:
+    """Refuse rules that leave an increment of the path without mass, ``sum_i w_i l_j'(c_i) l_k'(c_i)`` singular."""
+    slopes = lagrange_derivative(degree, np.array(rule.nodes))[:, 1:]
+    weights = np.asarray(rule.weights) if is_concrete(rule) else np.ones(len(rule.nodes))
+    if np.linalg.eigvalsh(slopes.T @ (weights[:, None] * slopes)).min() <= 1e-9:
+        raise ValueError(
+            f"Scheme: the kinetic rule with nodes {list(rule.nodes)} does not see every velocity of a path of degree {degree}; "
+            f"give one that does, e.g. micro(gauss({degree}))."
+        )
 
 
 def _check_placed(name: str, placed) -> None:

@@ -58,7 +58,9 @@ def simulate(
         ValueError, TypeError: bad arguments, before anything is computed.
         SimulationError: a step failed.
     """
-    macro_dt = jnp.asarray(_check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every), dtype=float)
+    macro_dt = jnp.asarray(
+        _check(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every), dtype=float
+    )
     start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
     newton, num_saves = newton or Newton(), num_steps // save_every
     memory = _checked_memory(system, scheme, start)
@@ -66,7 +68,7 @@ def simulate(
         run = partial(_run_static, system, scheme, newton, macro_dt, start.t)
         return run(start, memory, 0, num_saves, save_every, save_micro)[0]
 
-    check_constraints(system, start.q_s, start.q_f)
+    check_constraints(system, start.q_s, start.q_f, "simulate: the state")
     pieces, state, first_step = [], start, 0
     for saves in _chunks(num_saves, progress):
         run = partial(_run_traced, system, scheme, newton, macro_dt, start.t)
@@ -74,7 +76,7 @@ def simulate(
         pieces.append(piece)
         state, first_step = piece.final_state, first_step + saves * save_every
     trajectory = pieces[0] if len(pieces) == 1 else join(pieces)
-    if throw and int(trajectory.failed_at) >= 0:
+    if throw and is_concrete(trajectory.failed_at) and int(trajectory.failed_at) >= 0:
         raise _error(trajectory, scheme, macro_dt, save_every)
     return trajectory
 
@@ -94,7 +96,7 @@ def _run(
             jnp.where(status[1] < 0, jnp.maximum(status[0], info.result), status[0]),
             jnp.where(failed, k, status[1]),
         )
-        worst = (jnp.maximum(worst[0], info.iterations), jnp.fmax(worst[1], info.residual))
+        worst = (jnp.maximum(worst[0], info.iterations), jnp.maximum(worst[1], info.residual))
         state = jax.tree.map(lambda a: jnp.where(ok, a, jnp.nan), state)
         state = State(t_start + (k + 1) * macro_dt, state.q_s, state.q_f, state.p_s, state.p_f)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
@@ -165,7 +167,7 @@ def _vectors(state: State) -> dict:
     return {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
 
 
-def _check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every):
+def _check(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every):
     """Refuse bad arguments of `simulate`; returns macro_dt."""
     require_x64()
     if not isinstance(scheme, Scheme):
@@ -174,6 +176,8 @@ def _check(system, scheme, state, macro_dt, micro_dt, num_steps, save_every):
         )
     if not isinstance(state, State):
         raise TypeError(f"simulate: state is {type(state).__name__}; give a State, e.g. from initial_state(...).")
+    if not isinstance(newton, Newton | None):
+        raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(linear_solver='dense').")
     if (macro_dt is None) == (micro_dt is None):
         got = "neither" if macro_dt is None else "both"
         raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")

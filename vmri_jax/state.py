@@ -29,11 +29,12 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     return jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
 
 
-def project_momentum(system: System, q_s, q_f, p_s, p_f):
+def project_momentum(system: System, q_s, q_f, p_s, p_f, guess=None):
     """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v = 0``, and their velocities.
 
-    v is the velocity of the projected momentum, ``p - G^T mu = dT/dv``. For a kinetic energy at most quadratic in the
-    velocities this is one linear solve; otherwise Newton's iteration, run until it no longer moves.
+    v is the velocity of the projected momentum, ``p - G^T mu = dT/dv``: it minimises ``T(v) - p . v`` over ``G v = 0``.
+    For constant masses that is one linear solve, else Newton's iteration with a line search from `guess` (v_s, v_f), or
+    from rest; the kinetic energy must be convex in the velocities.
 
     Returns:
         (p_s, p_f, v_s, v_f)
@@ -50,19 +51,49 @@ def project_momentum(system: System, q_s, q_f, p_s, p_f):
             v_s, v_f = system.kinetic.velocity(p_s, p_f)
         return p_s, p_f, v_s, v_f
 
-    def momentum(v):
-        return jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
-
     p = jnp.concatenate([p_s, p_f])
-    v = jnp.zeros_like(p)
-    zero = jnp.zeros((jacobian.shape[0],) * 2)
-    for _ in range(3):  # exact after one where T is quadratic in v
-        matrix = jnp.block([[jax.jacfwd(momentum)(v), jacobian.T], [jacobian, zero]])
-        step = jnp.linalg.solve(matrix, jnp.concatenate([p - momentum(v), -jacobian @ v]))
-        v = v + step[: p.size]
+    v = _velocity(system, q_s, q_f, jacobian, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
     if jacobian.shape[0]:
-        p = momentum(v)
+        p = jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
     return p[:n_s], p[n_s:], v[:n_s], v[n_s:]
+
+
+def _velocity(system: System, q_s, q_f, jacobian, p, guess, max_iterations: int = 50):
+    """The v that minimises ``T(v) - p . v`` over ``jacobian v = 0``; NaN where Newton's iteration does not converge."""
+
+    def kinetic(system, q_s, q_f, v):
+        return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
+
+    def direction(at, v):
+        system, q_s, q_f, jacobian, p = at
+        hessian, gradient = (d(lambda v: kinetic(system, q_s, q_f, v))(v) for d in (jax.hessian, jax.grad))
+        matrix = jnp.block([[hessian, jacobian.T], [jacobian, jnp.zeros((jacobian.shape[0],) * 2)]])
+        return jnp.linalg.solve(matrix, jnp.concatenate([p - gradient, -jacobian @ v]))[: v.size]
+
+    def search(carry):
+        v, k, _ = carry
+        system, q_s, q_f, jacobian, p = fixed
+        d = direction(fixed, v)
+        small = _largest(d) <= 1e-9 * _largest(v)  # the two steps at the end do the rest
+        merit = jax.vmap(lambda v: kinetic(system, q_s, q_f, v) - p @ v)(v + fractions[:, None] * d)
+        on_constraints = _largest(jacobian @ v) <= 1e-9 * _largest(v)
+        better = jnp.isfinite(merit) & ((merit < merit[-1]) | ~on_constraints)
+        stop = small | ~jnp.any(better)
+        return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
+
+    at = (system, q_s, q_f, jacobian, p)
+    fixed, guess = jax.lax.stop_gradient((at, guess))
+    fractions = jnp.append(0.5 ** jnp.arange(12.0), 0.0)
+    start = (guess, 0, jnp.asarray(False))
+    v = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < max_iterations), search, start)[0]
+    for _ in range(2):  # Newton's map is flat at its fixed point: these two carry first and second derivatives
+        d = direction(at, v)
+        v = v + d
+    return jnp.where(_largest(d) <= 1e-6 * _largest(v) + 1e-300, v, jnp.nan)
+
+
+def _largest(a):
+    return jnp.max(jnp.abs(a), initial=0.0)
 
 
 def project_positions(system: System, q_s, q_f, iterations: int = 20):
@@ -102,10 +133,14 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     if project:
         q_s, q_f = _projected_positions(system, q_s, q_f)
-    values, p_s, p_f = _momenta(system, q_s, q_f, v_s, v_f)
-    if is_concrete((values, p_s, p_f)):
-        _check_constraint_values(np.asarray(values), project, tolerance)
-        check_constraints(system, q_s, q_f)
+    p_s, p_f = _momenta(system, q_s, q_f, v_s, v_f)
+    if is_concrete((q_s, q_f, p_s, p_f)):
+        advice = (
+            "projection did not reach the constraints; start closer to them."
+            if project
+            else "correct the positions, or pass project=True to move them onto the constraints."
+        )
+        check_constraints(system, q_s, q_f, "initial_state: the initial positions", tolerance, advice)
         if not all(np.isfinite(p).all() for p in (p_s, p_f)):
             raise ValueError(
                 "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
@@ -116,46 +151,45 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
 
 @jax.jit
 def _momenta(system, q_s, q_f, v_s, v_f):
-    """Constraint values and consistent momenta; what the user's functions return is checked while tracing."""
+    """Consistent momenta; what the user's functions return is checked while tracing."""
     check_system(system, q_s, q_f)
-    momenta = project_momentum(system, q_s, q_f, *legendre(system, q_s, q_f, v_s, v_f))[:2]
-    return system.constraints(q_s, q_f), *momenta
+    p_s, p_f = legendre(system, q_s, q_f, v_s, v_f)
+    return project_momentum(system, q_s, q_f, p_s, p_f, (v_s, v_f))[:2]
 
 
 _projected_positions = jax.jit(project_positions)
 
 
 @jax.jit
-def _constraint_jacobians(system, q_s, q_f):
-    return *jax.jacrev(system.g, argnums=(0, 1))(q_s, q_f), jax.jacrev(system.g_slow)(q_s)
+def _constraint_values(system, q_s, q_f):
+    """All constraints, and the Jacobians of g by q_s, of g by q_f and of g_slow by q_s."""
+    jacobians = *jax.jacrev(system.g, argnums=(0, 1))(q_s, q_f), jax.jacrev(system.g_slow)(q_s)
+    return system.constraints(q_s, q_f), *jacobians
 
 
-def _check_constraint_values(values, projected: bool, tolerance: float) -> None:
-    """Refuse positions off the constraints."""
-    if not np.isfinite(values).all():
-        raise ValueError(f"initial_state: the constraints are {values} at the initial positions, which is not finite.")
-    worst = np.abs(values).max(initial=0.0)
-    if worst > tolerance:
-        advice = (
-            "projection did not reach the constraints; start closer to them."
-            if projected
-            else "correct the positions, or pass project=True to move them onto the constraints."
-        )
-        raise ValueError(
-            f"initial_state: the initial positions violate the constraints by {worst:.3e} (row {np.abs(values).argmax()} "
-            f"of {values.size}, tolerance {tolerance:.0e}); {advice}"
-        )
-
-
-def check_constraints(system: System, q_s, q_f) -> None:
-    """Refuse constraints that cannot be kept where they are held, with the reason and the fix."""
+def check_constraints(
+    system: System, q_s, q_f, what: str, tolerance: float = 1e-6, advice: str = "start from initial_state(...)."
+) -> None:
+    """Refuse positions off the constraints, and constraints that cannot be kept where they are held."""
     if system.constraint is system.slow_constraint is None:
         return
-    slow, fast, alone = (np.asarray(d) for d in _constraint_jacobians(system, q_s, q_f))
+    values, slow, fast, alone = (np.asarray(a) for a in _constraint_values(system, q_s, q_f))
+    if not np.isfinite(values).all():
+        raise ValueError(f"{what}: the constraints are {values} there, which is not finite.")
+    worst = np.abs(values).max()
+    if worst > tolerance:
+        raise ValueError(
+            f"{what} violate the constraints by {worst:.3e} (row {np.abs(values).argmax()} of {values.size}, tolerance "
+            f"{tolerance:.0e}); {advice}"
+        )
     (n_g, n_s), (_, n_f), n_gs = slow.shape, fast.shape, len(alone)
     if n_gs > n_s:
         raise ValueError(
             f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
+        )
+    if n_gs and np.isfinite(alone).all() and _rank(alone) < n_gs:
+        raise ValueError(
+            f"System: the {n_gs} rows of slow_constraint have rank {_rank(alone)} at these positions; remove redundant rows."
         )
     if not n_g:
         return
@@ -175,9 +209,15 @@ def check_constraints(system: System, q_s, q_f) -> None:
             f"System: row(s) {slow_only.tolist()} of constraint do not depend on the fast variables q_f. {fix} "
             "Pass them as slow_constraint(q_s, params), which is held at the macro nodes."
         )
-    rank = np.linalg.matrix_rank(fast / np.linalg.norm(fast, axis=1, keepdims=True), tol=1e-8)
+    rank = _rank(fast)
     if rank < n_g:
         raise ValueError(
             f"System: the {n_g} constraint rows have rank {rank} in the fast variables at the initial positions. {fix} "
             "Remove redundant rows, or make the variables they need fast."
         )
+
+
+def _rank(jacobian) -> int:
+    """Rank of the rows, each scaled to length one."""
+    size = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    return int(np.linalg.matrix_rank(jacobian / np.where(size > 0, size, 1), tol=1e-8))

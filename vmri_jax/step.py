@@ -71,8 +71,10 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
     """The parts of a macro step whose slow equations, kicks aside, do not see the fast unknowns, else None."""
     n_s, n_f = q_s.shape[0], q_f.shape[0]
     params = system.params
-    if not n_s or scheme.degree > 1 or system.force is not None or not isinstance(system.kinetic, ConstantMass):
+    if scheme.degree > 1 or system.force is not None or not isinstance(system.kinetic, ConstantMass):
         return None
+    if scheme.num_micro == 1 and not n_s:
+        return None  # a part already
     slow_potential, fast_potential, constraint = system.slow_potential, system.fast_potential, system.constraint
     kicked = {}
     if slow_potential is not None and scheme.slow.grid == "macro" and scheme.slow.only_ends:
@@ -163,7 +165,7 @@ def start_memory(system: System, scheme: Scheme, state: State) -> Memory:
 def advance(system: System, scheme: Scheme, state: State, macro_dt, newton: Newton, memory: Memory):
     """`macro_step` that takes and hands on a `Memory`: (state, info, memory)."""
     state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
-    p_s, p_f, v_s, v_f = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    p_s, p_f, v_s, v_f = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f, memory.velocity)
     state = State(state.t, state.q_s, state.q_f, p_s, p_f)
     finite = jnp.all(jnp.isfinite(jnp.concatenate([state.q_s, state.q_f, p_s, p_f])))
     multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, info.multiplier, info.slow_multiplier)

@@ -49,11 +49,11 @@ def _solve(mass, p):
 
 
 def _mass(name: str, mass):
-    if not is_concrete(mass):
-        return mass
-    mass = mass if isinstance(mass, jax.Array) else np.asarray(mass, dtype=float)
+    mass = jnp.asarray(mass, dtype=float)
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
         raise ValueError(f"ConstantMass: {name} has shape {mass.shape}; give (n,) masses or an (n, n) mass matrix.")
+    if not is_concrete(mass):
+        return mass
     values = np.asarray(mass)
     if not np.all(np.isfinite(values)):
         raise ValueError(f"ConstantMass: {name} = {values} is not finite.")

@@ -54,15 +54,16 @@ class Trajectory(eqx.Module):
 
     @property
     def final_state(self):
-        """`State` at the last saved node."""
+        """`State` at the last saved node (of every run, in a batch)."""
         from vmri_jax.state import State
 
-        return State(self.t[-1], self.q_s[-1], self.q_f[-1], self.p_s[-1], self.p_f[-1])
+        return State(self.t[..., -1], *(x[..., -1, :] for x in (self.q_s, self.q_f, self.p_s, self.p_f)))
 
     def save(self, path) -> None:
         """Write all arrays to a .npz file (no pickled objects)."""
         arrays = {name: np.asarray(value) for name, value in _flat(self).items() if value is not None}
-        np.savez_compressed(path, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
+        with FilePath(path).open("wb") as file:  # an open file, or numpy appends .npz to other names
+            np.savez_compressed(file, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def load(cls, path) -> "Trajectory":

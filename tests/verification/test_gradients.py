@@ -87,3 +87,14 @@ def test_gradient_with_respect_to_a_state_and_the_step(fpu):
     ]
     assert np.allclose(gradient, expected, rtol=1e-6, atol=1e-9)
     assert float(by_step) == pytest.approx(central_difference(lambda x: end(start.q_f, x), 0.05, 1e-3), rel=1e-5)
+
+
+@pytest.mark.parametrize("hessian", [jax.hessian, lambda f: jax.jacfwd(jax.jacfwd(f))], ids=["over reverse", "forward"])
+def test_second_derivative(fpu, hessian):
+    def end(omega):
+        system = fpu.system.replace(params={"omega": omega})
+        return simulate(system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=3, save_every=3).q_f[-1, 0]
+
+    slope, step = jax.jit(jax.grad(end)), 1e-3
+    difference = float(slope(50.0 + step) - slope(50.0 - step)) / (2 * step)
+    assert float(jax.jit(hessian(end))(50.0)) == pytest.approx(difference, rel=1e-6)  # measured 2e-9

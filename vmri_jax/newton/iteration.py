@@ -53,7 +53,7 @@ def solve(equations: StepEquations, guess: Unknowns, newton: Newton):
     Converged when the predicted size of all further updates is below ``tolerance`` times the increments, or round-off
     of the positions. With the contraction ``theta = |d_k| / |d_(k-1)|`` the next update is expected to be
     ``|d_k| theta min(1, SAFETY theta)``: quadratic convergence with a margin, linear convergence at worst.
-    The solution is differentiable in both modes with respect to everything in `equations`.
+    The solution is differentiable in both modes, twice, with respect to everything in `equations`.
     """
     fixed = jax.lax.stop_gradient(equations)
     x, result, iterations = _iterate(fixed, jax.lax.stop_gradient(guess), newton)
@@ -62,26 +62,30 @@ def solve(equations: StepEquations, guess: Unknowns, newton: Newton):
 
 def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton):
     eps = jnp.finfo(jnp.result_type(float)).eps
-    floor = (eps * _largest(equations.q_s), eps * _largest(equations.q_f))
+    positions = jnp.maximum(_largest(equations.q_s), _largest(equations.q_f))
 
-    def size(d: Unknowns, x: Unknowns, relative):
-        """Largest update over what is accepted, slow and fast each by its own measure."""
-        tiny = jnp.finfo(eps.dtype).tiny
+    def size(d: Unknowns, x: Unknowns):
+        """Largest update over what is accepted, slow and fast each by its own measure.
+
+        Variables that only see round-off of the others (a centre of mass at rest) have no size of their own.
+        """
+        others = eps * jnp.maximum(_largest(x.slow), _largest(x.fast)) + jnp.finfo(eps.dtype).tiny
         return jnp.maximum(
-            _largest(d.slow) / (relative * _largest(x.slow) + floor[0] + tiny),
-            _largest(d.fast) / (relative * _largest(x.fast) + floor[1] + tiny),
+            _largest(d.slow) / (newton.tolerance * _largest(x.slow) + eps * _largest(equations.q_s) + others),
+            _largest(d.fast) / (newton.tolerance * _largest(x.fast) + eps * _largest(equations.q_f) + others),
         )
 
     def iterate(carry):
         x, previous, k, _ = carry
         d = _direction(newton.linear_solver, equations, x, equations.residual(x))
         x = jax.tree.map(jnp.add, x, d)
-        update = size(d, x, newton.tolerance)
+        update = size(d, x)
         contraction = update / previous
         shrink = contraction * jnp.minimum(1.0, SAFETY * contraction)  # of the next update: quadratic convergence
         error = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
         error = jnp.where(k == 0, update, error)
-        at_floor = (contraction > 0.5) & (size(d, x, ROUNDOFF_FLOOR * eps) <= ROUNDOFF_FLOOR)
+        largest = jnp.maximum(_largest(d.slow), _largest(d.fast))
+        at_floor = (contraction > 0.5) & (largest <= ROUNDOFF_FLOOR * eps * positions)
         last = jnp.where(update > previous, Result.DIVERGED, Result.STAGNATED)
         running = jnp.where(k + 1 >= newton.max_iterations, last, _RUNNING)
         result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, running)
@@ -122,6 +126,8 @@ def _differentiable(linear_solver: str, equations: StepEquations, x: Unknowns) -
 
 @_differentiable.defjvp
 def _implicit_derivative(linear_solver, primals, tangents):
-    equations, x = primals
+    equations, root = primals
+    # One more Newton step: it moves nothing, but makes the root depend on the equations, for second derivatives.
+    x = jax.tree.map(jnp.add, root, _direction(linear_solver, equations, root, equations.residual(root)))
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
     return x, _direction(linear_solver, equations, x, change)
