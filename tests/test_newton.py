@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from tests.support import compiled_step, largest_difference
-from vmri_jax import Newton, Result, State, fully_implicit, simulate
+from vmri_jax import ConstantMass, Newton, Result, State, System, fully_implicit, initial_state, simulate
 
 
 def step(problem, scheme, macro_dt, newton=None, state=None):
@@ -88,3 +88,20 @@ def test_bad_options_are_refused(arguments, message):
 def test_every_status_has_a_message():
     assert all(len(result.message) > 40 and result.message.endswith(".") for result in Result)
     assert [result.success for result in Result] == [True, True, False, False, False]
+
+
+def pair(q_s, q_f, params):
+    return jnp.sum((q_f - q_s) ** 4) / 2
+
+
+def stiff_pair(q_f, params):
+    return 50 * jnp.sum(q_f**2)
+
+
+def test_slow_variable_that_only_sees_round_off():
+    """A symmetric pair leaves its centre at rest but for round-off: no size of its own to converge relative to."""
+    system = System(ConstantMass([1.0], [1.0, 1.0]), pair, stiff_pair)
+    state = initial_state(system, [0.0], [0.3, -0.3], [0.0], [0.0, 0.0])
+    run = simulate(system, fully_implicit(4), state, macro_dt=0.1, num_steps=200)
+    assert int(run.info.iterations.max()) <= 3
+    assert float(jnp.abs(run.q_s).max()) < 1e-15  # measured 1e-17

@@ -43,7 +43,7 @@ def test_galerkin_schemes(degree, rule):
         (explicit_slow(3, 0.4), 1),
         (fully_explicit(3, 1.0), 1),
         (galerkin(2, 1, quadrature.gauss(3)), 2),
-        (galerkin(2, 3, quadrature.gauss(2)), 4),
+        (galerkin(2, 3, quadrature.lobatto(3)), 4),
         (galerkin(2, 2, quadrature.radau(2)), 3),
     ],
 )
@@ -74,3 +74,15 @@ def test_macro_rules_on_the_border_of_two_micro_intervals_are_kept_for_positions
 def test_unknown_rule_name_is_refused():
     with pytest.raises(ValueError, match="rule is 'simpson'; it must be 'gauss', 'lobatto' or a Rule"):
         galerkin(2, 2, "simpson")
+
+
+def test_kinetic_rule_that_misses_a_velocity_is_refused():
+    rule = micro(quadrature.gauss(2))
+    with pytest.raises(ValueError, match=r"kinetic rule .* does not see every velocity of a path of degree 3"):
+        Scheme(2, 3, kinetic=rule, slow=rule, fast=rule)
+
+
+def test_zero_constraint_weight_is_refused():
+    rule = micro(quadrature.midpoint)
+    with pytest.raises(ValueError, match="weight of the slow_constraint rule is zero"):
+        Scheme(2, kinetic=rule, slow=rule, fast=rule, slow_constraint=macro(quadrature.Rule((0, 1), (0, 1))))

@@ -8,7 +8,7 @@ import pytest
 from tests.support import largest_difference
 from tests.user_systems import arms_kinetic, bent_system, double_pendulum
 from vmri_jax import System, fully_implicit, initial_state, simulate
-from vmri_jax.diagnostics import constraint_residual
+from vmri_jax.diagnostics import constraint_residual, velocity
 from vmri_jax.state import legendre, project_momentum
 
 
@@ -140,3 +140,32 @@ def test_redundant_constraints_are_refused():
     q_s, q_f = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])
     with pytest.raises(ValueError, match=r"2 constraint rows have rank 1 in the fast variables.*Remove redundant rows"):
         initial_state(system, q_s, q_f, q_s, q_f)
+
+
+def quartic_kinetic(q_s, q_f, v_s, v_f, params):
+    return jnp.sum(v_s**2 / 2 + v_s**4 / 4) + jnp.sum(v_f**2) / 2
+
+
+def relativistic_kinetic(q_s, q_f, v_s, v_f, params):
+    """With the same equations of motion as -sqrt(1 - v^2); infinite slope at v = 1."""
+    return jnp.sum(1 - jnp.sqrt(1 - v_s**2)) + jnp.sum(v_f**2) / 2
+
+
+def soft_and_coupled(q_s, q_f, params):
+    return jnp.sum(q_s**2 + q_s * q_f) / 2
+
+
+@pytest.mark.parametrize(("kinetic", "v"), [(quartic_kinetic, 3.0), (relativistic_kinetic, 0.9)])
+def test_velocity_of_a_kinetic_energy_that_is_not_quadratic(kinetic, v):
+    system = System(kinetic, slow_potential=soft_and_coupled)
+    state = initial_state(system, [0.0], [0.1], [v], [0.5])
+    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    assert float(v_s[0]) == pytest.approx(v, rel=1e-13)
+    assert float(v_f[0]) == pytest.approx(0.5, rel=1e-13)
+
+
+def test_relativistic_run_keeps_its_energy_band():
+    system = System(relativistic_kinetic, slow_potential=soft_and_coupled)
+    state = initial_state(system, [0.0], [0.1], [0.9], [0.0])
+    run = simulate(system, fully_implicit(4), state, macro_dt=0.02, num_steps=500)
+    assert float(jnp.abs(run.energy - run.energy[0]).max()) < 5e-4  # measured 4e-5 with a stiff spring besides
