@@ -83,7 +83,7 @@ class Rule(eqx.Module):
 
     def repeat(self, count: int) -> "Rule":
         """Composite rule: this one on each of ``count`` equal subintervals, shared end nodes merged."""
-        _check_count("repeat", count, 1)
+        _check_count("repeat", count, 1, "count")
         nodes = tuple((m + node) / count for m in range(count) for node in self.nodes)
         return _merge(nodes, [self.weights / count] * count)
 
@@ -166,9 +166,9 @@ def affine(alpha) -> Rule:
     return alpha * left + (1 - alpha) * right
 
 
-def _check_count(name: str, n: int, least: int) -> None:
+def _check_count(name: str, n: int, least: int, what: str = "number of nodes") -> None:
     if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < least:
-        raise ValueError(f"{name}: the number is {n!r}; it must be an integer of at least {least}.")
+        raise ValueError(f"{name}: the {what} is {n!r}; it must be an integer of at least {least}.")
 
 
 left = Rule((0.0,), (1.0,))

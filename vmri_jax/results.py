@@ -50,7 +50,7 @@ class SimulationError(RuntimeError):
         result: the `Result` of the failing step.
         step: index of the failing macro step (0 = the first).
         time: time at the start of that step.
-        iterations, residual: the most Newton iterations and the largest residual of a step since the saved node before.
+        iterations, residual: the most Newton iterations and the largest residual of a step from the saved node before to it.
         trajectory: the `Trajectory` up to the failure (NaN after it).
     """
 

@@ -88,15 +88,14 @@ def _run(
     n = scheme.num_micro
 
     def step(_, carry):
-        state, memory, k, status, worst, _ = carry
+        state, memory, k, (result, failed_at), worst, _ = carry
         state, info, memory = advance(system, scheme, state, macro_dt, newton, memory)
-        failed = (info.result > Result.CONVERGED_AT_ROUNDOFF) & (status[1] < 0)
-        ok = (status[1] < 0) & ~failed
-        status = (
-            jnp.where(status[1] < 0, jnp.maximum(status[0], info.result), status[0]),
-            jnp.where(failed, k, status[1]),
-        )
-        worst = (jnp.maximum(worst[0], info.iterations), jnp.maximum(worst[1], info.residual))
+        alive = failed_at < 0  # until the step before
+        ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
+        now = (info.iterations, info.residual)
+        worst = tuple(jnp.where(alive, jnp.maximum(w, x), w) for w, x in zip(worst, now, strict=True))
+        result = jnp.where(alive, jnp.maximum(result, info.result), result)
+        status = (result, jnp.where(alive & ~ok, k, failed_at))
         state = jax.tree.map(lambda a: jnp.where(ok, a, jnp.nan), state)
         state = State(t_start + (k + 1) * macro_dt, state.q_s, state.q_f, state.p_s, state.p_f)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
