@@ -65,9 +65,9 @@ def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(f
     assert 1e-15 < largest_difference(loose.q_s, exact.q_s) < 1e-4
 
 
-def test_solution_does_not_depend_on_the_linear_solver(tsp):
+def test_solution_does_not_depend_on_the_method(tsp):
     scheme = fully_implicit(5)
-    ends = [step(tsp, scheme, 0.05, Newton(linear_solver=s))[0] for s in ("arrowhead", "dense")]
+    ends = [step(tsp, scheme, 0.05, Newton(method=s))[0] for s in ("arrowhead", "dense")]
     for a, b in zip(jax.tree.leaves(ends[0]), jax.tree.leaves(ends[1]), strict=True):
         assert largest_difference(a, b) < 1e-10
 
@@ -75,7 +75,7 @@ def test_solution_does_not_depend_on_the_linear_solver(tsp):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"linear_solver": "sparse"}, "linear_solver is 'sparse'; it must be one of arrowhead, dense"),
+        ({"method": "sparse"}, "method is 'sparse'; it must be one of arrowhead, dense"),
         ({"tolerance": 0.0}, "tolerance is 0.0; it must be positive"),
         ({"max_iterations": 0}, "max_iterations is 0; it must be positive"),
     ],

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import ConstantMass, System
-from vmri_jax.system import depends_on
+from vmri_jax.structure import depends_on
 
 
 def test_diagonal_and_matrix_masses_agree():

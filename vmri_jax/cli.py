@@ -102,7 +102,7 @@ def simulate(
     save_every: Annotated[
         int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
     ] = None,
-    linear_solver: Annotated[str, typer.Option(help="arrowhead or dense.")] = "arrowhead",
+    method: Annotated[str, typer.Option(help="arrowhead or dense.")] = "arrowhead",
     out: Annotated[Path | None, typer.Option(help="Write the trajectory here, .npz.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw it here: .png, .svg or .pdf.")] = None,
 ) -> None:
@@ -112,7 +112,7 @@ def simulate(
         _check_target("--plot", plot, (".png", ".svg", ".pdf"))
         problem = find_problem(system)
         chosen = find_scheme(scheme, num_micro, alpha=alpha, degree=degree, rule=rule)
-        newton = vm.Newton(linear_solver=linear_solver)  # pyright: ignore[reportArgumentType]
+        newton = vm.Newton(method=method)  # pyright: ignore[reportArgumentType]
         save_every = _default_save_every(steps) if save_every is None else save_every
         compiling = _compile_clock()
         start = time.perf_counter()

@@ -66,8 +66,12 @@ class StepEquations(eqx.Module):
 
     def action(self, path: Path, at: Path, x: Unknowns):
         """Augmented action times h; forces act on the virtual displacement of `path`, evaluated along `at`."""
+        return self.unconstrained(path, at) - self.constraint_work(path, x)
+
+    def unconstrained(self, path: Path, at: Path):
+        """The action times h without constraints."""
         discrete_lagrangian = lagrangian(self.system, self.scheme).at_nodes_inside(path)
-        return self.micro_dt * (discrete_lagrangian + self.virtual_work(path, at)) - self.constraint_work(path, x)
+        return self.micro_dt * (discrete_lagrangian + self.virtual_work(path, at))
 
     def virtual_work(self, path: Path, at: Path):
         """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, with the forces along `at`."""

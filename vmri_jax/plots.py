@@ -227,9 +227,9 @@ def plot_cost(
 
 def _cost_panel(axes: Axes, study: "CostStudy", paper_minimum: int | None, theme: Theme) -> None:
     one_label = len({label for label, _ in study.curves}) == 1
-    for i, (label, linear_solver) in enumerate(study.curves):
-        num_micro, cost = study.curve(label, linear_solver)
-        name = linear_solver if one_label else f"{label}, {linear_solver}"
+    for i, (label, method) in enumerate(study.curves):
+        num_micro, cost = study.curve(label, method)
+        name = method if one_label else f"{label}, {method}"
         color = theme.curves[i % len(theme.curves)]
         axes.loglog(num_micro, cost, marker=MARKERS[i], markersize=4, color=color, label=name)
         if np.isfinite(cost).any():

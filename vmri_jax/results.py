@@ -43,6 +43,21 @@ _MESSAGES = {
 }
 
 
+class Method(IntEnum):
+    """How the equations of a step were solved, in order of cost; of several the most expensive one is reported.
+
+    EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. The others are methods of `Newton`.
+    """
+
+    EXPLICIT = 0
+    LINEAR = 1
+    MARCH = 2
+    DECOUPLED = 3
+    FROZEN = 4
+    ARROWHEAD = 5
+    DENSE = 6
+
+
 class SimulationError(RuntimeError):
     """A run failed at some macro step; what was computed before is in `.trajectory`.
 

@@ -1,5 +1,6 @@
 """Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -63,16 +64,28 @@ def simulate(
     )
     start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
     newton, num_saves = newton or Newton(), num_steps // save_every
-    memory = _checked_memory(system, scheme, start)
+    memory = _checked_memory(system, scheme, start, macro_dt, newton)
     if not is_concrete((system, scheme, start, macro_dt, newton)):
         run = partial(_run_static, system, scheme, newton, macro_dt, start.t)
         return run(start, memory, 0, num_saves, save_every, save_micro)[0]
 
     check_constraints(system, start.q_s, start.q_f, "simulate: the state")
+    run = partial(_run_traced, system, scheme)
+    cheap = newton
+    if newton.method == "auto" and newton.marches(system, scheme):
+        cheap = dataclasses.replace(newton, method="march")  # "auto" compiles its fallback too: only if it is needed
     pieces, state, first_step = [], start, 0
     for saves in _chunks(num_saves, progress):
-        run = partial(_run_traced, system, scheme, newton, macro_dt, start.t)
-        piece, memory = run(state, memory, first_step, saves, save_every, save_micro)
+        piece, memory = run(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
+        failed = int(piece.failed_at)
+        if failed >= 0 and cheap is not newton:
+            cheap, kept = newton, (failed - first_step) // save_every
+            if kept:
+                pieces.append(piece.first(kept))
+                state, memory = pieces[-1].final_state, None
+                first_step, saves = first_step + kept * save_every, saves - kept
+            memory = _checked_memory(system, scheme, state, macro_dt, newton)
+            piece, memory = run(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
         pieces.append(piece)
         state, first_step = piece.final_state, first_step + saves * save_every
     trajectory = pieces[0] if len(pieces) == 1 else join(pieces)
@@ -92,7 +105,7 @@ def _run(
         state, info, memory = advance(system, scheme, state, macro_dt, newton, memory)
         alive = failed_at < 0  # until the step before
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
-        now = (info.iterations, info.residual)
+        now = (info.method, info.iterations, info.residual)
         worst = tuple(jnp.where(alive, jnp.maximum(w, x), w) for w, x in zip(worst, now, strict=True))
         result = jnp.where(alive, jnp.maximum(result, info.result), result)
         status = (result, jnp.where(alive & ~ok, k, failed_at))
@@ -103,7 +116,7 @@ def _run(
 
     def save(carry, _):
         state, memory, k, status = carry
-        worst = (jnp.asarray(0), jnp.zeros(()))
+        worst = (jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
         micro = jnp.zeros((n, state.q_f.shape[0])) if save_micro else None
         carry = (state, memory, k, status, worst, micro)
         state, memory, k, status, worst, micro = jax.lax.fori_loop(0, save_every, step, carry)
@@ -144,10 +157,10 @@ _run_static = jax.jit(_run, static_argnames=("num_saves", "save_micro", "save_ev
 
 
 @jax.jit
-def _checked_memory(system, scheme, state):
+def _checked_memory(system, scheme, state, macro_dt, newton):
     """`start_memory`; what the user's functions return is checked while tracing."""
     check_system(system, state.q_s, state.q_f)
-    return start_memory(system, scheme, state)
+    return start_memory(system, scheme, state, macro_dt, newton)
 
 
 def _chunks(num_saves: int, progress: bool):
@@ -176,7 +189,7 @@ def _check(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_ev
     if not isinstance(state, State):
         raise TypeError(f"simulate: state is {type(state).__name__}; give a State, e.g. from initial_state(...).")
     if not isinstance(newton, Newton | None):
-        raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(linear_solver='dense').")
+        raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(method='dense').")
     if (macro_dt is None) == (micro_dt is None):
         got = "neither" if macro_dt is None else "both"
         raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")

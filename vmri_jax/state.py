@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax import algebra
 from vmri_jax.checks import check_arrays, check_system, require_x64
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.system import ConstantMass, System
@@ -45,8 +46,9 @@ def project_momentum(system: System, q_s, q_f, p_s, p_f, guess=None):
         v_s, v_f = system.kinetic.velocity(p_s, p_f)
         if jacobian.shape[0]:
             inverse_mass = jnp.concatenate(system.kinetic.velocity(jacobian[:, :n_s], jacobian[:, n_s:]), axis=1)
-            mu = jnp.linalg.solve(inverse_mass @ jacobian.T, jacobian @ jnp.concatenate([v_s, v_f]))
-            correction = mu @ jacobian
+            drift = algebra.matvec(jacobian, jnp.concatenate([v_s, v_f]))
+            mu = algebra.solve(algebra.matmul(inverse_mass, jacobian.T), drift[:, None])
+            correction = jnp.sum(mu * jacobian, axis=0)
             p_s, p_f = p_s - correction[:n_s], p_f - correction[n_s:]
             v_s, v_f = system.kinetic.velocity(p_s, p_f)
         return p_s, p_f, v_s, v_f

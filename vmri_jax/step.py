@@ -18,25 +18,29 @@ import jax.numpy as jnp
 
 from vmri_jax.discrete_lagrangian import Term, lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
-from vmri_jax.newton import Newton, relative_residual, solve
+from vmri_jax.newton import Newton, Warm, interval_matrix, is_constant, solve
+from vmri_jax.path import control_nodes
 from vmri_jax.quadrature import micro, midpoint
-from vmri_jax.results import Result
+from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, project_momentum
-from vmri_jax.system import ConstantMass, System, depends_on
+from vmri_jax.structure import depends_on
+from vmri_jax.system import ConstantMass, System
 
 
 class StepInfo(eqx.Module):
     """What a macro step did.
 
     result: status code, see `Result`.
+    method: code of how its equations were solved, see `Method`; with "auto" ARROWHEAD says that it fell back.
     iterations: Newton iterations (the most that any of its solves took; 0 for explicit steps).
-    residual: largest residual left, relative to the momentum, and of the constraints.
+    residual: largest residual left, relative to the momentum, and of the constraints; 0 where equations are linear.
     q_f_micro: (num_micro, n_f) fast positions at the micro nodes, the start excluded.
     multiplier, slow_multiplier: (num_micro, r, n_g) and (r, n_gs) Lagrange multipliers at the control nodes.
     """
 
     result: Any
+    method: Any
     iterations: Any
     residual: Any
     q_f_micro: Any
@@ -45,12 +49,17 @@ class StepInfo(eqx.Module):
 
 
 class Memory(NamedTuple):
-    """What a step hands to the next: gradients of the kicks at the node they share, and what Newton starts from."""
+    """What a step hands to the next: gradients of the kicks at the node they share, and what Newton starts from.
+
+    matrix: of the micro intervals, computed once per run where it is constant, else once per macro step.
+    """
 
     kicks: Any
     velocity: Any
     multiplier: Any
     slow_multiplier: Any
+    matrix: Any = None
+    warm: Any = None
     parts: Any = None
 
 
@@ -144,11 +153,13 @@ def macro_step(
         macro_dt: length H of the macro step, positive.
         newton: how implicit equations are solved.
     """
-    state, info, _ = advance(system, scheme, state, macro_dt, newton or Newton(), start_memory(system, scheme, state))
+    newton = newton or Newton()
+    memory = start_memory(system, scheme, state, macro_dt, newton)
+    state, info, _ = advance(system, scheme, state, macro_dt, newton, memory)
     return state, info
 
 
-def start_memory(system: System, scheme: Scheme, state: State) -> Memory:
+def start_memory(system: System, scheme: Scheme, state: State, macro_dt, newton: Newton) -> Memory:
     """Memory of a first step: gradients evaluated, velocity from the momentum, multipliers zero."""
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     velocity = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f)[2:]
@@ -157,13 +168,39 @@ def start_memory(system: System, scheme: Scheme, state: State) -> Memory:
     memories = None
     if parts is not None:
         slow, fast = _slow_and_fast(state)
-        memories = start_memory(parts.slow, parts.slow_scheme, slow), start_memory(parts.fast, parts.fast_scheme, fast)
+        memories = (
+            start_memory(parts.slow, parts.slow_scheme, slow, macro_dt, newton),
+            start_memory(parts.fast, parts.fast_scheme, fast, macro_dt / scheme.num_micro, newton),
+        )
     kicks = _kick_gradients(own, scheme, state.q_s, state.q_f)
-    return Memory(kicks, velocity, jnp.zeros(n_g), jnp.zeros(n_gs), memories)
+    matrix = warm = None
+    if parts is None and not is_explicit(system, scheme) and newton.marches(system, scheme):
+        matrix = interval_matrix(_equations(system, scheme, state, macro_dt))
+        warm = Warm.straight(control_nodes(scheme.degree)[1:, None] * (macro_dt * velocity[0]), n_g, n_gs)
+    return Memory(kicks, velocity, jnp.zeros(n_g), jnp.zeros(n_gs), matrix, warm, memories)
+
+
+def _renew_matrix(system, scheme, state, macro_dt, memory: Memory) -> Memory:
+    """The matrix of the micro intervals at the start of this macro step, unless it is constant."""
+    if memory.parts is not None:
+        parts = split(system, scheme, state.q_s, state.q_f)
+        slow, fast = _slow_and_fast(state)
+        slow_memory, fast_memory = memory.parts
+        slow_memory = _renew_matrix(parts.slow, parts.slow_scheme, slow, macro_dt, slow_memory)
+        fast_memory = _renew_matrix(parts.fast, parts.fast_scheme, fast, macro_dt / scheme.num_micro, fast_memory)
+        return memory._replace(parts=(slow_memory, fast_memory))
+    if memory.matrix is None or is_constant(system, scheme, state.q_s, state.q_f):
+        return memory
+    return memory._replace(matrix=interval_matrix(_equations(system, scheme, state, macro_dt)))
+
+
+def _equations(system, scheme, state, macro_dt) -> StepEquations:
+    return StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
 
 
 def advance(system: System, scheme: Scheme, state: State, macro_dt, newton: Newton, memory: Memory):
     """`macro_step` that takes and hands on a `Memory`: (state, info, memory)."""
+    memory = _renew_matrix(system, scheme, state, macro_dt, memory)
     state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
     p_s, p_f, v_s, v_f = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f, memory.velocity)
     state = State(state.t, state.q_s, state.q_f, p_s, p_f)
@@ -214,6 +251,7 @@ def _drift(system, state, macro_dt):
     q_s, q_f = state.q_s + macro_dt * v_s, state.q_f + macro_dt * v_f
     info = StepInfo(
         jnp.asarray(int(Result.CONVERGED)),
+        jnp.asarray(int(Method.EXPLICIT)),
         jnp.asarray(0),
         jnp.zeros(()),
         q_f[None],
@@ -243,6 +281,7 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
     (fast, fast_memory), infos = jax.lax.scan(micro_step, (fast, fast_memory), length=num_micro)
     info = StepInfo(
         result=jnp.maximum(slow_info.result, infos.result.max()),
+        method=jnp.maximum(slow_info.method, infos.method.max()),
         iterations=jnp.maximum(slow_info.iterations, infos.iterations.max()),
         residual=jnp.maximum(slow_info.residual, infos.residual.max()),
         q_f_micro=infos.q_f_micro[:, 0],
@@ -255,23 +294,23 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
 
 def _move_coupled(system, scheme, state, macro_dt, newton, memory):
     """All unknowns of the macro step at once, by Newton's iteration."""
-    equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
+    equations = _equations(system, scheme, state, macro_dt)
     v_s, v_f = memory.velocity
     if isinstance(system.kinetic, ConstantMass):  # the momentum is at hand, kicks included
         v_s, v_f = system.kinetic.velocity(state.p_s, state.p_f)
-    x, result, iterations = solve(
-        equations, equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier), newton
-    )
-    residual, (p_s, p_f) = equations.evaluate(x)
+    guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
+    found, warm = solve(equations, guess, newton, memory.matrix, memory.warm)
+    x = found.x
     multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, x.multiplier, x.slow_multiplier)
-    memory = memory._replace(multiplier=multiplier[-1, -1], slow_multiplier=slow_multiplier[-1])
+    memory = memory._replace(multiplier=multiplier[-1, -1], slow_multiplier=slow_multiplier[-1], warm=warm)
     info = StepInfo(
-        result,
-        iterations,
-        relative_residual(equations, residual),
+        found.result,
+        found.method,
+        found.iterations,
+        found.residual,
         q_f_micro=equations.path(x).fast_start + x.fast[:, -1],
         multiplier=x.multiplier,
         slow_multiplier=x.slow_multiplier,
     )
-    end = State(state.t + macro_dt, state.q_s + x.slow[-1], info.q_f_micro[-1], p_s, p_f)
+    end = State(state.t + macro_dt, state.q_s + x.slow[-1], found.q_f, found.p_s, found.p_f)
     return end, info, memory

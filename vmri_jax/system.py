@@ -172,19 +172,3 @@ class Problem:
         from vmri_jax.state import initial_state
 
         return initial_state(self.system, self.q_s, self.q_f, self.v_s, self.v_f, self.t, project=project)
-
-
-def depends_on(function: Callable, *args) -> tuple[bool, ...]:
-    """Whether the outputs of ``function(*args)`` can depend on each argument, read off its jaxpr.
-
-    Structural and conservative: True may be wrong (``0 * x`` counts), False never is.
-    """
-    jaxpr = jax.make_jaxpr(function)(*args).jaxpr
-    needed = {id(v) for v in jaxpr.outvars}
-    for eqn in reversed(jaxpr.eqns):
-        if any(id(v) in needed for v in eqn.outvars):
-            needed.update(id(v) for v in eqn.invars)
-    leaves = [jax.tree.structure(a).num_leaves for a in args]
-    stops = np.cumsum(leaves)
-    used = [id(v) in needed for v in jaxpr.invars]
-    return tuple(any(used[stop - n : stop]) for n, stop in zip(leaves, stops, strict=True))

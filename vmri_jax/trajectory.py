@@ -10,12 +10,19 @@ import numpy as np
 
 from vmri_jax.results import Result
 
-FORMAT = "vmri_jax trajectory 1"
+FORMAT = "vmri_jax trajectory 2"
+NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
+"""Fields with one entry per saved node; all others but `STATUS` have one per saved interval."""
+STATUS = ("result", "failed_at")
 
 
 class RunInfo(NamedTuple):
-    """What the solver did between saved nodes: most iterations and largest residual of a step, as in `StepInfo`."""
+    """What the solver did between saved nodes: most expensive method, most iterations and largest residual of a step.
 
+    As in `StepInfo`; `Method` names the codes of the methods.
+    """
+
+    method: Any
     iterations: Any
     residual: Any
 
@@ -58,6 +65,12 @@ class Trajectory(eqx.Module):
         from vmri_jax.state import State
 
         return State(self.t[..., -1], *(x[..., -1, :] for x in (self.q_s, self.q_f, self.p_s, self.p_f)))
+
+    def first(self, count: int) -> "Trajectory":
+        """The first `count` saved intervals of a run that had not failed by then."""
+        stops = {name: count + 1 for name in NODES}
+        flat = {name: a if a is None or name in STATUS else a[: stops.get(name, count)] for name, a in _flat(self).items()}
+        return _from_flat(flat | {"result": jnp.asarray(int(Result.CONVERGED)), "failed_at": jnp.asarray(-1)})
 
     def save(self, path) -> None:
         """Write all arrays to a .npz file (no pickled objects)."""
@@ -107,6 +120,7 @@ class Trajectory(eqx.Module):
             "p_f": (("t", "fast"), self.p_f),
             "energy": ("t", self.energy),
             "constraint_residual": (("t", "level"), self.constraint_residual),
+            "method": ("t_end", self.info.method),
             "iterations": ("t_end", self.info.iterations),
             "residual": ("t_end", self.info.residual),
         }
@@ -121,16 +135,15 @@ class Trajectory(eqx.Module):
 
 def join(pieces: list[Trajectory]) -> Trajectory:
     """Consecutive trajectories, each starting where the one before ends, as one."""
-    nodes = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
     flat = [_flat(piece) for piece in pieces]
     failed = next((f for f in flat if int(f["failed_at"]) >= 0), flat[-1])
 
     def joined(name, first):
         if first is None:
             return None
-        if name in ("result", "failed_at"):
+        if name in STATUS:
             return jnp.asarray(failed[name])
-        skip = 1 if name in nodes else 0  # a piece starts with the last node of the one before
+        skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
         return jnp.concatenate([first] + [f[name][skip:] for f in flat[1:]])
 
     return _from_flat({name: joined(name, first) for name, first in flat[0].items()})

@@ -24,7 +24,7 @@ def study():
 
 
 def test_rows(study):
-    assert [(row.linear_solver, row.num_micro) for row in study.rows] == [
+    assert [(row.method, row.num_micro) for row in study.rows] == [
         ("dense", 1),
         ("dense", 3),
         ("arrowhead", 1),
@@ -62,14 +62,14 @@ def test_csv(study, tmp_path):
 def test_a_run_that_fails_has_no_time():
     problem = vm.systems.fermi_pasta_ulam(2, omega=1e9)
     study = cost_study(
-        problem, vm.fully_explicit, (2,), micro_dt=1.0, t_end=40.0, linear_solvers=("arrowhead",), repeats=1
+        problem, vm.fully_explicit, (2,), micro_dt=1.0, t_end=40.0, methods=("arrowhead",), repeats=1
     )
     (row,) = study.rows
     assert row.result == "NON_FINITE"
     assert np.isnan(row.us_per_micro_step)
 
 
-@pytest.mark.parametrize("bad", [{"num_micro": ()}, {"linear_solvers": ()}, {"repeats": 0}, {"t_end": 0.0}])
+@pytest.mark.parametrize("bad", [{"num_micro": ()}, {"methods": ()}, {"repeats": 0}, {"t_end": 0.0}])
 def test_bad_input(bad):
     arguments = {"num_micro": (1,), "micro_dt": 0.01, "t_end": 1.0} | bad
     with pytest.raises(ValueError, match="cost_study: num_micro"):

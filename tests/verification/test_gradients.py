@@ -50,10 +50,10 @@ def test_gradient_with_respect_to_a_stiffness(case):
     assert reverse == pytest.approx(expected, rel=2e-7)  # measured 1.6e-8, 1e-6 wanted
 
 
-def test_forward_reverse_and_both_linear_solvers_agree():
+def test_forward_reverse_and_both_methods_agree():
     values = []
     for solver in ("arrowhead", "dense"):
-        function, x = final_position(*CASES["tsp, fully implicit"], Newton(linear_solver=solver))
+        function, x = final_position(*CASES["tsp, fully implicit"], Newton(method=solver))
         values += [float(jax.jit(jax.jacfwd(function))(x)), float(jax.jit(jax.grad(function))(x))]
     assert np.allclose(values, values[0], rtol=1e-9, atol=0)
 

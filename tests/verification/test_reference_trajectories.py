@@ -19,9 +19,9 @@ def scheme_of(case):
     )
 
 
-@pytest.mark.parametrize("linear_solver", ["arrowhead", "dense"])
+@pytest.mark.parametrize("method", ["arrowhead", "dense"])
 @pytest.mark.parametrize("name", sorted(CASES))
-def test_trajectory_equals_the_reference(name, linear_solver):
+def test_trajectory_equals_the_reference(name, method):
     case = CASES[name]
     system = PROBLEMS[case["system"]]().system
     with np.load(DATA / "reference" / f"{name}.npz") as file:
@@ -34,7 +34,7 @@ def test_trajectory_equals_the_reference(name, linear_solver):
         macro_dt=case["macro_step"],
         num_steps=case["steps"],
         save_micro=True,
-        newton=Newton(linear_solver=linear_solver),
+        newton=Newton(method=method),
     )
     differences = {k: relative_difference(getattr(run, k), expected[k]) for k in ("q_s", "q_f", "p_s", "p_f")}
     # stored micro nodes of a step include its start, ours do not

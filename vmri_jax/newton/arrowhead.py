@@ -30,8 +30,11 @@ class Factors(NamedTuple):
     border: Any
 
 
-def factor(blocks: Blocks, like: Unknowns) -> Factors:
-    """Eliminate the chain; `like` gives the shapes of the unknowns."""
+def factor(blocks: Blocks, like: Unknowns, coupled: bool = True) -> Factors:
+    """Eliminate the chain; `like` gives the shapes of the unknowns.
+
+    With ``coupled=False`` the response of slow and fast variables to each other is left out: cheaper, not exact.
+    """
     n, r, n_f = like.fast.shape
     n_s, n_gs, n_g = like.slow.shape[1], like.slow_multiplier.shape[1], like.multiplier.shape[2]
     border = r * n_s
@@ -43,9 +46,13 @@ def factor(blocks: Blocks, like: Unknowns) -> Factors:
     zero = jnp.zeros((n, r * n_g, r * n_g))
     chain = jnp.linalg.inv(jnp.block([[top_left, top_right], [bottom_left, zero]]))
 
-    slots = blocks.fs.reshape(n, r + 1, n_f, border)
-    g = jnp.einsum("mji,mjgb->mjgib", blocks.basis[:, 1:, 1:], blocks.g_s[:, 1:]).reshape(n, r, n_g, border)
-    response, slow_rows = _march(blocks, chain, slots, g)
+    if coupled:
+        slots = blocks.fs.reshape(n, r + 1, n_f, border)
+        g = jnp.einsum("mji,mjgb->mjgib", blocks.basis[:, 1:, 1:], blocks.g_s[:, 1:]).reshape(n, r, n_g, border)
+        response, slow_rows = _march(blocks, chain, slots, g)
+    else:
+        response, slow_rows = jnp.zeros((n, r * (n_f + n_g), border)), jnp.zeros((r, n_s, border))
+        blocks = blocks._replace(sf=jnp.zeros_like(blocks.sf))
 
     force = -jnp.einsum("iga,ij->iajg", blocks.g_slow[:-1], nodes).reshape(border, r * n_gs) / n
     jacobian = jnp.einsum("iga,ij->igja", blocks.g_slow[1:], nodes).reshape(r * n_gs, border)

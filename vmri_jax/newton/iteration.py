@@ -1,7 +1,7 @@
-"""Newton's iteration with a convergence test aware of round-off, differentiable by the implicit function theorem."""
+"""Newton's iteration for the equations of a macro step: its flavours, its convergence test, its derivative."""
 
 from functools import partial
-from typing import Literal
+from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -9,58 +9,152 @@ import jax.numpy as jnp
 
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
-from vmri_jax.newton import arrowhead, dense
-from vmri_jax.results import Result
+from vmri_jax.newton import arrowhead, dense, march
+from vmri_jax.newton.interval import can_be_cut, is_linear
+from vmri_jax.newton.march import RUNNING, Warm
+from vmri_jax.results import Method, Result
 
-LINEAR_SOLVERS = {"arrowhead": arrowhead, "dense": dense}
 SAFETY = 100.0
 """Margin on the quadratic convergence that is expected of Newton's iteration."""
 ROUNDOFF_FLOOR = 100.0
 """Updates below this many units of round-off of the positions that no longer shrink are at the floor."""
 
+Choice = Literal["auto", "march", "frozen", "decoupled", "arrowhead", "dense"]
+
 
 class Newton(eqx.Module):
-    """How the implicit equations of a step are solved.
+    """How the implicit equations of a step are solved; every method ends at the same solution.
+
+    | method | matrix of an iteration | cost per micro step |
+    |---|---|---|
+    | "march" | slow path outside, micro intervals in order, each with a small matrix of its own | lowest |
+    | "frozen" | the arrowhead, factorised once per macro step | |
+    | "decoupled" | the same, without the weak coupling of slow and fast variables | |
+    | "arrowhead" | exact block elimination, O(num_micro) | |
+    | "dense" | exact, one dense factorisation, O(num_micro^2): baseline and oracle | highest |
+
+    "auto" takes "march" where the terms can be cut into micro intervals (constant masses, potentials on the micro grid
+    or kicks at the macro nodes), and "arrowhead" where they cannot or where "march" does not converge; which one it was
+    is in ``StepInfo.method`` and ``Trajectory.info.method``.
 
     Args:
-        linear_solver: "arrowhead" (block march plus border, O(num_micro)) or "dense" (O(num_micro^3), the oracle).
+        method: as above.
         tolerance: accepted error of the increments of the step, relative to their size. Errors of the positions at
             the level of round-off are always accepted.
         max_iterations: after so many iterations the step fails.
+        fixed_iterations: do exactly so many iterations and check the result afterwards, without a loop that depends
+            on the data: faster in batches of similar problems.
 
     Raises:
-        ValueError: an unknown solver, a tolerance that is not positive, max_iterations below 1.
+        ValueError: an unknown method, a tolerance that is not positive, a number of iterations below 1.
     """
 
-    linear_solver: Literal["arrowhead", "dense"] = eqx.field(static=True, default="arrowhead")
+    method: Choice = eqx.field(static=True, default="auto")
     tolerance: float = 1e-12
     max_iterations: int = 50
+    fixed_iterations: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if self.linear_solver not in LINEAR_SOLVERS:
-            raise ValueError(
-                f"Newton: linear_solver is {self.linear_solver!r}; it must be one of {', '.join(LINEAR_SOLVERS)}."
-            )
-        for name, least in (("tolerance", 0.0), ("max_iterations", 0)):
+        if self.method not in get_args(Choice):
+            raise ValueError(f"Newton: method is {self.method!r}; it must be one of {', '.join(get_args(Choice))}.")
+        for name, least in (("tolerance", 0.0), ("max_iterations", 0), ("fixed_iterations", 0)):
             value = getattr(self, name)
             if isinstance(value, int | float) and not value > least:
                 raise ValueError(f"Newton: {name} is {value}; it must be positive.")
 
+    def marches(self, system, scheme) -> bool:
+        """Whether the nested march is what this method starts with.
 
-def solve(equations: StepEquations, guess: Unknowns, newton: Newton):
-    """Solve ``equations.residual(x) = 0`` from a guess; returns (x, `Result` code, iterations).
+        Raises:
+            ValueError: "march" is asked for where it is not possible.
+        """
+        possible = can_be_cut(system, scheme)
+        if self.method == "march" and not possible:
+            raise ValueError(
+                "Newton: method 'march' needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the "
+                "macro nodes; a term of this scheme has nodes inside the macro interval. Take 'auto' or 'arrowhead'."
+            )
+        return possible and self.method in ("auto", "march")
+
+
+class Solution(NamedTuple):
+    """Unknowns of a macro step, fast position and momenta at its end, and how they were found (see `StepInfo`)."""
+
+    x: Unknowns
+    q_f: Any
+    p_s: Any
+    p_f: Any
+    residual: Any
+    result: Any
+    iterations: Any
+    method: Any
+
+
+def solve(
+    equations: StepEquations, guess: Unknowns, newton: Newton, matrix=None, warm: Warm | None = None
+) -> tuple[Solution, Warm | None]:
+    """Solve ``equations.residual(x) = 0``.
+
+    Args:
+        guess: where iterations over all unknowns start.
+        matrix, warm: matrix of the micro intervals and what the last step handed on, for the nested march.
+
+    The solution is differentiable in both modes, twice, with respect to everything in `equations`.
+    """
+    fixed, guess, matrix, warm = jax.lax.stop_gradient((equations, guess, matrix, warm))
+    if newton.marches(equations.system, equations.scheme):
+        linear = is_linear(equations.system, equations.scheme, equations.q_s, equations.q_f)
+        done, warm = march.solve(fixed, matrix, warm, newton, linear)
+        p_s, p_f = _momenta_after(fixed, done)
+        residual = relative_residual(fixed, *done.residual)
+        method = jnp.asarray(int(Method.LINEAR if linear else Method.MARCH))
+        found = Solution(done.x, done.end.q_f, p_s, p_f, residual, done.result, done.passes, method)
+        if newton.method == "auto" and not linear:
+            found = jax.lax.cond(
+                done.result <= Result.CONVERGED_AT_ROUNDOFF,
+                lambda: found,
+                lambda: _over_all_unknowns(fixed, guess, newton, "arrowhead"),
+            )
+    else:
+        method = "arrowhead" if newton.method == "auto" else newton.method
+        found = _over_all_unknowns(fixed, guess, newton, method)
+    x, end = _differentiable(equations, found.x, (found.q_f, found.p_s, found.p_f))
+    return Solution(x, *end, *found[4:]), warm
+
+
+def _momenta_after(equations: StepEquations, done: march.March):
+    """Momenta after a march: the slow one by the impulse it received, the fast one as handed on."""
+    h = equations.micro_dt
+    return equations.p_s + done.impulse / h, done.end.p_f / h
+
+
+def _end(equations: StepEquations, x: Unknowns):
+    """Fast position and momenta at the end of the step."""
+    return equations.q_f + x.fast[:, -1].sum(0), *equations.evaluate(x)[1]
+
+
+def _over_all_unknowns(equations: StepEquations, guess: Unknowns, newton: Newton, method: str) -> Solution:
+    x, result, iterations = _iterate(equations, guess, newton, method)
+    residual, (p_s, p_f) = equations.evaluate(x)
+    rows = jnp.maximum(_largest(residual.slow), _largest(residual.fast))
+    g = jnp.maximum(_largest(residual.multiplier), _largest(residual.slow_multiplier))
+    q_f = equations.q_f + x.fast[:, -1].sum(0)
+    code = jnp.asarray(int(Method[method.upper()]))
+    return Solution(x, q_f, p_s, p_f, relative_residual(equations, rows, g), result, iterations, code)
+
+
+def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton, method: str):
+    """Newton's iteration with the matrix at the present point, or at the guess; (x, `Result`, iterations).
 
     Converged when the predicted size of all further updates is below ``tolerance`` times the increments, or round-off
     of the positions. With the contraction ``theta = |d_k| / |d_(k-1)|`` the next update is expected to be
-    ``|d_k| theta min(1, SAFETY theta)``: quadratic convergence with a margin, linear convergence at worst.
-    The solution is differentiable in both modes, twice, with respect to everything in `equations`.
+    ``|d_k| theta min(1, SAFETY theta)``: quadratic convergence with a margin, linear convergence at worst. A matrix
+    that is not renewed converges linearly.
     """
-    fixed = jax.lax.stop_gradient(equations)
-    x, result, iterations = _iterate(fixed, jax.lax.stop_gradient(guess), newton)
-    return _differentiable(newton.linear_solver, equations, x), result, iterations
-
-
-def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton):
+    renewed = method in ("arrowhead", "dense")
+    solver = dense if method == "dense" else arrowhead
+    factor = partial(arrowhead.factor, coupled=False) if method == "decoupled" else solver.factor
+    factors = None if renewed else factor(linearize(equations, guess), guess)
     eps = jnp.finfo(jnp.result_type(float)).eps
     positions = jnp.maximum(_largest(equations.q_s), _largest(equations.q_f))
 
@@ -77,57 +171,59 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton):
 
     def iterate(carry):
         x, previous, k, _ = carry
-        d = _direction(newton.linear_solver, equations, x, equations.residual(x))
+        now = factor(linearize(equations, x), x) if renewed else factors
+        d = solver.solve(now, equations.residual(x))
         x = jax.tree.map(jnp.add, x, d)
         update = size(d, x)
         contraction = update / previous
-        shrink = contraction * jnp.minimum(1.0, SAFETY * contraction)  # of the next update: quadratic convergence
+        shrink = contraction * (jnp.minimum(1.0, SAFETY * contraction) if renewed else 1.0)  # of the next update
         error = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
         error = jnp.where(k == 0, update, error)
         largest = jnp.maximum(_largest(d.slow), _largest(d.fast))
         at_floor = (contraction > 0.5) & (largest <= ROUNDOFF_FLOOR * eps * positions)
         last = jnp.where(update > previous, Result.DIVERGED, Result.STAGNATED)
-        running = jnp.where(k + 1 >= newton.max_iterations, last, _RUNNING)
+        running = jnp.where(k + 1 >= newton.max_iterations, last, RUNNING)
         result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, running)
         result = jnp.where(error <= 1, Result.CONVERGED, result)
         result = jnp.where(jnp.isfinite(update), result, Result.NON_FINITE)
         return x, update, k + 1, result
 
-    start = (guess, jnp.inf, 0, jnp.asarray(_RUNNING))
-    x, _, iterations, result = jax.lax.while_loop(lambda carry: carry[3] == _RUNNING, iterate, start)
+    start = (guess, jnp.inf, 0, jnp.asarray(RUNNING))
+    if newton.fixed_iterations is None:
+        x, _, iterations, result = jax.lax.while_loop(lambda carry: carry[3] == RUNNING, iterate, start)
+    else:
+        x, _, iterations, result = jax.lax.fori_loop(0, newton.fixed_iterations, lambda _, at: iterate(at), start)
+        result = jnp.where(result == RUNNING, Result.STAGNATED, result)
     return x, result, iterations
-
-
-_RUNNING = -1
-
-
-def _direction(linear_solver: str, equations: StepEquations, x: Unknowns, residual: Unknowns) -> Unknowns:
-    """``-(dR/dx)^-1 residual`` with the matrix at x."""
-    solver = LINEAR_SOLVERS[linear_solver]
-    return solver.solve(solver.factor(linearize(equations, x), x), residual)
 
 
 def _largest(a):
     return jnp.max(jnp.abs(a), initial=0.0)
 
 
-def relative_residual(equations: StepEquations, residual: Unknowns):
+def relative_residual(equations: StepEquations, rows, g):
     """Largest residual left: of the momentum equations relative to the momentum, of the constraints in their unit."""
     momentum = jnp.maximum(_largest(equations.p_s), _largest(equations.p_f)) * equations.micro_dt
-    equation = jnp.maximum(_largest(residual.slow), _largest(residual.fast)) / jnp.where(momentum > 0, momentum, 1.0)
-    return jnp.maximum(equation, jnp.maximum(_largest(residual.multiplier), _largest(residual.slow_multiplier)))
+    return jnp.maximum(rows / jnp.where(momentum > 0, momentum, 1.0), g)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _differentiable(linear_solver: str, equations: StepEquations, x: Unknowns) -> Unknowns:
-    """x unchanged, with the derivative of the root: ``dx = -(dR/dx)^-1 (dR/dequations) dequations``."""
-    return x
+def _direction(equations: StepEquations, x: Unknowns, residual: Unknowns) -> Unknowns:
+    """``-(dR/dx)^-1 residual`` with the matrix at x."""
+    return arrowhead.solve(arrowhead.factor(linearize(equations, x), x), residual)
+
+
+@jax.custom_jvp
+def _differentiable(equations: StepEquations, x: Unknowns, end):
+    """x and end unchanged, with the derivative of the root: ``dx = -(dR/dx)^-1 (dR/dequations) dequations``."""
+    return x, end
 
 
 @_differentiable.defjvp
-def _implicit_derivative(linear_solver, primals, tangents):
-    equations, root = primals
+def _implicit_derivative(primals, tangents):
+    equations, root, _ = primals
     # One more Newton step: it moves nothing, but makes the root depend on the equations, for second derivatives.
-    x = jax.tree.map(jnp.add, root, _direction(linear_solver, equations, root, equations.residual(root)))
+    x = jax.tree.map(jnp.add, root, _direction(equations, root, equations.residual(root)))
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
-    return x, _direction(linear_solver, equations, x, change)
+    dx = _direction(equations, x, change)
+    end, d_end = jax.jvp(_end, (equations, x), (tangents[0], dx))
+    return (x, end), (dx, d_end)

@@ -25,7 +25,7 @@ class CostRow:
     """
 
     label: str
-    linear_solver: str
+    method: str
     num_micro: int
     num_unknowns: int
     num_steps: int
@@ -44,14 +44,14 @@ class CostStudy:
 
     @property
     def curves(self) -> list[tuple[str, str]]:
-        """The ``(label, linear_solver)`` pairs."""
-        return list(dict.fromkeys((row.label, row.linear_solver) for row in self.rows))
+        """The ``(label, method)`` pairs."""
+        return list(dict.fromkeys((row.label, row.method) for row in self.rows))
 
-    def curve(self, label: str, linear_solver: str) -> tuple[np.ndarray, np.ndarray]:
+    def curve(self, label: str, method: str) -> tuple[np.ndarray, np.ndarray]:
         """``num_micro`` and microseconds per micro step of one curve; failed runs are NaN."""
-        rows = [row for row in self.rows if (row.label, row.linear_solver) == (label, linear_solver)]
+        rows = [row for row in self.rows if (row.label, row.method) == (label, method)]
         if not rows:
-            raise ValueError(f"curve: no {(label, linear_solver)} in this study; it has {self.curves}.")
+            raise ValueError(f"curve: no {(label, method)} in this study; it has {self.curves}.")
         return np.array([row.num_micro for row in rows]), np.array([row.us_per_micro_step for row in rows])
 
     def __add__(self, other: "CostStudy") -> "CostStudy":
@@ -69,7 +69,7 @@ def cost_study(
     *,
     micro_dt: float,
     t_end: float,
-    linear_solvers: Sequence[str] = ("dense", "arrowhead"),
+    methods: Sequence[str] = ("dense", "arrowhead"),
     repeats: int = 5,
     min_seconds: float = 0.1,
     label: str = "",
@@ -90,7 +90,7 @@ def cost_study(
         num_micro: numbers of micro steps per macro step.
         micro_dt: the constant micro step h.
         t_end: simulated time of every timed run.
-        linear_solvers: see `vmri_jax.Newton`.
+        methods: see `vmri_jax.Newton`.
         repeats: timed runs of each program.
         min_seconds: runs shorter than this are called several times, at most 20, and averaged.
         label: name of this scheme or system in the rows.
@@ -99,19 +99,19 @@ def cost_study(
     Raises:
         ValueError: an empty or bad argument.
     """
-    if not num_micro or not linear_solvers or repeats < 1 or not (micro_dt > 0 and t_end > 0):
+    if not num_micro or not methods or repeats < 1 or not (micro_dt > 0 and t_end > 0):
         raise ValueError(
-            f"cost_study: num_micro = {list(num_micro)}, linear_solvers = {list(linear_solvers)}, repeats = {repeats}, "
+            f"cost_study: num_micro = {list(num_micro)}, methods = {list(methods)}, repeats = {repeats}, "
             f"micro_dt = {micro_dt}, t_end = {t_end}; give at least one of each, and positive times."
         )
     state = problem.state()
     n_g, n_gs = problem.system.num_constraints(state.q_s, state.q_f)
-    total = len(num_micro) * len(linear_solvers) + repeats
+    total = len(num_micro) * len(methods) + repeats
     programs, rows = [], []
-    for linear_solver in linear_solvers:
-        newton = vm.Newton(linear_solver=linear_solver)  # pyright: ignore[reportArgumentType]
+    for method in methods:
+        newton = vm.Newton(method=method)  # pyright: ignore[reportArgumentType]
         for n in num_micro:
-            progress(f"{label} {linear_solver}, {n} micro steps: compiling".strip(), len(programs), total)
+            progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(programs), total)
             scheme_n = scheme(n)
             num_steps = max(1, round(t_end / (n * micro_dt)))
             run = _program(problem.system, scheme_n, state, n * micro_dt, num_steps, newton)
@@ -121,7 +121,7 @@ def cost_study(
             rows.append(
                 CostRow(
                     label=label,
-                    linear_solver=linear_solver,
+                    method=method,
                     num_micro=n,
                     num_unknowns=scheme_n.degree * (state.q_s.size + n_gs + n * (state.q_f.size + n_g)),
                     num_steps=num_steps,

@@ -148,7 +148,7 @@ class CostPanel:
                 num_micro,
                 micro_dt=self.micro_dt,
                 t_end=t_end,
-                linear_solvers=(solver,),
+                methods=(solver,),
                 repeats=self.repeats,
                 label=self.title,
                 progress=part(progress, i, len(runs)),

@@ -1,0 +1,67 @@
+"""The programs that are timed: the built-in systems under the schemes of the reference study."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vmri_jax as vm
+
+SCHEMES: dict[str, Callable[[int], vm.Scheme]] = {
+    "fully implicit": vm.fully_implicit,
+    "explicit slow": vm.explicit_slow,
+    "fully explicit": vm.fully_explicit,
+}
+SYSTEMS = {
+    "FPU": vm.systems.fermi_pasta_ulam,
+    "TSP": vm.systems.triple_spherical_pendulum,
+    "SAM": vm.systems.simple_atomic_model,
+}
+
+
+def problem(name: str) -> vm.Problem:
+    """``"TSP"``, ``"SAM"``, or the chain with so many springs, ``"FPU l=50"``."""
+    system, _, springs = name.partition(" l=")
+    return SYSTEMS[system](int(springs)) if springs else SYSTEMS[system]()
+
+
+def unknowns(problem: vm.Problem, num_micro: int) -> int:
+    """Unknowns of one macro step of degree 1, all of them solved for at once."""
+    n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
+    return problem.q_s.size + n_gs + num_micro * (problem.q_f.size + n_g)
+
+
+def program(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float, newton: vm.Newton | None = None):
+    """``run(num_steps)``: simulate, and save the last node only; a run that fails is seen in its ``result``."""
+
+    def run(num_steps: int, state: vm.State) -> vm.Trajectory:
+        return vm.simulate(
+            problem.system,
+            scheme,
+            state,
+            micro_dt=micro_dt,
+            num_steps=num_steps,
+            save_every=num_steps,
+            newton=newton,
+            throw=False,
+        )
+
+    return partial(run, state=problem.state())
+
+
+def failed(trajectory: vm.Trajectory) -> bool:
+    """Whether any step, or any trajectory of a batch, failed."""
+    return bool(np.any(np.asarray(trajectory.failed_at) >= 0))
+
+
+def starts(problem: vm.Problem, batch: int, spread: float = 0.01) -> vm.State:
+    """So many starts that differ in their velocities, consistent with the constraints, batch axis first."""
+
+    def start(v_s, v_f):
+        return vm.initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f)
+
+    random = np.random.default_rng(0)
+    v_s, v_f = (jnp.asarray(v + spread * random.normal(size=(batch, v.size))) for v in (problem.v_s, problem.v_f))
+    return jax.jit(jax.vmap(start))(v_s, v_f)

@@ -1,0 +1,155 @@
+"""One micro interval as a problem of its own, and the Newton matrix its fast increments are corrected with."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.algebra import inverse, matvec, solve
+from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
+from vmri_jax.equations import StepEquations
+from vmri_jax.linearization import linearize
+from vmri_jax.path import lagrange_basis
+from vmri_jax.quadrature import micro, midpoint
+from vmri_jax.scheme import Scheme
+from vmri_jax.structure import has_constant_hessian, has_diagonal_hessian
+from vmri_jax.system import ConstantMass, System
+
+
+def can_be_cut(system: System, scheme: Scheme) -> bool:
+    """Whether every term lives on single micro intervals or is a kick at the macro nodes, with constant masses."""
+    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
+    local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
+    force = system.force is None or scheme.force.grid == "micro"
+    return isinstance(system.kinetic, ConstantMass) and local and force
+
+
+def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
+    """System and scheme of one micro interval: without the kicks at the macro nodes and the slow constraint."""
+    changes: dict[str, Any] = {"slow_constraint": None}
+    rules = {"slow": scheme.slow, "fast": scheme.fast, "force": scheme.force}
+    for name, placed in rules.items():
+        if placed.grid == "macro":
+            rules[name] = micro(midpoint)
+            changes |= {} if name == "force" else {f"{name}_potential": None}
+    local = Scheme(1, scheme.degree, kinetic=scheme.kinetic, constraint=scheme.constraint, **rules)
+    return system.replace(**changes), local
+
+
+def implicit_terms(system: System, scheme: Scheme) -> list[Term]:
+    """The potentials that the fast unknowns of a micro interval enter."""
+    terms = lagrangian(*interval_problem(system, scheme)).terms
+    return [term for term in terms if isinstance(term, Term) and term.inside.groups]
+
+
+def is_explicit_given_multipliers(system: System, scheme: Scheme) -> bool:
+    """Whether the fast increment of a micro interval is the momentum that arrives plus the constraint force."""
+    return scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
+
+
+class IntervalMatrix(NamedTuple):
+    """K, the derivative of the fast equations of a micro interval by its increments, without constraints.
+
+    inverse: of the rows of slots 0..r-1, (r, r, n_f) for every coordinate alone, or (r n_f, r n_f).
+    last: the row of slot r, which is the momentum handed on, (r, n_f) or (n_f, r n_f).
+    """
+
+    inverse: Any
+    last: Any
+
+    def solve(self, rows):
+        """The increments (r, n_f) for given rows (r, n_f)."""
+        if self.inverse.ndim == 3:
+            return jnp.sum(self.inverse * rows[None], axis=1)
+        return matvec(self.inverse, rows.reshape(-1)).reshape(rows.shape)
+
+    def outgoing(self, increments):
+        """Change (n_f,) of the last slot with the increments."""
+        if self.inverse.ndim == 3:
+            return jnp.sum(self.last * increments, axis=0)
+        return matvec(self.last, increments.reshape(-1))
+
+
+def _is_per_coordinate(system: System, scheme: Scheme, q_f) -> bool:
+    """Whether K is taken for every fast coordinate alone: explicit fast equations, or W a sum over the coordinates.
+
+    V is then left out: it is the soft potential, and h^2 times its curvature is small beside the mass.
+    """
+    if system.kinetic.fast.ndim == 2:
+        return False
+    terms = implicit_terms(system, scheme)
+    fast = [term for term in terms if term.arguments == ("q_f",)]
+    return not terms or bool(fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in fast)
+
+
+def is_constant(system: System, scheme: Scheme, q_s, q_f) -> bool:
+    """Whether K is the same for a whole run."""
+    q = {"q_s": q_s, "q_f": q_f}
+    terms = implicit_terms(system, scheme)
+    if _is_per_coordinate(system, scheme, q_f):
+        terms = [term for term in terms if term.arguments == ("q_f",)]
+    elif system.force is not None or (scheme.degree > 1 and system.constraint is not None):
+        return False
+    return all(has_constant_hessian(term.integrand, *(q[a] for a in term.arguments)) for term in terms)
+
+
+def is_linear(system: System, scheme: Scheme, q_s, q_f) -> bool:
+    """Whether there are only fast equations, linear ones with matrix K: one pass solves them."""
+    alone = system.constraint is system.slow_constraint is system.force is None and not q_s.shape[0]
+    complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
+    return (
+        alone
+        and (complete or not _is_per_coordinate(system, scheme, q_f))
+        and is_constant(system, scheme, q_s, q_f)
+    )
+
+
+def interval_matrix(equations: StepEquations) -> IntervalMatrix:
+    """K on the first micro interval of a macro step, on the straight path from its start."""
+    q_s, q_f = equations.q_s, equations.q_f
+    system, scheme = interval_problem(equations.system, equations.scheme)
+    local = StepEquations(
+        system, scheme, equations.t, q_s, q_f, equations.p_s, equations.p_f, equations.micro_dt
+    )
+    n_g, _ = system.num_constraints(q_s, q_f)
+    x = local.guess(*system.kinetic.velocity(equations.p_s, equations.p_f), jnp.zeros(n_g), jnp.zeros(0))
+    r, n_f = scheme.degree, q_f.shape[0]
+    if not _is_per_coordinate(equations.system, equations.scheme, q_f):
+        block = linearize(local, x).ff[0, :, :, 1:]
+        return IntervalMatrix(inverse(block[:-1].reshape(r * n_f, r * n_f)), block[-1].reshape(n_f, r * n_f))
+
+    block = jnp.zeros((r + 1, r, n_f))
+    for term in lagrangian(system, scheme).terms:
+        if isinstance(term, QuadraticKinetic):
+            block += term.fast_form[:, 1:, None] * term.mass.fast
+        elif term.inside.groups and term.arguments == ("q_f",):
+            q = term.inside.sample(local.path(x)).q_f
+            gradient = jax.vmap(jax.grad(term.integrand))
+            curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]  # the diagonal of each Hessian
+            basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))
+            weights = term.sign * equations.micro_dt**2 * term.inside.weights
+            block += jnp.einsum("k,ki,kj,ka->ija", weights, basis, basis[:, 1:], curvature)
+    if r == 1:
+        return IntervalMatrix(1 / block[:1], block[-1])
+    return IntervalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block[:-1]), 0, -1), block[-1])
+
+
+def solve_saddle(solve_k, jacobian, rows, g):
+    """(dx, dmu) with ``K dx - G_0^T dmu = -rows`` and ``G_1 dx = -g``, by the Schur complement ``G_1 K^-1 G_0^T``.
+
+    Args:
+        solve_k: K^-1, (r, n) rows to (r, n) increments.
+        jacobian: (r + 1, n_g, n) at the control nodes; G_0 are the first r of them, G_1 the last r.
+        rows, g: (r, n) and (r, n_g).
+    """
+    r, n_g = g.shape
+    dx = -solve_k(rows)
+    if not n_g:
+        return dx, g
+    columns = np.eye(r)[:, None, :, None] * jacobian[:-1, :, None, :]  # (node, constraint, row, coordinate)
+    response = jax.vmap(solve_k)(columns.reshape(r * n_g, r, -1))
+    schur = jnp.sum(jacobian[None, 1:] * response[:, :, None], axis=-1)  # (multiplier, node, constraint)
+    value = g + jnp.sum(jacobian[1:] * dx[:, None], axis=-1)
+    dmu = -solve(schur.reshape(r * n_g, r * n_g).T, value.reshape(r * n_g, 1))[:, 0]
+    return dx + jnp.sum(dmu[:, None, None] * response, axis=0), dmu.reshape(r, n_g)

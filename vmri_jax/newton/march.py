@@ -1,0 +1,252 @@
+"""Nested march: the slow path outside, the micro intervals in order inside, each solving only its own small system.
+
+A pass takes the slow path as known. It marches over the micro intervals; each corrects its fast increments and
+multipliers once, by a Newton step on its exact residual, and adds its impulse to the slow equations. Then the slow
+increments and slow multipliers are corrected from what is left of their equations. The matrices are cheap ones:
+
+* micro interval: ``[K, -G^T; G, 0]`` with the present constraint Jacobian G, and K from the start of the macro step
+  (`IntervalMatrix`: the mass alone where the fast equations are explicit, so that only the multipliers are solved for);
+* slow equations: mass and slow constraint. What they miss, the response of the fast variables and the curvature of V,
+  is learned from the passes (`Pairs`).
+
+The residual is exact, so all of this decides only how many passes there are. A pass costs one gradient of each term at
+each of its nodes, and stores nothing but the path.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.algebra import inverse, matmul
+from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
+from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
+from vmri_jax.newton.interval import IntervalMatrix, interval_problem, is_explicit_given_multipliers, solve_saddle
+from vmri_jax.newton.secant import Pairs
+from vmri_jax.path import control_nodes
+from vmri_jax.results import Result
+
+ROUNDOFF = 4.0
+"""Changes of the positions below so many units of round-off are accepted."""
+NOISE = 1e4
+"""Secant pairs shorter than so many units of round-off of the positions are not kept."""
+
+
+class Warm(NamedTuple):
+    """What a macro step hands to the next one.
+
+    slow (3, r, n_s), slow_multiplier (2, r, n_gs): unknowns of the last steps, the last one first.
+    multiplier (2, r, n_g): multipliers lambda of the last micro intervals, the last one first.
+    pairs: secant pairs of the slow unknowns.
+    """
+
+    slow: Any
+    slow_multiplier: Any
+    multiplier: Any
+    pairs: Pairs
+
+    @classmethod
+    def straight(cls, increments, n_g: int, n_gs: int) -> "Warm":
+        """The start of a run: straight motion with slow increments (r, n_s), no multipliers."""
+        r, n_s = increments.shape
+        slow = jnp.broadcast_to(increments, (3, r, n_s))
+        return cls(slow, jnp.zeros((2, r, n_gs)), jnp.zeros((2, r, n_g)), Pairs.none(r * (n_s + n_gs)))
+
+
+class Pass(NamedTuple):
+    """What a march over the micro intervals leaves.
+
+    q_f, p_f: end of the last interval, momentum times h.
+    start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path.
+    g: (n_g,) largest constraint values before the last correction.
+    multiplier: (2, r, n_g) multipliers lambda of the last two intervals, the last one first.
+    """
+
+    q_f: Any
+    p_f: Any
+    start: Any
+    increments: Any
+    g: Any
+    multiplier: Any
+
+
+def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multiplier, first) -> tuple[Unknowns, Pass]:
+    """One pass over the micro intervals: fast unknowns corrected for the given slow ones, and what they leave.
+
+    In the first pass fast increments start from straight motion, multipliers from the line through the last two.
+    """
+    h, (n, r, _) = equations.micro_dt, x.fast.shape
+    system, scheme = interval_problem(equations.system, equations.scheme)
+    kicks = lagrangian(system, scheme).kicks if n > 1 else ()
+    explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
+    basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # (n, r + 1, r): slow position at each node by increments
+    inverse_mass = _inverse_mass(system.kinetic.fast)
+
+    def interval(carry: Pass, at):
+        m, basis, scale, inside, inc, mu = at
+        q_s, steps = equations.q_s + _along(basis[0], x.slow), _along(basis[1:] - basis[0], x.slow)
+        mu = jnp.where(first, scale * (2 * carry.multiplier[0] - carry.multiplier[1]), mu)
+        if explicit:  # the increment follows from the multipliers
+            jacobian = jax.jacrev(system.g, argnums=1)(q_s, carry.q_f)
+            inc = -matrix.solve((carry.p_f - _along(mu[0], jacobian))[None])
+        else:
+            inc = jnp.where(first, control_nodes(r)[1:, None] * inverse_mass(carry.p_f), inc)
+
+        none = jnp.zeros_like(q_s), jnp.zeros_like(carry.q_f)
+        local = StepEquations(system, scheme, equations.t + m * h, q_s, carry.q_f, *none, h)
+
+        def gradient(inc):
+            path = local.path(Unknowns(steps, None, inc[None], None))
+            return jax.grad(local.unconstrained)(path, path)
+
+        d, change = jax.linearize(gradient, inc)
+        positions = local.path(Unknowns(steps, None, inc[None], None)).control_points()
+        g = jax.vmap(system.g)(*positions)[1:]
+        g_s, g_f = jax.vmap(jax.jacrev(system.g, argnums=(0, 1)))(*positions)
+
+        if explicit:
+            rows = jnp.zeros_like(inc)
+        else:
+            rows = jnp.concatenate([(d.fast_start - d.fast.sum(1)) + carry.p_f, d.fast[0, :-1]])
+            rows -= jnp.sum(mu[..., None] * g_f[:-1], axis=1)
+        dx, dmu = solve_saddle(matrix.solve, g_f, rows, g)
+        inc, mu, coupling = inc + dx, mu + dmu, change(dx)
+        q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
+
+        pull = -jnp.sum(mu[..., None] * g_s[:-1], axis=1)  # of the constraints on the slow path, at nodes 0..r-1
+        d_start = d.slow_start + coupling.slow_start + pull.sum(0)
+        d_steps = d.slow + coupling.slow + jnp.concatenate([pull[1:], jnp.zeros_like(pull[:1])])
+        start = carry.start + d_start
+        increments = carry.increments + basis[0][:, None] * d_start
+        increments += jnp.sum((basis[1:] - basis[0])[..., None] * d_steps[:, None], axis=0)
+        for term in kicks:  # where two micro intervals meet
+            d_s, d_f = term.gradient(equations.q_s + _along(basis[-1], x.slow), q_f)
+            weight = jnp.where(inside, h**2 * sum(w for w in (term.start, term.end) if w is not None), 0.0)
+            start, p_f = start + weight * d_s, p_f + weight * d_f
+            increments += basis[-1][:, None] * (weight * d_s)
+
+        g = jnp.maximum(carry.g, jnp.max(jnp.abs(g), axis=0, initial=0.0))
+        multiplier = jnp.stack([mu / scale, carry.multiplier[0]])
+        return Pass(q_f, p_f, start, increments, g, multiplier), (inc, mu)
+
+    zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(multiplier.shape[2])
+    carry = Pass(equations.q_f, h * equations.p_f, *zero, multiplier)
+    scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
+    end, (fast, mu) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, x.fast, x.multiplier))
+    return x._replace(fast=fast, multiplier=mu), end
+
+
+class March(NamedTuple):
+    """State of the iteration: unknowns of this pass, what it left and moved, secant pairs, and how it stands.
+
+    z, d: slow unknowns of the pass and the update they would get from mass and slow constraint alone.
+    impulse: on the slow variables over the step, times h.
+    residual: largest row of the momentum equations (times h) and largest constraint value.
+    """
+
+    x: Unknowns
+    end: Pass
+    z: Any
+    d: Any
+    pairs: Pairs
+    impulse: Any
+    residual: Any
+    passes: Any
+    result: Any
+
+
+def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, linear: bool) -> tuple[March, Warm]:
+    """Passes until neither the slow increments nor the end of the fast path change.
+
+    Accepted are changes of ``newton.tolerance`` relative to the motion over the step, and round-off of the positions.
+
+    Args:
+        matrix, warm: K of the micro intervals, and what the step before handed on.
+        newton: tolerance, max_iterations and fixed_iterations.
+        linear: the equations are linear with the given matrix (`is_linear`), so that one pass solves them.
+    """
+    system, scheme, h = equations.system, equations.scheme, equations.micro_dt
+    n, r, n_s, n_f = scheme.num_micro, scheme.degree, equations.q_s.shape[0], equations.q_f.shape[0]
+    eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
+    inverse_slow, inverse_fast = _inverse_mass(system.kinetic.slow), _inverse_mass(system.kinetic.fast)
+    kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
+    inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
+    accepted_slow, accepted_fast = ROUNDOFF * eps * _largest(equations.q_s), ROUNDOFF * eps * _largest(equations.q_f)
+
+    def slow_update(x: Unknowns, end: Pass):
+        """Update of the slow unknowns by mass and slow constraint, residuals of their equations, impulse."""
+        q = jnp.concatenate([equations.q_s[None], equations.q_s + x.slow])
+        g, jacobian = jax.vmap(system.g_slow)(q)[1:], jax.vmap(jax.jacrev(system.g_slow))(q)
+        pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian[:-1], axis=1)
+        rows = jnp.concatenate([(end.start - end.increments.sum(0) + h * equations.p_s)[None], end.increments[:-1]]) - pull
+        d, d_nu = solve_saddle(lambda rows: matmul(inverse_form, inverse_slow(rows)), jacobian, rows, g)
+        return jnp.concatenate([d.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), end.start - pull.sum(0)
+
+    def one_pass(last: March) -> March:
+        x, end = march(equations, matrix, last.x, warm.multiplier, last.passes == 0)
+        d, (rows, g), impulse = slow_update(x, end)
+        z = jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
+        noise = jnp.where(last.passes > 0, NOISE * eps * (_largest(equations.q_s) + _largest(x.slow)), jnp.inf)
+        pairs = last.pairs.add(z - last.z, d - last.d, noise, r * n_s)
+
+        motion = n * jnp.maximum(_largest(inverse_fast(last.end.p_f)), _largest(inverse_fast(end.p_f)))
+        others = eps * jnp.maximum(_largest(x.slow), motion) + tiny  # variables at rest have no size of their own
+        change = jnp.maximum(
+            _largest(d[: r * n_s]) / (newton.tolerance * _largest(x.slow) + accepted_slow + others),
+            _largest(end.q_f - last.end.q_f) / (newton.tolerance * motion + accepted_fast + others),
+        )
+        settled = (change <= 1) & (last.passes > 0)
+        if newton.fixed_iterations is None:
+            done, spent = settled, last.passes + 1 >= newton.max_iterations
+            running = jnp.where(spent, Result.STAGNATED, RUNNING)
+        else:
+            done, running = last.passes + 1 >= newton.fixed_iterations, jnp.asarray(int(Result.STAGNATED))
+        result = jnp.where(jnp.isfinite(change), jnp.where(settled, Result.CONVERGED, running), Result.NON_FINITE)
+        if n_s:
+            z_new = jnp.where(done, z, z + pairs.corrected(d, r * n_s))
+            slow, nu = jnp.split(z_new, [r * n_s])
+            x = x._replace(slow=slow.reshape(x.slow.shape), slow_multiplier=nu.reshape(x.slow_multiplier.shape))
+        residual = jnp.maximum(_largest(rows), _largest(end.p_f - last.end.p_f)), jnp.maximum(_largest(g), _largest(end.g))
+        return March(x, end, z, d, pairs, impulse, residual, last.passes + 1, result)
+
+    x = Unknowns(
+        slow=3 * (warm.slow[0] - warm.slow[1]) + warm.slow[2],
+        slow_multiplier=2 * warm.slow_multiplier[0] - warm.slow_multiplier[1],
+        fast=jnp.zeros((n, r, n_f)),
+        multiplier=jnp.zeros((n, *warm.multiplier.shape[1:])),
+    )
+    zero, none = jnp.zeros_like(warm.pairs.moves[0]), jnp.zeros(())
+    end = Pass(equations.q_f, h * equations.p_f, equations.q_s, x.slow, jnp.zeros(x.multiplier.shape[2]), warm.multiplier)
+    start = March(x, end, zero, zero, warm.pairs, equations.p_s, (none, none), jnp.asarray(0), jnp.asarray(RUNNING))
+    if linear:
+        done = one_pass(start)
+        done = done._replace(residual=(none, none), result=jnp.asarray(int(Result.CONVERGED)))
+    elif newton.fixed_iterations is None:
+        done = jax.lax.while_loop(lambda at: at.result == RUNNING, one_pass, start)
+    else:
+        done = jax.lax.fori_loop(0, newton.fixed_iterations, lambda _, at: one_pass(at), start)
+    slow = jnp.concatenate([done.x.slow[None], warm.slow[:-1]])
+    slow_multiplier = jnp.stack([done.x.slow_multiplier, warm.slow_multiplier[0]])
+    return done, Warm(slow, slow_multiplier, done.end.multiplier, done.pairs)
+
+
+RUNNING = -1
+"""Status of an iteration that goes on."""
+
+
+def _inverse_mass(mass):
+    """``p -> M^-1 p``, with the inverse computed once."""
+    if mass.ndim == 1:
+        inverse_diagonal = 1 / mass
+        return lambda p: inverse_diagonal * p
+    matrix = inverse(mass)
+    return lambda p: matmul(jnp.atleast_2d(p), matrix).reshape(p.shape)
+
+
+def _along(weights, increments):
+    """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
+    return jnp.sum(weights[..., None] * increments, axis=-2)
+
+
+def _largest(a):
+    return jnp.max(jnp.abs(a), initial=0.0)

@@ -1,0 +1,65 @@
+"""What a function's jaxpr tells about it: which arguments it depends on, and the structure of its Hessian.
+
+All answers are structural and conservative: what is called dependent may happen not to be (``0 * x`` counts), what is
+called independent, constant or diagonal is so.
+"""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+_ELEMENTWISE = frozenset(
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type copy copy_p cos cosh div eq "
+    "erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow is_finite le lgamma log log1p logistic lt max min mul ne neg "
+    "not or pow rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh".split()
+)
+
+
+def depends_on(function: Callable, *args) -> tuple[bool, ...]:
+    """Whether the outputs of ``function(*args)`` can depend on each argument."""
+    jaxpr = jax.make_jaxpr(function)(*args).jaxpr
+    needed = {id(v) for v in jaxpr.outvars}
+    for eqn in reversed(jaxpr.eqns):
+        if any(id(v) in needed for v in eqn.outvars):
+            needed.update(id(v) for v in eqn.invars)
+    leaves = [jax.tree.structure(a).num_leaves for a in args]
+    stops = np.cumsum(leaves)
+    used = [id(v) in needed for v in jaxpr.invars]
+    return tuple(any(used[stop - n : stop]) for n, stop in zip(leaves, stops, strict=True))
+
+
+def has_constant_hessian(function: Callable, *args) -> bool:
+    """Whether ``function(*args) -> ()`` is at most quadratic in its arguments."""
+
+    def product(args, directions):
+        return jax.jvp(jax.grad(lambda a: function(*a)), (args,), (directions,))[1]
+
+    return not depends_on(product, args, args)[0]
+
+
+def has_diagonal_hessian(function: Callable, q) -> bool:
+    """Whether ``function(q) -> ()`` is a sum over the elements of the vector q: each gradient entry sees its own alone."""
+    closed = jax.make_jaxpr(jax.grad(function))(q)
+    return _classes(closed.jaxpr, [_ELEMENT])[0] <= _ELEMENT
+
+
+_CONSTANT, _ELEMENT, _MIXED = range(3)
+
+
+def _classes(jaxpr, classes: list[int]) -> list[int]:
+    """How each output sees the input vector: not at all, element by element, or otherwise."""
+    known = dict(zip(map(id, jaxpr.invars), classes, strict=True))
+    for eqn in jaxpr.eqns:
+        inputs = [known.get(id(v), _CONSTANT) for v in eqn.invars]
+        inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
+        if max(inputs, default=_CONSTANT) == _CONSTANT:
+            outputs = [_CONSTANT] * len(eqn.outvars)
+        elif eqn.primitive.name in ("jit", "pjit", "closed_call", "custom_jvp_call") and inner is not None:
+            outputs = _classes(inner.jaxpr, inputs)
+        elif eqn.primitive.name in _ELEMENTWISE and _MIXED not in inputs:
+            outputs = [_ELEMENT] * len(eqn.outvars)
+        else:
+            outputs = [_MIXED] * len(eqn.outvars)
+        known.update(zip(map(id, eqn.outvars), outputs, strict=True))
+    return [known.get(id(v), _CONSTANT) for v in jaxpr.outvars]
