@@ -148,7 +148,7 @@ def test_a_failed_run_keeps_what_was_computed(vmri, tmp_path):
         (["fpu", *RUN[:4], "--alpha", 0.5], "use explicit-slow or fully-explicit"),
         (["fpu", *RUN[:4], "--scheme", "galerkin"], "needs the degree"),
         (["fpu", *RUN[:4], "--scheme", "galerkin", "--degree", 2, "--rule", "simpson"], "must be 'gauss', 'lobatto'"),
-        (["fpu", *RUN, "--method", "sparse"], "it must be one of arrowhead, dense"),
+        (["fpu", *RUN, "--method", "sparse"], "it must be one of auto, march, frozen, decoupled, arrowhead, dense"),
     ],
 )
 def test_bad_input_is_refused_in_one_panel(vmri, arguments, message):

@@ -28,7 +28,11 @@ def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
         p_f=wave(n_f),
         energy=2.0 + 1e-3 * np.sin(t),
         constraint_residual=np.full((num_nodes, 2), 1e-14 if constrained else 0.0),
-        info=RunInfo(iterations=np.ones(num_nodes - 1), residual=np.zeros(num_nodes - 1)),
+        info=RunInfo(
+            method=np.ones(num_nodes - 1, dtype=int),
+            iterations=np.ones(num_nodes - 1),
+            residual=np.zeros(num_nodes - 1),
+        ),
         result=0,
         failed_at=-1,
     )

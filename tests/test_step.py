@@ -126,8 +126,7 @@ def test_everything_at_once_makes_a_consistent_step():
     q_s, q_f, v_s, v_f = 0.6 * np.ones(3), np.array([0.3, 0.4, 1.5]), *rng.normal(size=(2, 3))
     state = initial_state(system, q_s, q_f, v_s, v_f, project=True)
     ends = [
-        compiled_step(system, galerkin(2, 2), state, 0.02, Newton(method=solver))
-        for solver in ("arrowhead", "dense")
+        compiled_step(system, galerkin(2, 2), state, 0.02, Newton(method=solver)) for solver in ("arrowhead", "dense")
     ]
     for end, info in ends:
         assert Result(int(info.result)).success

@@ -1,42 +1,50 @@
 """Small dense algebra as elementwise operations.
 
 XLA compiles a loop without library calls into one kernel; a LAPACK call or a matrix product inside it costs about a
-microsecond each. Up to `UNROLLED` rows systems are therefore eliminated by elementwise operations, beyond by LAPACK.
+microsecond each. Up to `ELEMENTWISE` rows systems are therefore eliminated by elementwise operations, beyond by LAPACK.
 """
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 
-UNROLLED = 16
+UNROLLED = 4
+"""Largest system whose elimination is written out step by step; larger ones go through a loop."""
+ELEMENTWISE = 16
 """Largest system that is eliminated by elementwise operations."""
 
 
 def matmul(a, b):
     """``a @ b`` of (..., i, k) and (..., k, j), as a sum of products."""
-    if a.shape[-2] * a.shape[-1] * b.shape[-1] > UNROLLED**3:
+    if a.shape[-2] * a.shape[-1] * b.shape[-1] > ELEMENTWISE**3:
         return a @ b
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
 def matvec(a, x):
     """``a @ x`` of (..., i, k) and (..., k), as a sum of products."""
-    if a.shape[-2] * a.shape[-1] > UNROLLED**3:
+    if a.shape[-2] * a.shape[-1] > ELEMENTWISE**3:
         return jnp.matvec(a, x)
     return jnp.sum(a * x[..., None, :], axis=-1)
 
 
 def solve(a, b):
-    """The x with ``a x = b`` for a (n, n), b (n, m): Gauss-Jordan without pivoting, or LU with it beyond `UNROLLED` rows.
+    """The x with ``a x = b`` for a (n, n), b (n, m): Gauss-Jordan without pivoting, or LU with it beyond `ELEMENTWISE` rows.
 
     Without pivoting a must be (close to) symmetric definite: mass matrices, ``G M^-1 G^T`` and their perturbations.
     """
     n = a.shape[0]
-    if n > UNROLLED:
+    if n > ELEMENTWISE:
         return jnp.linalg.solve(a, b)
-    rows = jnp.concatenate([a, b], axis=1)
-    for k in range(n):
+
+    def eliminate(k, rows):
         row = rows[k] / rows[k, k]
-        rows = rows - (rows[:, k] - np.eye(n)[k])[:, None] * row
+        return rows - (rows[:, k] - (jnp.arange(n) == k))[:, None] * row
+
+    rows = jnp.concatenate([a, b], axis=1)
+    if n > UNROLLED:
+        return jax.lax.fori_loop(0, n, eliminate, rows)[:, n:]
+    for k in range(n):
+        rows = eliminate(k, rows)
     return rows[:, n:]
 
 

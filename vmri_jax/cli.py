@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 import vmri_jax as vm
-from vmri_jax import plots
+from vmri_jax import plots, runtime
 from vmri_jax.catalogue import SCHEMES, SYSTEMS, find_problem, find_scheme
 from vmri_jax.study import choose_figures, reference_figures, reproduce
 
@@ -41,6 +41,7 @@ class BadInput(typer.BadParameter):
 
 def main() -> None:
     """Entry point."""
+    runtime.configure(cache=runtime.cache_folder())
     app()
 
 
@@ -102,7 +103,7 @@ def simulate(
     save_every: Annotated[
         int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
     ] = None,
-    method: Annotated[str, typer.Option(help="arrowhead or dense.")] = "arrowhead",
+    method: Annotated[str, typer.Option(help="auto, march, frozen, decoupled, arrowhead or dense.")] = "auto",
     out: Annotated[Path | None, typer.Option(help="Write the trajectory here, .npz.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw it here: .png, .svg or .pdf.")] = None,
 ) -> None:

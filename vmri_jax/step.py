@@ -175,7 +175,11 @@ def start_memory(system: System, scheme: Scheme, state: State, macro_dt, newton:
     kicks = _kick_gradients(own, scheme, state.q_s, state.q_f)
     matrix = warm = None
     if parts is None and not is_explicit(system, scheme) and newton.marches(system, scheme):
-        matrix = interval_matrix(_equations(system, scheme, state, macro_dt))
+        equations = _equations(system, scheme, state, macro_dt)
+        if is_constant(system, scheme, state.q_s, state.q_f):
+            matrix = interval_matrix(equations)
+        else:  # renewed by every macro step
+            matrix = jax.tree.map(lambda a: jnp.zeros(a.shape), jax.eval_shape(interval_matrix, equations))
         warm = Warm.straight(control_nodes(scheme.degree)[1:, None] * (macro_dt * velocity[0]), n_g, n_gs)
     return Memory(kicks, velocity, jnp.zeros(n_g), jnp.zeros(n_gs), matrix, warm, memories)
 
@@ -308,7 +312,7 @@ def _move_coupled(system, scheme, state, macro_dt, newton, memory):
         found.method,
         found.iterations,
         found.residual,
-        q_f_micro=equations.path(x).fast_start + x.fast[:, -1],
+        q_f_micro=(equations.path(x).fast_start + x.fast[:, -1]).at[-1].set(found.q_f),
         multiplier=x.multiplier,
         slow_multiplier=x.slow_multiplier,
     )

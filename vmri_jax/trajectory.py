@@ -68,8 +68,10 @@ class Trajectory(eqx.Module):
 
     def first(self, count: int) -> "Trajectory":
         """The first `count` saved intervals of a run that had not failed by then."""
-        stops = {name: count + 1 for name in NODES}
-        flat = {name: a if a is None or name in STATUS else a[: stops.get(name, count)] for name, a in _flat(self).items()}
+        stops = dict.fromkeys(NODES, count + 1)
+        flat = {
+            name: a if a is None or name in STATUS else a[: stops.get(name, count)] for name, a in _flat(self).items()
+        }
         return _from_flat(flat | {"result": jnp.asarray(int(Result.CONVERGED)), "failed_at": jnp.asarray(-1)})
 
     def save(self, path) -> None:

@@ -61,9 +61,7 @@ def test_csv(study, tmp_path):
 
 def test_a_run_that_fails_has_no_time():
     problem = vm.systems.fermi_pasta_ulam(2, omega=1e9)
-    study = cost_study(
-        problem, vm.fully_explicit, (2,), micro_dt=1.0, t_end=40.0, methods=("arrowhead",), repeats=1
-    )
+    study = cost_study(problem, vm.fully_explicit, (2,), micro_dt=1.0, t_end=40.0, methods=("arrowhead",), repeats=1)
     (row,) = study.rows
     assert row.result == "NON_FINITE"
     assert np.isnan(row.us_per_micro_step)

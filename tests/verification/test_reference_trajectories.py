@@ -1,4 +1,4 @@
-"""Every stored trajectory of an independent dense code is reproduced, with both linear solvers."""
+"""Every stored trajectory of an independent dense code is reproduced, with every method."""
 
 import json
 
@@ -19,7 +19,7 @@ def scheme_of(case):
     )
 
 
-@pytest.mark.parametrize("method", ["arrowhead", "dense"])
+@pytest.mark.parametrize("method", ["auto", "march", "frozen", "decoupled", "arrowhead", "dense"])
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_trajectory_equals_the_reference(name, method):
     case = CASES[name]

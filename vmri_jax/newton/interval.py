@@ -80,7 +80,7 @@ def _is_per_coordinate(system: System, scheme: Scheme, q_f) -> bool:
         return False
     terms = implicit_terms(system, scheme)
     fast = [term for term in terms if term.arguments == ("q_f",)]
-    return not terms or bool(fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in fast)
+    return not terms or (bool(fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in fast))
 
 
 def is_constant(system: System, scheme: Scheme, q_s, q_f) -> bool:
@@ -98,20 +98,14 @@ def is_linear(system: System, scheme: Scheme, q_s, q_f) -> bool:
     """Whether there are only fast equations, linear ones with matrix K: one pass solves them."""
     alone = system.constraint is system.slow_constraint is system.force is None and not q_s.shape[0]
     complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
-    return (
-        alone
-        and (complete or not _is_per_coordinate(system, scheme, q_f))
-        and is_constant(system, scheme, q_s, q_f)
-    )
+    return alone and (complete or not _is_per_coordinate(system, scheme, q_f)) and is_constant(system, scheme, q_s, q_f)
 
 
 def interval_matrix(equations: StepEquations) -> IntervalMatrix:
     """K on the first micro interval of a macro step, on the straight path from its start."""
     q_s, q_f = equations.q_s, equations.q_f
     system, scheme = interval_problem(equations.system, equations.scheme)
-    local = StepEquations(
-        system, scheme, equations.t, q_s, q_f, equations.p_s, equations.p_f, equations.micro_dt
-    )
+    local = StepEquations(system, scheme, equations.t, q_s, q_f, equations.p_s, equations.p_f, equations.micro_dt)
     n_g, _ = system.num_constraints(q_s, q_f)
     x = local.guess(*system.kinetic.velocity(equations.p_s, equations.p_f), jnp.zeros(n_g), jnp.zeros(0))
     r, n_f = scheme.degree, q_f.shape[0]
@@ -135,21 +129,23 @@ def interval_matrix(equations: StepEquations) -> IntervalMatrix:
     return IntervalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block[:-1]), 0, -1), block[-1])
 
 
-def solve_saddle(solve_k, jacobian, rows, g):
+def solve_saddle(solve_k, jacobian, push, rows, g):
     """(dx, dmu) with ``K dx - G_0^T dmu = -rows`` and ``G_1 dx = -g``, by the Schur complement ``G_1 K^-1 G_0^T``.
 
     Args:
         solve_k: K^-1, (r, n) rows to (r, n) increments.
-        jacobian: (r + 1, n_g, n) at the control nodes; G_0 are the first r of them, G_1 the last r.
-        rows, g: (r, n) and (r, n_g).
+        jacobian: (r, n_g, n) G_0, at the control nodes 0..r-1, where the multipliers act.
+        push: G_1 as a function, changes (r, n) of the control points 1..r to changes (r, n_g) of the constraints.
+        rows, g: (r, n), or None if they are zero, and (r, n_g).
     """
     r, n_g = g.shape
-    dx = -solve_k(rows)
-    if not n_g:
+    dx = jnp.zeros((r, jacobian.shape[-1])) if rows is None else -solve_k(rows)
+    if n_g == 0:
         return dx, g
-    columns = np.eye(r)[:, None, :, None] * jacobian[:-1, :, None, :]  # (node, constraint, row, coordinate)
+    columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
     response = jax.vmap(solve_k)(columns.reshape(r * n_g, r, -1))
-    schur = jnp.sum(jacobian[None, 1:] * response[:, :, None], axis=-1)  # (multiplier, node, constraint)
-    value = g + jnp.sum(jacobian[1:] * dx[:, None], axis=-1)
-    dmu = -solve(schur.reshape(r * n_g, r * n_g).T, value.reshape(r * n_g, 1))[:, 0]
-    return dx + jnp.sum(dmu[:, None, None] * response, axis=0), dmu.reshape(r, n_g)
+    schur = jax.vmap(push)(response).reshape(r * n_g, r * n_g)
+    if rows is not None:
+        g = g + push(dx)
+    dmu = -solve(schur.T, g.reshape(r * n_g, 1))
+    return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)

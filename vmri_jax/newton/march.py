@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from vmri_jax.algebra import inverse, matmul
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
+from vmri_jax.lanes import contiguous_lanes
 from vmri_jax.newton.interval import IntervalMatrix, interval_problem, is_explicit_given_multipliers, solve_saddle
 from vmri_jax.newton.secant import Pairs
 from vmri_jax.path import control_nodes
@@ -84,36 +85,38 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
 
     def interval(carry: Pass, at):
         m, basis, scale, inside, inc, mu = at
+        carry, inc, mu = contiguous_lanes((carry, inc, mu))
         q_s, steps = equations.q_s + _along(basis[0], x.slow), _along(basis[1:] - basis[0], x.slow)
         mu = jnp.where(first, scale * (2 * carry.multiplier[0] - carry.multiplier[1]), mu)
-        if explicit:  # the increment follows from the multipliers
-            jacobian = jax.jacrev(system.g, argnums=1)(q_s, carry.q_f)
-            inc = -matrix.solve((carry.p_f - _along(mu[0], jacobian))[None])
-        else:
-            inc = jnp.where(first, control_nodes(r)[1:, None] * inverse_mass(carry.p_f), inc)
-
         none = jnp.zeros_like(q_s), jnp.zeros_like(carry.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, carry.q_f, *none, h)
+        slow_nodes = jnp.concatenate([q_s[None], q_s + steps])
+
+        def jacobians(inc):
+            fast_nodes = jnp.concatenate([carry.q_f[None], carry.q_f + inc[:-1]])
+            return jax.vmap(jax.jacrev(system.g, argnums=(0, 1)))(slow_nodes[:-1], fast_nodes)
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
             return jax.grad(local.unconstrained)(path, path)
 
-        d, change = jax.linearize(gradient, inc)
-        positions = local.path(Unknowns(steps, None, inc[None], None)).control_points()
-        g = jax.vmap(system.g)(*positions)[1:]
-        g_s, g_f = jax.vmap(jax.jacrev(system.g, argnums=(0, 1)))(*positions)
-
-        if explicit:
-            rows = jnp.zeros_like(inc)
+        if explicit:  # the increment follows from the multipliers
+            g_s, g_f = jacobians(jnp.zeros((1, carry.q_f.size)))
+            inc = -matrix.solve((carry.p_f - _along(mu[0], g_f[0]))[None])
         else:
+            inc = jnp.where(first, control_nodes(r)[1:, None] * inverse_mass(carry.p_f), inc)
+            g_s, g_f = jacobians(inc)
+        d, change = jax.linearize(gradient, inc)
+        g, push = jax.linearize(lambda inc: jax.vmap(system.g)(slow_nodes[1:], carry.q_f + inc), inc)
+        rows = None
+        if not explicit:
             rows = jnp.concatenate([(d.fast_start - d.fast.sum(1)) + carry.p_f, d.fast[0, :-1]])
-            rows -= jnp.sum(mu[..., None] * g_f[:-1], axis=1)
-        dx, dmu = solve_saddle(matrix.solve, g_f, rows, g)
+            rows -= jnp.sum(mu[..., None] * g_f, axis=1)
+        dx, dmu = solve_saddle(matrix.solve, g_f, push, rows, g)
         inc, mu, coupling = inc + dx, mu + dmu, change(dx)
         q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
 
-        pull = -jnp.sum(mu[..., None] * g_s[:-1], axis=1)  # of the constraints on the slow path, at nodes 0..r-1
+        pull = -jnp.sum(mu[..., None] * g_s, axis=1)  # of the constraints on the slow path, at nodes 0..r-1
         d_start = d.slow_start + coupling.slow_start + pull.sum(0)
         d_steps = d.slow + coupling.slow + jnp.concatenate([pull[1:], jnp.zeros_like(pull[:1])])
         start = carry.start + d_start
@@ -127,10 +130,10 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
 
         g = jnp.maximum(carry.g, jnp.max(jnp.abs(g), axis=0, initial=0.0))
         multiplier = jnp.stack([mu / scale, carry.multiplier[0]])
-        return Pass(q_f, p_f, start, increments, g, multiplier), (inc, mu)
+        return contiguous_lanes((Pass(q_f, p_f, start, increments, g, multiplier), (inc, mu)))
 
     zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(multiplier.shape[2])
-    carry = Pass(equations.q_f, h * equations.p_f, *zero, multiplier)
+    carry = contiguous_lanes(Pass(equations.q_f, h * equations.p_f, *zero, multiplier))
     scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
     end, (fast, mu) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, x.fast, x.multiplier))
     return x._replace(fast=fast, multiplier=mu), end
@@ -175,14 +178,18 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
 
     def slow_update(x: Unknowns, end: Pass):
         """Update of the slow unknowns by mass and slow constraint, residuals of their equations, impulse."""
-        q = jnp.concatenate([equations.q_s[None], equations.q_s + x.slow])
-        g, jacobian = jax.vmap(system.g_slow)(q)[1:], jax.vmap(jax.jacrev(system.g_slow))(q)
-        pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian[:-1], axis=1)
-        rows = jnp.concatenate([(end.start - end.increments.sum(0) + h * equations.p_s)[None], end.increments[:-1]]) - pull
-        d, d_nu = solve_saddle(lambda rows: matmul(inverse_form, inverse_slow(rows)), jacobian, rows, g)
+        g, push = jax.linearize(lambda inc: jax.vmap(system.g_slow)(equations.q_s + inc), x.slow)
+        nodes = jnp.concatenate([equations.q_s[None], equations.q_s + x.slow[:-1]])
+        jacobian = jax.vmap(jax.jacrev(system.g_slow))(nodes)
+        pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
+        rows = (
+            jnp.concatenate([(end.start - end.increments.sum(0) + h * equations.p_s)[None], end.increments[:-1]]) - pull
+        )
+        d, d_nu = solve_saddle(lambda rows: matmul(inverse_form, inverse_slow(rows)), jacobian, push, rows, g)
         return jnp.concatenate([d.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), end.start - pull.sum(0)
 
     def one_pass(last: March) -> March:
+        last = contiguous_lanes(last)
         x, end = march(equations, matrix, last.x, warm.multiplier, last.passes == 0)
         d, (rows, g), impulse = slow_update(x, end)
         z = jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
@@ -206,8 +213,11 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
             z_new = jnp.where(done, z, z + pairs.corrected(d, r * n_s))
             slow, nu = jnp.split(z_new, [r * n_s])
             x = x._replace(slow=slow.reshape(x.slow.shape), slow_multiplier=nu.reshape(x.slow_multiplier.shape))
-        residual = jnp.maximum(_largest(rows), _largest(end.p_f - last.end.p_f)), jnp.maximum(_largest(g), _largest(end.g))
-        return March(x, end, z, d, pairs, impulse, residual, last.passes + 1, result)
+        residual = (
+            jnp.maximum(_largest(rows), _largest(end.p_f - last.end.p_f)),
+            jnp.maximum(_largest(g), _largest(end.g)),
+        )
+        return contiguous_lanes(March(x, end, z, d, pairs, impulse, residual, last.passes + 1, result))
 
     x = Unknowns(
         slow=3 * (warm.slow[0] - warm.slow[1]) + warm.slow[2],
@@ -216,8 +226,12 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         multiplier=jnp.zeros((n, *warm.multiplier.shape[1:])),
     )
     zero, none = jnp.zeros_like(warm.pairs.moves[0]), jnp.zeros(())
-    end = Pass(equations.q_f, h * equations.p_f, equations.q_s, x.slow, jnp.zeros(x.multiplier.shape[2]), warm.multiplier)
-    start = March(x, end, zero, zero, warm.pairs, equations.p_s, (none, none), jnp.asarray(0), jnp.asarray(RUNNING))
+    end = Pass(
+        equations.q_f, h * equations.p_f, equations.q_s, x.slow, jnp.zeros(x.multiplier.shape[2]), warm.multiplier
+    )
+    start = contiguous_lanes(
+        March(x, end, zero, zero, warm.pairs, equations.p_s, (none, none), jnp.asarray(0), jnp.asarray(RUNNING))
+    )
     if linear:
         done = one_pass(start)
         done = done._replace(residual=(none, none), result=jnp.asarray(int(Result.CONVERGED)))

@@ -1,0 +1,266 @@
+"""The benchmarks measure fairly, and every command gives tables, JSON and figures."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+import vmri_jax as vm
+from benchmarks import __main__ as command_line
+from benchmarks import batch, c_loops, compilation, cost, curves, floor, linear, measure, paper, programs, report
+from benchmarks.curves import Case
+from benchmarks.measure import Ratio, interleaved, ratio, steps_for
+from benchmarks.report import Claim, Report
+
+
+# --- measuring -------------------------------------------------------------------------------------------------------
+def test_ratio_of_medians_and_quartiles_of_pairs():
+    found = ratio([2.0, 4.0, 6.0, 8.0, 100.0], [1.0, 2.0, 2.0, 2.0, 2.0])
+    assert found == Ratio(3.0, 2.0, 4.0)
+    assert found.inverse == Ratio(1 / 3, 1 / 4, 1 / 2)
+    assert str(found) == "3 (2 to 4)"
+
+
+@pytest.mark.parametrize(("above", "below"), [([], []), ([1.0], [1.0, 2.0])])
+def test_samples_that_are_no_pairs_are_refused(above, below):
+    with pytest.raises(ValueError, match="must come from one `interleaved`"):
+        ratio(above, below)
+
+
+def test_runs_take_turns():
+    calls = []
+
+    def run(name, seconds):
+        def call():
+            calls.append(name)
+            time.sleep(seconds)
+
+        return call
+
+    told = []
+    seconds = interleaved({"a": run("a", 0.02), "b": run("b", 0.004)}, 3, min_seconds=0.016, tell=told.append)
+    assert told == ["a", "b"]
+    assert calls[:4] == ["a", "a", "b", "b"]  # one that compiles, one for the number of calls
+    per_sample = calls[4:].count("b") // 3
+    assert per_sample in (2, 3, 4)
+    b = ["b"] * per_sample
+    assert calls[4:] == ["a", *b, *b, "a", "a", *b]
+    assert [len(sample) for sample in seconds.values()] == [3, 3]
+    assert 3 < ratio(seconds["a"], seconds["b"]).value < 5.5
+
+
+def test_steps_that_last_so_long():
+    assert steps_for(lambda n: time.sleep(1e-3 + 1e-4 * n), 0.05, unit=7) in range(280, 560, 7)
+    assert steps_for(lambda n: time.sleep(1e-4 * n), 0.05, unit=3, most=9) == 9
+
+
+def test_pin():
+    """In a process of its own: it would keep the tests to one core."""
+    text = (
+        "import os; from benchmarks.measure import pin; everything = os.sched_getaffinity(0)\n"
+        "assert pin(-1) is None and os.sched_getaffinity(0) == everything\n"
+        "assert pin(None) == max(everything) and os.sched_getaffinity(0) == {max(everything)}\n"
+        "try: pin(10**6)\n"
+        "except ValueError as error: assert 'not one this process may use' in str(error)\n"
+        "else: raise AssertionError"
+    )
+    if hasattr(os, "sched_setaffinity"):
+        subprocess.run([sys.executable, "-c", text], check=True)
+
+
+# --- reporting -------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("at_most", "at_least", "holds", "target"),
+    [
+        (2.5, None, True, "≤ 2.5"),
+        (1.9, None, False, "≤ 1.9"),
+        (None, 2.0, True, "≥ 2"),
+        (2.2, 2.1, False, "≥ 2.1 and ≤ 2.2"),
+        (None, None, True, ""),
+    ],
+)
+def test_claim(at_most, at_least, holds, target):
+    claim = Claim("a over b", Ratio(2.0, 1.0, 3.0), at_most, at_least)
+    assert claim.holds is holds
+    assert claim.target == target
+
+
+def test_report_is_written_and_shown(tmp_path, monkeypatch):
+    console = Console(width=100, record=True, quiet=False, file=open(os.devnull, "w"))  # noqa: SIM115
+    monkeypatch.setattr(report, "console", console)
+    rows = [{"case": "first", "us": 1.25, "to C": None}, {"case": "second", "us": float("nan"), "to C": 2.0}]
+    found = Report("one", "quick", rows, [Claim("a over b", Ratio(2.0, 1.5, 2.5), 1.9)], ["Left out: nothing."], {})
+    path = found.write(tmp_path / "deep")
+    found.show(("case", "us", "to C"))
+    console.file.close()
+
+    written = json.loads(path.read_text())
+    assert written["benchmark"] == "one"
+    assert written["rows"][1]["us"] is None
+    assert written["claims"] == [
+        {
+            "what": "a over b",
+            "seen": {"value": 2.0, "low": 1.5, "high": 2.5},
+            "at_most": 1.9,
+            "at_least": None,
+            "holds": False,
+        }
+    ]
+    assert {"processor", "cores", "python", "jax", "vmri_jax", "xla_flags"} <= written["machine"].keys()
+    text = console.export_text()
+    assert "first" in text
+    assert "2 (1.5 to 2.5)" in text
+    assert "Left out" in text
+
+
+# --- commands --------------------------------------------------------------------------------------------------------
+TINY_COST = cost.Size(
+    turning={"cost": (Case("FPU l=3", "fully explicit", 1e-3, (1, 2), (2,), 1.05, 5.0),)},
+    once=(Case("FPU l=3", "fully implicit", 1e-3, (10,), (10,), dense=1.0),),
+    paper={"cost_fig5": (Case("FPU l=3", "explicit slow", 1e-2, (2,), (2,), paper_minimum=4),)},
+    linear=(Case("FPU l=3", "fully explicit", 1e-5, (100, 200)),),
+    most_unknowns=10,
+    repeats=2,
+    seconds=1e-3,
+)
+TINY = {
+    "cost": (cost, TINY_COST),
+    "floor": (
+        floor,
+        floor.Size((floor.Pair("FPU l=3", 1e-3, 2, ("fully explicit", "explicit slow"), 2.5, 3.0),), 2, 1e-3),
+    ),
+    "batch": (batch, batch.Size((batch.Case("FPU l=3", 1e-3, 0.6, True),), (2, 256), 2, 1e-3)),
+    "compile": (compilation, compilation.Size(("FPU l=3",), ("fully explicit",), (10,), 1)),
+}
+
+
+has_batches = pytest.mark.skipif(not hasattr(vm, "simulate_batch"), reason="no simulate_batch")
+
+
+@pytest.mark.parametrize("name", ["cost", "floor", pytest.param("batch", marks=has_batches), "compile"])
+def test_command(name, tmp_path, monkeypatch):
+    module, size = TINY[name]
+    monkeypatch.setattr(module, "sizes", lambda _, **options: replace(size, **options))
+    monkeypatch.setattr(command_line, "prepare", lambda *_, **__: None)  # the tests have started JAX already
+    told = []
+    run = module.run
+    monkeypatch.setattr(module, "run", lambda size, name, tell: run(size, name, told.append))
+    done = CliRunner().invoke(command_line.app, [name, "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.exception
+    assert len(told) == module.programs_of(size)
+
+    written = json.loads((tmp_path / f"{name}.json").read_text())
+    assert written["size"] == "quick"
+    assert all(row[column] is not None for row in written["rows"] for column in ("system", "case") if column in row)
+    for claim in written["claims"]:
+        seen = claim["seen"]
+        assert 0 < seen["low"] <= seen["high"]
+    assert set(module.COLUMNS) <= set().union(*written["rows"])
+    assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".png"}
+    CHECKS[name](written)
+
+
+def check_cost(found):
+    rows = {(row["case"], row["method"], row["num_micro"]): row for row in found["rows"]}
+    assert len(rows) == 3 + 2 + 2 + 2  # turning, once, paper, linear
+    assert rows["FPU l=3, fully implicit", "dense", 10]["unknowns"] == 33
+    assert rows["FPU l=3, fully explicit", "dense", 2]["iterations"] > 0  # not bypassed
+    assert rows["FPU l=3, fully explicit", "auto", 2]["iterations"] == 0
+    assert rows["FPU l=3, fully explicit", "auto", 200]["bytes"] > 0
+    assert (
+        rows["FPU l=3, fully explicit", "auto", 1]["micro steps"]
+        == rows["FPU l=3, fully explicit", "auto", 2]["micro steps"]
+    )
+    claims = [claim["what"] for claim in found["claims"]]
+    assert sum("dense over default" in what for what in claims) == 1  # the others have fewer than 10 micro steps
+    assert sum("over the cheapest" in what for what in claims) == 1
+    assert sum("slope" in what for what in claims) == 2
+
+
+def check_floor(found):
+    programs = [row["program"] for row in found["rows"]]
+    if c_loops.compiler() is None:
+        assert "No C compiler" in found["notes"][0]
+    else:
+        assert programs == ["fully explicit", "explicit slow", "C"]
+        assert found["rows"][2]["to C"] == 1.0
+        assert found["claims"][0]["what"] == "FPU l=3, num_micro 2: fully explicit over C"
+
+
+def check_batch(found):
+    sizes = [(row["program"], row["batch"]) for row in found["rows"] if row["program"] != "C"]
+    assert sizes == [("default", 2), ("default", 256), ("fixed", 2), ("fixed", 256)]
+    assert all(row["result"] == "CONVERGED" for row in found["rows"] if row["program"] != "C")
+
+
+def check_compile(found):
+    (row,) = found["rows"]
+    assert row["compilations"] == 1
+    assert 0 < row["later call, s"] < row["first call, s"] < row["process, s"]
+
+
+CHECKS = {"cost": check_cost, "floor": check_floor, "batch": check_batch, "compile": check_compile}
+
+
+def test_floor_without_a_compiler(monkeypatch):
+    monkeypatch.setattr(c_loops, "compiler", lambda: None)
+    found = floor.run(TINY["floor"][1], "quick")
+    assert "No C compiler" in found.notes[0]
+    assert [claim.what for claim in found.claims] == ["FPU l=3, num_micro 2: explicit slow over fully explicit"]
+    assert found.rows[0]["to C"] is None
+
+
+# --- what is measured ------------------------------------------------------------------------------------------------
+def test_unknowns_as_in_the_reference_study():
+    assert programs.unknowns(programs.problem("FPU l=3"), 60) == 183
+    assert programs.unknowns(programs.problem("SAM"), 20) == 307
+
+
+@pytest.mark.parametrize("system", ["FPU l=3", "TSP", "SAM"])
+def test_starts_differ_and_keep_to_the_constraints(system):
+    problem = programs.problem(system)
+    states = programs.starts(problem, 3)
+    assert states.q_s.shape == (3, problem.q_s.size)
+    assert np.abs(states.p_f[0] - states.p_f[1]).max() > 1e-4
+    assert isinstance(problem.system.kinetic, vm.ConstantMass)
+    for i in range(3):
+        velocity = problem.system.kinetic.velocity(states.p_s[i], states.p_f[i])
+        assert (
+            np.abs(jax.jvp(problem.system.constraints, (states.q_s[i], states.q_f[i]), velocity)[1]).max(initial=0)
+            < 1e-12
+        )
+
+
+def test_minima_of_the_paper():
+    cases = paper.cases((1,), (1,), {"explicit slow": (10, 100, 200)})
+    assert [case.paper_minimum for case in cases["cost_fig4"]] == [60, 20]
+    assert [case.paper_minimum for case in cases["cost_fig5"]] == [None, 12, 1]
+
+
+def test_slope():
+    x = np.array([1.0, 10.0, 100.0])
+    assert linear.slope(x, 7 * x**1.5) == pytest.approx(1.5)
+
+
+def test_failed_runs_are_not_timed():
+    """An explicit step beyond its stability limit."""
+    found = curves.measure(Case("FPU l=3", "fully explicit", 5.0, (1, 100)), 1, 1e-3)
+    assert not found.samples
+    assert found.rows[0]["result"] == "NON_FINITE"
+    assert found.turn() is None
+    assert "failed and were not timed" in cost._notes(TINY_COST, [found])[1]
+
+
+@pytest.mark.parametrize("name", ["quick", "full"])
+def test_sizes(name):
+    for module in (cost, floor, batch, compilation):
+        assert module.programs_of(module.sizes(name)) > 5
+    assert measure.MIN_SECONDS >= 0.01
