@@ -2,13 +2,16 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: reproduce test lint lock clean
+.PHONY: reproduce test bench lint lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/vmri reproduce --quick --out out
 
 test: .venv/installed  ## the whole test suite
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+bench: .venv/installed  ## the quick measurements: time, memory, against C; out/benchmarks
+	$(BIN)/python -m benchmarks all
 
 lint: .venv/installed  ## format, lint and types, as pre-commit runs them
 	$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/pyright

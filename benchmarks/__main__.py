@@ -1,45 +1,67 @@
-"""Command line of the benchmarks: every run prints a table and writes JSON with versions and machine."""
+"""Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
-import json
-import os
 from pathlib import Path
 from typing import Annotated
 
-import jax
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from benchmarks import num_micro
+from benchmarks import batch, compilation, cost, floor
+from benchmarks.measure import prepare
+from benchmarks.report import console, progress
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
+app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__, pretty_exceptions_show_locals=False)
 
-
-@app.callback()
-def one_core(core: Annotated[int, typer.Option(help="Core to run on, -1 for all.")] = 0) -> None:
-    """Pin the process to one core and switch 64-bit floats on."""
-    if core >= 0 and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {core})
-    jax.config.update("jax_enable_x64", True)
+Full = Annotated[bool, typer.Option("--full/--quick", help="All cases and more samples, or the few that show it.")]
+Core = Annotated[int | None, typer.Option(help="Core to keep to; by default the last one allowed, -1 for all.")]
+Out = Annotated[Path, typer.Option(help="Folder for the JSON files and the figures.")]
+Devices = Annotated[int, typer.Option(min=1, help="CPU devices to spread the batch over, each a core; 1 pins.")]
+OUT = Path("out/benchmarks")
 
 
-@app.command("num-micro")
-def num_micro_command(
-    out: Annotated[Path, typer.Option(help="Folder for the JSON file.")] = Path("out/benchmarks"),
-    repeats: Annotated[int, typer.Option(help="Interleaved repeats; the median is shown.")] = 7,
-) -> None:
-    """Time and memory of the arrowhead solver against num_micro, at constant micro step."""
-    rows = num_micro.measure(repeats)
-    table = Table(title="fully implicit, arrowhead: time and memory against num_micro")
-    for name in rows[0]:
-        table.add_column(name, justify="left" if name == "system" else "right")
-    for row in rows:
-        table.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()))
-    Console().print(table)
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / "num_micro.json"
-    path.write_text(json.dumps({"machine": num_micro.machine(), "rows": rows}, indent=1))
-    Console().print(f"written to {path}")
+@app.command("cost")
+def cost_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
+    """Time per micro step against num_micro; the dense solve; Fig. 4 and 5 of the reference study; linearity."""
+    prepare(core)
+    _measure("cost", cost, full, out)
+
+
+@app.command("floor")
+def floor_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
+    """Single runs against hand-written C loops."""
+    prepare(core)
+    _measure("floor", floor, full, out)
+
+
+@app.command("batch")
+def batch_command(full: Full = False, core: Core = None, out: Out = OUT, devices: Devices = 1) -> None:
+    """Time per trajectory against the batch size, and against one run of the C loop."""
+    prepare(core if devices == 1 else -1, devices=devices)
+    _measure("batch", batch, full, out, devices=devices)
+
+
+@app.command("compile")
+def compile_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
+    """Cold compile and first run in fresh processes; compilations over a sweep."""
+    prepare(core)
+    _measure("compile", compilation, full, out)
+
+
+@app.command("all")
+def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
+    """All of them, one after the other."""
+    prepare(core)
+    for name, module in (("floor", floor), ("batch", batch), ("compile", compilation), ("cost", cost)):
+        _measure(name, module, full, out)
+
+
+def _measure(title: str, module, full: bool, out: Path, **options) -> None:
+    """Measure, print and write."""
+    name = "full" if full else "quick"
+    size = module.sizes(name, **options)
+    with progress(title, module.programs_of(size)) as tell:
+        report = module.run(size, name, tell)
+    report.show(module.COLUMNS)
+    console.print(f"written to {report.write(out)}\n")
 
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ class CLoop:
 
 
 def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int) -> CLoop:
-    """`fully_explicit(num_micro)` on a `fermi_pasta_ulam` chain: the impulse method, its inner loop in registers.
+    """`fully_explicit(num_micro)` on a `fermi_pasta_ulam` chain: the impulse method, every micro step a sweep.
 
     Raises:
         NoCompiler: there is no C compiler.

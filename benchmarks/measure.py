@@ -11,6 +11,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from vmri_jax import runtime
+
 MIN_SECONDS = 0.02
 """A sample shorter than this is made of several calls; longer than clocks and schedulers disturb."""
 
@@ -75,7 +77,7 @@ def interleaved(
         calls[name] = max(1, round(min_seconds / _seconds(run, 1)))
     names = list(runs)
     for i in range(repeats):
-        start = i % len(names)
+        start = i % max(1, len(names))
         for name in names[start:] + names[:start]:
             seconds[name].append(_seconds(runs[name], calls[name]))
     return seconds
@@ -91,7 +93,7 @@ def steps_for(run: Callable[[int], object], seconds: float, unit: int = 1, most:
     none = _seconds(lambda: run(unit), 2)
     while True:
         taken = _seconds(lambda n=steps: run(n), 1)
-        if taken >= seconds / 8 and taken > 3 * none or taken >= seconds or steps * 4 > most:
+        if (taken >= seconds / 8 and taken > 3 * none) or taken >= seconds or steps * 4 > most:
             break
         steps *= 4
     return max(1, min(round(steps * seconds / taken), most) // unit) * unit
@@ -109,7 +111,6 @@ def pin(core: int | None) -> int | None:
 
     Returns the core, None if the process is free or the system does not know how to pin.
     """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not hasattr(os, "sched_setaffinity") or (core is not None and core < 0):
         return None
     allowed = os.sched_getaffinity(0)
@@ -118,6 +119,13 @@ def pin(core: int | None) -> int | None:
         raise ValueError(f"core {core} is not one this process may use; choose from {sorted(allowed)}.")
     os.sched_setaffinity(0, {core})
     return core
+
+
+def prepare(core: int | None = -1, cache: bool = True, devices: int = 1) -> None:
+    """Before JAX starts: keep to one core, set the compiler's flags and its cache, switch 64-bit floats on."""
+    pin(core)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices here are small: threads only make times scatter
+    runtime.configure(devices=devices if devices > 1 else None, cache=runtime.cache_folder() if cache else None)
 
 
 def machine() -> dict:

@@ -1,6 +1,7 @@
 """The programs that are timed: the built-in systems under the schemes of the reference study."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -21,10 +22,13 @@ SYSTEMS = {
 }
 
 
-def problem(name: str) -> vm.Problem:
-    """``"TSP"``, ``"SAM"``, or the chain with so many springs, ``"FPU l=50"``."""
+def problem(name: str, amplitude: float = 1.0) -> vm.Problem:
+    """``"TSP"``, ``"SAM"``, or the chain with so many springs, ``"FPU l=50"``; its start may be made smaller."""
     system, _, springs = name.partition(" l=")
-    return SYSTEMS[system](int(springs)) if springs else SYSTEMS[system]()
+    problem = SYSTEMS[system](int(springs)) if springs else SYSTEMS[system]()
+    if amplitude == 1.0:
+        return problem
+    return replace(problem, **{key: amplitude * getattr(problem, key) for key in ("q_s", "q_f", "v_s", "v_f")})
 
 
 def unknowns(problem: vm.Problem, num_micro: int) -> int:
@@ -37,18 +41,18 @@ def program(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float, newton: vm.
     """``run(num_steps)``: simulate, and save the last node only; a run that fails is seen in its ``result``."""
 
     def run(num_steps: int, state: vm.State) -> vm.Trajectory:
-        return vm.simulate(
-            problem.system,
-            scheme,
-            state,
-            micro_dt=micro_dt,
-            num_steps=num_steps,
-            save_every=num_steps,
-            newton=newton,
-            throw=False,
-        )
+        step = {"micro_dt": micro_dt, "num_steps": num_steps, "save_every": num_steps}
+        return vm.simulate(problem.system, scheme, state, **step, newton=newton, throw=False)
 
     return partial(run, state=problem.state())
+
+
+def short_program(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float):
+    """The same compiled once more as a whole, for every number of steps: a call costs nothing besides its steps."""
+    whole = jax.jit(
+        lambda num_steps, state: program(problem, scheme, micro_dt)(num_steps, state=state), static_argnums=0
+    )
+    return partial(whole, state=problem.state())
 
 
 def failed(trajectory: vm.Trajectory) -> bool:

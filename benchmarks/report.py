@@ -2,6 +2,7 @@
 
 import json
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -15,7 +16,7 @@ from rich.table import Table
 from benchmarks.measure import Ratio, Tell, machine
 from vmri_jax import plots
 
-console = Console()
+console = Console(width=None if sys.stdout.isatty() else 160)
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,8 @@ class Claim:
     @property
     def target(self) -> str:
         """In words."""
-        parts = [f"≥ {self.at_least:g}"] if self.at_least is not None else []
-        return " and ".join(parts + ([f"≤ {self.at_most:g}"] if self.at_most is not None else []))
+        parts = [f"≥ {self.at_least:.3g}"] if self.at_least is not None else []
+        return " and ".join(parts + ([f"≤ {self.at_most:.3g}"] if self.at_most is not None else []))
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Report:
         path.write_text(json.dumps(_finite(found), indent=1))
         for name, draw in self.figures.items():
             figure = draw()
-            _footer(figure)
+            _signature(figure)
             plots.save(figure, out / f"{name}.png")
         return path
 
@@ -86,7 +87,13 @@ class Report:
 @contextmanager
 def progress(title: str, total: int) -> Iterator[Tell]:
     """A bar of `total` parts; yields the function that is told each part before it starts."""
-    columns = (TextColumn(title), BarColumn(30), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[at]}"))
+    columns = (
+        TextColumn(title),
+        BarColumn(30),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[at]}"),
+    )
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=total, completed=-1, at="")
         yield lambda at: bar.update(task, advance=1, at=at)
@@ -96,7 +103,7 @@ def _rows_table(title: str, rows: Sequence[dict], columns: Sequence[str]) -> Tab
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
     for name in columns:
         text = all(isinstance(row.get(name), str | None) for row in rows)
-        table.add_column(name, justify="left" if text else "right")
+        table.add_column(name, justify="left" if text else "right", no_wrap=True)
     for row in rows:
         table.add_row(*(_cell(row.get(name)) for name in columns))
     return table
@@ -127,8 +134,9 @@ def _finite(value):
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _footer(figure: Figure) -> None:
+def _signature(figure: Figure) -> None:
+    """Machine and versions, at the top right."""
     m = machine()
     cores = "" if m["cores"] is None else f", {len(m['cores'])} core{'s' if len(m['cores']) > 1 else ''}"
     text = f"{m['processor']}{cores}; Python {m['python']}, JAX {m['jax']}, vmri_jax {m['vmri_jax']}"
-    figure.supxlabel(text, x=0.01, ha="left", fontsize=7, color=plots.LIGHT.ink)
+    figure.text(0.995, 0.99, text, ha="right", va="top", fontsize=6.5, color=plots.LIGHT.ink)

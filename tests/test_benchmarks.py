@@ -137,15 +137,12 @@ TINY = {
         floor,
         floor.Size((floor.Pair("FPU l=3", 1e-3, 2, ("fully explicit", "explicit slow"), 2.5, 3.0),), 2, 1e-3),
     ),
-    "batch": (batch, batch.Size((batch.Case("FPU l=3", 1e-3, 0.6, True),), (2, 256), 2, 1e-3)),
+    "batch": (batch, batch.Size((batch.Case("FPU l=3", 1e-3, 0.6, True),), (2, 256), 2, 1e-3, 1, 5120)),
     "compile": (compilation, compilation.Size(("FPU l=3",), ("fully explicit",), (10,), 1)),
 }
 
 
-has_batches = pytest.mark.skipif(not hasattr(vm, "simulate_batch"), reason="no simulate_batch")
-
-
-@pytest.mark.parametrize("name", ["cost", "floor", pytest.param("batch", marks=has_batches), "compile"])
+@pytest.mark.parametrize("name", TINY)
 def test_command(name, tmp_path, monkeypatch):
     module, size = TINY[name]
     monkeypatch.setattr(module, "sizes", lambda _, **options: replace(size, **options))

@@ -26,7 +26,7 @@ def difference(loop, problem, num_micro, micro_dt, num_steps):
 
 @needs_compiler
 @pytest.mark.parametrize("num_micro", [1, 7])
-@pytest.mark.parametrize("num_springs", [1, 3, 50, 65, 200])  # a vector, a block, blocks and a vector left over
+@pytest.mark.parametrize("num_springs", [1, 3, 50, 65, 200])  # with and without vectors, and numbers left over
 def test_chain(num_springs, num_micro):
     """From a start that leaves no spring at rest."""
     q_s, q_f, v_s, v_f = np.random.default_rng(0).normal(size=(4, num_springs))

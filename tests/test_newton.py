@@ -7,7 +7,6 @@ import pytest
 from tests.support import compiled_step, largest_difference
 from vmri_jax import ConstantMass, Newton, Result, State, System, fully_implicit, initial_state, simulate
 
-
 EXACT = Newton(method="arrowhead")
 
 

@@ -1,10 +1,11 @@
 """Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories."""
 
-from vmri_jax import diagnostics, quadrature
+from vmri_jax import diagnostics, quadrature, runtime
+from vmri_jax.batch import simulate_batch
 from vmri_jax.discrete_lagrangian import discrete_lagrangian, discrete_legendre
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import macro, micro
-from vmri_jax.results import Result, SimulationError
+from vmri_jax.results import Method, Result, SimulationError
 from vmri_jax.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin
 from vmri_jax.simulate import simulate
 from vmri_jax.state import State, initial_state
@@ -16,6 +17,7 @@ from vmri_jax import systems  # isort: skip  (written with the names above)
 
 __all__ = [
     "ConstantMass",
+    "Method",
     "Newton",
     "Problem",
     "Result",
@@ -37,6 +39,8 @@ __all__ = [
     "macro_step",
     "micro",
     "quadrature",
+    "runtime",
     "simulate",
+    "simulate_batch",
     "systems",
 ]

@@ -29,18 +29,19 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
     Raises:
         RuntimeError: JAX has already started, so that flags would have no effect.
     """
-    flags = [flag for flag in os.environ.get("XLA_FLAGS", "").split() if flag]
-    names = {flag.split("=")[0] for flag in flags}
-    wanted = [FAST_LOOPS] if fast_loops else []
-    wanted += [f"{DEVICES}{devices}"] if devices is not None else []
-    new = [flag for flag in wanted if flag.split("=")[0] not in names]  # what the user has set stays
-    if new and _started():
-        raise RuntimeError(
-            "runtime.configure: JAX has already started, its flags can no longer change; call configure before the first "
-            "computation (before any array is made)."
-        )
-    if new:
-        os.environ["XLA_FLAGS"] = " ".join([*flags, *new])
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    wanted = list(flags)
+    if fast_loops and not any(flag.startswith(FAST_LOOPS.split("=")[0]) for flag in flags):  # the user's own stays
+        wanted.append(FAST_LOOPS)
+    if devices is not None:
+        wanted = [flag for flag in wanted if not flag.startswith(DEVICES)] + [f"{DEVICES}{devices}"]
+    if set(wanted) != set(flags):
+        if _started():
+            raise RuntimeError(
+                "runtime.configure: JAX has already started, its flags can no longer change; call configure before the first "
+                "computation (before any array is made)."
+            )
+        os.environ["XLA_FLAGS"] = " ".join(wanted)
     jax.config.update("jax_enable_x64", True)
     if cache is not None:
         jax.config.update("jax_compilation_cache_dir", str(cache))

@@ -60,23 +60,23 @@ def simulate(
         SimulationError: a step failed.
     """
     macro_dt = jnp.asarray(
-        _check(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every), dtype=float
+        check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every), dtype=float
     )
     start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
     newton, num_saves = newton or Newton(), num_steps // save_every
-    memory = _checked_memory(system, scheme, start, macro_dt, newton)
+    memory = run_memory(system, scheme, start, macro_dt, newton)
     if not is_concrete((system, scheme, start, macro_dt, newton)):
-        run = partial(_run_static, system, scheme, newton, macro_dt, start.t)
-        return run(start, memory, 0, num_saves, save_every, save_micro)[0]
+        compiled = partial(_run_static, system, scheme, newton, macro_dt, start.t)
+        return compiled(start, memory, 0, num_saves, save_every, save_micro)[0]
 
     check_constraints(system, start.q_s, start.q_f, "simulate: the state")
-    run = partial(_run_traced, system, scheme)
+    compiled = partial(_run_traced, system, scheme)
     cheap = newton
     if newton.method == "auto" and newton.marches(system, scheme):
         cheap = dataclasses.replace(newton, method="march")  # "auto" compiles its fallback too: only if it is needed
     pieces, state, first_step = [], start, 0
     for saves in _chunks(num_saves, progress):
-        piece, memory = run(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
+        piece, memory = compiled(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
         failed = int(piece.failed_at)
         if failed >= 0 and cheap is not newton:
             cheap, kept = newton, (failed - first_step) // save_every
@@ -84,8 +84,8 @@ def simulate(
                 pieces.append(piece.first(kept))
                 state, memory = pieces[-1].final_state, None
                 first_step, saves = first_step + kept * save_every, saves - kept
-            memory = _checked_memory(system, scheme, state, macro_dt, newton)
-            piece, memory = run(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
+            memory = run_memory(system, scheme, state, macro_dt, newton)
+            piece, memory = compiled(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
         pieces.append(piece)
         state, first_step = piece.final_state, first_step + saves * save_every
     trajectory = pieces[0] if len(pieces) == 1 else join(pieces)
@@ -94,7 +94,7 @@ def simulate(
     return trajectory
 
 
-def _run(
+def run(
     system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro
 ) -> tuple[Trajectory, Memory]:
     """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one."""
@@ -152,12 +152,12 @@ def _run(
 
 # A traced save_every lets a sweep over step sizes compile once; under a transformation it is static instead, so that
 # the trip count of the loop is known and reverse mode works.
-_run_traced = jax.jit(_run, static_argnames=("num_saves", "save_micro"))
-_run_static = jax.jit(_run, static_argnames=("num_saves", "save_micro", "save_every"))
+_run_traced = jax.jit(run, static_argnames=("num_saves", "save_micro"))
+_run_static = jax.jit(run, static_argnames=("num_saves", "save_micro", "save_every"))
 
 
 @jax.jit
-def _checked_memory(system, scheme, state, macro_dt, newton):
+def run_memory(system, scheme, state, macro_dt, newton):
     """`start_memory`; what the user's functions return is checked while tracing."""
     check_system(system, state.q_s, state.q_f)
     return start_memory(system, scheme, state, macro_dt, newton)
@@ -179,7 +179,7 @@ def _vectors(state: State) -> dict:
     return {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
 
 
-def _check(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every):
+def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every):
     """Refuse bad arguments of `simulate`; returns macro_dt."""
     require_x64()
     if not isinstance(scheme, Scheme):

@@ -15,12 +15,13 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.discrete_lagrangian import Term, lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
 from vmri_jax.newton import Newton, Warm, interval_matrix, is_constant, solve
 from vmri_jax.path import control_nodes
-from vmri_jax.quadrature import micro, midpoint
+from vmri_jax.quadrature import is_concrete, micro, midpoint
 from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, project_momentum
@@ -223,29 +224,35 @@ def _interval(system, scheme, state, macro_dt, newton, memory):
     """Kick, move, kick. Multipliers in the info are scaled; momenta are not projected."""
     parts = split(system, scheme, state.q_s, state.q_f)
     own = system if parts is None else parts.kicks
-    state = _kick(own, scheme, state, macro_dt, memory.kicks, "start")
-    if parts is not None:
-        state, info, memory = _move_parts(parts, scheme.num_micro, state, macro_dt, newton, memory)
-    elif is_explicit(system, scheme):
-        state, info = _drift(system, state, macro_dt)
-    else:
-        state, info, memory = _move_coupled(system, scheme, state, macro_dt, newton, memory)
+    state = _kick(own, scheme, state, macro_dt, memory.kicks, ("start",))
+    state, info, memory = _move(system, scheme, state, macro_dt, newton, memory)
     kicks = _kick_gradients(own, scheme, state.q_s, state.q_f)
-    state = _kick(own, scheme, state, macro_dt, kicks, "end")
+    state = _kick(own, scheme, state, macro_dt, kicks, ("end",))
     return state, info, memory._replace(kicks=kicks)
+
+
+def _move(system, scheme, state, macro_dt, newton, memory):
+    """What happens between the kicks."""
+    parts = split(system, scheme, state.q_s, state.q_f)
+    if parts is not None:
+        return _move_parts(parts, scheme.num_micro, state, macro_dt, newton, memory)
+    if is_explicit(system, scheme):
+        return *_drift(system, state, macro_dt), memory
+    return _move_coupled(system, scheme, state, macro_dt, newton, memory)
 
 
 def _kick_gradients(system, scheme, q_s, q_f):
     return tuple(term.gradient(q_s, q_f) for term in lagrangian(system, scheme).kicks)
 
 
-def _kick(system, scheme, state, macro_dt, gradients, end: str) -> State:
-    """``p + H w dL/dq`` for the weight w that each kicked term has at this end of the interval."""
+def _kick(system, scheme, state, macro_dt, gradients, ends: tuple[str, ...]) -> State:
+    """``p + H w dL/dq`` for the weight w that each kicked term has at these ends of the interval."""
     p_s, p_f = state.p_s, state.p_f
     for term, (d_s, d_f) in zip(lagrangian(system, scheme).kicks, gradients, strict=True):
-        weight = getattr(term, end)
-        if weight is not None:
-            p_s, p_f = p_s + macro_dt * weight * d_s, p_f + macro_dt * weight * d_f
+        weights = [w for w in (getattr(term, end) for end in ends) if w is not None]
+        if weights:
+            impulse = macro_dt * sum(weights)
+            p_s, p_f = p_s + impulse * d_s, p_f + impulse * d_f
     return State(state.t, state.q_s, state.q_f, p_s, p_f)
 
 
@@ -253,15 +260,8 @@ def _drift(system, state, macro_dt):
     """Straight motion at constant momentum."""
     v_s, v_f = system.kinetic.velocity(state.p_s, state.p_f)
     q_s, q_f = state.q_s + macro_dt * v_s, state.q_f + macro_dt * v_f
-    info = StepInfo(
-        jnp.asarray(int(Result.CONVERGED)),
-        jnp.asarray(int(Method.EXPLICIT)),
-        jnp.asarray(0),
-        jnp.zeros(()),
-        q_f[None],
-        jnp.zeros((1, 1, 0)),
-        jnp.zeros((1, 0)),
-    )
+    status = (np.asarray(int(Result.CONVERGED)), np.asarray(int(Method.EXPLICIT)), np.asarray(0), np.zeros(()))
+    info = StepInfo(*status, q_f[None], jnp.zeros((1, 1, 0)), jnp.zeros((1, 0)))
     return State(state.t + macro_dt, q_s, q_f, state.p_s, state.p_f), info
 
 
@@ -277,23 +277,51 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
     slow_memory, fast_memory = memory.parts
     slow, slow_info, slow_memory = _interval(parts.slow, parts.slow_scheme, slow, macro_dt, newton, slow_memory)
 
-    def micro_step(carry, _):
-        fast, memory = carry
-        fast, info, memory = _interval(parts.fast, parts.fast_scheme, fast, macro_dt / num_micro, newton, memory)
-        return (fast, memory), info
-
-    (fast, fast_memory), infos = jax.lax.scan(micro_step, (fast, fast_memory), length=num_micro)
+    fast, fast_memory, infos = _march_fast(parts, num_micro, fast, macro_dt / num_micro, newton, fast_memory)
     info = StepInfo(
-        result=jnp.maximum(slow_info.result, infos.result.max()),
-        method=jnp.maximum(slow_info.method, infos.method.max()),
-        iterations=jnp.maximum(slow_info.iterations, infos.iterations.max()),
-        residual=jnp.maximum(slow_info.residual, infos.residual.max()),
+        *(jnp.maximum(a, b) for a, b in zip(_status(slow_info), _status(infos), strict=True)),
         q_f_micro=infos.q_f_micro[:, 0],
         multiplier=infos.multiplier[:, 0],
         slow_multiplier=slow_info.multiplier[0],
     )
     end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
     return end, info, memory._replace(parts=(slow_memory, fast_memory))
+
+
+def _march_fast(parts, num_micro, fast, micro_dt, newton, memory):
+    """num_micro steps of the fast variables; kicks of two steps at the node they share are merged into one."""
+    system, scheme = parts.fast, parts.fast_scheme
+
+    def micro_step(fast, memory, ends):
+        fast, info, memory = _move(system, scheme, fast, micro_dt, newton, memory)
+        kicks = _kick_gradients(system, scheme, fast.q_s, fast.q_f)
+        return _kick(system, scheme, fast, micro_dt, kicks, ends), info, memory, kicks
+
+    def inside(carry, _):
+        fast, info, memory, _ = micro_step(*carry, ("end", "start"))
+        if is_concrete(_status(info)):  # known beforehand: not worth an array over the micro steps
+            info = dataclasses.replace(info, result=None, method=None, iterations=None, residual=None)
+        return (fast, memory), info
+
+    fast = _kick(system, scheme, fast, micro_dt, memory.kicks, ("start",))
+    memory = memory._replace(kicks=None)  # needed again only at the last node
+    (fast, memory), infos = jax.lax.scan(inside, (fast, memory), length=num_micro - 1)
+    fast, info, memory, kicks = micro_step(fast, memory, ("end",))
+
+    def worst(before, last):
+        return last if before is None else jnp.maximum(jnp.max(before, initial=0), last)
+
+    def joined(before, last):
+        return jnp.concatenate([before, last[None]])
+
+    names = ("result", "method", "iterations", "residual")
+    fields = {f.name: (getattr(infos, f.name), getattr(info, f.name)) for f in dataclasses.fields(info)}
+    infos = StepInfo(**{name: (worst if name in names else joined)(*pair) for name, pair in fields.items()})
+    return fast, memory._replace(kicks=kicks), infos
+
+
+def _status(info: StepInfo) -> tuple:
+    return info.result, info.method, info.iterations, info.residual
 
 
 def _move_coupled(system, scheme, state, macro_dt, newton, memory):

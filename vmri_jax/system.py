@@ -45,7 +45,7 @@ def _times(mass, v):
 
 
 def _solve(mass, p):
-    return p / mass if mass.ndim == 1 else jnp.linalg.solve(mass, p[..., None])[..., 0]
+    return p * (1 / mass) if mass.ndim == 1 else jnp.linalg.solve(mass, p[..., None])[..., 0]
 
 
 def _mass(name: str, mass):

@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
@@ -106,8 +107,8 @@ def solve(
         linear = is_linear(equations.system, equations.scheme, equations.q_s, equations.q_f)
         done, warm = march.solve(fixed, matrix, warm, newton, linear)
         p_s, p_f = _momenta_after(fixed, done)
-        residual = relative_residual(fixed, *done.residual)
-        method = jnp.asarray(int(Method.LINEAR if linear else Method.MARCH))
+        residual = np.zeros(()) if linear else relative_residual(fixed, *done.residual)
+        method = np.asarray(int(Method.LINEAR if linear else Method.MARCH))
         found = Solution(done.x, done.end.q_f, p_s, p_f, residual, done.result, done.passes, method)
         if newton.method == "auto" and not linear:
             found = jax.lax.cond(
@@ -124,8 +125,8 @@ def solve(
 
 def _momenta_after(equations: StepEquations, done: march.March):
     """Momenta after a march: the slow one by the impulse it received, the fast one as handed on."""
-    h = equations.micro_dt
-    return equations.p_s + done.impulse / h, done.end.p_f / h
+    per_h = 1 / equations.micro_dt
+    return equations.p_s + per_h * done.impulse, per_h * done.end.p_f
 
 
 def _end(equations: StepEquations, x: Unknowns):
@@ -149,7 +150,7 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton, method: 
     Converged when the predicted size of all further updates is below ``tolerance`` times the increments, or round-off
     of the positions. With the contraction ``theta = |d_k| / |d_(k-1)|`` the next update is expected to be
     ``|d_k| theta min(1, SAFETY theta)``: quadratic convergence with a margin, linear convergence at worst. A matrix
-    that is not renewed converges linearly.
+    that is not renewed converges linearly; there the last update itself has to be that small.
     """
     renewed = method in ("arrowhead", "dense")
     solver = dense if method == "dense" else arrowhead
@@ -175,10 +176,11 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton, method: 
         d = solver.solve(now, equations.residual(x))
         x = jax.tree.map(jnp.add, x, d)
         update = size(d, x)
-        contraction = update / previous
-        shrink = contraction * (jnp.minimum(1.0, SAFETY * contraction) if renewed else 1.0)  # of the next update
-        error = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
-        error = jnp.where(k == 0, update, error)
+        contraction, error = update / previous, update
+        if renewed:  # quadratic convergence: the next update is known to be much smaller
+            shrink = contraction * jnp.minimum(1.0, SAFETY * contraction)
+            predicted = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
+            error = jnp.where(k == 0, update, predicted)
         largest = jnp.maximum(_largest(d.slow), _largest(d.fast))
         at_floor = (contraction > 0.5) & (largest <= ROUNDOFF_FLOOR * eps * positions)
         last = jnp.where(update > previous, Result.DIVERGED, Result.STAGNATED)

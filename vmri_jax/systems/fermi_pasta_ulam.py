@@ -11,8 +11,9 @@ from vmri_jax import ConstantMass, Problem, System
 
 def soft_springs(q_s, q_f, params):
     """``V = 1/4 [(s_1 - f_1)^4 + sum_i (s_{i+1} - f_{i+1} - s_i - f_i)^4 + (s_l + f_l)^4]``."""
-    inner = q_s[1:] - q_f[1:] - q_s[:-1] - q_f[:-1]
-    return ((q_s[0] - q_f[0]) ** 4 + jnp.sum(inner**4) + (q_s[-1] + q_f[-1]) ** 4) / 4
+    wall = jnp.zeros(1)
+    left, right = jnp.concatenate([wall, q_s + q_f]), jnp.concatenate([q_s - q_f, wall])
+    return jnp.sum((right - left) ** 4) / 4
 
 
 def stiff_springs(q_f, params):

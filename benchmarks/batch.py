@@ -1,0 +1,190 @@
+"""Batches: time per trajectory and micro step against the batch size, and against one run of the C loop."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
+
+import vmri_jax as vm
+from benchmarks import c_loops, programs
+from benchmarks.floor import c_loop
+from benchmarks.measure import Tell, interleaved, ratio, silent, steps_for
+from benchmarks.report import Claim, Report
+from vmri_jax import plots
+
+COLUMNS = ("system", "program", "batch", "ns/trajectory/micro step", "low", "high", "to C", "iterations", "result")
+NUM_MICRO = 10
+HELD = 256
+"""The batch size that is held against C."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One system under the fully explicit scheme.
+
+    target: the most that a trajectory in a batch of HELD may take over C.
+    fixed: whether a fixed number of iterations is also run.
+    """
+
+    system: str
+    micro_dt: float
+    target: float
+    fixed: bool
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is run: cases, batch sizes, samples of each program, seconds of a run, CPU devices,
+    and micro steps of all trajectories together in the first guess."""
+
+    cases: tuple[Case, ...]
+    batches: tuple[int, ...]
+    repeats: int
+    seconds: float
+    devices: int = 1
+    micro_steps: int = 200_000
+
+
+def sizes(name: str, devices: int = 1) -> Size:
+    """ "quick" or "full"."""
+    cases = (Case("FPU l=3", 0.001, 0.6, False), Case("TSP", 0.0002, 0.7, True), Case("SAM", 0.0002, 0.7, True))
+    if name == "quick":
+        return Size(cases, (1, 32, 256), 5, 0.05, devices)
+    return Size(cases, (1, 4, 16, 64, 256, 1024), 15, 0.2, devices)
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Report:
+    """Measure all of it."""
+    rows, claims, notes = [], [], []
+    if c_loops.compiler() is None:
+        notes.append("No C compiler (cc, gcc or clang) on the PATH: nothing was held against C. Install one for that.")
+    for case in size.cases:
+        some_rows, some_claims = _measure(case, size, tell)
+        rows += some_rows
+        claims += some_claims
+    return Report("batch", name, rows, claims, notes, {"batch": lambda: draw(rows, size.devices)})
+
+
+def programs_of(size: Size) -> int:
+    """How many programs are timed."""
+    return sum(len(size.batches) * (1 + case.fixed) for case in size.cases)
+
+
+def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, devices: int) -> Callable:
+    states = programs.starts(problem, batch)
+
+    def run(num_steps: int) -> vm.Trajectory:
+        return vm.simulate_batch(
+            problem.system,
+            vm.fully_explicit(NUM_MICRO),
+            states,
+            micro_dt=case.micro_dt,
+            num_steps=num_steps,
+            save_every=num_steps,
+            newton=newton,
+            devices=devices if batch % devices == 0 else 1,
+        )
+
+    return run
+
+
+def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
+    problem = programs.problem(case.system)
+    newtons = {"default": vm.Newton()}
+    if case.fixed:
+        newtons["fixed"] = vm.Newton(fixed_iterations=_fewest_iterations(problem, case))
+    runs, work, results = {}, {}, {}
+    for option, newton in newtons.items():
+        for batch in size.batches:
+            tell(f"{case.system}, batch {batch}, {option}")
+            simulate = _program(problem, case, batch, newton, min(size.devices, batch))
+            steps = _steps(simulate, batch, size)
+            key = f"{option} {batch}"
+            runs[key], work[key] = partial(simulate, steps), batch * steps * NUM_MICRO
+            results[key] = runs[key]()
+    if c_loops.compiler() is not None:
+        loop = partial(c_loop, case.system, problem, NUM_MICRO, case.micro_dt)
+        steps = steps_for(lambda n: loop(n)(), size.seconds, 10)
+        runs["C"], work["C"] = loop(steps), steps * NUM_MICRO
+    timed = interleaved(runs, size.repeats)
+    ns = {key: [1e9 * s / work[key] for s in timed[key]] for key in runs}
+
+    rows, claims = [], []
+    for key, sample in ns.items():
+        option, _, batch = key.partition(" ")
+        low, middle, high = (float(x) for x in np.quantile(sample, (0.25, 0.5, 0.75)))
+        info = _info(results[key]) if key in results else {"iterations": None, "result": ""}
+        to_c = ratio(sample, ns["C"]) if "C" in ns else None
+        rows.append(
+            {
+                "system": case.system,
+                "program": option,
+                "batch": int(batch or 1),
+                "micro_dt": case.micro_dt,
+                "ns/trajectory/micro step": middle,
+                "low": low,
+                "high": high,
+                "to C": to_c and to_c.value,
+                **info,
+            }
+        )
+        if to_c and key != "C" and int(batch) == HELD:
+            claims.append(Claim(f"{case.system}, batch of {HELD}, {option}: over C", to_c, at_most=case.target))
+    return rows, claims
+
+
+def _steps(simulate: Callable, batch: int, size: Size) -> int:
+    """Macro steps that last about long enough; few numbers are tried, since a batch is compiled for each."""
+    steps = max(1, size.micro_steps // (batch * NUM_MICRO))
+    (seconds,) = interleaved({"": partial(simulate, steps)}, 1, 0.0)[""]
+    return steps if seconds > size.seconds / 4 else round(steps * size.seconds / seconds)
+
+
+def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
+    """As many as keep a single run of a thousand steps converged, from what the default takes on average upwards."""
+    scheme, state, steps = vm.fully_explicit(NUM_MICRO), problem.state(), 1000
+    run = vm.simulate(problem.system, scheme, state, micro_dt=case.micro_dt, num_steps=steps)
+    taken = np.asarray(run.info.iterations)
+    for iterations in range(max(1, int(taken.mean())), int(taken.max())):
+        simulate = programs.program(problem, scheme, case.micro_dt, vm.Newton(fixed_iterations=iterations))
+        if not programs.failed(simulate(steps)):
+            return iterations
+    return max(1, int(taken.max()))
+
+
+def _info(trajectory: vm.Trajectory) -> dict:
+    worst = int(np.max(np.asarray(trajectory.result)))
+    return {"iterations": int(np.max(np.asarray(trajectory.info.iterations))), "result": vm.Result(worst).name}
+
+
+def draw(rows: list[dict], devices: int) -> Figure:
+    """One panel per system; the C loop is a line."""
+    names = list(dict.fromkeys(row["system"] for row in rows))
+    theme = plots.LIGHT
+    with plots.style():
+        figure = plots.NotebookFigure(figsize=(0.8 + 2.8 * len(names), 3.6))
+        panels = figure.subplots(1, len(names), squeeze=False)[0]
+        for axes, name in zip(panels, names, strict=True):
+            here = [row for row in rows if row["system"] == name]
+            for i, option in enumerate(("default", "fixed")):
+                points = [(r["batch"], r["ns/trajectory/micro step"]) for r in here if r["program"] == option]
+                if points:
+                    label = "fixed iterations" if option == "fixed" else option
+                    axes.loglog(*zip(*points, strict=True), marker=plots.MARKERS[i], color=theme.curves[i], label=label)
+            for row in here:
+                if row["program"] == "C":
+                    line = {"color": theme.ink, "linestyle": "--", "linewidth": 1.0, "label": "C, one trajectory"}
+                    axes.axhline(row["ns/trajectory/micro step"], **line)
+            axes.set(title=f"{name}, fully explicit", xlabel="batch size")
+            axes.xaxis.set_major_locator(FixedLocator(sorted({row["batch"] for row in here})))
+            axes.xaxis.set_major_formatter("{x:.0f}")
+            axes.xaxis.set_minor_locator(NullLocator())
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        panels[0].set(ylabel="ns per trajectory and micro step")
+        handles = {label: h for axes in panels for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+        figure.suptitle("Batches on one core" if devices == 1 else f"Batches on {devices} cores", x=0.01, ha="left")
+    return figure

@@ -1,0 +1,156 @@
+"""Cost of accuracy in the fast variables: time per micro step against num_micro, and against the dense solve."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+
+from matplotlib.figure import Figure
+
+from benchmarks import linear, paper
+from benchmarks.curves import Case, Curves, draw, measure
+from benchmarks.measure import silent
+from benchmarks.programs import SCHEMES
+from benchmarks.report import Claim, Report
+
+COLUMNS = (
+    "case",
+    "method",
+    "num_micro",
+    "unknowns",
+    "micro_dt",
+    "µs/micro step",
+    "to cheapest",
+    "iterations",
+    "result",
+)
+ALL = (1, 4, 8, 12, 20, 40, 60, 100)
+ONCE = (
+    Case("FPU l=3", "fully implicit", 0.001, (100,), (100,), dense=50.0),
+    Case("FPU l=50", "fully implicit", 0.001, (30,), (30,), dense=2000.0),
+    Case("SAM", "fully implicit", 0.0002, (50,), (50,), dense=100.0),
+)
+"""Single points at which the dense solve is held against the default one, however slow it is."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is run.
+
+    turning: cases in which cost must not turn up, by figure.
+    once: single points against the dense solve.
+    paper: cases of the figures of the reference study.
+    linear: cases run up to a large num_micro.
+    most_unknowns: the dense solve is left out beyond.
+    repeats, seconds: samples of each program, and how long a run takes.
+    """
+
+    turning: dict[str, tuple[Case, ...]]
+    once: tuple[Case, ...]
+    paper: dict[str, tuple[Case, ...]]
+    linear: tuple[Case, ...]
+    most_unknowns: int
+    repeats: int
+    seconds: float
+
+
+def _turning(num_micro, chains, dense_num_micro, fpu_dt: float, rigid_dt: float) -> tuple[Case, ...]:
+    """Every system under every scheme."""
+    systems = [*(f"FPU l={length}" for length in chains), "TSP", "SAM"]
+    cases = []
+    for system, scheme in product(systems, SCHEMES):
+        chain = system.startswith("FPU")
+        case = Case(system, scheme, fpu_dt if chain else rigid_dt, num_micro, dense_num_micro, 1.8, 10.0)
+        if chain and scheme != "fully implicit":
+            case = replace(case, turn=1.05)
+        if chain and fpu_dt == paper.FPU_DT:
+            case = paper.at_paper_steps(case)
+        cases.append(case)
+    return tuple(cases)
+
+
+def sizes(name: str) -> Size:
+    """ "quick" or "full"."""
+    if name == "quick":
+        return Size(
+            turning={"cost": _turning((1, 20, 100), (10, 200), (20,), 0.001, 0.0002)},
+            once=ONCE,
+            paper=paper.cases((1, 4, 20, 60, 100), (1, 8, 20), {"fully implicit": (30,), "explicit slow": (30,)}),
+            linear=linear.cases((10, 200, 5000)),
+            most_unknowns=310,
+            repeats=5,
+            seconds=0.05,
+        )
+    chains = (10, 50, 100, 200)
+    return Size(
+        turning={
+            "cost": _turning(ALL, chains, ALL, 0.001, 0.0002),
+            "cost_paper_steps": _turning(ALL, chains, (), paper.FPU_DT, paper.SAM_DT),
+        },
+        once=ONCE,
+        paper=paper.cases(ALL, ALL, dict.fromkeys(SCHEMES, (10, 40, 70, 100, 150, 200))),
+        linear=linear.cases((10, 50, 100, 500, 1000, 2500, 5000)),
+        most_unknowns=700,
+        repeats=9,
+        seconds=0.1,
+    )
+
+
+def run(size: Size, name: str, tell=silent) -> Report:
+    """Measure all of it."""
+    parts = {
+        name: [measure(case.affordable(size.most_unknowns), size.repeats, size.seconds, tell) for case in cases]
+        for name, cases in {**size.turning, **size.paper}.items()
+    }
+    once = [measure(case, max(3, size.repeats // 2), size.seconds, tell) for case in size.once]
+    lines = [linear.measure(case, size.repeats, size.seconds, tell) for case in size.linear]
+
+    everything = [*(curves for part in parts.values() for curves in part), *once]
+    claims = [claim for curves in everything for claim in _claims(curves)]
+    claims += [claim for line in lines for claim in line.claims]
+    rows = [row for curves in everything for row in curves.rows] + [row for line in lines for row in line.rows]
+    figures: dict = {file: partial(_draw, file, part) for file, part in parts.items()}
+    if lines:
+        figures["cost_linear"] = partial(linear.draw, lines)
+    return Report("cost", name, rows, claims, _notes(size, everything), figures)
+
+
+def _draw(file: str, part: list[Curves]) -> Figure:
+    per_scheme = len({curves.case.system for curves in part})
+    if file in paper.TITLES:
+        return draw(part, paper.TITLES[file], per_scheme)
+    dt = " and ".join(f"{h:g}" for h in dict.fromkeys(curves.case.micro_dt for curves in part))
+    return draw(part, f"Computing time does not turn up (micro steps {dt})", len(SCHEMES))
+
+
+def programs_of(size: Size) -> int:
+    """How many programs are timed."""
+    cases = [case for part in (*size.turning.values(), *size.paper.values()) for case in part]
+    return sum(c.affordable(size.most_unknowns).programs for c in cases) + sum(
+        c.programs for c in (*size.once, *size.linear)
+    )
+
+
+def _claims(curves: Curves) -> list[Claim]:
+    case, claims = curves.case, []
+    turn, dense = curves.turn(), curves.dense()
+    if turn is not None and len(case.num_micro) > 1:
+        what = f"{case.label}, h = {case.micro_dt:g}: num_micro {max(case.num_micro)} over the cheapest"
+        claims.append(Claim(what, turn, at_most=case.turn))
+    if dense is not None:
+        at = [n for n in case.dense_num_micro if n >= 10]
+        where = f"num_micro {min(at)}" + (f" to {max(at)}, least" if len(at) > 1 else "")
+        claims.append(Claim(f"{case.label}, {where}: dense over default", dense, at_least=case.dense))
+    return claims
+
+
+def _notes(size: Size, everything: list[Curves]) -> list[str]:
+    notes = [f"The dense solve was left out beyond {size.most_unknowns} unknowns, the single points aside."]
+    missing = [
+        f"{row['case']}, num_micro {row['num_micro']} ({row['result']})"
+        for curves in everything
+        for row in curves.rows
+        if row["µs/micro step"] != row["µs/micro step"]
+    ]
+    if missing:
+        notes.append(f"Runs that failed and were not timed: {'; '.join(missing)}.")
+    return notes

@@ -1,0 +1,145 @@
+"""Single runs against hand-written C on one core, and the implicit schemes against the explicit one."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import vmri_jax as vm
+from benchmarks import c_loops, programs
+from benchmarks.measure import Ratio, Tell, interleaved, ratio, silent, steps_for
+from benchmarks.report import Claim, Report
+from vmri_jax import plots
+
+COLUMNS = ("system", "program", "num_micro", "micro steps", "ns/micro step", "low", "high", "to C", "result")
+NUM_MICRO = 10
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One system: explicit runs, and those of other schemes, all against the C loop.
+
+    target: the most that the first scheme may take over C.
+    implicit: the most that the other schemes may take over the first one.
+    """
+
+    system: str
+    micro_dt: float
+    num_micro: int
+    schemes: tuple[str, ...]
+    target: float
+    implicit: float | None = None
+
+    @property
+    def label(self) -> str:
+        """Name in tables and figures."""
+        return f"{self.system}, num_micro {self.num_micro}"
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is run: pairs, samples of each program, seconds of a run."""
+
+    pairs: tuple[Pair, ...]
+    repeats: int
+    seconds: float
+
+
+def sizes(name: str) -> Size:
+    """ "quick" or "full"; the pairs are the same."""
+    explicit, every = ("fully explicit",), ("fully explicit", "explicit slow", "fully implicit")
+    chains = tuple(Pair(f"FPU l={length}", 0.001, n, explicit, 2.5) for length in (3, 50, 200) for n in (NUM_MICRO, 60))
+    pairs = (
+        *chains,
+        Pair("FPU l=10000", 0.001, NUM_MICRO, ("explicit slow",), 1 / 0.3),
+        Pair("TSP", 0.0002, NUM_MICRO, every, 4.0, 3.0),
+        Pair("SAM", 0.0002, NUM_MICRO, every, 8.0, 3.0),
+    )
+    return Size(pairs, 7, 0.1) if name == "quick" else Size(pairs, 25, 0.2)
+
+
+def c_loop(system: str, problem: vm.Problem, num_micro: int, micro_dt: float, num_steps: int) -> c_loops.CLoop:
+    """The C loop over `num_steps` macro steps: the impulse method, or RATTLE with every step a micro step.
+
+    Raises:
+        NoCompiler: there is no C compiler.
+    """
+    if system.startswith("FPU"):
+        return c_loops.fpu(problem, num_micro, micro_dt, num_steps)
+    return {"TSP": c_loops.tsp, "SAM": c_loops.sam}[system](problem, micro_dt, num_steps * num_micro)
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Report:
+    """Measure all of it; without a compiler only the implicit schemes are held against the explicit one."""
+    rows, claims, notes = [], [], []
+    if c_loops.compiler() is None:
+        notes.append("No C compiler (cc, gcc or clang) on the PATH: nothing was held against C. Install one for that.")
+    for pair in size.pairs:
+        some_rows, some_claims = _measure(pair, size, tell)
+        rows += some_rows
+        claims += some_claims
+    figures = {} if notes else {"floor": lambda: draw(rows)}
+    return Report("floor", name, rows, claims, notes, figures)
+
+
+def programs_of(size: Size) -> int:
+    """How many programs are timed."""
+    return sum(len(pair.schemes) for pair in size.pairs)
+
+
+def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
+    problem = programs.problem(pair.system)
+    runs, steps, results = {}, {}, {}
+    for scheme in pair.schemes:
+        tell(f"{pair.label}, {scheme}")
+        simulate = programs.program(problem, programs.SCHEMES[scheme](pair.num_micro), pair.micro_dt)
+        steps[scheme] = steps_for(simulate, size.seconds, 10)
+        runs[scheme] = partial(simulate, steps[scheme])
+        results[scheme] = vm.Result(int(np.asarray(runs[scheme]().result))).name
+    first = pair.schemes[0]
+    if c_loops.compiler() is not None:
+        steps["C"], results["C"] = steps[first], ""
+        runs["C"] = c_loop(pair.system, problem, pair.num_micro, pair.micro_dt, steps["C"])
+    timed = interleaved(runs, size.repeats)
+    ns = {name: [1e9 * s / (steps[name] * pair.num_micro) for s in timed[name]] for name in runs}
+
+    to_c = {name: ratio(sample, ns["C"]) for name, sample in ns.items()} if "C" in ns else {}
+    claims = [Claim(f"{pair.label}: {first} over C", to_c[first], at_most=pair.target)] if to_c else []
+    for other in pair.schemes[1:]:
+        claims.append(Claim(f"{pair.label}: {other} over {first}", ratio(ns[other], ns[first]), at_most=pair.implicit))
+    return [_row(pair, name, steps[name], ns[name], to_c.get(name), results[name]) for name in runs], claims
+
+
+def _row(pair: Pair, name: str, steps: int, ns: list[float], to_c: Ratio | None, result: str) -> dict:
+    low, middle, high = (float(x) for x in np.quantile(ns, (0.25, 0.5, 0.75)))
+    return {
+        "system": pair.system,
+        "program": name,
+        "num_micro": pair.num_micro,
+        "micro_dt": pair.micro_dt,
+        "micro steps": steps * pair.num_micro,
+        "ns/micro step": middle,
+        "low": low,
+        "high": high,
+        "to C": None if to_c is None else to_c.value,
+        "result": result,
+    }
+
+
+def draw(rows: list[dict]) -> Figure:
+    """Time over that of C, one bar per program."""
+    theme, rows = plots.LIGHT, [row for row in rows if row["program"] != "C"][::-1]
+    colors = dict(zip(programs.SCHEMES, theme.curves, strict=False))
+    with plots.style():
+        figure = plots.NotebookFigure(figsize=(7.2, 1.2 + 0.28 * len(rows)))
+        axes = figure.subplots()
+        labels = [f"{row['system']}, num_micro {row['num_micro']}, {row['program']}" for row in rows]
+        bars = axes.barh(labels, [row["to C"] for row in rows], color=[colors[row["program"]] for row in rows])
+        axes.bar_label(bars, fmt="%.2f", padding=3, fontsize=8)
+        axes.axvline(1.0, color=theme.ink, linewidth=1.0)
+        axes.set(xlabel="time over that of the C loop (the line at 1)", xscale="log")
+        axes.margins(x=0.15)
+        axes.grid(axis="y", visible=False)
+        figure.suptitle("One run on one core against C", x=0.01, ha="left")
+    return figure

@@ -1,0 +1,102 @@
+"""Linear in num_micro: time and temporary memory of one macro step up to thousands of micro steps."""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+import vmri_jax as vm
+from benchmarks import curves, programs
+from benchmarks.curves import Case
+from benchmarks.measure import Ratio, Tell, silent
+from benchmarks.report import Claim
+from vmri_jax import plots
+
+MEMORY_FROM = 100
+"""Below so many micro steps what does not depend on num_micro counts as well."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """Microseconds (one list per num_micro) and, from MEMORY_FROM on, temporary bytes of one macro step."""
+
+    case: Case
+    num_micro: np.ndarray
+    us: np.ndarray
+    bytes: np.ndarray
+    rows: list[dict]
+
+    @property
+    def claims(self) -> list[Claim]:
+        """Slopes in logarithms."""
+        what = f"{self.case.label}: slope of log {{}} against log num_micro up to {self.num_micro.max():g}"
+        slopes = [slope(self.num_micro, sample) for sample in self.us.T]
+        low, high = np.quantile(slopes, (0.25, 0.75))
+        seconds = Ratio(slope(self.num_micro, np.median(self.us, axis=1)), float(low), float(high))
+        many = self.num_micro[self.num_micro >= MEMORY_FROM]
+        claims = [Claim(what.format("time"), seconds, 1.1, 0.9)]
+        if many.size > 1:
+            memory = slope(many, self.bytes)
+            claims.append(Claim(what.format("memory"), Ratio(memory, memory, memory), 1.1))
+        return claims
+
+
+def slope(x, y) -> float:
+    """Least-squares slope of log y against log x."""
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0])
+
+
+def cases(num_micro: tuple[int, ...]) -> tuple[Case, ...]:
+    """One of each kind of step; micro steps so small that the largest macro step is still an ordinary one."""
+    return (
+        Case("FPU l=3", "fully implicit", 1e-5, num_micro),
+        Case("FPU l=50", "explicit slow", 1e-5, num_micro),
+        Case("TSP", "fully explicit", 1e-5, num_micro),
+        Case("SAM", "fully implicit", 1e-5, num_micro),
+    )
+
+
+def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Line:
+    """Time the macro steps of a case, and read the temporary memory off their compiled programs."""
+    found = curves.measure(case, repeats, seconds, tell)
+    problem = programs.problem(case.system)
+    num_micro, _ = found.curve("auto")
+    many = num_micro[num_micro >= MEMORY_FROM]
+    size = np.array([temporary_bytes(problem, programs.SCHEMES[case.scheme](int(n)), case.micro_dt) for n in many])
+    us = np.array([found.samples["auto", int(n)] for n in num_micro]) * num_micro[:, None]
+    by_n = dict(zip(many.tolist(), size.tolist(), strict=True))
+    rows = [row | {"bytes": by_n.get(row["num_micro"])} for row in found.rows]
+    return Line(case, num_micro, us, size, rows)
+
+
+def temporary_bytes(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float) -> int:
+    """Temporary memory of one compiled macro step."""
+    step = jax.jit(vm.macro_step)
+    compiled = step.lower(problem.system, scheme, problem.state(), scheme.num_micro * micro_dt).compile()
+    return compiled.memory_analysis().temp_size_in_bytes  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def draw(lines: list[Line]) -> Figure:
+    """Time and memory of a macro step, with a line of slope one."""
+    with plots.style():
+        figure = plots.NotebookFigure(figsize=(7.6, 3.8))
+        panels = figure.subplots(1, 2)
+        for i, line in enumerate(lines):
+            look = {"marker": plots.MARKERS[i], "color": plots.LIGHT.curves[i], "label": line.case.label}
+            panels[0].loglog(line.num_micro, np.median(line.us, axis=1), **look)
+            panels[1].loglog(line.num_micro[-len(line.bytes) :], line.bytes / 1024, **look)
+        for axes in panels:
+            (left, _), (bottom, _) = axes.get_xlim(), axes.get_ylim()
+            x = np.array([left, lines[0].num_micro.max()])
+            guide = {"color": plots.LIGHT.ink, "linestyle": ":", "linewidth": 1.0, "label": "slope 1"}
+            axes.loglog(x, bottom * x / left, **guide)
+            axes.set(xlabel="micro steps per macro step")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        panels[0].set(ylabel="µs per macro step")
+        panels[1].set(ylabel="temporary memory, KiB")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
+        figure.suptitle("Linear in num_micro", x=0.01, ha="left")
+    return figure

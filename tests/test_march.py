@@ -1,0 +1,222 @@
+"""The nested march and the other methods: same solution, few passes, honest about what they did."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.support import compiled_step, largest_difference
+from tests.user_systems import bent_system, double_pendulum, two_oscillators
+from vmri_jax import (
+    ConstantMass,
+    Method,
+    Newton,
+    Result,
+    Scheme,
+    System,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    galerkin,
+    initial_state,
+    macro,
+    micro,
+    quadrature,
+    simulate,
+    systems,
+)
+from vmri_jax.newton import interval
+from vmri_jax.newton.secant import Pairs
+
+METHODS = ["auto", "march", "frozen", "decoupled"]
+
+
+def ends_differ(a, b) -> float:
+    """Largest relative difference of two final states."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return max(largest_difference(x, y) / (1e-300 + float(np.abs(y).max(initial=0))) for x, y in pairs if x.size)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("name", "scheme", "macro_dt"),
+    [
+        ("fpu", galerkin(4, 2), 0.04),
+        ("fpu", explicit_slow(4), 0.04),
+        ("tsp", galerkin(3, 2, "lobatto"), 0.006),
+        ("tsp", galerkin(2, 3), 0.006),
+        ("sam", fully_explicit(5), 0.002),
+        ("sam", galerkin(2, 2), 0.002),
+    ],
+)
+def test_methods_agree_with_the_exact_one(name, scheme, macro_dt, method, request):
+    problem = request.getfixturevalue(name)
+
+    def end(method):
+        newton = Newton(method)
+        return simulate(
+            problem.system, scheme, problem.state(), macro_dt=macro_dt, num_steps=20, save_every=20, newton=newton
+        )
+
+    assert ends_differ(end(method).final_state, end("arrowhead").final_state) < 1e-11  # measured 1e-12
+
+
+def drag(t, q_s, q_f, v_s, v_f, params):
+    return -0.1 * v_s, -0.2 * v_f * jnp.sum(v_f**2)
+
+
+def skew(q_f, params):
+    return jnp.sum(jnp.cosh(q_f)) + 10 * (q_f[0] - q_f[1]) ** 2
+
+
+def link(q_s, q_f, params):
+    return jnp.stack([jnp.sum((q_f[:2] - q_s) ** 2) - 2.0])
+
+
+def test_full_masses_forces_and_coupled_fast_potential():
+    mass = ConstantMass(jnp.array([[5.0, 1.0], [1.0, 4.0]]), jnp.array([[1.0, 0.2, 0], [0.2, 1.0, 0.1], [0, 0.1, 2.0]]))
+    system = System(mass, fast_potential=skew, constraint=link, force=drag)
+    state = initial_state(system, [0.0, 0.0], [1.0, 1.0, 0.3], [0.1, 0.2], [0.0, 0.3, -0.2])
+    for scheme in (fully_implicit(4), galerkin(2, 2)):
+        ends = [compiled_step(system, scheme, state, 0.1, Newton(method))[0] for method in ("march", "arrowhead")]
+        assert ends_differ(*ends) < 1e-12  # measured 1e-15
+
+
+def test_equal_masses_converge():
+    """Fast and slow parts of one weight: nothing is weak about the coupling."""
+    problem = systems.triple_spherical_pendulum(masses=(1.0, 1.0, 1.0), stiffness=50.0)
+    run = simulate(problem.system, fully_implicit(10), problem.state(), macro_dt=0.1, num_steps=50)
+    assert int(run.info.method.max()) == Method.MARCH
+    assert int(run.info.iterations.max()) < 15  # measured 9
+
+
+@pytest.mark.parametrize(
+    ("scheme", "method"),
+    [
+        (fully_explicit(4), Method.EXPLICIT),
+        (explicit_slow(4), Method.LINEAR),
+        (fully_implicit(4), Method.MARCH),
+    ],
+)
+def test_info_says_how_a_step_was_solved(fpu, scheme, method):
+    assert int(compiled_step(fpu.system, scheme, fpu.state(), 0.01, Newton())[1].method) == method
+
+
+def test_terms_inside_the_macro_interval_take_the_arrowhead(fpu):
+    rule = micro(quadrature.midpoint)
+    scheme = Scheme(4, kinetic=rule, slow=macro(quadrature.gauss(2)), fast=rule)
+    assert int(compiled_step(fpu.system, scheme, fpu.state(), 0.01, Newton())[1].method) == Method.ARROWHEAD
+    with pytest.raises(ValueError, match="method 'march' needs a ConstantMass, and potentials"):
+        simulate(fpu.system, scheme, fpu.state(), macro_dt=0.01, num_steps=1, newton=Newton("march"))
+
+
+def test_kinetic_functions_take_the_arrowhead():
+    problem = double_pendulum()
+    info = compiled_step(problem.system, fully_implicit(3), problem.state(), 0.01, Newton())[1]
+    assert int(info.method) == Method.ARROWHEAD
+
+
+def test_auto_falls_back_where_the_march_does_not_converge(fpu):
+    """At H = 2 the curvature of V outweighs the mass of the slow variables."""
+    problem, newton = two_oscillators(kappa=25.0), Newton(max_iterations=6)
+    scheme, state = fully_implicit(20), problem.state()
+    march = compiled_step(problem.system, scheme, state, 40.0, Newton("march", max_iterations=6))[1]
+    assert int(march.result) == Result.STAGNATED
+    end, info = compiled_step(problem.system, scheme, state, 40.0, newton)
+    exact, _ = compiled_step(problem.system, scheme, state, 40.0, Newton("arrowhead"))
+    assert int(info.method) == Method.ARROWHEAD
+    assert ends_differ(end, exact) < 1e-12
+    run = simulate(problem.system, scheme, state, macro_dt=40.0, num_steps=3, newton=newton)
+    assert run.success
+    assert int(run.info.method.max()) == Method.ARROWHEAD
+
+
+def test_a_fallback_keeps_what_was_computed(fpu):
+    """The run goes on from the last saved node, with the same trajectory as the exact method."""
+    scheme = fully_implicit(100)
+    free = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20)
+    first = int(free.info.iterations[0])
+    assert first < int(free.info.iterations.max())
+    run = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20, newton=Newton(max_iterations=first))
+    exact = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20, newton=Newton("arrowhead"))
+    methods = np.asarray(run.info.method)
+    assert methods[0] == Method.MARCH
+    assert Method.ARROWHEAD in methods
+    assert largest_difference(run.q_f[:10], exact.q_f[:10]) < 1e-8  # errors grow fast at this step; measured 1e-10
+
+
+@pytest.mark.parametrize("method", ["march", "arrowhead"])
+def test_fixed_iterations(tsp, method):
+    def run(count):
+        newton = Newton(method, fixed_iterations=count)
+        return simulate(
+            tsp.system, fully_explicit(5), tsp.state(), macro_dt=0.002, num_steps=20, newton=newton, throw=False
+        )
+
+    free = simulate(tsp.system, fully_explicit(5), tsp.state(), macro_dt=0.002, num_steps=20)
+    enough = run(6)
+    assert enough.success
+    assert np.all(np.asarray(enough.info.iterations) == 6)
+    assert largest_difference(enough.q_f, free.q_f) < 1e-12  # measured 2e-15
+    assert Result(int(run(1).result)) is Result.STAGNATED
+
+
+def test_the_matrix_of_the_micro_intervals_is_the_derivative(tsp, fpu):
+    """Of the rows by the increments, for all coordinates at once and for each alone."""
+    from vmri_jax.equations import StepEquations
+    from vmri_jax.linearization import linearize
+
+    for problem, scheme in ((tsp, galerkin(2, 2)), (fpu, fully_implicit(2)), (fpu, explicit_slow(2))):
+        state = problem.state()
+        equations = StepEquations(
+            problem.system, scheme, 0.0, *(getattr(state, k) for k in ("q_s", "q_f", "p_s", "p_f")), 0.01
+        )
+        matrix = interval.interval_matrix(equations)
+        r, n_f = scheme.degree, state.q_f.size
+        system, local = interval.interval_problem(problem.system, scheme)
+        if problem is fpu:  # V is left out there
+            system = system.replace(slow_potential=None)
+        eqs = StepEquations(system, local, 0.0, state.q_s, state.q_f, state.p_s, state.p_f, 0.005)
+        x = eqs.guess(*system.kinetic.velocity(state.p_s, state.p_f), jnp.zeros(int(problem is tsp)), jnp.zeros(0))
+        block = linearize(eqs, x).ff[0, :, :, 1:]
+        rows = jnp.asarray(np.random.default_rng(0).normal(size=(r, n_f)))
+        inc = matrix.solve(rows)
+        assert largest_difference(jnp.einsum("iajb,jb->ia", block[:-1], inc), rows) < 1e-13
+        assert largest_difference(jnp.einsum("ajb,jb->a", block[-1], inc), matrix.outgoing(inc)) < 1e-13
+
+
+def test_constant_and_linear_parts_are_recognised(fpu, tsp):
+    q_s, q_f, none = fpu.q_s, fpu.q_f, jnp.zeros(0)
+    assert interval.is_constant(fpu.system, fully_implicit(3), q_s, q_f)
+    assert not interval.is_linear(fpu.system, fully_implicit(3), q_s, q_f)
+    fast = fpu.system.replace(slow_potential=None, kinetic=ConstantMass(none, jnp.ones(3)))
+    assert interval.is_linear(fast, fully_implicit(1), none, q_f)
+    assert interval.is_constant(tsp.system, fully_explicit(3), tsp.q_s, tsp.q_f)
+    assert not interval.is_constant(tsp.system, fully_implicit(3), tsp.q_s, tsp.q_f)
+    assert not interval.can_be_cut(bent_system(), fully_implicit(3))
+
+
+def test_secant_pairs_solve_a_linear_problem():
+    """After as many pairs as dimensions the update is exact."""
+    matrix = jnp.array([[1.0, 0.4, 0.0], [0.1, 0.7, 0.2], [0.0, 0.3, 1.2]])
+    target = jnp.array([1.0, -2.0, 0.5])
+    x, pairs, last = jnp.zeros(3), Pairs.none(3), None
+    for _ in range(5):
+        d = target - matrix @ x
+        if last is not None:
+            pairs = pairs.add(x - last[0], d - last[1], 1e-14, 3)
+        last = x, d
+        x = x + pairs.corrected(d, 3)
+    assert largest_difference(matrix @ x, target) < 1e-12  # measured 3e-16
+
+
+def test_no_library_call_in_a_compiled_run(tsp):
+    """The loop over macro steps of a small constrained system has no call out of it."""
+    run = jax.jit(
+        lambda state: simulate(
+            tsp.system, fully_explicit(5), state, macro_dt=0.001, num_steps=5, newton=Newton("march")
+        )
+    )
+    text = run.lower(tsp.state()).compile().as_text()
+    assert "custom-call" not in text
+    assert " dot(" not in text

@@ -1,0 +1,147 @@
+"""Batches of runs: many starts, step sizes or parameters of one system, lane by lane independent."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec
+
+from vmri_jax.newton import Newton
+from vmri_jax.scheme import Scheme
+from vmri_jax.simulate import check_run, run, run_memory
+from vmri_jax.state import State, check_constraints
+from vmri_jax.step import split
+from vmri_jax.system import System
+from vmri_jax.trajectory import Trajectory
+
+WORKING_SET = 8192
+"""Numbers that the lanes of a chunk may hold together: about the first-level cache."""
+
+
+def simulate_batch(
+    system: System,
+    scheme: Scheme,
+    states: State,
+    *,
+    macro_dt=None,
+    micro_dt=None,
+    num_steps: int,
+    save_every: int = 1,
+    save_micro: bool = False,
+    params=None,
+    newton: Newton | None = None,
+    chunk: int | None = None,
+    devices: int = 1,
+) -> Trajectory:
+    """Simulate a batch of states, each lane as `simulate` would; the arrays returned have a leading batch axis.
+
+    Lanes are computed side by side, with the batch axis contiguous in memory, in chunks that fit into the cache. A lane
+    that fails is NaN from there on and has its status in ``.result`` and ``.failed_at``; others do not notice, and
+    nothing is raised. Lanes that the nested march does not solve are run again with the exact arrowhead.
+
+    Args:
+        system, scheme: what moves, and how.
+        states: a `State` whose arrays have a leading batch axis, e.g. ``jax.vmap(make)(q_s, ...)`` or
+            ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``.
+        macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
+        num_steps, save_every, save_micro, newton: as in `simulate`. ``Newton(fixed_iterations=...)`` is worth trying.
+        params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
+        chunk: lanes that are computed side by side; chosen from the size of the problem if None.
+        devices: CPU devices over which chunks are spread, see `vmri_jax.runtime.configure`.
+
+    Raises:
+        ValueError, TypeError: bad arguments, before anything is computed.
+    """
+    newton = newton or Newton()
+    lanes, first = _check_states(states), jax.tree.map(lambda a: a[0], states)
+    name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
+    sizes = np.shape(dt)
+    if sizes not in ((), (lanes,)):
+        raise ValueError(
+            f"simulate_batch: {name} has shape {sizes}; give a number, or one for each of the {lanes} lanes."
+        )
+    if not (np.all(np.isfinite(dt)) and np.all(np.asarray(dt) > 0)):
+        raise ValueError(f"simulate_batch: every {name} must be a positive number, got {dt}.")
+    steps = {"macro_dt": macro_dt, "micro_dt": micro_dt} | {name: np.ravel(dt)[0]}
+    check_run(system, scheme, first, newton, **steps, num_steps=num_steps, save_every=save_every)
+    if not 1 <= devices <= jax.device_count():
+        raise ValueError(
+            f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call runtime.configure(devices={devices}) "
+            "before JAX starts."
+        )
+    if params is None:
+        check_constraints(system, first.q_s, first.q_f, "simulate_batch: the first state")
+        params = jax.tree.map(lambda a: jnp.broadcast_to(a, (lanes, *jnp.shape(a))), system.params)
+
+    macro_dt = jnp.broadcast_to(jnp.asarray(dt, float) * (scheme.num_micro if micro_dt is not None else 1), (lanes,))
+    size = _chunk(system, scheme, first) if chunk is None else chunk
+    static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}
+    go = partial(_in_chunks, system, scheme, chunk=size, devices=devices, **static)
+    cheap = newton
+    if newton.method == "auto" and newton.marches(system, scheme):
+        cheap = dataclasses.replace(newton, method="march")
+    batch = states, macro_dt, params
+    trajectory = go(cheap, batch)
+    failed = np.flatnonzero(np.asarray(trajectory.failed_at) >= 0)
+    if failed.size and cheap is not newton:
+        exact = dataclasses.replace(newton, method="arrowhead", fixed_iterations=None)
+        again = go(exact, jax.tree.map(lambda a: a[failed], batch))
+        trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b), trajectory, again)
+    return trajectory
+
+
+def _check_states(states) -> int:
+    """The number of lanes."""
+    if not isinstance(states, State):
+        raise TypeError(
+            f"simulate_batch: states is {type(states).__name__}; give a State whose arrays have a batch axis."
+        )
+    shapes = {name: np.shape(value) for name, value in vars(states).items()}
+    lanes = shapes["q_s"][:1]
+    if any(len(s) != (1 if name == "t" else 2) or s[:1] != lanes for name, s in shapes.items()) or lanes == (0,):
+        raise ValueError(
+            f"simulate_batch: the arrays of states have shapes {shapes}; give t (batch,) and all others (batch, n)."
+        )
+    return lanes[0]
+
+
+def _chunk(system: System, scheme: Scheme, state: State) -> int:
+    """A power of two of lanes whose unknowns fit into the working set."""
+    n_s, n_f = state.q_s.shape[0], state.q_f.shape[0]
+    unknowns = 0
+    if split(system, scheme, state.q_s, state.q_f) is None:
+        n_g = system.num_constraints(state.q_s, state.q_f)[0]
+        unknowns = scheme.num_micro * scheme.degree * (n_f + n_g)
+    return 2 ** int(np.clip(np.log2(WORKING_SET / (8 * (n_s + n_f) + unknowns)), 3, 10))
+
+
+def _in_chunks(system, scheme, newton, batch, *, chunk: int, devices: int, **static) -> Trajectory:
+    """All lanes, `chunk` per device at a time; the last ones are filled up with copies, so that one program does all."""
+    lanes = batch[1].shape[0]
+    together = min(chunk * devices, -(-lanes // devices) * devices)
+    pieces = []
+    for start in range(0, lanes, together):
+        index = np.minimum(np.arange(start, start + together), lanes - 1)
+        piece = _side_by_side(system, scheme, newton, jax.tree.map(lambda a, i=index: a[i], batch), devices, **static)
+        pieces.append(piece)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:lanes], *pieces)
+
+
+@partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"))
+def _side_by_side(system, scheme, newton, batch, devices, *, num_saves, save_every, save_micro) -> Trajectory:
+    def lane(system, scheme, newton, save_every, batch):
+        state, macro_dt, params = batch
+        system = system.replace(params=params)
+        memory = run_memory(system, scheme, state, macro_dt, newton)
+        return run(system, scheme, newton, macro_dt, state.t, state, memory, 0, num_saves, save_every, save_micro)[0]
+
+    lanes = jax.vmap(lane, in_axes=(None, None, None, None, 0))
+    if devices > 1:
+        mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
+        shared, spread = PartitionSpec(), PartitionSpec("lanes")
+        lanes = jax.shard_map(
+            lanes, mesh=mesh, in_specs=(shared, shared, shared, shared, spread), out_specs=spread, check_vma=False
+        )
+    return lanes(system, scheme, newton, save_every, batch)
