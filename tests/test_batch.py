@@ -26,12 +26,8 @@ def spread(problem, lanes: int) -> State:
     """States that differ in their velocities."""
     state = problem.state()
     scale = 1 + 0.02 * jnp.arange(lanes)[:, None]
-    return State(
-        jnp.zeros(lanes),
-        *(jnp.tile(q, (lanes, 1)) for q in (state.q_s, state.q_f)),
-        scale * state.p_s,
-        scale * state.p_f,
-    )
+    q_s, q_f = jnp.tile(state.q_s, (lanes, 1)), jnp.tile(state.q_f, (lanes, 1))
+    return State(jnp.zeros(lanes), q_s, q_f, scale * state.p_s, scale * state.p_f)
 
 
 @pytest.mark.parametrize(

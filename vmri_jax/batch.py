@@ -56,16 +56,23 @@ def simulate_batch(
     """
     newton = newton or Newton()
     lanes, first = _check_states(states), jax.tree.map(lambda a: a[0], states)
+    check_run(
+        system,
+        scheme,
+        first,
+        newton,
+        *(_first(dt) for dt in (macro_dt, micro_dt)),
+        num_steps=num_steps,
+        save_every=save_every,
+    )
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
-    sizes = np.shape(dt)
-    if sizes not in ((), (lanes,)):
+    dt = np.asarray(dt, dtype=float)
+    if dt.shape not in ((), (lanes,)):
         raise ValueError(
-            f"simulate_batch: {name} has shape {sizes}; give a number, or one for each of the {lanes} lanes."
+            f"simulate_batch: {name} has shape {dt.shape}; give a number, or one for each of the {lanes} lanes."
         )
-    if not (np.all(np.isfinite(dt)) and np.all(np.asarray(dt) > 0)):
+    if not (np.all(np.isfinite(dt)) and np.all(dt > 0)):
         raise ValueError(f"simulate_batch: every {name} must be a positive number, got {dt}.")
-    steps = {"macro_dt": macro_dt, "micro_dt": micro_dt} | {name: np.ravel(dt)[0]}
-    check_run(system, scheme, first, newton, **steps, num_steps=num_steps, save_every=save_every)
     if not 1 <= devices <= jax.device_count():
         raise ValueError(
             f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call runtime.configure(devices={devices}) "
@@ -75,7 +82,7 @@ def simulate_batch(
         check_constraints(system, first.q_s, first.q_f, "simulate_batch: the first state")
         params = jax.tree.map(lambda a: jnp.broadcast_to(a, (lanes, *jnp.shape(a))), system.params)
 
-    macro_dt = jnp.broadcast_to(jnp.asarray(dt, float) * (scheme.num_micro if micro_dt is not None else 1), (lanes,))
+    macro_dt = jnp.broadcast_to(dt * (scheme.num_micro if micro_dt is not None else 1), (lanes,))
     size = _chunk(system, scheme, first) if chunk is None else chunk
     static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}
     go = partial(_in_chunks, system, scheme, chunk=size, devices=devices, **static)
@@ -90,6 +97,11 @@ def simulate_batch(
         again = go(exact, jax.tree.map(lambda a: a[failed], batch))
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b), trajectory, again)
     return trajectory
+
+
+def _first(dt):
+    """The step size of the first lane."""
+    return None if dt is None else np.ravel(dt)[0]
 
 
 def _check_states(states) -> int:

@@ -187,8 +187,8 @@ def start_memory(system: System, scheme: Scheme, state: State, macro_dt, newton:
 
 def _renew_matrix(system, scheme, state, macro_dt, memory: Memory) -> Memory:
     """The matrix of the micro intervals at the start of this macro step, unless it is constant."""
-    if memory.parts is not None:
-        parts = split(system, scheme, state.q_s, state.q_f)
+    parts = split(system, scheme, state.q_s, state.q_f)
+    if parts is not None:
         slow, fast = _slow_and_fast(state)
         slow_memory, fast_memory = memory.parts
         slow_memory = _renew_matrix(parts.slow, parts.slow_scheme, slow, macro_dt, slow_memory)
@@ -277,13 +277,11 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
     slow_memory, fast_memory = memory.parts
     slow, slow_info, slow_memory = _interval(parts.slow, parts.slow_scheme, slow, macro_dt, newton, slow_memory)
 
-    fast, fast_memory, infos = _march_fast(parts, num_micro, fast, macro_dt / num_micro, newton, fast_memory)
-    info = StepInfo(
-        *(jnp.maximum(a, b) for a, b in zip(_status(slow_info), _status(infos), strict=True)),
-        q_f_micro=infos.q_f_micro[:, 0],
-        multiplier=infos.multiplier[:, 0],
-        slow_multiplier=slow_info.multiplier[0],
+    fast, fast_memory, status, q_f, multiplier = _march_fast(
+        parts, num_micro, fast, macro_dt / num_micro, newton, fast_memory
     )
+    status = (jnp.maximum(a, b) for a, b in zip(_status(slow_info), status, strict=True))
+    info = StepInfo(*status, q_f, multiplier, slow_info.multiplier[0])  # pyright: ignore[reportCallIssue]
     end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
     return end, info, memory._replace(parts=(slow_memory, fast_memory))
 
@@ -298,26 +296,20 @@ def _march_fast(parts, num_micro, fast, micro_dt, newton, memory):
         return _kick(system, scheme, fast, micro_dt, kicks, ends), info, memory, kicks
 
     def inside(carry, _):
-        fast, info, memory, _ = micro_step(*carry, ("end", "start"))
-        if is_concrete(_status(info)):  # known beforehand: not worth an array over the micro steps
-            info = dataclasses.replace(info, result=None, method=None, iterations=None, residual=None)
-        return (fast, memory), info
+        fast, memory = carry
+        fast, info, memory, _ = micro_step(fast, memory, ("end", "start"))
+        status = None if is_concrete(_status(info)) else _status(info)  # known beforehand: not worth arrays
+        return (fast, memory), (status, info.q_f_micro[0], info.multiplier[0])
 
     fast = _kick(system, scheme, fast, micro_dt, memory.kicks, ("start",))
     memory = memory._replace(kicks=None)  # needed again only at the last node
-    (fast, memory), infos = jax.lax.scan(inside, (fast, memory), length=num_micro - 1)
-    fast, info, memory, kicks = micro_step(fast, memory, ("end",))
-
-    def worst(before, last):
-        return last if before is None else jnp.maximum(jnp.max(before, initial=0), last)
-
-    def joined(before, last):
-        return jnp.concatenate([before, last[None]])
-
-    names = ("result", "method", "iterations", "residual")
-    fields = {f.name: (getattr(infos, f.name), getattr(info, f.name)) for f in dataclasses.fields(info)}
-    infos = StepInfo(**{name: (worst if name in names else joined)(*pair) for name, pair in fields.items()})
-    return fast, memory._replace(kicks=kicks), infos
+    (fast, memory), (before, q_f, multiplier) = jax.lax.scan(inside, (fast, memory), length=num_micro - 1)
+    fast, last, memory, kicks = micro_step(fast, memory, ("end",))
+    status = _status(last)
+    if before is not None:
+        status = tuple(jnp.maximum(jnp.max(a, initial=0), b) for a, b in zip(before, status, strict=True))
+    q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
+    return fast, memory._replace(kicks=kicks), status, q_f, multiplier
 
 
 def _status(info: StepInfo) -> tuple:

@@ -25,6 +25,12 @@ def can_be_cut(system: System, scheme: Scheme) -> bool:
     return isinstance(system.kinetic, ConstantMass) and local and force
 
 
+def constant_mass(system: System) -> ConstantMass:
+    """The masses of a system that can be cut."""
+    assert isinstance(system.kinetic, ConstantMass)
+    return system.kinetic
+
+
 def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
     """System and scheme of one micro interval: without the kicks at the macro nodes and the slow constraint."""
     changes: dict[str, Any] = {"slow_constraint": None}
@@ -76,7 +82,7 @@ def _is_per_coordinate(system: System, scheme: Scheme, q_f) -> bool:
 
     V is then left out: it is the soft potential, and h^2 times its curvature is small beside the mass.
     """
-    if system.kinetic.fast.ndim == 2:
+    if constant_mass(system).fast.ndim == 2:
         return False
     terms = implicit_terms(system, scheme)
     fast = [term for term in terms if term.arguments == ("q_f",)]
@@ -107,7 +113,8 @@ def interval_matrix(equations: StepEquations) -> IntervalMatrix:
     system, scheme = interval_problem(equations.system, equations.scheme)
     local = StepEquations(system, scheme, equations.t, q_s, q_f, equations.p_s, equations.p_f, equations.micro_dt)
     n_g, _ = system.num_constraints(q_s, q_f)
-    x = local.guess(*system.kinetic.velocity(equations.p_s, equations.p_f), jnp.zeros(n_g), jnp.zeros(0))
+    v_s, v_f = constant_mass(system).velocity(equations.p_s, equations.p_f)
+    x = local.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(0))
     r, n_f = scheme.degree, q_f.shape[0]
     if not _is_per_coordinate(equations.system, equations.scheme, q_f):
         block = linearize(local, x).ff[0, :, :, 1:]

@@ -12,7 +12,7 @@ from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
 from vmri_jax.newton import arrowhead, dense, march
 from vmri_jax.newton.interval import can_be_cut, is_linear
-from vmri_jax.newton.march import RUNNING, Warm
+from vmri_jax.newton.march import RUNNING
 from vmri_jax.results import Method, Result
 
 SAFETY = 100.0
@@ -92,8 +92,8 @@ class Solution(NamedTuple):
 
 
 def solve(
-    equations: StepEquations, guess: Unknowns, newton: Newton, matrix=None, warm: Warm | None = None
-) -> tuple[Solution, Warm | None]:
+    equations: StepEquations, guess: Unknowns, newton: Newton, matrix: Any = None, warm: Any = None
+) -> tuple[Solution, Any]:
     """Solve ``equations.residual(x) = 0``.
 
     Args:
@@ -173,7 +173,7 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton, method: 
     def iterate(carry):
         x, previous, k, _ = carry
         now = factor(linearize(equations, x), x) if renewed else factors
-        d = solver.solve(now, equations.residual(x))
+        d = solver.solve(now, equations.residual(x))  # pyright: ignore[reportArgumentType]
         x = jax.tree.map(jnp.add, x, d)
         update = size(d, x)
         contraction, error = update / previous, update

@@ -23,7 +23,13 @@ from vmri_jax.algebra import inverse, matmul
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.lanes import contiguous_lanes
-from vmri_jax.newton.interval import IntervalMatrix, interval_problem, is_explicit_given_multipliers, solve_saddle
+from vmri_jax.newton.interval import (
+    IntervalMatrix,
+    constant_mass,
+    interval_problem,
+    is_explicit_given_multipliers,
+    solve_saddle,
+)
 from vmri_jax.newton.secant import Pairs
 from vmri_jax.path import control_nodes
 from vmri_jax.results import Result
@@ -82,7 +88,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
     kicks = lagrangian(system, scheme).kicks if n > 1 else ()
     explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
     basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # (n, r + 1, r): slow position at each node by increments
-    inverse_mass = _inverse_mass(system.kinetic.fast)
+    inverse_mass = _inverse_mass(constant_mass(system).fast)
 
     def interval(carry: Pass, at):
         m, basis, scale, inside, inc, mu = at
@@ -172,7 +178,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     system, scheme, h = equations.system, equations.scheme, equations.micro_dt
     n, r, n_s, n_f = scheme.num_micro, scheme.degree, equations.q_s.shape[0], equations.q_f.shape[0]
     eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
-    inverse_slow, inverse_fast = _inverse_mass(system.kinetic.slow), _inverse_mass(system.kinetic.fast)
+    mass = constant_mass(system)
+    inverse_slow, inverse_fast = _inverse_mass(mass.slow), _inverse_mass(mass.fast)
     kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
     inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
     accepted_slow, accepted_fast = ROUNDOFF * eps * _largest(equations.q_s), ROUNDOFF * eps * _largest(equations.q_f)
