@@ -10,6 +10,13 @@ settings.register_profile("repeatable", derandomize=True, deadline=None, databas
 settings.load_profile("repeatable")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forget_programs():
+    """Compiled programs of a module go when it is done: each holds memory maps, of which a process has only so many."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def fpu():
     """The Fermi-Pasta-Ulam chain with three stiff springs."""
@@ -32,3 +39,23 @@ def sam():
     from vmri_jax import systems
 
     return systems.simple_atomic_model()
+
+
+def pytest_addoption(parser):
+    parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def default_method(request):
+    """`Newton()` with the method of the command line: the tests hold for every method."""
+    from vmri_jax import Newton
+
+    method = request.config.getoption("--method")
+    if method is None:
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        defaults = Newton.__init__.__defaults__ or ()
+        patch.setattr(Newton.__init__, "__defaults__", (method, *defaults[1:]))
+        assert Newton().method == method
+        yield

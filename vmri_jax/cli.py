@@ -231,7 +231,8 @@ def _summary(
         "simulated time": f"{float(trajectory.t[0]):g} to {float(trajectory.t[-1]):g}",
         "wall time": f"{seconds:.2f} s, of which {compiling:.2f} s compiling",
         "per micro step": f"{1e6 * max(seconds - compiling, 0.0) / (steps * num_micro):.3g} µs",
-        "Newton iterations": f"at most {int(np.max(trajectory.info.iterations))} per step",
+        "Newton iterations": f"at most {int(np.max(trajectory.info.iterations))} per step, "
+        f"{vm.Method(int(np.max(trajectory.info.method))).name.lower()}",
         "energy error": f"{error:.2e}{'' if absolute else ' of the energy at the start'}",
     }
     if position > 0:
