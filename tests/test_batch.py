@@ -100,6 +100,7 @@ def test_one_compilation_for_all_chunks_and_step_sizes(fpu):
         ({"macro_dt": np.array([0.1, -0.1, 0.1])}, "every macro_dt must be a positive number"),
         ({"num_steps": 0}, "num_steps is 0; it must be an integer of at least 1"),
         ({"devices": 99}, "devices is 99, but JAX has"),
+        ({"chunk": 0}, "chunk is 0; it must be an integer of at least 1, or None"),
     ],
 )
 def test_bad_input_is_refused(fpu, changes, message):

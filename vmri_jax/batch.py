@@ -78,6 +78,8 @@ def simulate_batch(
             f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call runtime.configure(devices={devices}) "
             "before JAX starts."
         )
+    if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
+        raise ValueError(f"simulate_batch: chunk is {chunk!r}; it must be an integer of at least 1, or None.")
     if params is None:
         check_constraints(system, first.q_s, first.q_f, "simulate_batch: the first state")
         params = jax.tree.map(lambda a: jnp.broadcast_to(a, (lanes, *jnp.shape(a))), system.params)

@@ -109,8 +109,8 @@ def run(
         worst = tuple(jnp.where(alive, jnp.maximum(w, x), w) for w, x in zip(worst, now, strict=True))
         result = jnp.where(alive, jnp.maximum(result, info.result), result)
         status = (result, jnp.where(alive & ~ok, k, failed_at))
-        state = jax.tree.map(lambda a: jnp.where(ok, a, jnp.nan), state)
-        state = State(t_start + (k + 1) * macro_dt, state.q_s, state.q_f, state.p_s, state.p_f)
+        p_s, p_f = jnp.where(ok, state.p_s, jnp.nan), jnp.where(ok, state.p_f, jnp.nan)  # positions follow, see below
+        state = State(t_start + (k + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
         return state, memory, k + 1, status, worst, micro
 
@@ -129,7 +129,8 @@ def run(
     phase = (nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f)
     energy = jax.vmap(partial(diagnostics.energy, system))(*phase)
 
-    # A potential may be NaN where its gradient is not (a logarithm beyond its pole): such nodes are no result either.
+    # The energy is NaN from a failing step on. A potential may also be NaN where its gradient is not (a logarithm beyond
+    # its pole): such nodes are no result either.
     broken = jnp.cumsum(~jnp.isfinite(energy)) > 0
     at_node = first_step + jnp.argmax(broken) * save_every - 1
     newly = broken.any() & (status[1] < 0)

@@ -182,7 +182,8 @@ def start_memory(system: System, scheme: Scheme, state: State, macro_dt, newton:
         else:  # renewed by every macro step
             matrix = jax.tree.map(lambda a: jnp.zeros(a.shape), jax.eval_shape(interval_matrix, equations))
         warm = Warm.straight(control_nodes(scheme.degree)[1:, None] * (macro_dt * velocity[0]), n_g, n_gs)
-    return Memory(kicks, velocity, jnp.zeros(n_g), jnp.zeros(n_gs), matrix, warm, memories)
+    kept = None if isinstance(system.kinetic, ConstantMass) else velocity  # there momenta say the same
+    return Memory(kicks, kept, jnp.zeros(n_g), jnp.zeros(n_gs), matrix, warm, memories)
 
 
 def _renew_matrix(system, scheme, state, macro_dt, memory: Memory) -> Memory:
@@ -209,7 +210,7 @@ def advance(system: System, scheme: Scheme, state: State, macro_dt, newton: Newt
     state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
     p_s, p_f, v_s, v_f = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f, memory.velocity)
     state = State(state.t, state.q_s, state.q_f, p_s, p_f)
-    finite = jnp.all(jnp.isfinite(jnp.concatenate([state.q_s, state.q_f, p_s, p_f])))
+    finite = jnp.all(jnp.isfinite(p_s)) & jnp.all(jnp.isfinite(p_f))  # positions become infinite by momenta that are
     multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, info.multiplier, info.slow_multiplier)
     info = dataclasses.replace(
         info,
@@ -217,7 +218,8 @@ def advance(system: System, scheme: Scheme, state: State, macro_dt, newton: Newt
         multiplier=multiplier,
         slow_multiplier=slow_multiplier,
     )
-    return state, info, memory._replace(velocity=(v_s, v_f))
+    kept = None if isinstance(system.kinetic, ConstantMass) else (v_s, v_f)
+    return state, info, memory._replace(velocity=kept)
 
 
 def _interval(system, scheme, state, macro_dt, newton, memory):
@@ -319,9 +321,10 @@ def _status(info: StepInfo) -> tuple:
 def _move_coupled(system, scheme, state, macro_dt, newton, memory):
     """All unknowns of the macro step at once, by Newton's iteration."""
     equations = _equations(system, scheme, state, macro_dt)
-    v_s, v_f = memory.velocity
     if isinstance(system.kinetic, ConstantMass):  # the momentum is at hand, kicks included
         v_s, v_f = system.kinetic.velocity(state.p_s, state.p_f)
+    else:
+        v_s, v_f = memory.velocity
     guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
     found, warm = solve(equations, guess, newton, memory.matrix, memory.warm)
     x = found.x
