@@ -82,20 +82,21 @@ def simulate_batch(
         raise ValueError(f"simulate_batch: chunk is {chunk!r}; it must be an integer of at least 1, or None.")
     if params is None:
         check_constraints(system, first.q_s, first.q_f, "simulate_batch: the first state")
-        params = jax.tree.map(lambda a: jnp.broadcast_to(a, (lanes, *jnp.shape(a))), system.params)
-
-    macro_dt = jnp.broadcast_to(dt * (scheme.num_micro if micro_dt is not None else 1), (lanes,))
+    macro_dt = dt * (scheme.num_micro if micro_dt is not None else 1)
     size = _chunk(system, scheme, first) if chunk is None else chunk
     static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}
     go = partial(_in_chunks, system, scheme, chunk=size, devices=devices, **static)
     cheap = newton
-    if newton.method == "auto" and newton.marches(system, scheme):
+    if newton.falls_back and newton.marches(system, scheme):
         cheap = dataclasses.replace(newton, method="march")
-    batch = states, macro_dt, params
+    batch = {"state": states}  # what differs between the lanes
+    batch |= {} if params is None else {"params": params}
+    batch |= {} if dt.ndim == 0 else {"macro_dt": macro_dt}
+    go = partial(go, macro_dt)
     trajectory = go(cheap, batch)
     failed = np.flatnonzero(np.asarray(trajectory.failed_at) >= 0)
     if failed.size and cheap is not newton:
-        exact = dataclasses.replace(newton, method="arrowhead", fixed_iterations=None)
+        exact = dataclasses.replace(newton, method="arrowhead")
         again = go(exact, jax.tree.map(lambda a: a[failed], batch))
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b), trajectory, again)
     return trajectory
@@ -131,31 +132,32 @@ def _chunk(system: System, scheme: Scheme, state: State) -> int:
     return 2 ** int(np.clip(np.log2(WORKING_SET / (8 * (n_s + n_f) + unknowns)), 3, 10))
 
 
-def _in_chunks(system, scheme, newton, batch, *, chunk: int, devices: int, **static) -> Trajectory:
+def _in_chunks(system, scheme, macro_dt, newton, batch, *, chunk: int, devices: int, **static) -> Trajectory:
     """All lanes, `chunk` per device at a time; the last ones are filled up with copies, so that one program does all."""
-    lanes = batch[1].shape[0]
+    lanes = batch["state"].q_s.shape[0]
     together = min(chunk * devices, -(-lanes // devices) * devices)
     pieces = []
     for start in range(0, lanes, together):
         index = np.minimum(np.arange(start, start + together), lanes - 1)
-        piece = _side_by_side(system, scheme, newton, jax.tree.map(lambda a, i=index: a[i], batch), devices, **static)
+        piece = _side_by_side(
+            system, scheme, macro_dt, newton, jax.tree.map(lambda a, i=index: a[i], batch), devices, **static
+        )
         pieces.append(piece)
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:lanes], *pieces)
 
 
 @partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"))
-def _side_by_side(system, scheme, newton, batch, devices, *, num_saves, save_every, save_micro) -> Trajectory:
-    def lane(system, scheme, newton, save_every, batch):
-        state, macro_dt, params = batch
-        system = system.replace(params=params)
+def _side_by_side(system, scheme, macro_dt, newton, batch, devices, *, num_saves, save_every, save_micro) -> Trajectory:
+    def lane(system, scheme, macro_dt, newton, save_every, batch):
+        state, macro_dt = batch["state"], batch.get("macro_dt", macro_dt)
+        system = system.replace(params=batch.get("params", system.params))
         memory = run_memory(system, scheme, state, macro_dt, newton)
-        return run(system, scheme, newton, macro_dt, state.t, state, memory, 0, num_saves, save_every, save_micro)[0]
+        saves = num_saves, save_every, save_micro
+        return run(system, scheme, newton, macro_dt, state.t, state, memory, 0, *saves, lanes=True)[0]
 
-    lanes = jax.vmap(lane, in_axes=(None, None, None, None, 0))
+    lanes = jax.vmap(lane, in_axes=(None,) * 5 + (0,))
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         shared, spread = PartitionSpec(), PartitionSpec("lanes")
-        lanes = jax.shard_map(
-            lanes, mesh=mesh, in_specs=(shared, shared, shared, shared, spread), out_specs=spread, check_vma=False
-        )
-    return lanes(system, scheme, newton, save_every, batch)
+        lanes = jax.shard_map(lanes, mesh=mesh, in_specs=(shared,) * 5 + (spread,), out_specs=spread, check_vma=False)
+    return lanes(system, scheme, macro_dt, newton, save_every, batch)

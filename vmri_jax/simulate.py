@@ -9,6 +9,7 @@ import numpy as np
 
 from vmri_jax import diagnostics
 from vmri_jax.checks import check_arrays, check_system, require_x64
+from vmri_jax.lanes import contiguous_lanes
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Result, SimulationError
@@ -72,7 +73,7 @@ def simulate(
     check_constraints(system, start.q_s, start.q_f, "simulate: the state")
     compiled = partial(_run_traced, system, scheme)
     cheap = newton
-    if newton.method == "auto" and newton.marches(system, scheme):
+    if newton.falls_back and newton.marches(system, scheme):
         cheap = dataclasses.replace(newton, method="march")  # "auto" compiles its fallback too: only if it is needed
     pieces, state, first_step = [], start, 0
     for saves in _chunks(num_saves, progress):
@@ -95,13 +96,16 @@ def simulate(
 
 
 def run(
-    system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro
+    system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro, lanes=False
 ) -> tuple[Trajectory, Memory]:
-    """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one."""
+    """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one.
+
+    With `lanes` batches are stored with the batch axis contiguous; that is not differentiable in reverse mode.
+    """
     n = scheme.num_micro
 
     def step(_, carry):
-        state, memory, k, (result, failed_at), worst, _ = carry
+        state, memory, k, (result, failed_at), worst, _ = contiguous_lanes(carry) if lanes else carry
         state, info, memory = advance(system, scheme, state, macro_dt, newton, memory)
         alive = failed_at < 0  # until the step before
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
@@ -112,7 +116,8 @@ def run(
         p_s, p_f = jnp.where(ok, state.p_s, jnp.nan), jnp.where(ok, state.p_f, jnp.nan)  # positions follow, see below
         state = State(t_start + (k + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
-        return state, memory, k + 1, status, worst, micro
+        carry = state, memory, k + 1, status, worst, micro
+        return contiguous_lanes(carry) if lanes else carry
 
     def save(carry, _):
         state, memory, k, status = carry

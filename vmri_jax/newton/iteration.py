@@ -44,7 +44,7 @@ class Newton(eqx.Module):
             the level of round-off are always accepted.
         max_iterations: after so many iterations the step fails.
         fixed_iterations: do exactly so many iterations and check the result afterwards, without a loop that depends
-            on the data: faster in batches of similar problems.
+            on the data; a step that has not converged then has failed, whatever the method.
 
     Raises:
         ValueError: an unknown method, a tolerance that is not positive, a number of iterations below 1.
@@ -62,6 +62,11 @@ class Newton(eqx.Module):
             value = getattr(self, name)
             if isinstance(value, int | float) and not value > least:
                 raise ValueError(f"Newton: {name} is {value}; it must be positive.")
+
+    @property
+    def falls_back(self) -> bool:
+        """Whether a step that the nested march does not solve is solved by the exact arrowhead."""
+        return self.method == "auto" and self.fixed_iterations is None
 
     def marches(self, system, scheme) -> bool:
         """Whether the nested march is what this method starts with.
@@ -110,7 +115,7 @@ def solve(
         residual = np.zeros(()) if linear else relative_residual(fixed, *done.residual)
         method = np.asarray(int(Method.LINEAR if linear else Method.MARCH))
         found = Solution(done.x, done.end.q_f, p_s, p_f, residual, done.result, done.passes, method)
-        if newton.method == "auto" and not linear:
+        if newton.falls_back and not linear:
             found = jax.lax.cond(
                 done.result <= Result.CONVERGED_AT_ROUNDOFF,
                 lambda: found,

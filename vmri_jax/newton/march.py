@@ -211,7 +211,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         motion = n * jnp.maximum(_largest(inverse_fast(last.end.p_f)), _largest(inverse_fast(end.p_f)))
         others = eps * jnp.maximum(_largest(x.slow), motion) + tiny  # variables at rest have no size of their own
         moved = _largest(end.q_f - last.end.q_f)  # already corrected, so what counts is the next change
-        shrink = jnp.where(last.passes > 1, jnp.minimum(SAFETY * moved / last.moved, 1.0), 1.0)
+        before = jnp.where((last.passes > 1) & (last.moved > 0), last.moved, moved + tiny)
+        shrink = jnp.minimum(SAFETY * moved / before, 1.0)
         change = jnp.maximum(
             _largest(d[: r * n_s]) / (newton.tolerance * _largest(x.slow) + accepted_slow + others),
             moved * shrink / (newton.tolerance * motion + accepted_fast + others),
