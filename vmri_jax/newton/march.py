@@ -36,8 +36,6 @@ from vmri_jax.results import Result
 
 ROUNDOFF = 4.0
 """Changes of the positions below so many units of round-off are accepted."""
-SAFETY = 10.0
-"""Margin on how much the next change of the fast path will be smaller."""
 NOISE = 1e4
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
 
@@ -154,7 +152,6 @@ class March(NamedTuple):
     z, d: slow unknowns of the pass and the update they would get from mass and slow constraint alone.
     impulse: on the slow variables over the step, times h.
     residual: largest row of the momentum equations (times h) and largest constraint value.
-    moved: change of the end of the fast path since the pass before.
     """
 
     x: Unknowns
@@ -164,7 +161,6 @@ class March(NamedTuple):
     pairs: Pairs
     impulse: Any
     residual: Any
-    moved: Any
     passes: Any
     result: Any
 
@@ -210,12 +206,9 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
 
         motion = n * jnp.maximum(_largest(inverse_fast(last.end.p_f)), _largest(inverse_fast(end.p_f)))
         others = eps * jnp.maximum(_largest(x.slow), motion) + tiny  # variables at rest have no size of their own
-        moved = _largest(end.q_f - last.end.q_f)  # already corrected, so what counts is the next change
-        before = jnp.where((last.passes > 1) & (last.moved > 0), last.moved, moved + tiny)
-        shrink = jnp.minimum(SAFETY * moved / before, 1.0)
         change = jnp.maximum(
             _largest(d[: r * n_s]) / (newton.tolerance * _largest(x.slow) + accepted_slow + others),
-            moved * shrink / (newton.tolerance * motion + accepted_fast + others),
+            _largest(end.q_f - last.end.q_f) / (newton.tolerance * motion + accepted_fast + others),
         )
         settled = (change <= 1) & (last.passes > 0)
         if newton.fixed_iterations is None:
@@ -232,7 +225,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
             jnp.maximum(_largest(rows), _largest(end.p_f - last.end.p_f)),
             jnp.maximum(_largest(g), _largest(end.g)),
         )
-        return contiguous_lanes(March(x, end, z, d, pairs, impulse, residual, moved, last.passes + 1, result))
+        return contiguous_lanes(March(x, end, z, d, pairs, impulse, residual, last.passes + 1, result))
 
     x = Unknowns(
         slow=3 * (warm.slow[0] - warm.slow[1]) + warm.slow[2],
@@ -245,7 +238,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         equations.q_f, h * equations.p_f, equations.q_s, x.slow, jnp.zeros(x.multiplier.shape[2]), warm.multiplier
     )
     start = contiguous_lanes(
-        March(x, end, zero, zero, warm.pairs, equations.p_s, (none, none), none, jnp.asarray(0), jnp.asarray(RUNNING))
+        March(x, end, zero, zero, warm.pairs, equations.p_s, (none, none), jnp.asarray(0), jnp.asarray(RUNNING))
     )
     if linear:
         done = one_pass(start)
