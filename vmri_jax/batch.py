@@ -46,7 +46,7 @@ def simulate_batch(
         states: a `State` whose arrays have a leading batch axis, e.g. ``jax.vmap(make)(q_s, ...)`` or
             ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``.
         macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
-        num_steps, save_every, save_micro, newton: as in `simulate`. ``Newton(fixed_iterations=...)`` is worth trying.
+        num_steps, save_every, save_micro, newton: as in `simulate`.
         params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
         devices: CPU devices over which chunks are spread, see `vmri_jax.runtime.configure`.
