@@ -181,7 +181,7 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton, method: 
         d = solver.solve(now, equations.residual(x))  # pyright: ignore[reportArgumentType]
         x = jax.tree.map(jnp.add, x, d)
         update = size(d, x)
-        contraction, error = update / previous, update
+        contraction, error = update / jnp.maximum(previous, jnp.finfo(eps.dtype).tiny), update
         if renewed:  # quadratic convergence: the next update is known to be much smaller
             shrink = contraction * jnp.minimum(1.0, SAFETY * contraction)
             predicted = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
