@@ -15,10 +15,11 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from benchmarks import __main__ as command_line
-from benchmarks import batch, c_loops, compilation, cost, curves, floor, linear, measure, paper, programs, report
+from benchmarks import batch, c_loops, compilation, cost, curves, floor, linear, paper, programs, report
 from benchmarks.curves import Case
 from benchmarks.measure import Ratio, interleaved, ratio, steps_for
 from benchmarks.report import Claim, Report
+from vmri_jax.study import timing
 
 
 # --- measuring -------------------------------------------------------------------------------------------------------
@@ -260,4 +261,4 @@ def test_failed_runs_are_not_timed():
 def test_sizes(name):
     for module in (cost, floor, batch, compilation):
         assert module.programs_of(module.sizes(name)) > 5
-    assert measure.MIN_SECONDS >= 0.01
+    assert timing.MIN_SECONDS >= 0.01

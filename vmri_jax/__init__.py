@@ -2,6 +2,7 @@
 
 from vmri_jax import diagnostics, quadrature, runtime
 from vmri_jax.batch import simulate_batch
+from vmri_jax.composition import Composition, compose
 from vmri_jax.discrete_lagrangian import discrete_lagrangian, discrete_legendre
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import macro, micro
@@ -16,6 +17,7 @@ from vmri_jax.trajectory import Trajectory
 from vmri_jax import systems  # isort: skip  (written with the names above)
 
 __all__ = [
+    "Composition",
     "ConstantMass",
     "Method",
     "Newton",
@@ -27,6 +29,7 @@ __all__ = [
     "StepInfo",
     "System",
     "Trajectory",
+    "compose",
     "diagnostics",
     "discrete_lagrangian",
     "discrete_legendre",

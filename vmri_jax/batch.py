@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
+from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.newton import Newton
 from vmri_jax.scheme import Scheme
 from vmri_jax.simulate import check_run, run, run_memory
@@ -22,7 +23,7 @@ WORKING_SET = 8192
 
 def simulate_batch(
     system: System,
-    scheme: Scheme,
+    scheme: Scheme | Composition,
     states: State,
     *,
     macro_dt=None,
@@ -83,11 +84,11 @@ def simulate_batch(
     if params is None:
         check_constraints(system, first.q_s, first.q_f, "simulate_batch: the first state")
     macro_dt = dt * (scheme.num_micro if micro_dt is not None else 1)
-    size = _chunk(system, scheme, first) if chunk is None else chunk
+    size = _chunk(system, stage_scheme(scheme), first) if chunk is None else chunk
     static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}
     go = partial(_in_chunks, system, scheme, chunk=size, devices=devices, **static)
     cheap = newton
-    if newton.falls_back and newton.marches(system, scheme):
+    if newton.falls_back and newton.marches(system, stage_scheme(scheme)):
         cheap = dataclasses.replace(newton, method="march")
     batch = {"state": states}  # what differs between the lanes
     batch |= {} if params is None else {"params": params}

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.composition import Composition
 from vmri_jax.newton import Newton
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, project_momentum
@@ -70,7 +71,9 @@ def translation_along(direction):
     return generator
 
 
-def symplectic_defect(system: System, scheme: Scheme, state: State, macro_dt, newton: Newton | None = None):
+def symplectic_defect(
+    system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton | None = None
+):
     """Largest entry of ``M^T J M - J`` for the derivative M of one macro step, on the constraint manifold.
 
     With constraints, the form is compared on tangent vectors of ``{g = 0, G v = 0}`` only, in an orthonormal basis.

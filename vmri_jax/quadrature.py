@@ -103,6 +103,12 @@ class Rule(eqx.Module):
                 return k
         return 2 * len(x)
 
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether the rule is its own mirror image, ``theta -> 1 - theta``; needs concrete weights."""
+        x, w = np.array(self.nodes), np.asarray(self.weights)
+        return bool(np.allclose(x, 1 - x[::-1], rtol=0, atol=1e-12) and np.allclose(w, w[::-1], rtol=0, atol=1e-12))
+
 
 def _merge(nodes: tuple[float, ...], weights: list) -> Rule:
     """Rule of all the nodes, equal ones merged and their weights summed in order."""

@@ -10,6 +10,8 @@ A scheme is data. The reference schemes and the Galerkin family are points in on
 | `galerkin(num_micro, degree, rule)` | micro(rule) | micro(rule) | no | min(2 degree, rule order) |
 """
 
+from dataclasses import dataclass, replace
+
 import equinox as eqx
 import numpy as np
 
@@ -87,6 +89,71 @@ class Scheme(eqx.Module):
     def order(self) -> int:
         """Order of convergence, ``min(2 degree, order of the rules of T, V and W)``; needs concrete weights."""
         return min(2 * self.degree, *(placed.rule.order for placed in (self.kinetic, self.slow, self.fast)))
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether a step forward and a step back with -H lead back to the start; needs concrete weights."""
+        return all(placed.rule.is_symmetric for placed in (self.kinetic, self.slow, self.fast, self.force))
+
+    @property
+    def micro_times(self) -> np.ndarray:
+        """(num_micro,) ends of the micro steps in units of the macro step."""
+        return np.arange(1, self.num_micro + 1) / self.num_micro
+
+    def describe(self) -> "Description":
+        """Order, symmetry, evaluations and solves per macro step; prints as a table."""
+        drifts = self.degree == 1 and self.fast.only_ends and self.fast.grid == "micro"
+        kicked = self.degree == 1 and self.slow.only_ends and self.slow.grid == "macro"
+        free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
+        slow, fast = (_evaluations(placed, self.num_micro) for placed in (self.slow, self.fast))
+        return Description(self.order, self.is_symmetric, 1, self.num_micro, self.degree, slow, fast, free, 1)
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a scheme promises and what a macro step costs. Evaluations are per pass where equations are solved.
+
+    order, symmetric: of convergence; whether time-reversible.
+    stages, num_micro, degree: steps of the scheme per macro step, micro steps per macro step, degree of the path.
+    slow_evaluations, fast_evaluations: gradients of V and of W; at a node that two macro steps share, once.
+    solves: systems of equations with constant masses and no constraint or force: none for explicit schemes, one per
+        micro step (of the fast variables of one micro step) where V only kicks, else one per stage.
+    constrained_solves: the same with constraints on slow and fast variables together.
+    """
+
+    order: int
+    symmetric: bool
+    stages: int
+    num_micro: int
+    degree: int
+    slow_evaluations: int
+    fast_evaluations: int
+    solves: int
+    constrained_solves: int
+
+    def repeated(self, stages: int, order: int, symmetric: bool) -> "Description":
+        """Of a composition of so many stages."""
+        counts = ("num_micro", "slow_evaluations", "fast_evaluations", "solves", "constrained_solves")
+        more = {name: stages * getattr(self, name) for name in counts}
+        return replace(self, order=order, symmetric=symmetric, stages=stages, **more)
+
+    def __str__(self) -> str:
+        per = "per macro step"
+        rows = {
+            "order": f"{self.order}, {'symmetric' if self.symmetric else 'not symmetric'}",
+            "path": f"{self.num_micro} micro steps of degree {self.degree} {per}"
+            + (f", in {self.stages} stages" if self.stages > 1 else ""),
+            "gradients of V": f"{self.slow_evaluations} {per}",
+            "gradients of W": f"{self.fast_evaluations} {per}",
+            "solves": f"{self.solves or 'none'} {per}; with constraints {self.constrained_solves}",
+        }
+        return "\n".join(f"{name:<16}{value}" for name, value in rows.items())
+
+
+def _evaluations(placed: PlacedRule, num_micro: int) -> int:
+    nodes = placed.composite(num_micro).nodes
+    shared = nodes[0] <= NODE_TOLERANCE and nodes[-1] >= 1 - NODE_TOLERANCE
+    return len(nodes) - shared
 
 
 def _positive_integer(name: str, value) -> int:

@@ -9,20 +9,21 @@ import numpy as np
 
 from vmri_jax import diagnostics
 from vmri_jax.checks import check_arrays, check_system, require_x64
+from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.lanes import contiguous_lanes
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Result, SimulationError
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
-from vmri_jax.step import Memory, advance, start_memory
+from vmri_jax.step import Memory, Stages, advance, start_memory
 from vmri_jax.system import System
 from vmri_jax.trajectory import RunInfo, Trajectory, join
 
 
 def simulate(
     system: System,
-    scheme: Scheme,
+    scheme: Scheme | Composition,
     state: State,
     *,
     macro_dt=None,
@@ -73,7 +74,7 @@ def simulate(
     check_constraints(system, start.q_s, start.q_f, "simulate: the state")
     compiled = partial(_run_traced, system, scheme)
     cheap = newton
-    if newton.falls_back and newton.marches(system, scheme):
+    if newton.falls_back and newton.marches(system, stage_scheme(scheme)):
         cheap = dataclasses.replace(newton, method="march")  # "auto" compiles its fallback too: only if it is needed
     pieces, state, first_step = [], start, 0
     for saves in _chunks(num_saves, progress):
@@ -88,7 +89,9 @@ def simulate(
             memory = run_memory(system, scheme, state, macro_dt, newton)
             piece, memory = compiled(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
         pieces.append(piece)
-        state, first_step = piece.final_state, first_step + saves * save_every
+        first_step += saves * save_every
+        if first_step < num_steps:
+            state = piece.final_state
     trajectory = pieces[0] if len(pieces) == 1 else join(pieces)
     if throw and is_concrete(trajectory.failed_at) and int(trajectory.failed_at) >= 0:
         raise _error(trajectory, scheme, macro_dt, save_every)
@@ -97,7 +100,7 @@ def simulate(
 
 def run(
     system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro, lanes=False
-) -> tuple[Trajectory, Memory]:
+) -> tuple[Trajectory, Memory | Stages]:
     """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one.
 
     With `lanes` batches are stored with the batch axis contiguous; that is not differentiable in reverse mode.
@@ -150,7 +153,7 @@ def run(
         info=RunInfo(*worst),
         result=status[0],
         failed_at=status[1],
-        t_micro=nodes.t[1:, None] - macro_dt * (1 - np.arange(1, n + 1) / n) if save_micro else None,
+        t_micro=nodes.t[1:, None] - macro_dt * (1 - scheme.micro_times) if save_micro else None,
         q_f_micro=micro,
     )
     return trajectory, memory
@@ -188,7 +191,7 @@ def _vectors(state: State) -> dict:
 def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every):
     """Refuse bad arguments of `simulate`; returns macro_dt."""
     require_x64()
-    if not isinstance(scheme, Scheme):
+    if not isinstance(scheme, Scheme | Composition):
         raise TypeError(
             f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
         )
@@ -218,7 +221,7 @@ def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save
     return dt if micro_dt is None else scheme.num_micro * micro_dt
 
 
-def _error(trajectory: Trajectory, scheme: Scheme, macro_dt, save_every: int) -> SimulationError:
+def _error(trajectory: Trajectory, scheme: Scheme | Composition, macro_dt, save_every: int) -> SimulationError:
     step = int(trajectory.failed_at)
     interval = step // save_every
     return SimulationError(

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.composition import Composition
 from vmri_jax.discrete_lagrangian import Term, lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
 from vmri_jax.newton import Newton, Warm, interval_matrix, is_constant, solve
@@ -37,7 +38,8 @@ class StepInfo(eqx.Module):
     iterations: Newton iterations (the most that any of its solves took; 0 for explicit steps).
     residual: largest residual left, relative to the momentum, and of the constraints; 0 where equations are linear.
     q_f_micro: (num_micro, n_f) fast positions at the micro nodes, the start excluded.
-    multiplier, slow_multiplier: (num_micro, r, n_g) and (r, n_gs) Lagrange multipliers at the control nodes.
+    multiplier, slow_multiplier: (num_micro, r, n_g) and (r, n_gs) Lagrange multipliers at the control nodes; of the
+        stages of a composition one after the other, (s r, n_gs).
     """
 
     result: Any
@@ -141,7 +143,7 @@ def is_explicit(system: System, scheme: Scheme) -> bool:
 
 
 def macro_step(
-    system: System, scheme: Scheme, state: State, macro_dt, newton: Newton | None = None
+    system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton | None = None
 ) -> tuple[State, StepInfo]:
     """One macro step, ``(state, info) = macro_step(system, scheme, state, macro_dt)``; pure and not compiled.
 
@@ -160,8 +162,22 @@ def macro_step(
     return state, info
 
 
-def start_memory(system: System, scheme: Scheme, state: State, macro_dt, newton: Newton) -> Memory:
+class Stages(NamedTuple):
+    """Memory of a composition: what the last stage hands to the next one, and every stage's own (stacked)."""
+
+    last: Memory
+    own: Memory
+
+
+def start_memory(
+    system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton
+) -> Memory | Stages:
     """Memory of a first step: gradients evaluated, velocity from the momentum, multipliers zero."""
+    if isinstance(scheme, Composition):
+        own = jax.vmap(lambda c: start_memory(system, scheme.scheme, state, c * macro_dt, newton))(
+            jnp.asarray(scheme.coefficients)
+        )
+        return Stages(jax.tree.map(lambda a: a[0], own), own)  # pyright: ignore[reportArgumentType]
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     velocity = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f)[2:]
     parts = split(system, scheme, state.q_s, state.q_f)
@@ -204,8 +220,10 @@ def _equations(system, scheme, state, macro_dt) -> StepEquations:
     return StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
 
 
-def advance(system: System, scheme: Scheme, state: State, macro_dt, newton: Newton, memory: Memory):
-    """`macro_step` that takes and hands on a `Memory`: (state, info, memory)."""
+def advance(system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton, memory):
+    """`macro_step` that takes and hands on a memory: (state, info, memory)."""
+    if isinstance(scheme, Composition):
+        return _advance_stages(system, scheme, state, macro_dt, newton, memory)
     memory = _renew_matrix(system, scheme, state, macro_dt, memory)
     state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
     p_s, p_f, v_s, v_f = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f, memory.velocity)
@@ -220,6 +238,29 @@ def advance(system: System, scheme: Scheme, state: State, macro_dt, newton: Newt
     )
     kept = None if isinstance(system.kinetic, ConstantMass) else (v_s, v_f)
     return state, info, memory._replace(velocity=kept)
+
+
+def _advance_stages(system, scheme, state, macro_dt, newton, memory: Stages):
+    """The stages of a composition, one after the other."""
+
+    def stage(carry, at):
+        (state, last), (c, own) = carry, at
+        memory = _at_same_point(own, last)
+        state, info, memory = advance(system, scheme.scheme, state, c * macro_dt, newton, memory)
+        return (state, memory), (memory, info)
+
+    stages = jnp.asarray(scheme.coefficients), memory.own
+    (state, last), (own, infos) = jax.lax.scan(stage, (state, memory.last), stages)
+    worst = {name: jnp.max(getattr(infos, name)) for name in ("result", "method", "iterations", "residual")}
+    along = {name: jnp.concatenate(getattr(infos, name)) for name in ("q_f_micro", "multiplier", "slow_multiplier")}
+    return state, StepInfo(**worst, **along), Stages(last, own)
+
+
+def _at_same_point(own: Memory, last: Memory) -> Memory:
+    """What a stage learned in the macro step before, with what belongs to its starting point from the stage before."""
+    parts = None if own.parts is None else tuple(map(_at_same_point, own.parts, last.parts))
+    warm = None if own.warm is None else own.warm._replace(multiplier=last.warm.multiplier)
+    return last._replace(matrix=own.matrix, warm=warm, parts=parts)
 
 
 def _interval(system, scheme, state, macro_dt, newton, memory):
