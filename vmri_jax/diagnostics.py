@@ -1,5 +1,7 @@
 """What a discrete trajectory should keep, and how to see whether it does."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,6 +73,31 @@ def translation_along(direction):
     return generator
 
 
+def frequencies(system: System, state: State):
+    """Angular frequencies of small vibrations about a state, the largest first: those of the frozen linear problem.
+
+    Square roots of the generalised eigenvalues of ``Hessian(V + W)`` and the mass matrix on the tangent space of the
+    constraints; zero where the curvature is not positive. Away from equilibrium they are estimates: forces of the
+    constraints are left out.
+    """
+    n_s = state.q_s.size
+    q = jnp.concatenate([state.q_s, state.q_f])
+    v = jnp.concatenate(velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
+
+    def potential(q):
+        q_s, q_f, params = q[:n_s], q[n_s:], system.params
+        slow = 0.0 if system.slow_potential is None else system.slow_potential(q_s, q_f, params)
+        return slow + (0.0 if system.fast_potential is None else system.fast_potential(q_f, params))
+
+    mass = jax.hessian(lambda v: system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params))(v)
+    normals = np.asarray(jax.jacfwd(lambda q: system.constraints(q[:n_s], q[n_s:]))(q))
+    tangents = np.linalg.svd(normals)[2][len(normals) :] if normals.size else np.eye(len(q))
+    half = np.linalg.cholesky(tangents @ np.asarray(mass) @ tangents.T)
+    stiffness = tangents @ np.asarray(jax.hessian(potential)(q)) @ tangents.T
+    inner = np.linalg.solve(half, np.linalg.solve(half, stiffness).T)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh((inner + inner.T) / 2)[::-1], 0.0))
+
+
 def symplectic_defect(
     system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton | None = None
 ):
@@ -99,7 +126,19 @@ def symplectic_defect(
     return jnp.max(jnp.abs(tangents @ (M.T @ J @ M - J) @ tangents.T))
 
 
-def observed_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> float:
+class OrderFit(NamedTuple):
+    """An observed order, half the width of its 95 % confidence interval (NaN for two points), and the points fitted."""
+
+    order: float
+    half_width: float
+    points: int
+
+
+STUDENT = (np.nan, 12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23)
+"""Quantiles 0.975 of Student's t distribution for 0, 1, ... degrees of freedom; about 2 beyond."""
+
+
+def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> OrderFit:
     """Order of convergence: least-squares slope of log error over log step, round-off plateau masked.
 
     The plateau is where errors stop falling with the step: from the first interval, towards smaller steps, whose slope
@@ -124,4 +163,16 @@ def observed_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) 
     level = max(floor, e[flat[0] + 1 :].max() if flat.size else 0.0)
     keep = e > plateau * level
     keep[:2] = True
-    return float(np.polyfit(np.log(h[keep]), np.log(e[keep]), 1)[0])
+    x, y = np.log(h[keep]), np.log(e[keep])
+    slope, intercept = np.polyfit(x, y, 1)
+    free = len(x) - 2
+    half_width = np.nan
+    if free:
+        scatter = np.sum((y - slope * x - intercept) ** 2) / free / np.sum((x - x.mean()) ** 2)
+        half_width = (STUDENT[free] if free < len(STUDENT) else 2.0) * np.sqrt(scatter)
+    return OrderFit(float(slope), float(half_width), len(x))
+
+
+def observed_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> float:
+    """The order of `fit_order`."""
+    return fit_order(macro_dt, errors, plateau, floor).order

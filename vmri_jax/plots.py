@@ -19,7 +19,7 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocat
 import vmri_jax as vm
 
 if TYPE_CHECKING:
-    from vmri_jax.study import ConvergenceStudy, CostStudy
+    from vmri_jax.study import ConvergenceStudy, CostStudy, WorkPrecision
 
 
 @dataclass(frozen=True)
@@ -187,6 +187,80 @@ def plot_convergence(
             axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=1, handlelength=2.4)
         figure.suptitle(title, x=0.01, ha="left")
     return figure
+
+
+def plot_work_precision(
+    study: "WorkPrecision", title: str = "", work: str = "seconds", theme: Theme = LIGHT
+) -> NotebookFigure:
+    """Error of the positions against work, one curve per scheme; the Pareto front is underlaid.
+
+    Args:
+        study: from `vmri_jax.study.work_precision`, or the runs of a recommendation.
+        title: over the figure.
+        work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
+        theme: colours.
+    """
+    labels = {
+        "seconds": "computing time of the run",
+        "slow_evaluations": r"evaluations of $\nabla V$",
+        "fast_evaluations": r"evaluations of $\nabla W$",
+        "solves": "systems of equations solved",
+    }
+    if work not in labels:
+        raise ValueError(f"plot_work_precision: work is {work!r}; it must be one of {', '.join(labels)}.")
+    front = [row for row in study.pareto(work) if getattr(row, work) > 0]
+    with style(theme):
+        figure = NotebookFigure(figsize=(7.2, 4.3))
+        axes = figure.subplots()
+        axes.loglog(
+            [getattr(row, work) for row in front],
+            [row.error_q for row in front],
+            color=theme.faint,
+            linewidth=7,
+            solid_capstyle="round",
+            zorder=1,
+            label="best of all",
+        )
+        for i, scheme in enumerate(study.schemes):
+            curve = sorted(study.curve(scheme), key=lambda row: row.num_steps)
+            axes.loglog(
+                [getattr(row, work) or np.nan for row in curve],
+                [row.error_q for row in curve],
+                marker=MARKERS[i // len(theme.curves) % len(MARKERS)],
+                markersize=4,
+                color=theme.curves[i % len(theme.curves)],
+                markerfacecolor=theme.paper,
+                linewidth=1.1,
+                label=scheme,
+            )
+        axes.set(xlabel=labels[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
+        worst = max((row.error_q for row in front), default=1.0)
+        axes.set_ylim(top=30 * worst)
+        if study.reference.error_q > 0:
+            axes.axhline(study.reference.error_q, color=theme.ink, linewidth=0.8, linestyle=":")
+            axes.text(
+                0.995,
+                study.reference.error_q,
+                "error of the reference ",
+                transform=axes.get_yaxis_transform(),
+                ha="right",
+                va="bottom",
+                fontsize=7.5,
+            )
+        if work == "seconds":
+            axes.xaxis.set_major_formatter(lambda x, _: _seconds(x))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        _legend_beside(axes)
+        figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+def _seconds(x: float) -> str:
+    """A power of ten of seconds with its unit."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if x >= 0.999 * size:
+            return f"{x / size:g} {unit}"
+    return f"{x / 1e-9:g} ns"
 
 
 def plot_cost(

@@ -94,7 +94,7 @@ def simulate(
             state = piece.final_state
     trajectory = pieces[0] if len(pieces) == 1 else join(pieces)
     if throw and is_concrete(trajectory.failed_at) and int(trajectory.failed_at) >= 0:
-        raise _error(trajectory, scheme, macro_dt, save_every)
+        raise simulation_error(trajectory, macro_dt, save_every)
     return trajectory
 
 
@@ -221,7 +221,8 @@ def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save
     return dt if micro_dt is None else scheme.num_micro * micro_dt
 
 
-def _error(trajectory: Trajectory, scheme: Scheme | Composition, macro_dt, save_every: int) -> SimulationError:
+def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> SimulationError:
+    """The error that says how a failed run failed."""
     step = int(trajectory.failed_at)
     interval = step // save_every
     return SimulationError(

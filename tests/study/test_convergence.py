@@ -87,7 +87,8 @@ def test_a_run_that_fails_is_a_row_of_nan(reference):
 
 def test_errors_near_the_reference_are_not_fitted(study):
     macro_dt, errors = study.errors("second order")
-    coarse = dataclasses.replace(study, reference=dataclasses.replace(study.reference, error_q=errors[-1] / 50))
+    worse = dataclasses.replace(study.references[""], error_q=errors[-1] / 50)
+    coarse = dataclasses.replace(study, references={"": worse})
     assert coarse.usable("second order")[0].tolist() == macro_dt[:2].tolist()
 
 

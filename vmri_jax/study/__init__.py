@@ -1,16 +1,15 @@
-"""Studies of schemes: convergence, computing time, and the reference study with its report."""
+"""Studies of schemes: convergence, work and precision, advice, computing time, and the reference study with its report."""
 
-from vmri_jax.study.convergence import (
-    ConvergenceRow,
-    ConvergenceStudy,
-    ReferenceSolution,
-    convergence_study,
-    reference_solution,
-)
+from vmri_jax.study.advisor import Recommendation, recommend
+from vmri_jax.study.convergence import ConvergenceRow, ConvergenceStudy, convergence_study
 from vmri_jax.study.cost import CostRow, CostStudy, cost_study
 from vmri_jax.study.figures import Check, ConvergenceFigure, CostFigure, CostPanel, Findings
+from vmri_jax.study.menu import Family, families
+from vmri_jax.study.program import Program
 from vmri_jax.study.reference import reference_figures
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.report import FigureResult, Report, choose_figures, reproduce
+from vmri_jax.study.work_precision import WorkPrecision, WorkRow, work_precision
 
 __all__ = [
     "Check",
@@ -21,14 +20,22 @@ __all__ = [
     "CostPanel",
     "CostRow",
     "CostStudy",
+    "Family",
     "FigureResult",
     "Findings",
+    "Program",
+    "Recommendation",
     "ReferenceSolution",
     "Report",
+    "WorkPrecision",
+    "WorkRow",
     "choose_figures",
     "convergence_study",
     "cost_study",
+    "families",
+    "recommend",
     "reference_figures",
     "reference_solution",
     "reproduce",
+    "work_precision",
 ]

@@ -5,13 +5,21 @@ The error of a run is the largest difference over all saved nodes and all coordi
     error_q = max |q - q_ref|        error_p = max |p - p_ref|.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from vmri_jax.composition import Composition
+from vmri_jax.diagnostics import OrderFit
+from vmri_jax.study.program import Program
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Progress, silent, write_csv
 
 FLOOR_FACTOR = 100.0
@@ -19,96 +27,184 @@ FLOOR_FACTOR = 100.0
 
 
 @dataclass(frozen=True)
-class ReferenceSolution:
-    """What runs are compared with: q and p, shape (num_saves + 1, n_s + n_f), slow coordinates first.
+class ConvergenceRow:
+    """One run: how wrong it is, what it keeps, how it went.
 
-    error_q, error_p: how accurate they are; errors near them are not fitted.
+    case: label of the parameters, "" if there is one set only.
+    error_q, error_p: of positions and momenta.
+    energy_error, energy_drift, energy_band: largest change of the energy since the start; change over the run of the
+        straight line fitted to it; and largest distance from that line.
+    momentum_error: largest change of a momentum map since the start.
+    constraint_residual: largest constraint value, of positions or velocities.
+    iterations, method, result: most Newton iterations of a step, costliest `Method`, `Result`.
     """
 
-    q: np.ndarray
-    p: np.ndarray
-    error_q: float = 0.0
-    error_p: float = 0.0
-
-
-@dataclass(frozen=True)
-class ConvergenceRow:
-    """One run: errors of positions and momenta, largest energy error and constraint residual, Newton, status."""
-
     scheme: str
+    case: str
     num_micro: int
+    degree: int
     macro_dt: float
     error_q: float
     error_p: float
     energy_error: float
+    energy_drift: float
+    energy_band: float
+    momentum_error: float
     constraint_residual: float
     iterations: int
+    method: str
     result: str
 
 
 @dataclass(frozen=True)
 class ConvergenceStudy:
-    """Rows of a convergence study, schemes one after the other and macro steps as given."""
+    """Rows of a convergence study, schemes one after the other, then cases, and macro steps as given.
+
+    references: reference solutions by case.
+    """
 
     rows: tuple[ConvergenceRow, ...]
-    reference: ReferenceSolution
+    references: Mapping[str, ReferenceSolution]
 
     @property
     def schemes(self) -> list[str]:
         """Labels of the schemes."""
         return list(dict.fromkeys(row.scheme for row in self.rows))
 
-    def errors(self, scheme: str, quantity: str = "q") -> tuple[np.ndarray, np.ndarray]:
-        """Macro steps, largest first, and errors of one scheme in "q" or "p"; failed runs are NaN."""
-        rows = sorted((row for row in self.rows if row.scheme == scheme), key=lambda row: -row.macro_dt)
+    @property
+    def cases(self) -> list[str]:
+        """Labels of the parameters."""
+        return list(self.references)
+
+    def errors(self, scheme: str, quantity: str = "q", case: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Macro steps, largest first, and errors of one scheme in "q" or "p"; failed runs are NaN.
+
+        Args:
+            case: label of the parameters, the first one by default.
+        """
+        case = self.cases[0] if case is None else case
+        rows = sorted((r for r in self.rows if (r.scheme, r.case) == (scheme, case)), key=lambda row: -row.macro_dt)
         if not rows:
-            raise ValueError(f"errors: no scheme {scheme!r} in this study; it has {', '.join(self.schemes)}.")
+            cases = f" and the cases {', '.join(self.cases)}" if len(self.cases) > 1 else ""
+            raise ValueError(f"errors: no scheme {scheme!r} in this study; it has {', '.join(self.schemes)}{cases}.")
         return np.array([row.macro_dt for row in rows]), np.array([getattr(row, f"error_{quantity}") for row in rows])
 
-    def usable(self, scheme: str, quantity: str = "q") -> tuple[np.ndarray, np.ndarray]:
+    def usable(self, scheme: str, quantity: str = "q", case: str | None = None) -> tuple[np.ndarray, np.ndarray]:
         """`errors` of the runs that did not fail and lie well above the error of the reference."""
-        macro_dt, errors = self.errors(scheme, quantity)
-        floor = getattr(self.reference, f"error_{quantity}")
+        macro_dt, errors = self.errors(scheme, quantity, case)
+        floor = getattr(self.references[self.cases[0] if case is None else case], f"error_{quantity}")
         usable = np.isfinite(errors) & (errors > FLOOR_FACTOR * floor)
         return macro_dt[usable], errors[usable]
 
-    def order(self, scheme: str, quantity: str = "q", points: int = 4) -> float:
-        """Observed order: slope of log error over log step through the last `points` usable errors.
+    def fit(self, scheme: str, quantity: str = "q", points: int = 4, case: str | None = None) -> OrderFit:
+        """Slope of log error over log step through the last `points` usable errors, and how certain it is.
 
         NaN where fewer than two runs can be used.
         """
-        macro_dt, errors = self.usable(scheme, quantity)
+        macro_dt, errors = self.usable(scheme, quantity, case)
         if len(errors) < 2:
-            return float("nan")
-        return vm.diagnostics.observed_order(macro_dt[-points:], errors[-points:])
+            return OrderFit(np.nan, np.nan, len(errors))
+        return vm.diagnostics.fit_order(macro_dt[-points:], errors[-points:])
+
+    def order(self, scheme: str, quantity: str = "q", points: int = 4, case: str | None = None) -> float:
+        """Observed order: that of `fit`."""
+        return self.fit(scheme, quantity, points, case).order
+
+    def table(self):
+        """Observed orders and the errors at the smallest step that did not fail, as a `rich.table.Table`."""
+        from rich.table import Table
+
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for name in ("scheme", *(("case",) if len(self.cases) > 1 else ())):
+            table.add_column(name)
+        for name in ("order of q", "order of p", "smallest H", "error of q", "error of p", "energy", "failed"):
+            table.add_column(name, justify="right")
+        for scheme in self.schemes:
+            for case in self.cases:
+                rows = [r for r in self.rows if (r.scheme, r.case) == (scheme, case)]
+                ran = [row for row in rows if np.isfinite(row.error_q)]
+                last = min(ran, key=lambda row: row.macro_dt, default=None)
+                fits = [self.fit(scheme, quantity, case=case) for quantity in "qp"]
+                numbers = ["-"] * 4
+                if last is not None:
+                    numbers = [
+                        f"{last.macro_dt:g}",
+                        *(f"{x:.1e}" for x in (last.error_q, last.error_p, last.energy_error)),
+                    ]
+                labels = (scheme, case) if len(self.cases) > 1 else (scheme,)
+                failed = f"{len(rows) - len(ran)} of {len(rows)}" if len(ran) < len(rows) else ""
+                table.add_row(*labels, *(_order(fit) for fit in fits), *numbers, failed)
+        return table
+
+    def plot(self, orders: Sequence[int] = (), title: str = ""):
+        """Errors against the macro step, see `vmri_jax.plots.plot_convergence`."""
+        from vmri_jax import plots
+
+        return plots.plot_convergence(self, orders, title)
 
     def to_csv(self, path: str | Path) -> None:
         """Write the rows to a CSV file."""
         write_csv(path, self.rows)
 
+    def to_json(self, path: str | Path) -> None:
+        """Write the rows, and how accurate the references are, to a JSON file; NaN becomes null."""
+        references = {case: {"error_q": r.error_q, "error_p": r.error_p} for case, r in self.references.items()}
+        rows = [{k: None if v != v else v for k, v in asdict(row).items()} for row in self.rows]
+        Path(path).write_text(json.dumps({"references": references, "rows": rows}, indent=1))
+
+    def to_xarray(self):
+        """An `xarray.Dataset` over (scheme, case, macro_dt); needs the extra ``vmri_jax[xarray]``."""
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError("to_xarray needs xarray; install it with pip install 'vmri_jax[xarray]'.") from error
+        steps = sorted({row.macro_dt for row in self.rows}, reverse=True)
+        axes = {"scheme": self.schemes, "case": self.cases, "macro_dt": steps}
+        shape = tuple(len(values) for values in axes.values())
+        names = ("error_q", "error_p", "energy_error", "energy_drift", "energy_band", "momentum_error")
+        data: dict[str, Any] = {name: np.full(shape, np.nan) for name in (*names, "constraint_residual", "iterations")}
+        data |= {name: np.full(shape, "", dtype="U24") for name in ("method", "result")}
+        for row in self.rows:
+            at = tuple(values.index(getattr(row, axis)) for axis, values in axes.items())
+            for name, array in data.items():
+                array[at] = getattr(row, name)
+        return xarray.Dataset({name: (tuple(axes), array) for name, array in data.items()}, coords=axes)
+
+
+def _order(fit: OrderFit) -> str:
+    if not np.isfinite(fit.order):
+        return "-"
+    return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
+
 
 def convergence_study(
     problem: vm.Problem,
-    schemes: Mapping[str, vm.Scheme],
+    schemes: Mapping[str, vm.Scheme | Composition],
     macro_dt: Sequence[float],
     t_end: float,
     *,
     num_saves: int = 10,
-    reference: ReferenceSolution | None = None,
+    params: Mapping[str, Any] | None = None,
+    momentum_maps: Sequence[Callable] = (),
+    reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
     newton: vm.Newton | None = None,
     progress: Progress = silent,
 ) -> ConvergenceStudy:
     """Run every scheme with every macro step to `t_end` and compare with a reference.
 
-    Each scheme is compiled once for all its step sizes. A run that fails becomes a row of NaN with its status.
+    Each scheme is compiled once for all its step sizes. Runs with several sets of parameters are computed side by side.
+    A run that fails becomes a row of NaN with its status.
 
     Args:
         problem: system and start.
-        schemes: schemes by label.
+        schemes: schemes by label, of any num_micro and degree.
         macro_dt: macro steps H; each must divide `t_end` into a multiple of `num_saves` steps.
         t_end: time simulated.
         num_saves: nodes compared, equally spaced over `t_end`.
-        reference: compare with this; by default `reference_solution`.
+        params: parameters of the system by label, if there are several sets; positions and velocities at the start are
+            those of `problem`.
+        momentum_maps: infinitesimal generators of symmetries, see `vmri_jax.diagnostics.momentum_map`.
+        reference: compare with this (by label of the parameters if there are several); by default `reference_solution`.
         newton: how implicit equations are solved.
         progress: told about every run before it starts.
 
@@ -122,64 +218,74 @@ def convergence_study(
     steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
     if not steps:
         raise ValueError("convergence_study: macro_dt is empty; give the macro steps to run.")
-    state = problem.state()
+    cases = {"": problem}
+    if params is not None:
+        cases = {case: replace(problem, system=problem.system.replace(params=p)) for case, p in params.items()}
+    if not cases:
+        raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
     total = len(schemes) * len(steps)
-    if reference is None:
-        progress("reference solution", 0, total)
-        reference = reference_solution(problem, t_end, num_saves=num_saves)
-    shape = (num_saves + 1, state.q_s.size + state.q_f.size)
-    if reference.q.shape != shape or reference.p.shape != shape:
-        raise ValueError(
-            f"convergence_study: reference has q of shape {reference.q.shape} and p of shape {reference.p.shape}; both "
-            f"must be {shape}: num_saves + 1 nodes from the start to t_end, slow coordinates first."
-        )
+    references = _references(cases, reference, t_end, num_saves, progress, total)
 
     rows = []
-    for label, scheme in schemes.items():
-        for num_steps in steps:
-            progress(f"{label}, H = {t_end / num_steps:g}", len(rows), total)
-            trajectory = vm.simulate(
-                problem.system,
-                scheme,
-                state,
-                macro_dt=t_end / num_steps,
-                num_steps=num_steps,
-                save_every=num_steps // num_saves,
-                newton=newton,
-                throw=False,
-            )
-            rows.append(_row(label, scheme, t_end / num_steps, trajectory, reference))
+    for i, (label, scheme) in enumerate(schemes.items()):
+        run = _runner(list(cases.values()), scheme, t_end, num_saves, newton)
+        by_step = []
+        for j, num_steps in enumerate(steps):
+            progress(f"{label}, H = {t_end / num_steps:g}", i * len(steps) + j, total)
+            by_step.append((t_end / num_steps, run(num_steps)))
+        for k, (case, changed) in enumerate(cases.items()):
+            for dt, runs in by_step:
+                rows.append(_row(label, case, scheme, dt, changed.system, momentum_maps, runs[k], references[case]))
     progress("done", total, total)
-    return ConvergenceStudy(tuple(rows), reference)
+    return ConvergenceStudy(tuple(rows), references)
 
 
-def reference_solution(
-    problem: vm.Problem, t_end: float, *, num_saves: int = 10, num_steps: int = 1000, degree: int = 4
-) -> ReferenceSolution:
-    """Fine single-rate solution of order ``2 degree``, checked against itself at half the step.
+def _runner(problems: Sequence[vm.Problem], scheme, t_end: float, num_saves: int, newton):
+    """``run(num_steps)``: a trajectory of each problem."""
+    if len(problems) == 1:
+        program = Program(problems[0], scheme, t_end, num_saves, newton)
+        return lambda num_steps: [program(num_steps)]
+    states = jax.tree.map(lambda *a: jnp.stack(a), *(problem.state() for problem in problems))
+    params = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *(p.system.params for p in problems))
 
-    Args:
-        problem: system and start.
-        t_end: time simulated.
-        num_saves: saved nodes, equally spaced over `t_end`.
-        num_steps: steps of the coarser of the two runs, a multiple of `num_saves`; the finer one is returned.
-        degree: polynomial degree of the path, with Gauss quadrature on every term.
-
-    Returns:
-        The solution; its errors are the largest differences between the two runs.
-
-    Raises:
-        SimulationError: a run failed; take more steps.
-    """
-    scheme = vm.galerkin(1, degree, "gauss")
-    solutions = []
-    for n in (num_steps, 2 * num_steps):
-        trajectory = vm.simulate(
-            problem.system, scheme, problem.state(), macro_dt=t_end / n, num_steps=n, save_every=n // num_saves
+    def run(num_steps: int) -> list[vm.Trajectory]:
+        batch = vm.simulate_batch(
+            problems[0].system,
+            scheme,
+            states,
+            macro_dt=t_end / num_steps,
+            num_steps=num_steps,
+            save_every=num_steps // num_saves,
+            params=params,
+            newton=newton,
         )
-        solutions.append(_joined(trajectory))
-    (q_coarse, p_coarse), (q, p) = solutions
-    return ReferenceSolution(q, p, float(np.abs(q - q_coarse).max()), float(np.abs(p - p_coarse).max()))
+        return [jax.tree.map(lambda a, i=i: a[i], batch) for i in range(len(problems))]
+
+    return run
+
+
+def _references(cases, reference, t_end, num_saves, progress, total) -> dict[str, Any]:
+    """A reference of the right shape for every case."""
+    if reference is None:
+        told = lambda what, *_: progress(what, 0, total)  # noqa: E731
+        return {
+            case: reference_solution(problem, t_end, num_saves=num_saves, progress=told)
+            for case, problem in cases.items()
+        }
+    references: dict[str, Any] = dict(reference if isinstance(reference, Mapping) else dict.fromkeys(cases, reference))
+    if set(references) != set(cases) or (len(cases) > 1 and not isinstance(reference, Mapping)):
+        raise ValueError(
+            f"convergence_study: params has the labels {list(cases)}, so reference must be a mapping with the same ones."
+        )
+    for case, problem in cases.items():
+        shape = (num_saves + 1, problem.q_s.size + problem.q_f.size)
+        found = references[case]
+        if found.q.shape != shape or found.p.shape != shape:
+            raise ValueError(
+                f"convergence_study: reference has q of shape {found.q.shape} and p of shape {found.p.shape}; both "
+                f"must be {shape}: num_saves + 1 nodes from the start to t_end, slow coordinates first."
+            )
+    return references
 
 
 def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
@@ -193,23 +299,35 @@ def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
     return num_steps
 
 
-def _joined(trajectory: vm.Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    return (
-        np.concatenate([trajectory.q_s, trajectory.q_f], axis=1),
-        np.concatenate([trajectory.p_s, trajectory.p_f], axis=1),
-    )
-
-
-def _row(label, scheme, macro_dt, trajectory: vm.Trajectory, reference: ReferenceSolution) -> ConvergenceRow:
-    q, p = _joined(trajectory)
+def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, reference) -> ConvergenceRow:
+    error_q, error_p = reference.errors(trajectory)
+    energy = np.asarray(trajectory.energy)
+    drift, band = _drift_and_band(np.asarray(trajectory.t), energy)
+    phase = trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f
+    maps = [np.asarray(jax.vmap(lambda *z, xi=xi: vm.diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
     return ConvergenceRow(
         scheme=label,
+        case=case,
         num_micro=scheme.num_micro,
+        degree=scheme.degree,
         macro_dt=macro_dt,
-        error_q=float(np.abs(q - reference.q).max()),
-        error_p=float(np.abs(p - reference.p).max()),
-        energy_error=float(np.abs(trajectory.energy - trajectory.energy[0]).max()),
+        error_q=error_q,
+        error_p=error_p,
+        energy_error=float(np.abs(energy - energy[0]).max()),
+        energy_drift=drift,
+        energy_band=band,
+        momentum_error=float(max((np.abs(m - m[0]).max() for m in maps), default=0.0)),
         constraint_residual=float(np.max(trajectory.constraint_residual)),
         iterations=int(np.max(trajectory.info.iterations)),
+        method=vm.Method(int(np.max(trajectory.info.method))).name,
         result=vm.Result(int(trajectory.result)).name,
     )
+
+
+def _drift_and_band(t: np.ndarray, energy: np.ndarray) -> tuple[float, float]:
+    """Change over the run of the line fitted to the energy, and the largest distance from it."""
+    if not np.isfinite(energy).all():
+        return float("nan"), float("nan")
+    x = t - t.mean()
+    slope = float(x @ energy / (x @ x))
+    return slope * float(t[-1] - t[0]), float(np.abs(energy - energy.mean() - slope * x).max())

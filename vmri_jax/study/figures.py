@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 
 import vmri_jax as vm
 from vmri_jax import plots
-from vmri_jax.study.convergence import ConvergenceStudy, ReferenceSolution, convergence_study, reference_solution
+from vmri_jax.study.convergence import ConvergenceStudy, convergence_study
 from vmri_jax.study.cost import CostStudy, cost_study
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Progress, part, write_csv
 
 ORDER_TOLERANCE = 0.2
@@ -97,7 +98,8 @@ class ConvergenceFigure:
 
     def _seen(self, study: ConvergenceStudy) -> str:
         orders = [f"{label}: {study.order(label, 'q'):.2f} / {study.order(label, 'p'):.2f}" for label in study.schemes]
-        reference = f"reference good to {study.reference.error_q:.0e} / {study.reference.error_p:.0e}"
+        known = study.references[""]
+        reference = f"reference good to {known.error_q:.0e} / {known.error_p:.0e}"
         failed = sum(row.result not in ("CONVERGED", "CONVERGED_AT_ROUNDOFF") for row in study.rows)
         failures = [f"{failed} of {len(study.rows)} runs failed"] if failed else []
         return "; ".join(["orders of positions / momenta, " + orders[0], *orders[1:], reference, *failures]) + "."

@@ -1,0 +1,289 @@
+"""The cheapest setting for the error one can accept: a staged search over schemes, num_micro and macro steps.
+
+Stage 1 takes every family of `menu.families` with a middling num_micro and finds the largest macro step that keeps the
+error, giving up on a family as soon as it is much slower than the best so far. Stage 2 varies num_micro of the best
+families, uphill from where they stand. Stage 3 times the best settings in turn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.study.menu import Family, families
+from vmri_jax.study.program import Program
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.table import Progress, silent
+from vmri_jax.study.timing import interleaved
+from vmri_jax.study.work_precision import WorkPrecision, WorkRow, work_row
+
+NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
+FIRST = 5
+"""The num_micro of stage 1."""
+PATIENCE = 5.0
+"""A setting that takes so many times the best one is given up."""
+KEPT = 4
+"""Families that go to stage 2, settings that go to stage 3."""
+CLOSE = 1.1
+"""The number of steps is found within this factor."""
+MARGIN = 10.0
+"""A target must lie so many times above the error of the reference."""
+LONGEST = 20.0
+"""Seconds of a run after which a setting is given up, whatever the others take."""
+MAX_STEPS = 2**22
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A scheme with its num_micro and number of macro steps, and what a run of it gave."""
+
+    family: Family
+    num_micro: int
+    num_steps: int
+    row: WorkRow
+
+    @property
+    def scheme(self):
+        """The scheme itself."""
+        return self.family.make(self.num_micro)
+
+
+class Search:
+    """Runs of one problem, each done once: programs, errors and times by family, num_micro and number of steps.
+
+    Args:
+        problem: system and start.
+        t_end: simulated time.
+        menu: families to choose from.
+        reference: what runs are compared with; its number of nodes is that of the runs.
+        newton: how implicit equations are solved.
+    """
+
+    def __init__(self, problem, t_end: float, menu: Sequence[Family], reference: ReferenceSolution, newton=None):
+        self.problem, self.t_end, self.menu, self.reference, self.newton = problem, t_end, menu, reference, newton
+        self.frequency = float(vm.diagnostics.frequencies(problem.system, problem.state())[0])
+        self.programs: dict[tuple[str, int], Program] = {}
+        self.settings: dict[tuple[str, int, int], Setting] = {}
+
+    def at(self, family: Family, num_micro: int, num_steps: int) -> Setting:
+        """The run with these settings and a first idea of its time."""
+        key = (family.name, num_micro, num_steps)
+        if key not in self.settings:
+            if key[:2] not in self.programs:
+                made = Program(self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton)
+                self.programs[key[:2]] = made
+            program = self.programs[key[:2]]
+            [seconds] = interleaved({"": program.timed(num_steps)}, 2, 0.0).values()
+            row = work_row(family.label(num_micro), program, num_steps, self.reference, [min(seconds)])
+            self.settings[key] = Setting(family, num_micro, num_steps, row)
+        return self.settings[key]
+
+    def reach(self, family: Family, num_micro: int, error: float, limit: float) -> Setting | None:
+        """The fewest steps that keep the error; None if runs that do not keep it take longer than `limit` seconds.
+
+        The next number of steps is guessed from the order of the scheme and kept between those that were too few and
+        those that were enough.
+        """
+        unit, order = self.reference.num_saves, family.make(num_micro).order
+        n = max(1, round(family.coarsest(num_micro, self.frequency, self.t_end) / unit))
+        too_few, enough, best = 0, MAX_STEPS // unit, None
+        while n <= MAX_STEPS // unit:
+            setting = self.at(family, num_micro, n * unit)
+            miss = setting.row.error_q / error
+            if miss <= 1:
+                enough, best = n, setting
+            else:
+                too_few = n
+                if best is None and setting.row.seconds > limit:
+                    return None
+            if best is not None and enough <= max(too_few + 1, CLOSE * too_few):
+                return best
+            n = round(n * np.clip(1.03 * miss ** (1 / order), 0.25, 4)) if np.isfinite(miss) else 2 * n
+            if best is not None and not too_few < n < enough:  # the order misleads
+                n = min(max(round(np.sqrt(max(too_few, enough / 4) * enough)), too_few + 1), enough - 1)
+            n = max(n, too_few + 1)
+        return best
+
+    def cheapest(self, error: float, progress: Progress = silent, exhaustive: bool = False) -> list[Setting]:
+        """Settings that keep the error, the fastest first, the first KEPT of them timed in turn.
+
+        Args:
+            exhaustive: try every num_micro of every family, to check the staged search.
+        """
+        reached: dict[tuple[str, int], Setting] = {}
+        limit = LONGEST
+
+        def attempt(family: Family, num_micro: int, done: int, total: int) -> Setting | None:
+            nonlocal limit
+            key = (family.name, num_micro)
+            progress(f"{family.label(num_micro)} at {error:.0e}", done, total)
+            setting = self.reach(family, num_micro, error, limit)
+            if setting is not None:
+                reached[key] = setting
+                limit = min(limit, (10 if exhaustive else 1) * PATIENCE * setting.row.seconds)
+            return setting
+
+        total = len(self.menu) + KEPT
+        for i, family in enumerate(self.menu):
+            for num_micro in NUM_MICRO if exhaustive else (FIRST,):
+                attempt(family, num_micro, i, total)
+        if not exhaustive:
+            firsts = sorted(reached.values(), key=lambda s: s.row.seconds)[:KEPT]
+            for i, first in enumerate(firsts):
+                for direction in (1, -1):
+                    at, best = NUM_MICRO.index(FIRST) + direction, first
+                    while 0 <= at < len(NUM_MICRO):
+                        setting = attempt(first.family, NUM_MICRO[at], len(self.menu) + i, total)
+                        if setting is None or setting.row.seconds > 1.05 * best.row.seconds:
+                            break
+                        best, at = setting, at + direction
+        ranked = sorted(reached.values(), key=lambda s: s.row.seconds)
+        return sorted(self._timed(ranked[: 2 * KEPT]), key=lambda s: s.row.seconds) + ranked[2 * KEPT :]
+
+    def _timed(self, settings: Sequence[Setting]) -> list[Setting]:
+        """The same with medians of runs that took turns."""
+        programs = [self.programs[s.family.name, s.num_micro] for s in settings]
+        runs = {str(i): p.timed(s.num_steps) for i, (p, s) in enumerate(zip(programs, settings, strict=True))}
+        timed = interleaved(runs, 5)
+        found = []
+        for i, (program, setting) in enumerate(zip(programs, settings, strict=True)):
+            row = work_row(setting.row.scheme, program, setting.num_steps, self.reference, timed[str(i)])
+            found.append(replace(setting, row=row))
+            self.settings[setting.family.name, setting.num_micro, setting.num_steps] = found[-1]
+        return found
+
+    def rows(self) -> WorkPrecision:
+        """All runs so far."""
+        order = sorted(self.settings.values(), key=lambda s: (s.family.name, s.num_micro, s.num_steps))
+        return WorkPrecision(tuple(s.row for s in order), self.t_end, self.reference)
+
+
+@dataclass(frozen=True)
+class Verification:
+    """A run with another start, not seen by the search: its error and time over those predicted."""
+
+    error_q: float
+    seconds: float
+    error_ratio: float
+    time_ratio: float
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """The cheapest setting found for an error, and how it was found.
+
+    scheme, macro_dt, num_steps: what to give to `vmri_jax.simulate`.
+    setting: the same with its error and time; others: the runners-up, the fastest first.
+    verification: the same setting from another start.
+    runs: all runs of the search; ``runs.pareto()`` is their Pareto front.
+    """
+
+    error: float
+    setting: Setting
+    others: tuple[Setting, ...]
+    verification: Verification | None
+    runs: WorkPrecision
+
+    @property
+    def scheme(self):
+        """The scheme or composition."""
+        return self.setting.scheme
+
+    @property
+    def macro_dt(self) -> float:
+        """Macro step H."""
+        return self.setting.row.macro_dt
+
+    @property
+    def num_steps(self) -> int:
+        """Macro steps up to t_end."""
+        return self.setting.num_steps
+
+    def command(self, system: str) -> str:
+        """The command that runs it."""
+        s = self.setting
+        step = f"--num-micro {s.num_micro} --macro-dt {s.row.macro_dt:.17g} --steps {s.num_steps}"
+        return f"vmri simulate {system} {s.family.options} {step} --out run.npz"
+
+
+def check_target(error: float, t_end: float, problem: vm.Problem) -> None:
+    """Refuse errors and times that no run can meet."""
+    if not (np.isfinite(t_end) and t_end > 0):
+        raise ValueError(f"recommend: t_end is {t_end}; it must be a positive number.")
+    size = float(max(np.abs(problem.q_s).max(initial=0), np.abs(problem.q_f).max(initial=0), 1e-300))
+    floor = 100 * np.finfo(float).eps * size
+    if not (np.isfinite(error) and error > floor):
+        raise ValueError(
+            f"recommend: error is {error:g}; the largest position is {size:.3g}, so that round-off alone is about "
+            f"{floor:.0e}. Give a larger error, in the unit of the positions."
+        )
+
+
+def recommend(
+    problem: vm.Problem,
+    error: float,
+    t_end: float,
+    *,
+    menu: Sequence[Family] | None = None,
+    num_saves: int = 1,
+    reference: ReferenceSolution | None = None,
+    newton: vm.Newton | None = None,
+    verify: bool = True,
+    exhaustive: bool = False,
+    progress: Progress = silent,
+) -> Recommendation:
+    """Find the scheme, num_micro and macro step that reach an error in the least time on this machine.
+
+    Args:
+        problem: system and start.
+        error: largest accepted ``|q - q_ref|`` over the compared nodes, in the unit of the positions.
+        t_end: simulated time.
+        menu: families to choose from, by default `families()`.
+        num_saves: nodes compared, equally spaced; 1 compares at t_end.
+        reference: compare with this; by default `reference_solution`.
+        newton: how implicit equations are solved.
+        verify: run the setting from another start, and compare with its own reference.
+        exhaustive: search without shortcuts.
+        progress: told about every attempt.
+
+    Raises:
+        ValueError: an error below round-off or below what the reference can tell, or that no setting reaches.
+        SimulationError: the reference could not be computed.
+    """
+    check_target(error, t_end, problem)
+    if reference is None:
+        reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
+    if error < MARGIN * reference.error_q:
+        raise ValueError(
+            f"recommend: error is {error:g}, but the reference solution is only good to {reference.error_q:.1e}; give an "
+            f"error of at least {MARGIN * reference.error_q:.1e}, or a better reference, or a smaller t_end."
+        )
+    search = Search(problem, t_end, families() if menu is None else menu, reference, newton)
+    found = search.cheapest(error, progress, exhaustive)
+    if not found:
+        best = min(search.settings.values(), key=lambda s: np.nan_to_num(s.row.error_q, nan=np.inf))
+        raise ValueError(
+            f"recommend: no setting reached {error:g} in {len(search.settings)} runs; the best was {best.row.error_q:.1e} "
+            f"with {best.row.scheme} and {best.num_steps} steps. Give a larger error."
+        )
+    checked = None
+    if verify:
+        progress("another start", 1, 1)
+        checked = _verified(problem, t_end, found[0], reference.num_saves, newton)
+    progress("done", 1, 1)
+    return Recommendation(error, found[0], tuple(found[1:]), checked, search.rows())
+
+
+def _verified(problem, t_end, setting: Setting, num_saves: int, newton) -> Verification:
+    """The setting from a start whose velocities differ by about a hundredth."""
+    random = np.random.default_rng(1)
+    size = 0.01 * max(np.abs(problem.v_s).max(initial=0), np.abs(problem.v_f).max(initial=0))
+    changes = {name: getattr(problem, name) for name in ("v_s", "v_f")}
+    changes = {name: v + size * random.normal(size=np.shape(v)) for name, v in changes.items()}
+    other = replace(problem, **changes)
+    reference = reference_solution(other, t_end, num_saves=num_saves)
+    program = Program(other, setting.scheme, t_end, num_saves, newton)
+    [seconds] = interleaved({"": program.timed(setting.num_steps)}, 5).values()
+    row = work_row(setting.row.scheme, program, setting.num_steps, reference, seconds)
+    return Verification(row.error_q, row.seconds, row.error_q / setting.row.error_q, row.seconds / setting.row.seconds)

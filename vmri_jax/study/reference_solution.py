@@ -1,0 +1,109 @@
+"""Reference solutions: what runs are compared with, and how accurate it is itself."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.simulate import simulation_error
+from vmri_jax.study.program import Program, joined
+from vmri_jax.study.table import Progress, silent
+
+ROUNDOFF = 1e-13
+"""Differences of two runs below this, relative to the solution, are round-off."""
+MAX_STEPS = 2**17
+
+
+@dataclass(frozen=True)
+class ReferenceSolution:
+    """What runs are compared with: q and p, shape (num_saves + 1, n_s + n_f), slow coordinates first.
+
+    error_q, error_p: how accurate they are; errors near them are not fitted.
+    """
+
+    q: np.ndarray
+    p: np.ndarray
+    error_q: float = 0.0
+    error_p: float = 0.0
+
+    @property
+    def num_saves(self) -> int:
+        """Saved nodes, the start not counted."""
+        return len(self.q) - 1
+
+    def errors(self, trajectory: vm.Trajectory) -> tuple[float, float]:
+        """Largest error of q and of p over nodes and coordinates; NaN for a run that failed."""
+        q, p = joined(trajectory)
+        return float(np.abs(q - self.q).max()), float(np.abs(p - self.p).max())
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a .npz file."""
+        with Path(path).open("wb") as file:
+            np.savez_compressed(file, q=self.q, p=self.p, error_q=self.error_q, error_p=self.error_p)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ReferenceSolution":
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: something else is in it.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                return cls(data["q"], data["p"], float(data["error_q"]), float(data["error_p"]))
+        except FileNotFoundError:
+            raise FileNotFoundError(f"{path} does not exist; give a file written by ReferenceSolution.save.") from None
+        except Exception as error:
+            raise ValueError(f"{path} is not a file written by ReferenceSolution.save ({error}).") from error
+
+
+def reference_solution(
+    problem: vm.Problem,
+    t_end: float,
+    *,
+    num_saves: int = 10,
+    num_steps: int | None = None,
+    degree: int = 4,
+    progress: Progress = silent,
+) -> ReferenceSolution:
+    """Fine single-rate solution of order ``2 degree``, checked against itself at half the step.
+
+    Args:
+        problem: system and start.
+        t_end: time simulated.
+        num_saves: saved nodes, equally spaced over `t_end`.
+        num_steps: steps of the coarser of the two runs, a multiple of `num_saves`; by default steps are halved until
+            two runs agree to round-off or no longer come closer.
+        degree: polynomial degree of the path, with Gauss quadrature on every term.
+        progress: told about every run.
+
+    Returns:
+        The finer of the two runs that agree best; its errors are the largest differences between them.
+
+    Raises:
+        SimulationError: runs failed with every number of steps; the last one is in it.
+    """
+    program = Program(problem, vm.galerkin(1, degree, "gauss"), t_end, num_saves)
+    fixed = num_steps is not None
+    n = num_steps if fixed else num_saves * max(1, 32 // num_saves)
+    coarse, best, last_error = None, None, np.inf
+    while True:
+        progress(f"reference solution, {n} steps", 0, 1)
+        trajectory = program(n)
+        fine = joined(trajectory) if bool(trajectory.success) else None
+        if coarse is not None and fine is not None:
+            error_q, error_p = (float(np.abs(a - b).max()) for a, b in zip(coarse, fine, strict=True))
+            if best is None or error_q < best.error_q:
+                best = ReferenceSolution(*fine, error_q, error_p)
+            settled = error_q > last_error / 2 and error_q < 1e-6 * max(1.0, np.abs(fine[0]).max())
+            if fixed or settled or error_q <= ROUNDOFF * np.abs(fine[0]).max():
+                return best
+            last_error = error_q
+        if (fixed and (fine is None or n > num_steps)) or n >= MAX_STEPS:
+            break
+        coarse, n = fine, 2 * n
+    if best is not None:
+        return best
+    raise simulation_error(trajectory, t_end / n, n // num_saves)

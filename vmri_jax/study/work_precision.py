@@ -1,0 +1,239 @@
+"""Work and precision: what an error costs in time and in evaluations, run by run, and the best of all runs."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.composition import Composition
+from vmri_jax.study.program import Program
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.table import Progress, silent, write_csv
+from vmri_jax.study.timing import interleaved, machine
+
+FINEST_ERROR = 1e-10
+"""Ladders of steps end below this error, or where the reference is no better."""
+SLOWEST = 2.0
+"""Ladders of steps end with a run of so many seconds."""
+
+
+@dataclass(frozen=True)
+class WorkRow:
+    """One run: its error and what it costs.
+
+    error_q, error_p: largest error over the compared nodes, see `ReferenceSolution`.
+    seconds, low, high: median and quartiles of the wall time of the run, compiled before.
+    compile_seconds: of the program, which all runs of the scheme share.
+    slow_evaluations, fast_evaluations, solves: gradients of V and of W and systems of equations in the whole run, one
+        pass of a solve evaluating once; counted from the scheme and the passes that the run reports.
+    """
+
+    scheme: str
+    num_micro: int
+    order: int
+    num_steps: int
+    macro_dt: float
+    error_q: float
+    error_p: float
+    seconds: float
+    low: float
+    high: float
+    compile_seconds: float
+    slow_evaluations: int
+    fast_evaluations: int
+    solves: int
+    iterations: int
+    method: str
+    result: str
+
+
+@dataclass(frozen=True)
+class WorkPrecision:
+    """Rows of one comparison and the reference they were held against."""
+
+    rows: tuple[WorkRow, ...]
+    t_end: float
+    reference: ReferenceSolution
+
+    @property
+    def schemes(self) -> list[str]:
+        """Labels of the schemes."""
+        return list(dict.fromkeys(row.scheme for row in self.rows))
+
+    def curve(self, scheme: str) -> list[WorkRow]:
+        """The runs of a scheme that did not fail, the coarsest first."""
+        return [row for row in self.rows if row.scheme == scheme and np.isfinite(row.error_q)]
+
+    def pareto(self, work: str = "seconds") -> list[WorkRow]:
+        """The runs that no other one beats both in error and in work, the cheapest first.
+
+        Args:
+            work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
+        """
+        front: list[WorkRow] = []
+        for row in sorted(self.rows, key=lambda r: (getattr(r, work), r.error_q)):
+            if np.isfinite(row.error_q) and (not front or row.error_q < front[-1].error_q):
+                front.append(row)
+        return front
+
+    def cheapest(self, error: float, scheme: str | None = None) -> WorkRow | None:
+        """The fastest run (of a scheme) with at most this error of the positions, None if there is none."""
+        rows = [r for r in self.rows if r.error_q <= error and scheme in (None, r.scheme)]
+        return min(rows, key=lambda row: row.seconds, default=None)
+
+    def table(self):
+        """The Pareto front as a `rich.table.Table`."""
+        return rows_table(self.pareto())
+
+    def plot(self, title: str = "", work: str = "seconds"):
+        """Error against work, see `vmri_jax.plots.plot_work_precision`."""
+        from vmri_jax import plots
+
+        return plots.plot_work_precision(self, title, work)
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the rows to a CSV file."""
+        write_csv(path, self.rows)
+
+    def to_json(self, path: str | Path) -> None:
+        """Write rows, error of the reference, machine and versions to a JSON file; NaN becomes null."""
+        rows = [{k: None if v != v else v for k, v in asdict(row).items()} for row in self.rows]
+        known = {"error_q": self.reference.error_q, "error_p": self.reference.error_p}
+        found = {"t_end": self.t_end, "reference": known, "machine": machine(), "rows": rows}
+        Path(path).write_text(json.dumps(found, indent=1))
+
+
+def rows_table(rows: Sequence[WorkRow]):
+    """Runs as a `rich.table.Table`."""
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("scheme")
+    for name in ("H", "steps", "error of q", "time", "grad V", "grad W", "solves"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        counts = (f"{n:,}" for n in (row.slow_evaluations, row.fast_evaluations, row.solves))
+        numbers = f"{row.macro_dt:.4g}", f"{row.num_steps:,}", f"{row.error_q:.1e}", duration(row.seconds)
+        table.add_row(row.scheme, *numbers, *counts)
+    return table
+
+
+def duration(seconds: float) -> str:
+    """With a unit: 12 µs, 3.4 ms, 1.2 s."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 1e-6:.2g} µs"
+
+
+def work_row(label: str, program: Program, num_steps: int, reference: ReferenceSolution, seconds=(np.nan,)) -> WorkRow:
+    """Run the program once more and say what it gave and cost."""
+    trajectory, scheme = program(num_steps), program.scheme
+    error_q, error_p = reference.errors(trajectory)
+    cost, passes = scheme.describe(), np.maximum(np.asarray(trajectory.info.iterations), 1)
+    method = vm.Method(int(np.max(trajectory.info.method)))
+    solves = 0
+    if method > vm.Method.EXPLICIT:
+        constrained = max(program.problem.system.num_constraints(program.problem.q_s, program.problem.q_f)) > 0
+        solves = num_steps * (cost.constrained_solves if constrained else cost.solves)
+    evaluations = num_steps * float(passes.mean())
+    low, middle, high = (float(x) for x in np.quantile(seconds, (0.25, 0.5, 0.75)))
+    return WorkRow(
+        scheme=label,
+        num_micro=scheme.num_micro,
+        order=scheme.order,
+        num_steps=num_steps,
+        macro_dt=program.t_end / num_steps,
+        error_q=error_q,
+        error_p=error_p,
+        seconds=middle,
+        low=low,
+        high=high,
+        compile_seconds=program.compile_seconds,
+        slow_evaluations=round(evaluations * cost.slow_evaluations),
+        fast_evaluations=round(evaluations * cost.fast_evaluations),
+        solves=solves,
+        iterations=int(np.max(trajectory.info.iterations)),
+        method=method.name,
+        result=vm.Result(int(trajectory.result)).name,
+    )
+
+
+def work_precision(
+    problem: vm.Problem,
+    schemes: Mapping[str, vm.Scheme | Composition],
+    t_end: float,
+    *,
+    num_steps: Sequence[int] | None = None,
+    num_saves: int = 1,
+    reference: ReferenceSolution | None = None,
+    newton: vm.Newton | None = None,
+    repeats: int = 5,
+    progress: Progress = silent,
+) -> WorkPrecision:
+    """Error against wall time and evaluations for every scheme over a ladder of macro steps.
+
+    Every scheme is compiled once. The errors of all runs are found first; then the runs take turns on the clock, so that
+    a slow moment of the machine hits all of them, and the median is kept. A run that fails is a row of NaN.
+
+    Args:
+        problem: system and start.
+        schemes: schemes by label.
+        t_end: simulated time.
+        num_steps: numbers of macro steps, multiples of `num_saves`; by default doubled from the step at which the fastest
+            vibration begins to be seen until the error falls no more or is below 1e-10, or a run takes two seconds.
+        num_saves: nodes compared, equally spaced.
+        reference: compare with this; by default `reference_solution`.
+        newton: how implicit equations are solved.
+        repeats: timed samples of every run.
+        progress: told about every run.
+
+    Raises:
+        ValueError: no scheme, or numbers of steps that are no multiples of num_saves.
+    """
+    if not schemes:
+        raise ValueError("work_precision: schemes is empty; give at least one, e.g. {'impulse': fully_explicit(10)}.")
+    if num_steps is not None and (not len(num_steps) or any(n < 1 or n % num_saves for n in num_steps)):
+        raise ValueError(f"work_precision: num_steps is {list(num_steps)}; give multiples of num_saves = {num_saves}.")
+    if reference is None:
+        reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
+    frequency = float(vm.diagnostics.frequencies(problem.system, problem.state())[0])
+    runs, rows = {}, []
+    for i, (label, scheme) in enumerate(schemes.items()):
+        program = Program(problem, scheme, t_end, num_saves, newton)
+        start = max(1, int(frequency * t_end / scheme.num_micro / scheme.degree))
+        ladder = _given(num_steps) if num_steps is not None else _doubled(start, num_saves, reference)
+        n = next(ladder)
+        while n:
+            progress(f"{label}, {n} steps", i, len(schemes) + 1)
+            [seconds] = interleaved({"": program.timed(n)}, 1, 0.0).values()
+            row = work_row(label, program, n, reference, seconds)
+            runs[label, n] = program, row
+            n = ladder.send(row)
+    progress("measuring times", len(schemes), len(schemes) + 1)
+    fine = {key: program.timed(key[1]) for key, (program, row) in runs.items() if np.isfinite(row.error_q)}
+    timed = interleaved(fine, repeats)  # pyright: ignore[reportArgumentType]
+    for key, (program, row) in runs.items():
+        rows.append(work_row(key[0], program, key[1], reference, timed[key]) if key in timed else row)
+    progress("done", 1, 1)
+    return WorkPrecision(tuple(rows), t_end, reference)
+
+
+def _given(num_steps: Sequence[int]):
+    """The numbers of steps, one after the other."""
+    yield from num_steps
+    yield 0
+
+
+def _doubled(start: int, num_saves: int, reference: ReferenceSolution):
+    """Numbers of steps, doubled until more of them bring nothing; is sent the row of each."""
+    n, best = num_saves * max(1, start // num_saves), np.inf
+    while True:
+        row: WorkRow = yield n
+        fell = not np.isfinite(row.error_q) or row.error_q < best / 1.5
+        if row.error_q < max(FINEST_ERROR, reference.error_q) or row.seconds > SLOWEST or (not fell and best < 1e-6):
+            yield 0
+        best, n = np.nanmin([best, row.error_q]), 2 * n
