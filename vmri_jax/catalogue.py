@@ -85,8 +85,11 @@ def find_problem(name: str) -> vm.Problem:
     return _problem_in(_run_file(path), path, attribute)
 
 
-def find_scheme(name: str, num_micro: int, **options) -> vm.Scheme:
+def find_scheme(name: str, num_micro: int, compose: str | None = None, **options) -> vm.Scheme | vm.Composition:
     """A built-in scheme by name; options that are None keep their defaults.
+
+    Args:
+        compose: name of a composition of it, see `vmri_jax.compose`.
 
     Raises:
         ValueError: an unknown name, or an option the scheme does not have.
@@ -102,7 +105,8 @@ def find_scheme(name: str, num_micro: int, **options) -> vm.Scheme:
             raise ValueError(f"the scheme {name} has no {key}; leave --{key} out or use {' or '.join(takers)}.")
     if name == "galerkin" and "degree" not in given:
         raise ValueError("the scheme galerkin needs the degree of its path; give e.g. --degree 2.")
-    return scheme.factory(num_micro, **given)
+    made = scheme.factory(num_micro, **given)
+    return made if compose is None else vm.compose(made, compose)
 
 
 def _unknown(kind: str, name: str, known: Iterable[str]) -> str:

@@ -1,7 +1,9 @@
-"""The command line ``vmri``: systems, schemes, one run, the reference study."""
+"""The command line ``vmri``: systems, schemes, one run, what accuracy costs, the reference study."""
 
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +20,20 @@ from rich.text import Text
 import vmri_jax as vm
 from vmri_jax import plots, runtime
 from vmri_jax.catalogue import SCHEMES, SYSTEMS, find_problem, find_scheme
-from vmri_jax.study import choose_figures, reference_figures, reproduce
+from vmri_jax.composition import COMPOSITIONS
+from vmri_jax.study import (
+    Recommendation,
+    WorkPrecision,
+    WorkRow,
+    choose_figures,
+    cost_page,
+    recommend,
+    reference_figures,
+    reproduce,
+)
+from vmri_jax.study.advisor import NothingReached, check_target
+from vmri_jax.study.table import Progress as StudyProgress
+from vmri_jax.study.work_precision import rows_table
 
 SAVED_NODES = 1000
 """About as many nodes are saved by default."""
@@ -80,6 +95,13 @@ def schemes() -> None:
         options = " ".join(f"--{option}" for option in entry.options)
         table.add_row(f"[bold]{name}[/bold]", entry.order, options, entry.title)
     console.print(table)
+    console.print(
+        "\nOf higher order, [bold]--compose[/bold] NAME: several steps of a scheme of order 2, some backwards.\n"
+    )
+    table = Table("name", "order", "stages", "source", box=None, pad_edge=False)
+    for name, entry in COMPOSITIONS.items():
+        table.add_row(f"[bold]{name}[/bold]", f"{entry.order}", f"{len(entry.coefficients)}", entry.source)
+    console.print(table)
 
 
 @app.command(
@@ -100,6 +122,9 @@ def simulate(
     ] = None,
     degree: Annotated[int | None, typer.Option(help="Degree of the path, galerkin.")] = None,
     rule: Annotated[str | None, typer.Option(help="gauss or lobatto, galerkin. [dim]gauss[/dim]")] = None,
+    compose: Annotated[
+        str | None, typer.Option(help="Compose the scheme to a higher order, e.g. suzuki4, kahan-li8.")
+    ] = None,
     save_every: Annotated[
         int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
     ] = None,
@@ -112,7 +137,7 @@ def simulate(
         _check_target("--out", out, (".npz",))
         _check_target("--plot", plot, (".png", ".svg", ".pdf"))
         problem = find_problem(system)
-        chosen = find_scheme(scheme, num_micro, alpha=alpha, degree=degree, rule=rule)
+        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         newton = vm.Newton(method=method)  # pyright: ignore[reportArgumentType]
         save_every = _default_save_every(steps) if save_every is None else save_every
         compiling = _compile_clock()
@@ -138,6 +163,75 @@ def simulate(
 
 
 @app.command(
+    epilog="Examples:\n\nvmri tune fpu --error 1e-4 --t-end 10\n\nvmri tune my_file.py:my_problem --error 1e-3 --t-end 2"
+)
+def tune(
+    system: Annotated[str, typer.Argument(help="fpu, tsp, sam, or my_file.py:my_problem.")],
+    error: Annotated[float, typer.Option(help="Largest accepted error of a position at the end, in its unit.")],
+    t_end: Annotated[float, typer.Option(help="Simulated time.")],
+    exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Search without shortcuts.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv or .json.")] = None,
+) -> None:
+    """Find the scheme, num_micro and macro step that reach an error in the least time on this machine."""
+    try:
+        _check_target("--out", out, (".csv", ".json"))
+        problem = find_problem(system)
+        check_target(error, t_end, problem)
+        with _progress() as tell:
+            found = recommend(problem, error, t_end, exhaustive=exhaustive, progress=tell)
+    except NothingReached as failure:
+        _write_runs(failure.runs, out)
+        console.print(failure.runs.table())
+        _print_failure("Nothing reached the error", f"{failure} The best runs are above.")
+        raise typer.Exit(1) from failure
+    except vm.SimulationError as failure:
+        _print_failure("No reference solution", str(failure))
+        raise typer.Exit(1) from failure
+    except (ValueError, TypeError) as wrong:
+        raise BadInput(str(wrong)) from wrong
+    _write_runs(found.runs, out)
+    console.print("[bold]Errors against time[/bold], the best of all runs\n", found.runs.table())
+    console.print(f"\n[bold]For an error of {error:g}[/bold], the fastest\n", rows_table(_rows_of(found)))
+    seen = found.verification
+    if seen is not None:
+        console.print(
+            f"\nFrom another start the first of them has {seen.error_ratio:.2g} times this error and takes "
+            f"{seen.time_ratio:.2g} times as long."
+        )
+    console.print(f"\n[bold]{escape(found.setting.command(system))}[/bold]", soft_wrap=True)
+
+
+@app.command(epilog="Examples:\n\nvmri cost tsp --out out/tsp\n\nvmri cost my_file.py:my_problem --t-end 5")
+def cost(
+    system: Annotated[str, typer.Argument(help="fpu, tsp, sam, or my_file.py:my_problem.")],
+    t_end: Annotated[
+        float | None, typer.Option(help="Simulated time. [dim]8 periods of the fastest vibration[/dim]")
+    ] = None,
+    error: Annotated[
+        list[float] | None, typer.Option(help="Error asked for; may be repeated. [dim]1e-2 to 1e-8 of the motion[/dim]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the page.")] = Path("out/cost"),
+) -> None:
+    """One page: what accuracy costs, which scheme to take for which error, where the time goes."""
+    try:
+        problem = find_problem(system)
+        for asked in error or [1.0]:
+            check_target(asked, 1.0 if t_end is None else t_end, problem)
+        out.mkdir(parents=True, exist_ok=True)
+        with _progress() as tell:
+            page = cost_page(problem, system, out, t_end=t_end, errors=error, progress=tell)
+    except OSError as wrong:
+        raise BadInput(f"--out {out}: {wrong.strerror}; give a folder that can be written.") from wrong
+    except vm.SimulationError as failure:
+        _print_failure("No reference solution", str(failure))
+        raise typer.Exit(1) from failure
+    except (ValueError, TypeError) as wrong:
+        raise BadInput(str(wrong)) from wrong
+    console.print(rows_table([answer.setting.row for answer in page.answers if answer.setting is not None]))
+    console.print(f"\nPage: [bold]{escape(str(page.path))}[/bold]", soft_wrap=True)
+
+
+@app.command(
     name="reproduce",
     epilog="Examples:\n\nvmri reproduce\n\nvmri reproduce --only fig6 --only fig9 --out study\n\nvmri reproduce --full",
 )
@@ -158,12 +252,7 @@ def reproduce_command(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise BadInput(f"--out {out}: {error.strerror}; give a folder that can be written.") from error
-    columns = (BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, transient=True) as bars:
-        task = bars.add_task("starting")
-
-        def show(what: str, done: int, total: int) -> None:
-            bars.update(task, description=what, completed=done, total=total)
+    with _progress() as show:
 
         def figure_done(result) -> None:
             mark = (
@@ -179,6 +268,25 @@ def reproduce_command(
         reasons = "\n".join(f"{figure.name}: {figure.error}" for figure in report.failed)
         _print_failure("Figures that failed", reasons)
         raise typer.Exit(1)
+
+
+@contextmanager
+def _progress() -> Iterator[StudyProgress]:
+    """A bar; yields the function that moves it."""
+    columns = (BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True) as bars:
+        task = bars.add_task("starting")
+        yield lambda what, done, total: bars.update(task, description=what, completed=done, total=total)
+
+
+def _rows_of(found: Recommendation, count: int = 5) -> list[WorkRow]:
+    """The setting recommended and the next ones."""
+    return [setting.row for setting in (found.setting, *found.others)[:count]]
+
+
+def _write_runs(runs: WorkPrecision, out: Path | None) -> None:
+    if out is not None:
+        runs.to_csv(out) if out.suffix == ".csv" else runs.to_json(out)
 
 
 def _run(

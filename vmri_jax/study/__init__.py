@@ -3,6 +3,7 @@
 from vmri_jax.study.advisor import Recommendation, recommend
 from vmri_jax.study.convergence import ConvergenceRow, ConvergenceStudy, convergence_study
 from vmri_jax.study.cost import CostRow, CostStudy, cost_study
+from vmri_jax.study.cost_page import CostPage, cost_page
 from vmri_jax.study.figures import Check, ConvergenceFigure, CostFigure, CostPanel, Findings
 from vmri_jax.study.menu import Family, families
 from vmri_jax.study.program import Program
@@ -17,6 +18,7 @@ __all__ = [
     "ConvergenceRow",
     "ConvergenceStudy",
     "CostFigure",
+    "CostPage",
     "CostPanel",
     "CostRow",
     "CostStudy",
@@ -31,6 +33,7 @@ __all__ = [
     "WorkRow",
     "choose_figures",
     "convergence_study",
+    "cost_page",
     "cost_study",
     "families",
     "recommend",

@@ -48,6 +48,19 @@ class Setting:
         """The scheme itself."""
         return self.family.make(self.num_micro)
 
+    def command(self, system: str) -> str:
+        """The command that runs it."""
+        step = f"--num-micro {self.num_micro} --macro-dt {self.row.macro_dt:.17g} --steps {self.num_steps}"
+        return f"vmri simulate {system} {self.family.options} {step} --out run.npz"
+
+
+class NothingReached(ValueError):
+    """No setting reached the error; what was run is in `.runs`."""
+
+    def __init__(self, message: str, runs: WorkPrecision):
+        self.runs = runs
+        super().__init__(message)
+
 
 class Search:
     """Runs of one problem, each done once: programs, errors and times by family, num_micro and number of steps.
@@ -200,12 +213,6 @@ class Recommendation:
         """Macro steps up to t_end."""
         return self.setting.num_steps
 
-    def command(self, system: str) -> str:
-        """The command that runs it."""
-        s = self.setting
-        step = f"--num-micro {s.num_micro} --macro-dt {s.row.macro_dt:.17g} --steps {s.num_steps}"
-        return f"vmri simulate {system} {s.family.options} {step} --out run.npz"
-
 
 def check_target(error: float, t_end: float, problem: vm.Problem) -> None:
     """Refuse errors and times that no run can meet."""
@@ -248,7 +255,8 @@ def recommend(
         progress: told about every attempt.
 
     Raises:
-        ValueError: an error below round-off or below what the reference can tell, or that no setting reaches.
+        ValueError: an error below round-off or below what the reference can tell.
+        NothingReached: no setting keeps the error; carries the runs.
         SimulationError: the reference could not be computed.
     """
     check_target(error, t_end, problem)
@@ -263,9 +271,10 @@ def recommend(
     found = search.cheapest(error, progress, exhaustive)
     if not found:
         best = min(search.settings.values(), key=lambda s: np.nan_to_num(s.row.error_q, nan=np.inf))
-        raise ValueError(
-            f"recommend: no setting reached {error:g} in {len(search.settings)} runs; the best was {best.row.error_q:.1e} "
-            f"with {best.row.scheme} and {best.num_steps} steps. Give a larger error."
+        raise NothingReached(
+            f"recommend: no setting reached {error:g} in {len(search.settings)} runs; the best error was "
+            f"{best.row.error_q:.1e}, with {best.row.scheme} and {best.num_steps} steps. Give a larger error.",
+            search.rows(),
         )
     checked = None
     if verify:

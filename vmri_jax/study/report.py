@@ -1,22 +1,14 @@
 """Runs the reference study and writes it down: figures, tables and one self-contained HTML report."""
 
-import base64
-import os
-import platform
 import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
-from importlib.metadata import version
-from io import BytesIO
 from pathlib import Path
-
-import jax
-import jinja2
 
 from vmri_jax import plots
 from vmri_jax.study.figures import Check, ConvergenceFigure, CostFigure
+from vmri_jax.study.html import embedded, svg, write_page
 from vmri_jax.study.reference import reference_figures
 from vmri_jax.study.table import Progress, part, silent
 
@@ -102,52 +94,24 @@ def _run_figure(figure, out: Path, references: dict, progress: Progress) -> Figu
         findings = figure.measure(progress, references)
         findings.to_csv(out / f"{figure.name}.csv")
         plots.save(findings.draw(figure.title, plots.LIGHT), out / f"{figure.name}.png")
-        images = [_svg(findings.draw("", theme), theme) for theme in (plots.LIGHT, plots.DARK)]
-        (out / f"{figure.name}.svg").write_bytes(images[0])
+        (out / f"{figure.name}.svg").write_bytes(svg(findings.draw("", plots.LIGHT), plots.LIGHT))
+        images = embedded(lambda theme: findings.draw("", theme))
     except Exception as error:  # whatever it is, the other figures are worth having
         seconds, message = time.perf_counter() - start, f"{type(error).__name__}: {error}"
         details = "".join(traceback.format_exception(error))
         return FigureResult(figure.name, figure.title, figure.paper, "", (), seconds, error=message, traceback=details)
     seconds = time.perf_counter() - start
-    embedded = [f"data:image/svg+xml;base64,{base64.b64encode(image).decode()}" for image in images]
-    return FigureResult(figure.name, figure.title, figure.paper, findings.seen, findings.checks, seconds, *embedded)
-
-
-def _svg(figure, theme: plots.Theme) -> bytes:
-    buffer = BytesIO()
-    with plots.style(theme):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
+    return FigureResult(figure.name, figure.title, figure.paper, findings.seen, findings.checks, seconds, *images)
 
 
 def _write_html(path: Path, results: list[FigureResult], size: str, seconds: float) -> None:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("vmri_jax.study", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
     checks = [check for figure in results for check in figure.checks]
-    path.write_text(
-        environment.get_template("report.html.j2").render(
-            figures=results,
-            agreeing=sum(check.agrees for check in checks),
-            num_checks=len(checks),
-            size=size,
-            minutes=seconds / 60,
-            date=datetime.now().strftime("%-d %B %Y, %H:%M"),
-            machine=_machine(),
-            versions=f"vmri_jax {version('vmri_jax')}, JAX {jax.__version__}, Python {platform.python_version()}",
-        ),
-        encoding="utf-8",
-    )
-
-
-def _machine() -> str:
-    processor = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():  # Linux, where platform knows only the architecture
-        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        processor = names[0] if names else processor
-    threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
-    return (
-        f"{processor}, {os.cpu_count()} cores, {platform.system()}, JAX on {jax.default_backend()}, linear algebra on "
-        f"{threads} {'thread' if threads == '1' else 'threads'}"
+    write_page(
+        path,
+        "report.html.j2",
+        figures=results,
+        agreeing=sum(check.agrees for check in checks),
+        num_checks=len(checks),
+        size=size,
+        minutes=seconds / 60,
     )

@@ -108,7 +108,7 @@ def machine() -> dict:
     """Versions, processor, cores of this process and compiler flags, for every file of results."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     return {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": cores,
         "system": platform.platform(),
         "python": platform.python_version(),
@@ -120,7 +120,8 @@ def machine() -> dict:
     }
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Name of the processor."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())

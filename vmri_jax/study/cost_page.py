@@ -1,0 +1,258 @@
+"""One page on what accuracy costs for a system: which scheme to take for which error, and where the time goes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import vmri_jax as vm
+from vmri_jax import plots
+from vmri_jax.study.advisor import MARGIN, Search, Setting
+from vmri_jax.study.html import embedded, write_page
+from vmri_jax.study.menu import Family, families
+from vmri_jax.study.reference_solution import reference_solution
+from vmri_jax.study.table import Progress, part, silent
+from vmri_jax.study.timing import interleaved
+from vmri_jax.study.work_precision import WorkPrecision, duration
+
+PERIODS = 8
+"""Simulated by default: so many periods of the fastest vibration."""
+RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
+"""Errors asked for by default, relative to how far the system moves."""
+SHOWN = 8
+"""Schemes in the figure."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The cheapest setting for an error, None if nothing reached it, and all others that keep it, the fastest first."""
+
+    error: float
+    setting: Setting | None
+    all: tuple[Setting, ...] = ()
+
+
+@dataclass(frozen=True)
+class CostPage:
+    """What was found, and where the page lies.
+
+    answers: by error, the largest first.
+    runs: every run of the search.
+    shares: parts of the time of the middle answer by what it is spent on.
+    """
+
+    path: Path
+    name: str
+    t_end: float
+    answers: tuple[Answer, ...]
+    runs: WorkPrecision
+    shares: dict[str, float]
+
+
+def default_t_end(problem: vm.Problem) -> float:
+    """PERIODS periods of the fastest vibration, rounded to one digit; 1 if nothing vibrates."""
+    frequency = float(vm.diagnostics.frequencies(problem.system, problem.state())[0])
+    if not frequency > 0:
+        return 1.0
+    t_end = PERIODS * 2 * math.pi / frequency
+    return float(f"{t_end:.0e}")
+
+
+def cost_page(
+    problem: vm.Problem,
+    name: str,
+    out: str | Path,
+    *,
+    t_end: float | None = None,
+    errors: Sequence[float] | None = None,
+    menu: Sequence[Family] | None = None,
+    progress: Progress = silent,
+) -> CostPage:
+    """Search for the cheapest settings for a few errors and write ``cost.html``, ``cost.png`` and ``cost.csv``.
+
+    The page is rewritten after every error, so that what is found is kept whatever happens later.
+
+    Args:
+        problem: system and start.
+        name: of the system, for the title and the commands: a built-in one or ``my_file.py:my_problem``.
+        out: folder, made if it does not exist.
+        t_end: simulated time, by default `default_t_end`.
+        errors: largest ``|q - q_ref|`` at t_end; by default a ladder relative to how far the system moves.
+        menu: families to choose from.
+        progress: told what is running.
+
+    Raises:
+        ValueError: errors that are not positive.
+        SimulationError: no reference solution could be computed.
+    """
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    t_end = default_t_end(problem) if t_end is None else t_end
+    reference = reference_solution(problem, t_end, num_saves=1, progress=progress)
+    if errors is None:
+        motion = 10.0 ** math.floor(math.log10(max(np.abs(reference.q[-1] - reference.q[0]).max(), 1e-300)))
+        errors = [motion * error for error in RELATIVE_ERRORS if motion * error > MARGIN * reference.error_q]
+    if not errors or min(errors) <= 0:
+        raise ValueError(f"cost_page: errors are {list(errors)}; give positive numbers, in the unit of the positions.")
+    search = Search(problem, t_end, families() if menu is None else menu, reference)
+    answers, page = [], None
+    for i, error in enumerate(sorted(errors, reverse=True)):
+        found = search.cheapest(error, part(progress, i, len(errors)))
+        answers.append(Answer(error, found[0] if found else None, tuple(found)))
+        shares = _shares(problem, answers[len(answers) // 2].setting)
+        page = CostPage(out / "cost.html", name, t_end, tuple(answers), search.rows(), shares)
+        _write(page, problem, out)
+    progress("done", 1, 1)
+    return page  # pyright: ignore[reportReturnType]
+
+
+def _write(page: CostPage, problem: vm.Problem, out: Path) -> None:
+    shown = _shown(page)
+    page.runs.to_csv(out / "cost.csv")
+    plots.save(_draw_all(page, shown, plots.LIGHT), out / "cost.png")
+    n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
+    reached = [answer for answer in page.answers if answer.setting is not None]
+    write_page(
+        page.path,
+        "cost_page.html.j2",
+        page=page,
+        sizes={"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": n_g + n_gs},
+        reached=reached,
+        growth=_growth(reached),
+        multirate=_multirate(page),
+        duration=duration,
+        work_precision=embedded(partial(plots.plot_work_precision, shown, "", "seconds")),
+        by_num_micro=embedded(partial(_draw_num_micro, page)),
+        shares_figure=embedded(partial(_draw_shares, page)),
+    )
+
+
+def _shown(page: CostPage) -> WorkPrecision:
+    """The runs of the best num_micro of the families that are best somewhere, or nearly so."""
+    best: dict[str, tuple[float, str]] = {}
+    for answer in page.answers:
+        fastest = answer.setting.row.seconds if answer.setting else math.inf
+        for setting in answer.all:
+            ratio = setting.row.seconds / fastest
+            if ratio < best.get(setting.family.name, (math.inf, ""))[0]:
+                best[setting.family.name] = ratio, setting.row.scheme
+    labels = [label for _, label in sorted(best.values())[:SHOWN]]
+    rows = [row for label in labels for row in page.runs.rows if row.scheme == label]
+    return WorkPrecision(tuple(rows), page.t_end, page.runs.reference)
+
+
+def _growth(reached: Sequence[Answer]) -> float:
+    """Factor in time for a hundredth of the error, the geometric mean over the answers; NaN for less than two."""
+    if len(reached) < 2:
+        return math.nan
+    first, last = reached[0], reached[-1]
+    times = last.setting.row.seconds / first.setting.row.seconds  # pyright: ignore[reportOptionalMemberAccess]
+    return times ** (math.log(100) / math.log(first.error / last.error))
+
+
+def _multirate(page: CostPage) -> list[tuple[float, str, int, float]]:
+    """By error: the family of the answer, its best num_micro, and how much faster than one micro step that is."""
+    gains = []
+    for answer in page.answers:
+        if answer.setting is None:
+            continue
+        family = answer.setting.family.name
+        single = [s.row.seconds for s in answer.all if s.family.name == family and s.num_micro == 1]
+        if single:
+            gains.append((answer.error, family, answer.setting.num_micro, single[0] / answer.setting.row.seconds))
+    return gains
+
+
+def _shares(problem: vm.Problem, setting: Setting | None) -> dict[str, float]:
+    """Parts of the time of a run: gradients of V and of W, constraints with their Jacobian, all the rest."""
+    if setting is None:
+        return {}
+    system, row = problem.system, setting.row
+    n_s = problem.q_s.size
+    terms, n_constraints = {}, sum(system.num_constraints(problem.q_s, problem.q_f))
+
+    def whole(function, *arguments):
+        return lambda q: jnp.concatenate(jax.grad(function, argnums=(0, 1))(q[:n_s], q[n_s:], *arguments))
+
+    if system.slow_potential is not None:
+        terms["gradient of V"] = whole(system.slow_potential, system.params), row.slow_evaluations
+    if system.fast_potential is not None:
+        fast = system.fast_potential
+        terms["gradient of W"] = whole(lambda _, q_f, params: fast(q_f, params), system.params), row.fast_evaluations
+    if n_constraints:
+
+        def rows(q):
+            value, pull = jax.vjp(lambda q: system.constraints(q[:n_s], q[n_s:]), q)
+            return sum(value) + jax.vmap(pull)(jnp.eye(n_constraints))[0].sum(0)
+
+        evaluations = row.fast_evaluations if row.fast_evaluations else row.slow_evaluations
+        terms["constraints"] = rows, evaluations
+    q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
+    shares = {name: _seconds_each(f, q) * count / row.seconds for name, (f, count) in terms.items()}
+    total = sum(shares.values())
+    shares = {name: share / max(total, 1.0) for name, share in shares.items()}
+    return shares | {"everything else": max(0.0, 1.0 - total)}
+
+
+def _seconds_each(function, q, count: int = 2000) -> float:
+    """Seconds per evaluation in a compiled loop in which every evaluation waits for the one before."""
+
+    @jax.jit
+    def loop(q, nothing):
+        return jax.lax.fori_loop(0, count, lambda _, q: q + nothing * function(q), q)
+
+    [seconds] = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005).values()
+    return float(np.median(seconds)) / count
+
+
+def _draw_all(page: CostPage, shown: WorkPrecision, theme: plots.Theme) -> Figure:
+    title = f"{page.name}: what accuracy costs over a time of {page.t_end:g}"
+    return plots.plot_work_precision(shown, title, "seconds", theme)
+
+
+def _draw_num_micro(page: CostPage, theme: plots.Theme) -> Figure:
+    """Time against num_micro of the families that were varied, at each error, one panel per error."""
+    answers = [answer for answer in page.answers if answer.all]
+    names = list(dict.fromkeys(s.family.name for answer in answers for s in answer.all[: 2 * SHOWN]))
+    colors = {name: theme.curves[i % len(theme.curves)] for i, name in enumerate(names)}
+    with plots.style(theme):
+        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+        panels = figure.subplots(1, max(1, len(answers)), sharey=True, squeeze=False)[0]
+        drawn = {}
+        for axes, answer in zip(panels, answers, strict=False):
+            for name in names:
+                settings = sorted((s for s in answer.all if s.family.name == name), key=lambda s: s.num_micro)
+                if len(settings) >= 3:
+                    x, y = [s.num_micro for s in settings], [s.row.seconds for s in settings]
+                    drawn[name] = axes.loglog(x, y, "o-", color=colors[name], markersize=3.5, linewidth=1.2)[0]
+            axes.set(title=f"error {answer.error:.0e}", xlabel="num_micro")
+            axes.xaxis.set_major_formatter("{x:g}")
+        panels[0].set_ylabel("computing time")
+        panels[0].yaxis.set_major_formatter(lambda x, _: duration(x))
+        if drawn:
+            figure.legend(drawn.values(), drawn, loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+def _draw_shares(page: CostPage, theme: plots.Theme) -> Figure:
+    """One bar, cut by what the time is spent on."""
+    with plots.style(theme):
+        figure = plots.NotebookFigure(figsize=(7.2, 1.1))
+        axes = figure.subplots()
+        left = 0.0
+        for i, (name, share) in enumerate(page.shares.items()):
+            last = name == "everything else"
+            axes.barh([0], [share], left=left, color=theme.faint if last else theme.curves[i % len(theme.curves)])
+            if share > 0.06:
+                ink = theme.ink if last else theme.paper
+                axes.text(left + share / 2, 0, f"{name}\n{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
+            left += share
+        axes.set(xlim=(0, 1))
+        axes.set_axis_off()
+    return figure

@@ -1,0 +1,54 @@
+"""Self-contained HTML pages: templates of this folder, figures embedded in light and dark, the machine in words."""
+
+import base64
+import os
+import platform
+from collections.abc import Callable
+from datetime import datetime
+from importlib.metadata import version
+from io import BytesIO
+from pathlib import Path
+
+import jax
+import jinja2
+from matplotlib.figure import Figure
+
+from vmri_jax import plots
+from vmri_jax.study.timing import processor
+
+
+def write_page(path: Path, template: str, **values) -> None:
+    """Render a template of this folder; it also knows the date, the machine and the versions."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("vmri_jax.study", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    text = environment.get_template(template).render(
+        date=datetime.now().strftime("%-d %B %Y, %H:%M"),
+        machine=_machine(),
+        versions=f"vmri_jax {version('vmri_jax')}, JAX {jax.__version__}, Python {platform.python_version()}",
+        **values,
+    )
+    path.write_text(text, encoding="utf-8")
+
+
+def embedded(draw: Callable[[plots.Theme], Figure]) -> tuple[str, str]:
+    """A figure as two data addresses, drawn light and dark."""
+    images = [svg(draw(theme), theme) for theme in (plots.LIGHT, plots.DARK)]
+    light, dark = (f"data:image/svg+xml;base64,{base64.b64encode(image).decode()}" for image in images)
+    return light, dark
+
+
+def svg(figure: Figure, theme: plots.Theme) -> bytes:
+    """The figure as an SVG file."""
+    buffer = BytesIO()
+    with plots.style(theme):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def _machine() -> str:
+    threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
+    return (
+        f"{processor()}, {os.cpu_count()} cores, {platform.system()}, JAX on {jax.default_backend()}, linear algebra on "
+        f"{threads} {'thread' if threads == '1' else 'threads'}"
+    )
