@@ -236,7 +236,7 @@ def plot_work_precision(
         axes.set(xlabel=labels[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
         worst = max((row.error_q for row in front), default=1.0)
         axes.set_ylim(top=30 * worst)
-        if study.reference.error_q > 0:
+        if study.reference.error_q > axes.get_ylim()[0]:
             axes.axhline(study.reference.error_q, color=theme.ink, linewidth=0.8, linestyle=":")
             axes.text(
                 0.995,

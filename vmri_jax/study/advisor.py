@@ -154,6 +154,10 @@ class Search:
         ranked = sorted(reached.values(), key=lambda s: s.row.seconds)
         return sorted(self._timed(ranked[: 2 * KEPT]), key=lambda s: s.row.seconds) + ranked[2 * KEPT :]
 
+    def time_again(self, labels: Sequence[str]) -> None:
+        """Time all runs of these schemes in turn."""
+        self._timed([s for s in self.settings.values() if s.row.scheme in labels and np.isfinite(s.row.error_q)])
+
     def _timed(self, settings: Sequence[Setting]) -> list[Setting]:
         """The same with medians of runs that took turns."""
         programs = [self.programs[s.family.name, s.num_micro] for s in settings]

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 import vmri_jax as vm
 from vmri_jax import plots
@@ -21,7 +22,7 @@ from vmri_jax.study.table import Progress, part, silent
 from vmri_jax.study.timing import interleaved
 from vmri_jax.study.work_precision import WorkPrecision, duration
 
-PERIODS = 8
+PERIODS = 30
 """Simulated by default: so many periods of the fastest vibration."""
 RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 """Errors asked for by default, relative to how far the system moves."""
@@ -105,19 +106,25 @@ def cost_page(
     for i, error in enumerate(sorted(errors, reverse=True)):
         found = search.cheapest(error, part(progress, i, len(errors)))
         answers.append(Answer(error, found[0] if found else None, tuple(found)))
-        shares = _shares(problem, answers[len(answers) // 2].setting)
-        page = CostPage(out / "cost.html", name, t_end, tuple(answers), search.rows(), shares)
-        _write(page, problem, out)
+        page = _write(search, answers, problem, name, out)
+    progress("measuring times", 1, 1)
+    search.time_again(_shown(answers))
+    page = _write(search, answers, problem, name, out)
     progress("done", 1, 1)
     return page  # pyright: ignore[reportReturnType]
 
 
-def _write(page: CostPage, problem: vm.Problem, out: Path) -> None:
-    shown = _shown(page)
-    page.runs.to_csv(out / "cost.csv")
-    plots.save(_draw_all(page, shown, plots.LIGHT), out / "cost.png")
+def _write(search: Search, answers: Sequence[Answer], problem: vm.Problem, name: str, out: Path) -> CostPage:
+    """The page of what is known so far."""
+    runs, shares = search.rows(), _shares(problem, answers[len(answers) // 2].setting)
+    page = CostPage(out / "cost.html", name, search.t_end, tuple(answers), runs, shares)
+    labels = _shown(answers)
+    shown = replace(runs, rows=tuple(row for label in labels for row in runs.rows if row.scheme == label))
+    runs.to_csv(out / "cost.csv")
+    title = f"{name}: what accuracy costs over a time of {search.t_end:g}"
+    plots.save(plots.plot_work_precision(shown, title), out / "cost.png")
     n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
-    reached = [answer for answer in page.answers if answer.setting is not None]
+    reached = [answer for answer in answers if answer.setting is not None]
     write_page(
         page.path,
         "cost_page.html.j2",
@@ -131,20 +138,18 @@ def _write(page: CostPage, problem: vm.Problem, out: Path) -> None:
         by_num_micro=embedded(partial(_draw_num_micro, page)),
         shares_figure=embedded(partial(_draw_shares, page)),
     )
+    return page
 
 
-def _shown(page: CostPage) -> WorkPrecision:
-    """The runs of the best num_micro of the families that are best somewhere, or nearly so."""
+def _shown(answers: Sequence[Answer]) -> list[str]:
+    """Labels, with the best num_micro, of the families that are best for some error, or nearly so."""
     best: dict[str, tuple[float, str]] = {}
-    for answer in page.answers:
+    for answer in answers:
         fastest = answer.setting.row.seconds if answer.setting else math.inf
         for setting in answer.all:
-            ratio = setting.row.seconds / fastest
-            if ratio < best.get(setting.family.name, (math.inf, ""))[0]:
-                best[setting.family.name] = ratio, setting.row.scheme
-    labels = [label for _, label in sorted(best.values())[:SHOWN]]
-    rows = [row for label in labels for row in page.runs.rows if row.scheme == label]
-    return WorkPrecision(tuple(rows), page.t_end, page.runs.reference)
+            found = setting.row.seconds / fastest, setting.row.scheme
+            best[setting.family.name] = min(found, best.get(setting.family.name, (math.inf, "")))
+    return [label for _, label in sorted(best.values())[:SHOWN]]
 
 
 def _growth(reached: Sequence[Answer]) -> float:
@@ -211,11 +216,6 @@ def _seconds_each(function, q, count: int = 2000) -> float:
     return float(np.median(seconds)) / count
 
 
-def _draw_all(page: CostPage, shown: WorkPrecision, theme: plots.Theme) -> Figure:
-    title = f"{page.name}: what accuracy costs over a time of {page.t_end:g}"
-    return plots.plot_work_precision(shown, title, "seconds", theme)
-
-
 def _draw_num_micro(page: CostPage, theme: plots.Theme) -> Figure:
     """Time against num_micro of the families that were varied, at each error, one panel per error."""
     answers = [answer for answer in page.answers if answer.all]
@@ -233,6 +233,7 @@ def _draw_num_micro(page: CostPage, theme: plots.Theme) -> Figure:
                     drawn[name] = axes.loglog(x, y, "o-", color=colors[name], markersize=3.5, linewidth=1.2)[0]
             axes.set(title=f"error {answer.error:.0e}", xlabel="num_micro")
             axes.xaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter(NullFormatter())
         panels[0].set_ylabel("computing time")
         panels[0].yaxis.set_major_formatter(lambda x, _: duration(x))
         if drawn:

@@ -2,9 +2,11 @@
 
 import time
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
@@ -13,17 +15,10 @@ from vmri_jax.simulate import check_run, run
 from vmri_jax.step import start_memory
 
 
-@partial(jax.jit, static_argnames=("num_saves",))
-def _from_the_start(system, scheme, newton, state, t_end, num_steps, save_every, num_saves) -> vm.Trajectory:
-    macro_dt = t_end / num_steps
-    memory = start_memory(system, scheme, state, macro_dt, newton)
-    return run(system, scheme, newton, macro_dt, state.t, state, memory, 0, num_saves, save_every, False)[0]
-
-
 class Program:
     """``program(num_steps)`` simulates `problem` over `t_end` in so many macro steps; compiled when first called.
 
-    A call costs a tenth of a millisecond besides its steps. As in `vmri_jax.simulate`, "auto" takes the nested march and
+    A call costs some ten microseconds besides its steps. As in `vmri_jax.simulate`, "auto" takes the nested march and
     compiles its fallback only when a step needs it. A run that fails is seen in the trajectory; nothing is raised.
 
     Args:
@@ -48,6 +43,7 @@ class Program:
         cheap = self.newton.falls_back and self.newton.marches(problem.system, stage_scheme(scheme))
         self._cheap = replace(self.newton, method="march") if cheap else self.newton
         self.compile_seconds = float("nan")
+        self._structure: Any = None  # of a trajectory, known from the first trace on
 
     @cached_property
     def _compiled(self):
@@ -58,12 +54,32 @@ class Program:
         return self._compile(self.newton)
 
     def _compile(self, newton):
-        """The program with everything but the number of steps filled in."""
-        start = time.perf_counter()
+        """``run(num_steps)`` that gives the arrays of the trajectory; bare arrays in and out make a call cheap."""
         data = self.problem.system, self.scheme, newton, self.state, self.t_end
-        compiled = _from_the_start.lower(*data, 1, 1, num_saves=self.num_saves).compile()
-        self.compile_seconds = time.perf_counter() - start
-        return partial(compiled, *data)
+        leaves, structure = jax.tree.flatten(data)
+
+        @jax.jit
+        def run_all(leaves, num_steps, save_every):
+            system, scheme, newton, state, t_end = jax.tree.unflatten(structure, leaves)
+            macro_dt = t_end / num_steps
+            memory = start_memory(system, scheme, state, macro_dt, newton)
+            saves = 0, self.num_saves, save_every, False
+            trajectory, _ = run(system, scheme, newton, macro_dt, state.t, state, memory, *saves)
+            arrays, self._structure = jax.tree.flatten(trajectory)
+            return arrays
+
+        leaves = jax.device_put([jnp.asarray(leaf) for leaf in leaves])
+        start = time.perf_counter()
+        jax.block_until_ready(run_all(leaves, self.num_saves, 1))
+        self.compile_seconds = time.perf_counter() - start  # and a run of the fewest steps
+        return lambda num_steps: run_all(leaves, num_steps, num_steps // self.num_saves)
+
+    def _chosen(self, num_steps: int):
+        """The program that solves this run, and its arrays."""
+        arrays = self._compiled(num_steps)
+        if self._cheap is self.newton or int(jax.tree.unflatten(self._structure, arrays).failed_at) < 0:
+            return self._compiled, arrays
+        return self._exact, self._exact(num_steps)
 
     def __call__(self, num_steps: int) -> vm.Trajectory:
         """The trajectory with `num_saves` + 1 nodes.
@@ -72,20 +88,14 @@ class Program:
             ValueError: num_steps is not a positive multiple of num_saves.
         """
         if num_steps < 1 or num_steps % self.num_saves:
-            raise ValueError(
-                f"Program: num_steps is {num_steps}; it must be a multiple of {self.num_saves}, at least one."
-            )
-        trajectory = self._compiled(num_steps, num_steps // self.num_saves)
-        if self._cheap is not self.newton and int(trajectory.failed_at) >= 0:
-            trajectory = self._exact(num_steps, num_steps // self.num_saves)
-        return trajectory
+            raise ValueError(f"Program: num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
+        _, arrays = self._chosen(num_steps)
+        return jax.tree.unflatten(self._structure, arrays)
 
     def timed(self, num_steps: int):
         """A function without arguments that runs and waits, for a clock; takes the fallback if the run needs it."""
-        compiled = self._compiled
-        if self._cheap is not self.newton and int(compiled(num_steps, num_steps // self.num_saves).failed_at) >= 0:
-            compiled = self._exact
-        return lambda: jax.block_until_ready(compiled(num_steps, num_steps // self.num_saves))
+        chosen, _ = self._chosen(num_steps)
+        return lambda: chosen(num_steps)[0].block_until_ready()  # the arrays of one program are ready together
 
 
 def joined(trajectory: vm.Trajectory) -> tuple[np.ndarray, np.ndarray]:

@@ -204,15 +204,16 @@ def work_precision(
     runs, rows = {}, []
     for i, (label, scheme) in enumerate(schemes.items()):
         program = Program(problem, scheme, t_end, num_saves, newton)
-        start = max(1, int(frequency * t_end / scheme.num_micro / scheme.degree))
-        ladder = _given(num_steps) if num_steps is not None else _doubled(start, num_saves, reference)
-        n = next(ladder)
-        while n:
+        coarsest = num_saves * max(1, int(frequency * t_end / scheme.num_micro / scheme.degree / num_saves))
+        ladder, seen = list(num_steps or [coarsest]), []
+        while ladder:
+            n = ladder.pop(0)
             progress(f"{label}, {n} steps", i, len(schemes) + 1)
             [seconds] = interleaved({"": program.timed(n)}, 1, 0.0).values()
-            row = work_row(label, program, n, reference, seconds)
-            runs[label, n] = program, row
-            n = ladder.send(row)
+            seen.append(work_row(label, program, n, reference, seconds))
+            runs[label, n] = program, seen[-1]
+            if num_steps is None and _goes_on(seen, reference):
+                ladder = [2 * n]
     progress("measuring times", len(schemes), len(schemes) + 1)
     fine = {key: program.timed(key[1]) for key, (program, row) in runs.items() if np.isfinite(row.error_q)}
     timed = interleaved(fine, repeats)  # pyright: ignore[reportArgumentType]
@@ -222,18 +223,8 @@ def work_precision(
     return WorkPrecision(tuple(rows), t_end, reference)
 
 
-def _given(num_steps: Sequence[int]):
-    """The numbers of steps, one after the other."""
-    yield from num_steps
-    yield 0
-
-
-def _doubled(start: int, num_saves: int, reference: ReferenceSolution):
-    """Numbers of steps, doubled until more of them bring nothing; is sent the row of each."""
-    n, best = num_saves * max(1, start // num_saves), np.inf
-    while True:
-        row: WorkRow = yield n
-        fell = not np.isfinite(row.error_q) or row.error_q < best / 1.5
-        if row.error_q < max(FINEST_ERROR, reference.error_q) or row.seconds > SLOWEST or (not fell and best < 1e-6):
-            yield 0
-        best, n = np.nanmin([best, row.error_q]), 2 * n
+def _goes_on(rows: Sequence[WorkRow], reference: ReferenceSolution) -> bool:
+    """Whether twice the steps of the last run may bring something."""
+    last, before = rows[-1], [row.error_q for row in rows[:-1] if np.isfinite(row.error_q)]
+    stands = before and min(before) < 1e-6 and not last.error_q < min(before) / 1.5
+    return not (last.error_q < max(FINEST_ERROR, reference.error_q) or last.seconds > SLOWEST or stands)

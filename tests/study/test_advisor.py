@@ -1,0 +1,188 @@
+"""The search for the cheapest setting: what it promises, what it refuses, what it keeps when it fails."""
+
+import dataclasses
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.study.test_convergence import PROBLEM
+from vmri_jax.study import (
+    Program,
+    ReferenceSolution,
+    cost_page,
+    families,
+    recommend,
+    reference_solution,
+    work_precision,
+)
+from vmri_jax.study.advisor import NUM_MICRO, NothingReached
+from vmri_jax.study.cost_page import default_t_end
+
+SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return reference_solution(PROBLEM, 1.0, num_saves=1)
+
+
+@pytest.fixture(scope="module")
+def found(reference):
+    return recommend(PROBLEM, 1e-5, 1.0, menu=SHORT_MENU, reference=reference)
+
+
+def test_a_reference_refines_itself_until_it_agrees(reference):
+    assert 0 < reference.error_q < 1e-12
+    assert reference.num_saves == 1
+
+
+def test_a_reference_survives_a_file(reference, tmp_path):
+    reference.save(tmp_path / "reference.npz")
+    again = ReferenceSolution.load(tmp_path / "reference.npz")
+    np.testing.assert_array_equal(again.q, reference.q)
+    assert again.error_p == reference.error_p
+    (tmp_path / "other.npz").write_text("no")
+    with pytest.raises(ValueError, match=r"not a file written by ReferenceSolution\.save"):
+        ReferenceSolution.load(tmp_path / "other.npz")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        ReferenceSolution.load(tmp_path / "none.npz")
+
+
+def test_the_setting_keeps_the_error(found):
+    run = vm.simulate(
+        PROBLEM.system,
+        found.scheme,
+        PROBLEM.state(),
+        macro_dt=found.macro_dt,
+        num_steps=found.num_steps,
+        save_every=found.num_steps,
+    )
+    truth = reference_solution(PROBLEM, 1.0, num_saves=1, num_steps=500)
+    assert truth.errors(run)[0] == pytest.approx(found.setting.row.error_q, rel=1e-3)
+    assert found.setting.row.error_q <= 1e-5
+
+
+def test_steps_are_as_few_as_possible(found, reference):
+    """A tenth fewer steps miss the error."""
+    program = Program(PROBLEM, found.scheme, 1.0)
+    fewer = int(found.num_steps / 1.15)
+    assert reference.errors(program(fewer))[0] > 1e-5
+
+
+def test_from_another_start_it_does_about_as_well(found):
+    assert 0.2 < found.verification.error_ratio < 5
+
+
+def test_the_front_falls(found):
+    front = found.runs.pareto()
+    assert all(a.seconds <= b.seconds and a.error_q > b.error_q for a, b in pairwise(front))
+    assert found.runs.cheapest(1e-5).error_q <= 1e-5
+    assert found.runs.cheapest(1e-30) is None
+
+
+def test_the_command_names_the_setting(found):
+    command = found.setting.command("my_file.py:spring")
+    assert command.startswith("vmri simulate my_file.py:spring --scheme fully-explicit")
+    assert f"--steps {found.num_steps}" in command
+
+
+def test_exhaustive_search_tries_every_num_micro(reference):
+    menu = [SHORT_MENU[0]]
+    found = recommend(PROBLEM, 1e-3, 1.0, menu=menu, reference=reference, exhaustive=True, verify=False)
+    assert {row.num_micro for row in found.runs.rows} == set(NUM_MICRO)
+
+
+@pytest.mark.parametrize(
+    ("error", "t_end", "words"),
+    [(1e-18, 1.0, "round-off"), (float("nan"), 1.0, "round-off"), (1e-4, 0.0, "t_end is 0.0")],
+)
+def test_refuses(error, t_end, words):
+    with pytest.raises(ValueError, match=words):
+        recommend(PROBLEM, error, t_end)
+
+
+def test_refuses_what_the_reference_cannot_tell(reference):
+    poor = dataclasses.replace(reference, error_q=1e-6)
+    with pytest.raises(ValueError, match=r"only good to 1\.0e-06"):
+        recommend(PROBLEM, 1e-6, 1.0, reference=poor)
+
+
+def test_nothing_reached_hands_back_the_runs(reference):
+    wrong = dataclasses.replace(reference, q=reference.q + 1.0)
+    with pytest.raises(NothingReached, match=r"no setting reached 0\.0001") as caught:
+        recommend(PROBLEM, 1e-4, 1.0, menu=SHORT_MENU[:1], reference=wrong, verify=False)
+    assert len(caught.value.runs.rows) > 3
+
+
+def test_a_system_that_fails_at_every_step_says_so():
+    def broken(q_s, q_f, params):
+        return jnp.sum(jnp.log(-1.0 - q_s**2))
+
+    system = PROBLEM.system.replace(slow_potential=broken)
+    with pytest.raises(vm.SimulationError, match="NON_FINITE"):
+        recommend(dataclasses.replace(PROBLEM, system=system), 1e-4, 0.1)
+
+
+def test_a_program_is_compiled_once_for_all_numbers_of_steps():
+    traced = []
+
+    def spring(q_f, params):
+        traced.append(1)
+        return jnp.sum(q_f**2)
+
+    problem = dataclasses.replace(PROBLEM, system=PROBLEM.system.replace(fast_potential=spring))
+    program = Program(problem, vm.fully_explicit(3), 1.0, num_saves=2)
+    program(10)
+    before = len(traced)
+    program(20)
+    assert len(traced) == before
+    with pytest.raises(ValueError, match="multiple of 2"):
+        program(5)
+    direct = vm.simulate(
+        problem.system, vm.fully_explicit(3), problem.state(), macro_dt=0.1, num_steps=10, save_every=5
+    )
+    np.testing.assert_allclose(program(10).q_f, direct.q_f, rtol=1e-12)
+
+
+def test_work_precision_counts_and_times(reference, tmp_path):
+    schemes = {"impulse": vm.fully_explicit(4), "midpoint": vm.fully_implicit(4)}
+    study = work_precision(PROBLEM, schemes, 1.0, num_steps=(50, 100), reference=reference, repeats=2)
+    impulse, midpoint = study.curve("impulse"), study.curve("midpoint")
+    assert (impulse[0].slow_evaluations, impulse[0].fast_evaluations, impulse[0].solves) == (50, 200, 0)
+    assert midpoint[1].solves == 100
+    assert midpoint[1].fast_evaluations >= 400
+    assert all(0 < row.low <= row.seconds <= row.high for row in study.rows)
+    assert impulse[0].error_q / impulse[1].error_q == pytest.approx(4, rel=0.2)
+    study.to_csv(tmp_path / "study.csv")
+    study.to_json(tmp_path / "study.json")
+    assert len((tmp_path / "study.csv").read_text().splitlines()) == 5
+    labels = {work: study.plot(work=work).axes[0].get_xlabel() for work in ("seconds", "solves")}
+    assert labels == {"seconds": "computing time of the run", "solves": "systems of equations solved"}
+    with pytest.raises(ValueError, match="schemes is empty"):
+        work_precision(PROBLEM, {}, 1.0)
+    with pytest.raises(ValueError, match="num_saves = 10"):
+        work_precision(PROBLEM, schemes, 1.0, num_steps=(55,), num_saves=10)
+
+
+def test_ladders_end_by_themselves(reference):
+    study = work_precision(PROBLEM, {"high order": vm.galerkin(2, 4)}, 1.0, reference=reference, repeats=1)
+    errors = [row.error_q for row in study.curve("high order")]
+    assert errors[0] > 1e3 * errors[-1]
+    assert len(errors) < 12
+
+
+def test_cost_page(tmp_path):
+    page = cost_page(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-5, 1e-3), menu=SHORT_MENU)
+    text = page.path.read_text()
+    assert [answer.error for answer in page.answers] == [1e-3, 1e-5]
+    assert "What accuracy costs" in text
+    setting = page.answers[1].setting
+    assert setting is not None and setting.command("spring") in text.replace("&#34;", '"')
+    assert sum(page.shares.values()) == pytest.approx(1)
+    assert {"cost.html", "cost.png", "cost.csv"} <= {path.name for path in tmp_path.iterdir()}
+    assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)
+    with pytest.raises(ValueError, match="positive"):
+        cost_page(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))
