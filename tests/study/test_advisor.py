@@ -180,7 +180,8 @@ def test_cost_page(tmp_path):
     assert [answer.error for answer in page.answers] == [1e-3, 1e-5]
     assert "What accuracy costs" in text
     setting = page.answers[1].setting
-    assert setting is not None and setting.command("spring") in text.replace("&#34;", '"')
+    assert setting is not None
+    assert setting.command("spring") in text.replace("&#34;", '"')
     assert sum(page.shares.values()) == pytest.approx(1)
     assert {"cost.html", "cost.png", "cost.csv"} <= {path.name for path in tmp_path.iterdir()}
     assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)

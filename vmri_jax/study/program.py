@@ -2,8 +2,7 @@
 
 import time
 from dataclasses import replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +12,28 @@ import vmri_jax as vm
 from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.simulate import check_run, run
 from vmri_jax.step import start_memory
+from vmri_jax.trajectory import RunInfo
+
+TRAJECTORY = jax.tree.structure(vm.Trajectory(*[0.0] * 7, info=RunInfo(0, 0, 0), result=0, failed_at=0))
+"""How a trajectory without micro nodes is made of its arrays."""
+
+
+@partial(jax.jit, static_argnames=("structure", "num_saves"))
+def _run(leaves, num_steps, save_every, *, structure, num_saves):
+    """The arrays of a trajectory; system, scheme, Newton, state and t_end come as arrays and their structure."""
+    system, scheme, newton, state, t_end = jax.tree.unflatten(structure, leaves)
+    macro_dt = t_end / num_steps
+    memory = start_memory(system, scheme, state, macro_dt, newton)
+    trajectory, _ = run(
+        system, scheme, newton, macro_dt, state.t, state, memory, 0, num_saves, save_every, save_micro=False
+    )
+    return jax.tree.leaves(trajectory)
 
 
 class Program:
-    """``program(num_steps)`` simulates `problem` over `t_end` in so many macro steps; compiled when first called.
+    """``program(num_steps)`` simulates `problem` over `t_end` in so many macro steps.
+
+    Compiled when first called, once for all problems of the same structure.
 
     A call costs some ten microseconds besides its steps. As in `vmri_jax.simulate`, "auto" takes the nested march and
     compiles its fallback only when a step needs it. A run that fails is seen in the trajectory; nothing is raised.
@@ -43,7 +60,6 @@ class Program:
         cheap = self.newton.falls_back and self.newton.marches(problem.system, stage_scheme(scheme))
         self._cheap = replace(self.newton, method="march") if cheap else self.newton
         self.compile_seconds = float("nan")
-        self._structure: Any = None  # of a trajectory, known from the first trace on
 
     @cached_property
     def _compiled(self):
@@ -55,29 +71,18 @@ class Program:
 
     def _compile(self, newton):
         """``run(num_steps)`` that gives the arrays of the trajectory; bare arrays in and out make a call cheap."""
-        data = self.problem.system, self.scheme, newton, self.state, self.t_end
-        leaves, structure = jax.tree.flatten(data)
-
-        @jax.jit
-        def run_all(leaves, num_steps, save_every):
-            system, scheme, newton, state, t_end = jax.tree.unflatten(structure, leaves)
-            macro_dt = t_end / num_steps
-            memory = start_memory(system, scheme, state, macro_dt, newton)
-            saves = 0, self.num_saves, save_every, False
-            trajectory, _ = run(system, scheme, newton, macro_dt, state.t, state, memory, *saves)
-            arrays, self._structure = jax.tree.flatten(trajectory)
-            return arrays
-
+        leaves, structure = jax.tree.flatten((self.problem.system, self.scheme, newton, self.state, self.t_end))
         leaves = jax.device_put([jnp.asarray(leaf) for leaf in leaves])
+        static = {"structure": structure, "num_saves": self.num_saves}
         start = time.perf_counter()
-        jax.block_until_ready(run_all(leaves, self.num_saves, 1))
+        jax.block_until_ready(_run(leaves, self.num_saves, 1, **static))
         self.compile_seconds = time.perf_counter() - start  # and a run of the fewest steps
-        return lambda num_steps: run_all(leaves, num_steps, num_steps // self.num_saves)
+        return lambda num_steps: _run(leaves, num_steps, num_steps // self.num_saves, **static)
 
     def _chosen(self, num_steps: int):
         """The program that solves this run, and its arrays."""
         arrays = self._compiled(num_steps)
-        if self._cheap is self.newton or int(jax.tree.unflatten(self._structure, arrays).failed_at) < 0:
+        if self._cheap is self.newton or int(jax.tree.unflatten(TRAJECTORY, arrays).failed_at) < 0:
             return self._compiled, arrays
         return self._exact, self._exact(num_steps)
 
@@ -90,7 +95,7 @@ class Program:
         if num_steps < 1 or num_steps % self.num_saves:
             raise ValueError(f"Program: num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
         _, arrays = self._chosen(num_steps)
-        return jax.tree.unflatten(self._structure, arrays)
+        return jax.tree.unflatten(TRAJECTORY, arrays)
 
     def timed(self, num_steps: int):
         """A function without arguments that runs and waits, for a clock; takes the fallback if the run needs it."""
