@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from vmri_jax import cli
-from vmri_jax.study import reference
+from vmri_jax.catalogue import find_problem
+from vmri_jax.study import families, reference, reference_solution
 
 USER_FILE = """
 import jax.numpy as jnp
@@ -215,3 +216,63 @@ def test_reproduce_keeps_the_other_figures(vmri, tmp_path, monkeypatch):
     assert code == 1
     assert "fig6: RuntimeError: out of luck" in text
     assert "out of luck" in (tmp_path / "study" / "report.html").read_text()
+
+
+@pytest.fixture
+def short_menu(monkeypatch):
+    """The search chooses among few schemes."""
+    menu = [family for family in families() if family.name in ("fully explicit", "explicit slow")]
+    for module in ("advisor", "page"):
+        monkeypatch.setattr(f"vmri_jax.study.{module}.families", lambda: menu)
+
+
+def test_tune_prints_a_command_that_keeps_its_promise(vmri, short_menu, tmp_path):
+    code, text = vmri("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "1", "--out", "runs.csv")
+    assert code == 0
+    assert "From another start" in text
+    assert (tmp_path / "runs.csv").read_text().startswith("scheme,num_micro,order")
+    command = re.search(r"vmri (simulate user\.py:my_problem .*run\.npz)", text)
+    assert command
+    assert vmri(*command[1].split())[0] == 0
+    run = vm.Trajectory.load(tmp_path / "run.npz")
+    truth = reference_solution(find_problem("user.py:my_problem"), 1.0, num_saves=1)
+    assert abs(run.q_s[-1, 0] - truth.q[-1, 0]) < 1e-3
+    assert float(run.t[-1]) == pytest.approx(1.0)
+
+
+def test_tune_that_reaches_nothing_keeps_the_runs(vmri, short_menu, tmp_path, monkeypatch):
+    monkeypatch.setattr("vmri_jax.study.advisor.MAX_STEPS", 16)
+    code, text = vmri("tune", "user.py:my_problem", "--error", "1e-9", "--t-end", "1", "--out", "runs.json")
+    assert code == 1
+    assert "no setting reached 1e-09" in text
+    assert '"error_q"' in (tmp_path / "runs.json").read_text()
+
+
+def test_cost_writes_its_page(vmri, short_menu, tmp_path):
+    code, text = vmri("cost", "user.py:my_problem", "--t-end", "1", "--error", "1e-3", "--out", "page")
+    assert code == 0
+    assert "page/cost.html" in text
+    assert (tmp_path / "page" / "cost.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("tune", "user.py:my_problem", "--error", "1e-19", "--t-end", "1"), "round-off alone"),
+        (("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "-1"), "t_end is -1.0"),
+        (("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "1", "--out", "runs.txt"), ".csv or .json"),
+        (("cost", "user.py:my_problem", "--error", "-1"), "round-off alone"),
+        (("cost", "user.py:my_problem", "--t-end", "0"), "t_end is 0.0"),
+        (("simulate", "fpu", *RUN, "--compose", "yoshida5"), "there is no composition"),
+    ],
+)
+def test_what_the_search_refuses(vmri, arguments, message):
+    code, text = vmri(*arguments)
+    assert code == 2
+    assert message in text
+
+
+def test_simulate_composes(vmri):
+    code, text = vmri("simulate", "fpu", *RUN, "--num-micro", "3", "--compose", "suzuki4")
+    assert code == 0
+    assert "15 micro steps" in text

@@ -33,7 +33,7 @@ from vmri_jax.study import (
 )
 from vmri_jax.study.advisor import NothingReached, check_target
 from vmri_jax.study.table import Progress as StudyProgress
-from vmri_jax.study.work_precision import rows_table
+from vmri_jax.study.work import rows_table
 
 SAVED_NODES = 1000
 """About as many nodes are saved by default."""
@@ -215,7 +215,7 @@ def cost(
     """One page: what accuracy costs, which scheme to take for which error, where the time goes."""
     try:
         problem = find_problem(system)
-        for asked in error or [1.0]:
+        for asked in error or [np.finfo(float).max]:
             check_target(asked, 1.0 if t_end is None else t_end, problem)
         out.mkdir(parents=True, exist_ok=True)
         with _progress() as tell:

@@ -19,7 +19,7 @@ from vmri_jax.study import (
     work_precision,
 )
 from vmri_jax.study.advisor import NUM_MICRO, NothingReached
-from vmri_jax.study.cost_page import default_t_end
+from vmri_jax.study.page import default_t_end
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
 

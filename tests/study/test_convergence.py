@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -127,3 +128,49 @@ def test_bad_input(reference, changes, message):
 def test_asking_for_a_scheme_that_was_not_run(study):
     with pytest.raises(ValueError, match=r"no scheme 'third order'.*first order, second order"):
         study.order("third order")
+
+
+def test_energy_momentum_and_confidence(reference):
+    maps = [vm.diagnostics.translation_along([1.0, 0.0, 0.0])]
+    free = dataclasses.replace(
+        PROBLEM,
+        system=vm.System(vm.ConstantMass(jnp.ones(3), jnp.ones(3)), lambda q_s, q_f, _: jnp.sum((q_s - q_f) ** 4)),
+        q_s=jnp.ones(3),
+        q_f=jnp.zeros(3),
+        v_s=jnp.arange(3.0),
+        v_f=jnp.ones(3),
+    )
+    schemes = {"impulse": vm.fully_explicit(2)}
+    study = convergence_study(free, schemes, (0.05, 0.025, 0.0125), 1.0, num_saves=10, momentum_maps=maps)
+    assert all(row.momentum_error < 1e-13 for row in study.rows)
+    assert all(row.energy_band <= 2 * row.energy_error for row in study.rows)
+    errors = [row.energy_error for row in study.rows]
+    assert errors[0] / errors[2] == pytest.approx(16, rel=0.3)
+    fit = study.fit("impulse")
+    assert fit.points == 3
+    assert abs(fit.order - 2) <= fit.half_width + 0.05
+
+
+def test_cases_side_by_side(tmp_path):
+    params = {"soft": jnp.asarray(10.0), "stiff": jnp.asarray(40.0)}
+    schemes = {"impulse": vm.fully_explicit(4), "composed": vm.compose(vm.fully_explicit(4), "suzuki4")}
+    study = convergence_study(PROBLEM, schemes, STEPS, 1.0, num_saves=5, params=params)
+    assert study.cases == ["soft", "stiff"]
+    for case in params:
+        assert study.order("impulse", case=case) == pytest.approx(2, abs=0.1)
+        alone = dataclasses.replace(PROBLEM, system=PROBLEM.system.replace(params=params[case]))
+        single = convergence_study(alone, schemes, STEPS, 1.0, num_saves=5, reference=study.references[case])
+        np.testing.assert_allclose(study.errors("composed", "p", case)[1], single.errors("composed", "p")[1], rtol=1e-3)
+    data = study.to_xarray()
+    assert data.error_q.dims == ("scheme", "case", "macro_dt")
+    assert (
+        float(data.error_q.sel(scheme="impulse", case="stiff", macro_dt=0.01))
+        == study.errors("impulse", case="stiff")[1][1]
+    )
+    study.to_json(tmp_path / "study.json")
+    assert len(json.loads((tmp_path / "study.json").read_text())["rows"]) == 12
+    assert study.table().row_count == 4
+    with pytest.raises(ValueError, match="reference must be a mapping"):
+        convergence_study(PROBLEM, schemes, STEPS, 1.0, num_saves=5, params=params, reference=study.references["soft"])
+    with pytest.raises(ValueError, match="params is empty"):
+        convergence_study(PROBLEM, schemes, STEPS, 1.0, num_saves=5, params={})

@@ -3,14 +3,14 @@
 from vmri_jax.study.advisor import Recommendation, recommend
 from vmri_jax.study.convergence import ConvergenceRow, ConvergenceStudy, convergence_study
 from vmri_jax.study.cost import CostRow, CostStudy, cost_study
-from vmri_jax.study.cost_page import CostPage, cost_page
 from vmri_jax.study.figures import Check, ConvergenceFigure, CostFigure, CostPanel, Findings
 from vmri_jax.study.menu import Family, families
+from vmri_jax.study.page import CostPage, cost_page
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference import reference_figures
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.report import FigureResult, Report, choose_figures, reproduce
-from vmri_jax.study.work_precision import WorkPrecision, WorkRow, work_precision
+from vmri_jax.study.solutions import ReferenceSolution, reference_solution
+from vmri_jax.study.work import WorkPrecision, WorkRow, work_precision
 
 __all__ = [
     "Check",

@@ -13,10 +13,10 @@ import numpy as np
 import vmri_jax as vm
 from vmri_jax.study.menu import Family, families
 from vmri_jax.study.program import Program
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.solutions import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Progress, silent
 from vmri_jax.study.timing import interleaved
-from vmri_jax.study.work_precision import WorkPrecision, WorkRow, work_row
+from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
 
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 FIRST = 5

@@ -19,7 +19,7 @@ import vmri_jax as vm
 from vmri_jax.composition import Composition
 from vmri_jax.diagnostics import OrderFit
 from vmri_jax.study.program import Program
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.solutions import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Progress, silent, write_csv
 
 FLOOR_FACTOR = 100.0

@@ -11,7 +11,7 @@ import vmri_jax as vm
 from vmri_jax import plots
 from vmri_jax.study.convergence import ConvergenceStudy, convergence_study
 from vmri_jax.study.cost import CostStudy, cost_study
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.solutions import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Progress, part, write_csv
 
 ORDER_TOLERANCE = 0.2

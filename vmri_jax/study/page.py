@@ -17,10 +17,10 @@ from vmri_jax import plots
 from vmri_jax.study.advisor import MARGIN, Search, Setting
 from vmri_jax.study.html import embedded, write_page
 from vmri_jax.study.menu import Family, families
-from vmri_jax.study.reference_solution import reference_solution
+from vmri_jax.study.solutions import reference_solution
 from vmri_jax.study.table import Progress, part, silent
 from vmri_jax.study.timing import interleaved
-from vmri_jax.study.work_precision import WorkPrecision, duration
+from vmri_jax.study.work import WorkPrecision, duration
 
 PERIODS = 30
 """Simulated by default: so many periods of the fastest vibration."""
@@ -127,7 +127,7 @@ def _write(search: Search, answers: Sequence[Answer], problem: vm.Problem, name:
     reached = [answer for answer in answers if answer.setting is not None]
     write_page(
         page.path,
-        "cost_page.html.j2",
+        "cost.html.j2",
         page=page,
         sizes={"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": n_g + n_gs},
         reached=reached,

@@ -10,7 +10,7 @@ import numpy as np
 import vmri_jax as vm
 from vmri_jax.composition import Composition
 from vmri_jax.study.program import Program
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.solutions import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Progress, silent, write_csv
 from vmri_jax.study.timing import interleaved, machine
 
