@@ -41,7 +41,9 @@ def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
 def study(orders=(1, 2)):
     """A convergence study of exact orders."""
     rows = [
-        ConvergenceRow(f"order {order}", "", 5, 1, dt, dt**order, 10 * dt**order, 0.0, 0.0, 0.0, 0.0, 0.0, 2, "MARCH", "CONVERGED")
+        ConvergenceRow(
+            f"order {order}", "", 5, 1, dt, dt**order, 10 * dt**order, 0.0, 0.0, 0.0, 0.0, 0.0, 2, "MARCH", "CONVERGED"
+        )
         for order in orders
         for dt in (0.1, 0.01, 0.001)
     ]

@@ -1,0 +1,105 @@
+"""Observed orders: Galerkin schemes and compositions on all systems, against solutions of the continuous equations."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import vmri_jax as vm
+from benchmarks import programs
+from benchmarks.measure import Tell, silent
+from benchmarks.report import Report
+from vmri_jax.diagnostics import fit_order
+from vmri_jax.study import Program, ReferenceSolution
+
+COLUMNS = ("system", "scheme", "num_micro", "order", "of q", "+-", "of p", "+- ", "points", "finest error", "holds")
+TRUTH = Path(__file__).parent.parent / "tests" / "data" / "ground_truth"
+TOLERANCE = 0.25
+COARSEST, FLOOR = 3e-4, 3e-12
+"""Errors of the positions between these are fitted: smaller ones are round-off, larger ones are not yet asymptotic."""
+MOST_STEPS = 40_000
+
+
+@dataclass(frozen=True)
+class Case:
+    """One scheme on one system."""
+
+    system: str
+    label: str
+    scheme: vm.Scheme | vm.Composition
+    num_micro: int
+
+
+@dataclass(frozen=True)
+class Size:
+    """What is run."""
+
+    cases: tuple[Case, ...]
+
+
+def sizes(name: str) -> Size:
+    """ "quick": degrees 1 to 4 with 4 micro steps and compositions; "full": also 1 and 10 micro steps."""
+    cases = []
+    for system in ("FPU l=3", "TSP", "SAM"):
+        for rule in ("gauss", "lobatto"):
+            for num_micro in (4,) if name == "quick" else (1, 4, 10):
+                for degree in (1, 2, 3, 4):
+                    scheme = vm.galerkin(num_micro, degree, rule)
+                    cases.append(Case(system, f"galerkin {degree}, {rule}", scheme, num_micro))
+    bases: dict[str, Callable[[int], vm.Scheme]] = {"fully explicit": vm.fully_explicit, "explicit slow": vm.explicit_slow}
+    for base, make in bases.items():
+        for system in ("FPU l=3", "TSP"):
+            for composition in ("suzuki4", "kahan-li6", "kahan-li8"):
+                cases.append(Case(system, f"{base}, {composition}", vm.compose(make(5), composition), 5))
+    return Size(tuple(cases))
+
+
+def programs_of(size: Size) -> int:
+    """How many schemes are run."""
+    return len(size.cases)
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Report:
+    """Measure all of it."""
+    rows = []
+    for case in size.cases:
+        tell(f"{case.system}, {case.label}, {case.num_micro}")
+        rows.append(measure(case))
+    missed = [row for row in rows if row["holds"] == "no"]
+    notes = [f"{len(rows) - len(missed)} of {len(rows)} orders of q and p are within {TOLERANCE} of the order expected."]
+    return Report("orders", name, rows, [], notes, {})
+
+
+def truth(system: str) -> ReferenceSolution:
+    """Positions and momenta at t = 1, good to about 1e-14."""
+    problem = programs.problem(system)
+    with np.load(TRUTH / {"FPU l=3": "fpu3_t1.npz", "TSP": "tsp_t1.npz", "SAM": "sam_t1.npz"}[system]) as file:
+        q, v = file["q"][[0, -1]], file["v"][[0, -1]]
+    kinetic = problem.system.kinetic
+    masses = np.concatenate([np.asarray(kinetic.slow), np.asarray(kinetic.fast)])  # pyright: ignore[reportAttributeAccessIssue]
+    return ReferenceSolution(q, masses * v)
+
+
+def measure(case: Case) -> dict:
+    """Errors at t = 1 over macro steps that shrink by the square root of 2, and the slope through the last of them."""
+    problem, reference = programs.problem(case.system), truth(case.system)
+    program, order = Program(problem, case.scheme, 1.0), case.scheme.order
+    steps, errors = [], []
+    n = max(2, round(100 / case.scheme.num_micro / case.scheme.degree))
+    while n < MOST_STEPS:
+        error = reference.errors(program(n))
+        if error[0] < FLOOR:
+            break
+        if error[0] < COARSEST:
+            steps.append(n)
+            errors.append(error)
+        n = max(n + 1, round(n * 2**0.5))
+    row = {"system": case.system, "scheme": case.label, "num_micro": case.num_micro, "order": order}
+    if len(steps) < 2:
+        return row | {"points": len(steps), "holds": "no"}
+    kept = slice(-5, None)
+    fits = [fit_order(1 / np.array(steps[kept]), np.array(errors)[kept, i]) for i in (0, 1)]
+    holds = all(abs(fit.order - order) <= TOLERANCE for fit in fits)
+    found = {"of q": fits[0].order, "+-": fits[0].half_width, "of p": fits[1].order, "+- ": fits[1].half_width}
+    return row | found | {"points": fits[0].points, "finest error": errors[-1][0], "holds": "yes" if holds else "no"}
