@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks import batch, compilation, cost, floor
+from benchmarks import batch, compilation, cost, floor, orders, peers
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -15,6 +15,10 @@ Full = Annotated[bool, typer.Option("--full/--quick", help="All cases and more s
 Core = Annotated[int | None, typer.Option(help="Core to keep to; by default the last one allowed, -1 for all.")]
 Out = Annotated[Path, typer.Option(help="Folder for the JSON files and the figures.")]
 Devices = Annotated[int, typer.Option(min=1, help="CPU devices to spread the batch over, each a core; 1 pins.")]
+Only = Annotated[
+    list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
+]
+Peer = Annotated[list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")]
 OUT = Path("out/benchmarks")
 
 
@@ -44,6 +48,20 @@ def compile_command(full: Full = False, core: Core = None, out: Out = OUT) -> No
     """Cold compile and first run in fresh processes; compilations over a sweep."""
     prepare(core)
     _measure("compile", compilation, full, out)
+
+
+@app.command("orders")
+def orders_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
+    """Observed orders of Galerkin schemes and compositions, on all systems."""
+    prepare(core)
+    _measure("orders", orders, full, out)
+
+
+@app.command("peers")
+def peers_command(full: Full = False, core: Core = None, out: Out = OUT, only: Only = None, peer: Peer = None) -> None:
+    """Time to reach an error, against other integrators; the extra `peers` installs them."""
+    prepare(core)
+    _measure("peers", peers, full, out, only=only or (), peers=peer or ())
 
 
 @app.command("all")

@@ -1,0 +1,134 @@
+"""The problems that all integrators are given, and what an integrator hands over to be compared."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import vmri_jax as vm
+from benchmarks import programs
+from benchmarks.peers.mechanics import Particles
+
+LEVELS = (1e-2, 2e-4, 2e-6, 1e-8)
+"""Largest errors ``max |q - q_ref|`` at the end that are asked for."""
+BATCH_LEVEL = 2e-4
+"""The same for batches, of the worst lane."""
+TRUTH = Path(__file__).parents[2] / "tests" / "data" / "ground_truth"
+FILES = {"FPU l=3": "fpu3", "FPU l=200": "fpu200", "TSP": "tsp", "SAM": "sam"}
+NAMES = ("FPU l=3 t=1", "FPU l=3 t=100", "FPU l=200 t=1", "TSP t=1", "TSP t=10", "SAM t=1", "SAM t=10")
+
+
+class NotRepresentable(ValueError):
+    """A peer has no means to state this problem exactly; the message says which one it lacks."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One problem over one time: integrate `problem` from its start to `t_end`.
+
+    q_end: (n,) positions at `t_end`, slow ones first, of a solution far more accurate than any level.
+    source: where that solution is from.
+    """
+
+    name: str
+    system: str
+    problem: vm.Problem
+    t_end: float
+    q_end: np.ndarray
+    source: str
+
+    @cached_property
+    def state(self) -> vm.State:
+        """The start, velocities consistent with the constraints."""
+        return self.problem.state()
+
+    @cached_property
+    def masses(self) -> np.ndarray:
+        """(n,) masses per coordinate, slow ones first."""
+        kinetic: Any = self.problem.system.kinetic
+        return np.concatenate([kinetic.slow, kinetic.fast])
+
+    @cached_property
+    def q(self) -> np.ndarray:
+        """(n,) positions at the start."""
+        return np.concatenate([self.state.q_s, self.state.q_f])
+
+    @cached_property
+    def v(self) -> np.ndarray:
+        """(n,) velocities at the start."""
+        return np.concatenate([self.state.p_s, self.state.p_f]) / self.masses
+
+    @cached_property
+    def energy(self) -> float:
+        """Energy of the start as this project evaluates it."""
+        s = self.state
+        return float(vm.diagnostics.energy(self.problem.system, s.q_s, s.q_f, s.p_s, s.p_f))
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether it is a Fermi-Pasta-Ulam chain; else it is made of `particles`."""
+        return self.system.startswith("FPU")
+
+    @property
+    def omega(self) -> float:
+        """Frequency of the stiff springs of a chain."""
+        return float(self.problem.system.params["omega"])
+
+    @cached_property
+    def particles(self) -> Particles:
+        """Masses, springs and rods of a system of particles."""
+        return Particles.of(self.problem)
+
+    def error(self, q) -> float:
+        """``max |q - q_end|``; infinite for a run that failed."""
+        error = float(np.max(np.abs(np.asarray(q) - self.q_end)))
+        return error if np.isfinite(error) else np.inf
+
+
+def case(name: str) -> Case:
+    """One of `NAMES`, with the reference from the folder `TRUTH`.
+
+    Raises:
+        ValueError: another name.
+    """
+    if name not in NAMES:
+        raise ValueError(f"case: there is no {name!r}; there are {', '.join(NAMES)}.")
+    system, _, t_end = name.rpartition(" t=")
+    path = TRUTH / f"{FILES[system]}_t{t_end}.npz"
+    with np.load(path) as file:
+        q_end = file["q"][-1]
+    return Case(name, system, programs.problem(system), float(t_end), q_end, path.name)
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """One method of one integrator, from coarse to fine settings.
+
+    kind: what a setting is, "tol" or "steps".
+    build: makes everything that is made once; what it returns integrates the case from its start to its end and gives the
+        positions there, slow ones first.
+    """
+
+    method: str
+    kind: str
+    settings: Sequence[float]
+    build: Callable[[Any], Callable[[], Any]]
+
+    def label(self, setting: float) -> str:
+        """Method and setting."""
+        return f"{self.method}, {setting:.0e}" if self.kind == "tol" else f"{self.method}, {setting:g} steps"
+
+
+def tolerances(first: float, last: float, per_decade: int = 2) -> list[float]:
+    """Tolerances from `first` down to `last`."""
+    count = round(per_decade * np.log10(first / last)) + 1
+    return [float(x) for x in np.geomspace(first, last, count)]
+
+
+def step_counts(first: float, last: float, per_octave: int = 2) -> list[int]:
+    """Numbers of steps from `first` up to `last`."""
+    count = round(per_octave * np.log2(last / first)) + 1
+    return sorted({max(1, round(x)) for x in np.geomspace(first, last, count)})

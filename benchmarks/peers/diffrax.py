@@ -1,0 +1,92 @@
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+"""diffrax: adaptive Runge-Kutta methods (Dopri8, Tsit5) and the semi-implicit Euler method, each compiled once."""
+
+from functools import partial
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+
+from benchmarks.peers import equations
+from benchmarks.peers.cases import Case, Ladder, step_counts, tolerances
+
+CHUNK = 64
+"""Lanes at once that fit into the cache."""
+MOST_STEPS = 20_000
+"""Of the adaptive methods per unit of time: a step too large may leave them with a step size that is no number, for ever."""
+SOLVERS: tuple[Any, ...] = (diffrax.Dopri8, diffrax.Tsit5)
+
+
+def ladders(case: Case) -> list[Ladder]:
+    """Tolerances for the adaptive methods; steps for the semi-implicit one, which wants forces without velocities."""
+    start = (jnp.asarray(case.q), jnp.asarray(case.v))
+
+    def adaptive(solver) -> Ladder:
+        solve = jax.jit(solution(case, solver()))
+        return Ladder(
+            solver.__name__, "tol", tolerances(1e-2, 1e-14), lambda tol: partial(solve, start, jnp.asarray(tol))
+        )
+
+    found = [adaptive(solver) for solver in SOLVERS]
+    if case.is_chain:
+        solve = jax.jit(semi_implicit(case))
+        settings = step_counts(32 * case.t_end, 1e7 * case.t_end)
+        found.append(
+            Ladder("SemiImplicitEuler", "steps", settings, lambda n: partial(solve, start, jnp.asarray(case.t_end / n)))
+        )
+    return found
+
+
+def solution(case: Case, solver):
+    """``solve(y, tol)``: positions at the end from ``y = (q, v)``, with relative and absolute tolerance tol."""
+    accelerate = equations.acceleration(case)
+    term: Any = diffrax.ODETerm(lambda t, y, args: (y[1], accelerate(*y)))
+
+    def solve(y, tol):
+        controller = diffrax.PIDController(rtol=tol, atol=tol)
+        return _end(
+            term, solver, y, case.t_end, None, stepsize_controller=controller, max_steps=round(MOST_STEPS * case.t_end)
+        )
+
+    return solve
+
+
+def semi_implicit(case: Case):
+    """``solve(y, dt)``: the same by the symplectic Euler method, the velocity first."""
+    accelerate = equations.acceleration(case)
+    drift: Any = diffrax.ODETerm(lambda t, v, args: v)
+    kick: Any = diffrax.ODETerm(lambda t, q, args: accelerate(q, None))
+
+    def solve(y, dt):
+        return _end((drift, kick), diffrax.SemiImplicitEuler(), y, case.t_end, dt, max_steps=None)
+
+    return solve
+
+
+def _end(terms, solver, y, t_end: float, dt, **options):
+    found = diffrax.diffeqsolve(terms, solver, 0.0, t_end, dt, y, throw=False, **options)
+    ys: Any = found.ys
+    return jnp.where(found.result == diffrax.RESULTS.successful, ys[0][-1], jnp.nan)
+
+
+energy = equations.energy
+
+
+def batch_ladders(case: Case, states, q, v) -> list[Ladder]:
+    """The adaptive methods under ``jax.vmap``, all lanes at once or in chunks."""
+    starts = (jnp.asarray(q), jnp.asarray(v))
+
+    def ladder(solver, chunk: int | None) -> Ladder:
+        solve = solution(case, solver())
+
+        @jax.jit
+        def run(starts, tol):
+            if chunk is None:
+                return jax.vmap(lambda y: solve(y, tol))(starts)
+            return jax.lax.map(lambda y: solve(y, tol), starts, batch_size=chunk)
+
+        name = f"{solver.__name__} {'all' if chunk is None else chunk}"
+        return Ladder(name, "tol", tolerances(1e-2, 1e-12), lambda tol: partial(run, starts, jnp.asarray(tol)))
+
+    return [ladder(solver, chunk) for solver in SOLVERS for chunk in (None, CHUNK)]

@@ -1,0 +1,80 @@
+"""Work-precision diagrams: error against time, one figure per family of problems, ours on top."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
+
+from benchmarks.peers.cases import LEVELS
+from benchmarks.peers.scan import Point, front
+from vmri_jax import plots
+
+FAMILIES = {"FPU": "Fermi-Pasta-Ulam chain", "TSP": "Triple spherical pendulum", "SAM": "Simple atomic model"}
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#a3508a", "#b98700", "#56a0d3", "#8a6d5a", "#d680a8", "#5f6b75", "#9aa5ae")
+SHOWN = (2e-10, 5e-2)
+"""Errors between which a figure goes, or less where none is so small."""
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*")
+
+
+def by_family(found: Mapping[str, Sequence[Point]], peers: Sequence[str]) -> dict[str, Callable[[], Figure]]:
+    """By file name, functions that draw; batches have a figure of their own."""
+    single = {title: points for title, points in found.items() if not title.endswith("batch")}
+    batches = {title: points for title, points in found.items() if title.endswith("batch")}
+    drawn: dict[str, Callable[[], Figure]] = {}
+    for family, words in FAMILIES.items():
+        own = {title: points for title, points in single.items() if title.startswith(family)}
+        if own:
+            drawn[f"peers_{family.lower()}"] = partial(draw, own, peers, f"{words}: time to an error")
+    if batches:
+        drawn["peers_batch"] = partial(draw, batches, peers, "Batches of starts: time to an error of the worst lane")
+    return drawn
+
+
+def draw(found: Mapping[str, Sequence[Point]], peers: Sequence[str], title: str) -> Figure:
+    """One panel per case."""
+    with plots.style():
+        figure = plots.NotebookFigure(figsize=(max(7.2, 0.7 + 3.4 * len(found)), 4.7))
+        panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
+        handles: dict = {}
+        lowest = min((p.settled for points in found.values() for p in points), default=SHOWN[0])
+        for axes, (name, points) in zip(panels, found.items(), strict=True):
+            _panel(axes, points, peers)
+            axes.set(title=name, xlabel="time, s", ylim=(max(SHOWN[0], lowest / 3), SHOWN[1]))
+            handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        panels[0].set(ylabel=r"error $\max\,|q - q_{\mathrm{ref}}|$ at the end")
+        ordered = [peer for peer in peers if peer in handles]
+        columns = min(len(ordered), 5)
+        figure.legend([handles[peer] for peer in ordered], ordered, loc="outside lower center", ncols=columns)
+        figure.suptitle(title, x=0.01, ha="left")
+    return figure
+
+
+def _panel(axes: Axes, points: Sequence[Point], peers: Sequence[str]) -> None:
+    theme = plots.LIGHT
+    for level in LEVELS:
+        axes.axhline(level, color=theme.faint, linewidth=1.0, linestyle=(0, (4, 2)), zorder=0)
+    for i, peer in reversed(list(enumerate(peers))):
+        shown = [p for p in front([p for p in points if p.peer == peer]) if p.settled < 1.0]
+        if not shown:
+            continue
+        ours = i == 0
+        x, y = [p.seconds for p in shown], [max(p.settled, SHOWN[0] / 10) for p in shown]
+        look = {"color": COLORS[i], "marker": MARKERS[i], "label": peer}
+        strong = {"linewidth": 2.8, "markersize": 5.5, "zorder": 5}
+        weak = {"linewidth": 1.1, "markersize": 3.6, "zorder": 3, "alpha": 0.9}
+        axes.loglog(x, y, **look, **(strong if ours else weak))
+    left, right = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if right > 100 * left else (1.0, 3.0), numticks=12))
+    axes.xaxis.set_major_formatter(LogFormatterSciNotation(labelOnlyBase=False, minor_thresholds=(9, 9)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(axis="y", visible=False)
+    axes.set_yticks(LEVELS, [_power(level) for level in LEVELS])
+    axes.minorticks_off()
+
+
+def _power(level: float) -> str:
+    mantissa, _, exponent = f"{level:.0e}".partition("e")
+    power = rf"10^{{{int(exponent)}}}"
+    return f"${power}$" if mantissa == "1" else rf"${mantissa}\cdot{power}$"

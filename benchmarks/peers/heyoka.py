@@ -1,0 +1,107 @@
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+"""heyoka: Taylor's method of adaptive step and order, compiled for the equations; multipliers eliminated by hand."""
+
+from typing import Any
+
+import heyoka as hy
+import numpy as np
+
+from benchmarks.peers.cases import Case, Ladder, tolerances
+from benchmarks.peers.mechanics import chain_accelerations
+
+COMPACT = 50
+"""From so many coordinates on loops are compiled instead of one long program, which would take minutes to compile."""
+
+
+def equations(case: Case) -> tuple[list, list[tuple[Any, Any]]]:
+    """The variables (q, v), and their derivatives beside them."""
+    n = case.q.size
+    q, v = ([hy.expression(f"{name}{i}") for i in range(n)] for name in "qv")
+    a = chain_accelerations(q, case.omega) if case.is_chain else case.particles.accelerations(q, v, hy.sqrt)
+    return [*q, *v], list(zip([*q, *v], [*v, *a], strict=True))
+
+
+def integrator(case: Case, tol: float, **options):
+    """A Taylor integrator of the case."""
+    _, system = equations(case)
+    compact = case.q.size >= COMPACT
+    return hy.taylor_adaptive(system, np.concatenate([case.q, case.v]), tol=tol, compact_mode=compact, **options)
+
+
+def ladders(case: Case) -> list[Ladder]:
+    """One: a tolerance per rung; the order follows from it."""
+
+    def build(tol: float):
+        start, n = np.concatenate([case.q, case.v]), case.q.size
+        taylor = integrator(case, tol)
+
+        def run():
+            taylor.time = 0.0
+            taylor.state[:] = start
+            taylor.propagate_until(case.t_end)
+            return taylor.state[:n].copy()
+
+        return run
+
+    return [Ladder("Taylor", "tol", tolerances(1e-2, 1e-15), build)]
+
+
+def energy(case: Case) -> float:
+    """Of the start: heyoka's own expression for the Hamiltonian of the chain, else springs and weights as it knows them."""
+    variables, _ = equations(case)
+    q, v = variables[: case.q.size], variables[case.q.size :]
+    kinetic = hy.sum([m / 2 * x**2 for m, x in zip(case.masses, v, strict=True)])
+    function: Any = hy.cfunc([kinetic + _potential(case, q)], variables)
+    return float(function(np.concatenate([case.q, case.v]))[0])
+
+
+def _potential(case: Case, q: list):
+    if case.is_chain:
+        n = len(q) // 2
+        s, f = q[:n], q[n:]
+        gaps = [s[0] - f[0], *(s[i + 1] - f[i + 1] - s[i] - f[i] for i in range(n - 1)), s[-1] + f[-1]]
+        return hy.sum([d**4 / 4.0 for d in gaps] + [case.omega**2 / 2 * x**2 for x in f])
+    p = case.particles
+    weights = [p.gravity * m * q[3 * i + 2] for i, m in enumerate(p.masses)]
+    lengths = [hy.sqrt(hy.sum([(q[3 * j + a] - q[3 * i + a]) ** 2 for a in range(3)])) for i, j, _, _ in p.springs]
+    springs = [k / 2 * (x - rest) ** 2 for x, (_, _, k, rest) in zip(lengths, p.springs, strict=True)]
+    return hy.sum(weights + springs)
+
+
+def batch_ladders(case: Case, states, q, v) -> list[Ladder]:
+    """Its batch mode, as many lanes as the processor has in a vector, one batch after the other or as an ensemble."""
+    size, n = hy.recommended_simd_size(), case.q.size
+    starts = np.concatenate([q, v], axis=1).reshape(-1, size, 2 * n).transpose(0, 2, 1)  # (batches, 2 n, lanes)
+
+    def prepare(tol: float):
+        _, system = equations(case)
+        return hy.taylor_adaptive_batch(system, starts[0].copy(), tol=tol, compact_mode=n >= COMPACT)
+
+    def start(taylor, i: int):
+        taylor.set_time(0.0)
+        taylor.state[:] = starts[i]
+        return taylor
+
+    def one_by_one(tol: float):
+        taylor = prepare(tol)
+
+        def run():
+            ends = []
+            for i in range(len(starts)):
+                start(taylor, i).propagate_until(case.t_end)
+                ends.append(taylor.state[:n].T.copy())
+            return np.concatenate(ends)
+
+        return run
+
+    def ensemble(tol: float):
+        taylor = prepare(tol)
+
+        def run():
+            found = hy.ensemble_propagate_until_batch(taylor, case.t_end, len(starts), start, max_workers=1)
+            return np.concatenate([last[0].state[:n].T for last in found])
+
+        return run
+
+    settings = tolerances(1e-2, 1e-12)
+    return [Ladder("batch", "tol", settings, one_by_one), Ladder("ensemble", "tol", settings, ensemble)]

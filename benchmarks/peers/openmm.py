@@ -1,0 +1,109 @@
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
+"""OpenMM: its r-RESPA integrator with constraints (MTSIntegrator), on the Reference platform, which computes in doubles."""
+
+import numpy as np
+import openmm as mm
+
+from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers.mechanics import from_masses, to_masses
+
+NUM_MICRO = (1, 4)
+"""Micro steps per macro step that are tried; every one of them is interpreted on its own, more make a step slower."""
+SLOW, FAST = 0, 1  # force groups
+FIXED = 1e20
+"""Mass of the particle at the origin: OpenMM constrains no particle of infinite mass; this one moves less than round-off."""
+TOLERANCE = 1e-13
+"""Relative error of a rod; the iteration ends below it."""
+
+
+def ladders(case: Case) -> list[Ladder]:
+    """Some numbers of micro steps; numbers of macro steps."""
+
+    def ladder(num_micro: int) -> Ladder:
+        def build(num_steps: int):
+            context, x, v = prepare(case, num_micro)
+            integrator = context.getIntegrator()
+            integrator.setStepSize(case.t_end / num_steps)
+
+            def run():
+                context.setPositions(x)
+                context.setVelocities(v)
+                try:
+                    integrator.step(num_steps)
+                except mm.OpenMMException:  # a step too large
+                    return np.full(case.q.size, np.nan)
+                return positions(case, context)
+
+            return run
+
+        return Ladder(f"MTS {num_micro}", "steps", step_counts(4 * case.t_end, 1e7 * case.t_end), build)
+
+    return [ladder(n) for n in NUM_MICRO]
+
+
+def prepare(case: Case, num_micro: int):
+    """Context, positions and velocities at the start; lengths in nm, times in ps, energies in kJ/mol fit together."""
+    system, x, v = _chain(case) if case.is_chain else _particles(case)
+    integrator = mm.MTSIntegrator(1e-3, [(SLOW, 1), (FAST, num_micro)])
+    integrator.setConstraintTolerance(TOLERANCE)
+    context = mm.Context(system, integrator, mm.Platform.getPlatformByName("Reference"))
+    context.setPositions(x)
+    context.setVelocities(v)
+    return context, x, v
+
+
+def positions(case: Case, context) -> np.ndarray:
+    """Of the case, slow ones first."""
+    x = np.asarray(context.getState(positions=True).getPositions(asNumpy=True)._value)
+    return from_masses(x[:, 0]) if case.is_chain else x[: len(case.particles.masses)].reshape(-1)
+
+
+def energy(case: Case) -> float:
+    """Of the start: potential and kinetic energy of the context."""
+    context, _, _ = prepare(case, 1)
+    state = context.getState(energy=True)
+    return state.getPotentialEnergy()._value + state.getKineticEnergy()._value
+
+
+def _chain(case: Case):
+    """Its masses on a line: quartic springs ``d^4`` between the stiff ones and to the walls at 0."""
+    x, v = (np.stack([a, 0 * a, 0 * a], axis=1) for a in (to_masses(case.q), to_masses(case.v)))
+    n = len(x)
+    system, stiff = mm.System(), mm.HarmonicBondForce()
+    soft, walls = mm.CustomBondForce("r^4"), mm.CustomExternalForce("x^4")
+    for _ in range(n):
+        system.addParticle(1.0)
+    for i in range(0, n, 2):
+        stiff.addBond(i, i + 1, 0.0, case.omega**2 / 2)
+    for i in range(1, n - 1, 2):
+        soft.addBond(i, i + 1)
+    walls.addParticle(0)
+    walls.addParticle(n - 1)
+    _add(system, {stiff: FAST, soft: SLOW, walls: SLOW})
+    return system, x, v
+
+
+def _particles(case: Case):
+    """The particles, and one more that stays at the origin."""
+    p, n = case.particles, len(case.particles.masses)
+    system, stiff, soft = mm.System(), mm.HarmonicBondForce(), mm.HarmonicBondForce()
+    weight = mm.CustomExternalForce("w*z")
+    weight.addPerParticleParameter("w")
+    for i, m in enumerate(p.masses):
+        system.addParticle(m)
+        weight.addParticle(i, [m * p.gravity])
+    system.addParticle(FIXED)
+    fast = case.problem.q_s.size // 3
+    for i, j, k, length in p.springs:
+        (stiff if min(i, j) >= fast else soft).addBond(i, j, length, k)
+    for i, j, length in p.rods:
+        system.addConstraint(n if i < 0 else i, j, length)
+    _add(system, {stiff: FAST, soft: SLOW, weight: SLOW})
+    x, v = (np.vstack([a.reshape(-1, 3), np.zeros(3)]) for a in (case.q, case.v))
+    return system, x, v
+
+
+def _add(system, groups) -> None:
+    for force, group in groups.items():
+        force.setForceGroup(group)
+        system.addForce(force)

@@ -1,0 +1,90 @@
+"""vmri_jax itself: every scheme is compiled once as a program that only steps, for all numbers of steps."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vmri_jax as vm
+from benchmarks.peers.cases import Case, Ladder, step_counts
+from vmri_jax.composition import stage_scheme
+from vmri_jax.simulate import run, run_memory
+
+COMPOSED = {"kahan-li8": (2, 4), "kahan-li6": (2, 4), "suzuki4": (2, 4, 8)}
+"""Compositions of `vm.fully_explicit` that are tried, with numbers of micro steps; the finest first."""
+EXPLICIT = (4, 8, 16)
+"""Numbers of micro steps of `vm.fully_explicit` on its own."""
+
+
+def schemes(case: Case) -> dict[str, vm.Scheme | vm.Composition]:
+    """Those that are the fastest somewhere on these problems, or close to it; implicit ones of high degree never are."""
+    explicit = vm.fully_explicit
+    found: dict[str, vm.Scheme | vm.Composition] = {
+        f"explicit {n}, {name}": vm.compose(explicit(n), name) for name, micro in COMPOSED.items() for n in micro
+    }
+    if not case.is_chain:
+        found |= {"Gauss 2": vm.galerkin(1, 2, "gauss"), "Lobatto 2": vm.galerkin(2, 2, "lobatto")}
+    return found | {f"explicit {n}": explicit(n) for n in EXPLICIT}
+
+
+def batch_schemes() -> dict[str, vm.Scheme | vm.Composition]:
+    """The same for batches and moderate errors."""
+    composed = {f"explicit {n}, suzuki4": vm.compose(vm.fully_explicit(n), "suzuki4") for n in (2, 4)}
+    return composed | {f"explicit {n}": vm.fully_explicit(n) for n in (4, 8)}
+
+
+def program(case: Case, scheme: vm.Scheme | vm.Composition):
+    """``run(start, t_end, num_steps)``: positions at the end, NaN where a step failed; compiled once for all of these.
+
+    It is what `vm.simulate` compiles, without the checks around it, which take a millisecond per call.
+    """
+    system, newton, n_s, n_f = case.problem.system, vm.Newton(), case.problem.q_s.size, case.problem.q_f.size
+    if newton.falls_back and newton.marches(system, stage_scheme(scheme)):  # as `vm.simulate` starts a run
+        newton = dataclasses.replace(newton, method="march")
+
+    @jax.jit
+    def steps(start, t_end, num_steps):
+        q_s, q_f, p_s, p_f = jnp.split(start, np.cumsum([n_s, n_f, n_s]))
+        state, macro_dt = vm.State(jnp.zeros(()), q_s, q_f, p_s, p_f), t_end / num_steps
+        memory = run_memory(system, scheme, state, macro_dt, newton)
+        last, _ = run(system, scheme, newton, macro_dt, state.t, state, memory, 0, 1, num_steps, False)
+        return jnp.concatenate([last.q_s[-1], last.q_f[-1]])
+
+    return steps
+
+
+def ladders(case: Case) -> list[Ladder]:
+    """One per scheme: numbers of macro steps."""
+    start, t_end = jnp.concatenate([jnp.asarray(case.q), jnp.asarray(case.masses * case.v)]), jnp.asarray(case.t_end)
+
+    def ladder(name: str, scheme) -> Ladder:
+        steps = program(case, scheme)
+        settings = step_counts(max(2, 2 * case.t_end), 1e6 * case.t_end)
+        return Ladder(name, "steps", settings, lambda num_steps: partial(steps, start, t_end, jnp.asarray(num_steps)))
+
+    return [ladder(name, scheme) for name, scheme in schemes(case).items()]
+
+
+def energy(case: Case) -> float:
+    """Of the start."""
+    return case.energy
+
+
+def batch_ladders(case: Case, states: vm.State, q, v) -> list[Ladder]:
+    """`vm.simulate_batch` with the same schemes."""
+
+    def ladder(name: str, scheme) -> Ladder:
+        def build(num_steps: int):
+            steps = {"macro_dt": case.t_end / num_steps, "num_steps": num_steps, "save_every": num_steps}
+
+            def run():
+                end = vm.simulate_batch(case.problem.system, scheme, states, **steps)
+                return jnp.concatenate([end.q_s[:, -1], end.q_f[:, -1]], axis=1)
+
+            return run
+
+        return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end), build)
+
+    return [ladder(name, scheme) for name, scheme in batch_schemes().items()]

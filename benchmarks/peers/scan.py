@@ -1,0 +1,105 @@
+"""One run of every setting: its error and a rough time, so that only those that count are timed with care."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.peers.cases import LEVELS, Case, Ladder
+
+FINE = 0.1
+"""A ladder ends at the first error below so many times the finest level."""
+CLOSE = 1.3
+"""Settings that are at most so many times slower than the cheapest are timed too."""
+MOST = 3
+"""Candidates per peer and level."""
+ENOUGH = 0.01
+"""Seconds that the calls for a rough time take together, at least."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One setting of one peer that was run.
+
+    settled: the largest error of it and of all finer settings of its ladder: no level is reached by luck.
+    seconds: the fastest of a few calls.
+    build: seconds for everything made beforehand.
+    compile: seconds by which the first call of its ladder was longer than a run.
+    """
+
+    peer: str
+    label: str
+    error: float
+    settled: float
+    seconds: float
+    build: float
+    compile: float
+    run: Callable[[], Any]
+
+
+def scan(
+    peer: str, ladders: Sequence[Ladder], case: Case, seconds: float, levels: Sequence[float] = LEVELS
+) -> list[Point]:
+    """Climb every ladder until the error is a tenth of the finest level, a run takes longer than `seconds`, or a setting can no longer
+    be the cheapest one: another ladder has reached the finest level in less time."""
+    found: list[Point] = []
+    for ladder in ladders:
+        enough = min((p.seconds for p in found if p.settled <= min(levels)), default=np.inf)
+        rungs: list[Point] = []
+        for setting in ladder.settings:
+            rungs.append(_try(peer, ladder, setting, case, rungs[0].compile if rungs else None))
+            if rungs[-1].error < FINE * min(levels) or rungs[-1].seconds > min(seconds, CLOSE * enough):
+                break
+        worst = 0.0
+        for rung in reversed(rungs):
+            worst = max(worst, rung.error)
+            found.append(replace(rung, settled=worst))
+    return found
+
+
+def candidates(points: Sequence[Point], level: float) -> list[Point]:
+    """The cheapest settings that reach a level, the first one and those close to it."""
+    good = sorted((p for p in points if p.settled <= level), key=lambda p: p.seconds)
+    return [p for p in good if p.seconds <= CLOSE * good[0].seconds][:MOST]
+
+
+def front(points: Sequence[Point]) -> list[Point]:
+    """Those that no other beats in both time and settled error, fastest first."""
+    best, kept = np.inf, []
+    for p in sorted(points, key=lambda p: (p.seconds, p.settled)):
+        if p.settled < best:
+            best = p.settled
+            kept.append(p)
+    return kept
+
+
+def _try(peer: str, ladder: Ladder, setting, case: Case, compiled: float | None) -> Point:
+    """One setting; `compiled` is what compiling took before, None if this is the first call."""
+    start = time.perf_counter()
+    run = ladder.build(setting)
+    built = time.perf_counter()
+    try:
+        q = jax.block_until_ready(run())
+    except (RuntimeError, ArithmeticError):  # an integrator that gives up, where others return NaN
+        q = np.full(case.q_end.shape, np.nan)
+    first = time.perf_counter() - built
+    error = case.error(q)
+    seconds = 0.0
+    if np.isfinite(error):
+        seconds = _rough(run, None if compiled is None else first)
+    if compiled is None:
+        compiled = max(0.0, first - seconds)
+    return Point(peer, ladder.label(setting), error, error, seconds, built - start, compiled, run)
+
+
+def _rough(run: Callable[[], Any], first: float | None) -> float:
+    """Seconds of the fastest of up to five calls; the first one counts if nothing was compiled in it."""
+    taken = [] if first is None else [first]
+    while not taken or (len(taken) < 5 and sum(taken) < ENOUGH):
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        taken.append(time.perf_counter() - start)
+    return min(taken)

@@ -1,0 +1,244 @@
+"""The peers integrate the very problems that ours integrate; those whose package is absent are skipped."""
+
+import json
+import time
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import benchmarks.__main__ as command_line
+import vmri_jax as vm
+from benchmarks import c_loops
+from benchmarks.peers import cases, compare, equations, mechanics, ours
+from benchmarks.peers.cases import Ladder, NotRepresentable
+from benchmarks.peers.scan import Point, candidates, front, scan
+
+LANES = 16
+SHORT = ("FPU l=3 t=1", "TSP t=1", "SAM t=1")
+pytestmark = pytest.mark.filterwarnings("ignore")  # the peers' own
+
+
+def module(peer: str):
+    """Of a peer; the test is skipped where it cannot run."""
+    if peer == "C by hand" and c_loops.compiler() is None:
+        pytest.skip("no C compiler (cc, gcc or clang) on the PATH")
+    return pytest.importorskip(f"benchmarks.peers.{compare.PEERS[peer]}")
+
+
+def climb(ladder: Ladder, case: cases.Case) -> list[float]:
+    """Errors of every fourth setting, until one is below 1e-5 or a run takes a while."""
+    errors = []
+    for setting in ladder.settings[::4]:
+        (point,) = scan("", [replace(ladder, settings=[setting])], case, 1.0)
+        errors.append(point.error)
+        if point.error < 1e-5 or point.seconds > 0.1:
+            break
+    return errors
+
+
+# --- the same problem ------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("peer", compare.PEERS)
+@pytest.mark.parametrize("name", SHORT)
+def test_energy_at_the_start(peer, name):
+    found, case = module(peer), cases.case(name)
+    if peer == "JAX MD" and not case.is_chain:
+        with pytest.raises(NotRepresentable, match="no constraints"):
+            found.ladders(case)
+        return
+    assert compare.energy_difference(found, case) < 1e-10  # measured 4e-16
+
+
+@pytest.mark.parametrize("peer", compare.PEERS)
+@pytest.mark.parametrize("name", SHORT[:2])
+def test_errors_fall(peer, name):
+    """Along the last ladders of a peer, to errors that only the same problem can give."""
+    found, case = module(peer), cases.case(name)
+    if peer == "JAX MD" and not case.is_chain:
+        pytest.skip("JAX MD has no constraints")
+    for ladder in found.ladders(case)[-1 if name == "TSP t=1" else -2 :]:
+        errors = climb(ladder, case)
+        last = errors[-3:]
+        assert all(b < a for a, b in pairwise(last)), (ladder.method, errors)
+        assert errors[-1] < 1e-3
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """A case with some starts."""
+    return compare.batch_case("FPU l=3 t=1", LANES)
+
+
+@pytest.mark.parametrize("peer", compare.BATCHED)
+def test_batches(peer, batch):
+    found = module(peer)
+    case, starts = batch
+    for ladder in found.batch_ladders(case, *starts)[-2:]:
+        errors = climb(ladder, case)
+        assert errors[-1] < 1e-5, (ladder.method, errors)
+
+
+@pytest.mark.parametrize("name", SHORT[::2])
+def test_accelerations(name):
+    """Those written by hand are those of the system, with the multipliers of ``G M^-1 G^T``."""
+    case = cases.case(name)
+    system, n_s = case.problem.system, case.state.q_s.size
+    slow, fast = system.slow_potential, system.fast_potential
+    assert slow is not None
+    assert fast is not None
+
+    def potential(q):
+        return slow(q[:n_s], q[n_s:], system.params) + fast(q[n_s:], system.params)
+
+    def constraints(q):
+        return system.constraints(q[:n_s], q[n_s:])
+
+    def curvature(q, v):
+        return jax.jvp(lambda q: jax.jvp(constraints, (q,), (v,))[1], (q,), (v,))[1]
+
+    q, v = jnp.asarray(case.q + 0.1 * np.random.default_rng(0).normal(size=case.q.size)), jnp.asarray(case.v)
+    free, g = -jax.grad(potential)(q) / case.masses, jax.jacrev(constraints)(q)
+    mu = jnp.linalg.solve((g / case.masses) @ g.T, -curvature(q, v) - g @ free) if g.shape[0] else jnp.zeros(0)
+    expected = free + g.T @ mu / case.masses
+    assert np.abs(jax.jit(equations.acceleration(case))(q, v) - expected).max() < 1e-11 * np.abs(expected).max()
+
+
+def test_chain_of_any_length():
+    """The array form, for long chains, is the one over single numbers."""
+    case = cases.case("FPU l=200 t=1")
+    q = np.random.default_rng(0).normal(size=400)
+    long = np.asarray(equations.acceleration(case)(jnp.asarray(q), None))
+    assert np.abs(long - np.array(mechanics.chain_accelerations(list(q), case.omega))).max() < 1e-11
+    assert np.abs(mechanics.from_masses(mechanics.to_masses(q)) - q).max() < 1e-14
+
+
+def test_elimination():
+    matrix = [[4.0, None, 1.0], [None, 3.0, 2.0], [1.0, 2.0, 5.0]]
+    dense = np.array([[x or 0.0 for x in row] for row in matrix])
+    right = [1.0, 2.0, 3.0]
+    assert np.allclose(mechanics.solve(matrix, right), np.linalg.solve(dense, right), rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", cases.NAMES)
+def test_references(name):
+    case = cases.case(name)
+    assert case.q_end.shape == case.q.shape
+    assert case.error(case.q_end) == 0
+    assert case.error(np.full(case.q.size, np.nan)) == np.inf
+    assert name.startswith(case.system)
+
+
+def test_unknown_case():
+    with pytest.raises(ValueError, match="there is no 'FPU l=4 t=1'; there are FPU l=3 t=1"):
+        cases.case("FPU l=4 t=1")
+
+
+def test_without_a_compiler(monkeypatch):
+    monkeypatch.setattr(c_loops, "compiler", lambda: None)
+    size = compare.Size(SHORT[:1], (), ("C by hand",), 1.0, 1, 1)
+    assert compare.run(size, "quick").notes == [
+        "FPU l=3 t=1: C by hand was left out: there is no C compiler (cc, gcc or clang) on the PATH."
+    ]
+
+
+# --- scan ------------------------------------------------------------------------------------------------------------
+@pytest.fixture
+def line():
+    """A case whose solution is 0."""
+    return SimpleNamespace(q_end=np.zeros(1), error=lambda q: float(np.nan_to_num(np.abs(q[0]), nan=np.inf)))
+
+
+def test_scan(line):
+    """Levels are reached where no finer setting misses them; a ladder ends when it is fine enough."""
+    errors = {1: np.nan, 2: 1e-5, 4: 1e-3, 8: 1e-6, 16: 1e-10, 32: 1e-12}
+    ladder = Ladder("method", "steps", list(errors), lambda n: lambda: np.array([errors[n]]))
+    points = {p.label: p for p in scan("one", [ladder], line, 1.0)}
+    assert [points[f"method, {n} steps"].settled for n in (1, 2, 4, 8, 16)] == [np.inf, 1e-3, 1e-3, 1e-6, 1e-10]
+    assert "method, 32 steps" not in points
+
+
+def test_scan_of_an_integrator_that_gives_up(line):
+    def run():
+        raise RuntimeError("too large a step")
+
+    (point,) = scan("one", [Ladder("method", "tol", [1e-3], lambda tol: run)], line, 1.0)
+    assert point.error == np.inf
+    assert point.label == "method, 1e-03"
+
+
+def point(error: float, seconds: float) -> Point:
+    return Point("one", f"{error}", error, error, seconds, 0.0, 0.0, lambda: None)
+
+
+def test_candidates_and_front():
+    points = [point(1e-3, 1.0), point(1e-5, 1.2), point(1e-4, 2.0), point(1e-9, 4.0)]
+    assert [p.seconds for p in candidates(points, 1e-2)] == [1.0, 1.2]
+    assert [p.seconds for p in candidates(points, 1e-8)] == [4.0]
+    assert candidates(points, 1e-12) == []
+    assert [p.seconds for p in front(points)] == [1.0, 1.2, 4.0]
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+def test_sizes():
+    assert compare.programs_of(compare.sizes("quick")) == 7 * 11 + 2 * 4
+    size = compare.sizes("full", only=["TSP"], peers=["heyoka"])
+    assert size.cases == ("TSP t=1", "TSP t=10")
+    assert size.batches == ("TSP t=1, batch",)
+    assert size.peers == ("vmri_jax", "heyoka")
+    with pytest.raises(ValueError, match="there is no case LJ"):
+        compare.sizes("quick", only=["LJ"])
+    with pytest.raises(ValueError, match="there is no lammps"):
+        compare.sizes("quick", peers=["lammps"])
+
+
+def test_command(tmp_path, monkeypatch):
+    """With ours, one that is absent, one that cannot, and one that is slower and coarse."""
+
+    def slow(case):
+        return [Ladder("slow", "steps", [1, 2], lambda n: lambda: (time.sleep(0.01), case.q_end + 1e-3)[1])]
+
+    def absent(case):
+        raise ModuleNotFoundError(name="nowhere")
+
+    def cannot(case):
+        raise NotRepresentable("it knows no springs")
+
+    def energy(case):
+        return case.energy
+
+    modules = {
+        "vmri_jax": ours,
+        "OpenMM": SimpleNamespace(ladders=slow, energy=energy),
+        "scipy": SimpleNamespace(ladders=absent, energy=energy),
+        "MuJoCo": SimpleNamespace(ladders=cannot, energy=energy),
+    }
+    monkeypatch.setattr(ours, "schemes", lambda case: {"one": vm.compose(vm.fully_explicit(2), "kahan-li8")})
+    monkeypatch.setattr(ours, "batch_schemes", lambda: {"one": vm.fully_explicit(4)})
+    monkeypatch.setattr(compare, "load", modules.__getitem__)
+    size = compare.Size(("FPU l=3 t=1",), ("FPU l=3 t=1, batch",), tuple(modules), 1.0, 2, 2, LANES)
+    monkeypatch.setattr(command_line.peers, "sizes", lambda name, **_: size)
+    monkeypatch.setattr(command_line, "prepare", lambda *_, **__: None)  # the tests have started JAX already
+    told = []
+    run = command_line.peers.run
+    monkeypatch.setattr(command_line.peers, "run", lambda size, name, tell: run(size, name, told.append))
+    done = CliRunner().invoke(command_line.app, ["peers", "--out", str(tmp_path), "--only", "FPU"])
+    assert done.exit_code == 0, done.exception
+    assert len(told) == compare.programs_of(size)
+
+    found = json.loads((tmp_path / "peers.json").read_text())
+    rows = {(row["case"], row["peer"]): row for row in found["rows"]}
+    assert set(rows) == {("FPU l=3 t=1", "vmri_jax"), ("FPU l=3 t=1", "OpenMM"), ("FPU l=3 t=1, batch", "vmri_jax")}
+    assert [level["level"] for level in rows["FPU l=3 t=1", "vmri_jax"]["levels"]] == list(cases.LEVELS)
+    assert rows["FPU l=3 t=1", "OpenMM"]["1e-08"] == "not reached"
+    assert {claim["what"] for claim in found["claims"]} == {"FPU l=3 t=1, 1e-02: OpenMM over ours"}
+    assert found["claims"][0]["seen"]["value"] > 3
+    notes = " ".join(found["notes"])
+    assert "scipy was left out: there is no nowhere; pip install" in notes
+    assert "MuJoCo was left out: it knows no springs" in notes
+    assert "OpenMM does not reach 2e-04 or 2e-06 or 1e-08: its best is" in notes
+    assert {path.name for path in tmp_path.iterdir()} == {"peers.json", "peers_fpu.png", "peers_batch.png"}
