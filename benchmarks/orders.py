@@ -16,10 +16,10 @@ from vmri_jax.study import Program, ReferenceSolution
 COLUMNS = ("system", "scheme", "num_micro", "order", "of q", "+-", "of p", "+- ", "points", "finest error", "holds")
 TRUTH = Path(__file__).parent.parent / "tests" / "data" / "ground_truth"
 TOLERANCE = 0.25
-COARSEST, FLOOR = 1e-4, 3e-13
+COARSEST, FLOOR = 1e-4, 1e-12
 """Errors between these, relative to the largest position or momentum, are fitted: below is round-off, above the steps are
 not yet small."""
-RATIO = 2**0.25
+RATIO = 2**0.5
 """From one number of steps to the next."""
 MOST_STEPS = 20_000
 
@@ -106,7 +106,7 @@ def measure(case: Case) -> dict:
         fitted = np.flatnonzero((error > FLOOR) & (error < COARSEST))[-6:]
         if len(fitted) < 3:
             return row | {"points": len(fitted), "holds": "no"}
-        fits.append(fit_order(1 / np.array(steps)[fitted], error[fitted]))
+        fits.append(fit_order(1 / np.array(steps)[fitted], error[fitted], plateau=0.0))
     holds = all(abs(fit.order - order) <= TOLERANCE for fit in fits)
     found = {"of q": fits[0].order, "+-": fits[0].half_width, "of p": fits[1].order, "+- ": fits[1].half_width}
     finest = {"points": min(fit.points for fit in fits), "finest error": float(np.nanmin(np.array(errors)[:, 0]))}

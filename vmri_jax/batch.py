@@ -1,7 +1,7 @@
 """Batches of runs: many starts, step sizes or parameters of one system, lane by lane independent."""
 
 import dataclasses
-from functools import partial
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from vmri_jax.composition import Composition, stage_scheme
+from vmri_jax.lanes import over_lanes
 from vmri_jax.newton import Newton
 from vmri_jax.scheme import Scheme
 from vmri_jax.simulate import check_run, run, run_memory
@@ -17,8 +18,8 @@ from vmri_jax.step import split
 from vmri_jax.system import System
 from vmri_jax.trajectory import Trajectory
 
-WORKING_SET = 8192
-"""Numbers that the lanes of a chunk may hold together: about the first-level cache."""
+WORKING_SET = 32768
+"""Numbers that the lanes of a chunk may hold together, 256 kB: well within the second-level cache."""
 
 
 def simulate_batch(
@@ -56,7 +57,9 @@ def simulate_batch(
         ValueError, TypeError: bad arguments, before anything is computed.
     """
     newton = newton or Newton()
-    lanes, first = _check_states(states), jax.tree.map(lambda a: a[0], states)
+    lanes = _check_states(states)
+    states, params = jax.tree.map(np.asarray, (states, params))  # cut into pieces without a compiled program for each
+    first = jax.tree.map(lambda a: a[0], states)
     check_run(
         system,
         scheme,
@@ -125,12 +128,24 @@ def _check_states(states) -> int:
 
 def _chunk(system: System, scheme: Scheme, state: State) -> int:
     """A power of two of lanes whose unknowns fit into the working set."""
-    n_s, n_f = state.q_s.shape[0], state.q_f.shape[0]
-    unknowns = 0
-    if split(system, scheme, state.q_s, state.q_f) is None:
-        n_g = system.num_constraints(state.q_s, state.q_f)[0]
-        unknowns = scheme.num_micro * scheme.degree * (n_f + n_g)
-    return 2 ** int(np.clip(np.log2(WORKING_SET / (8 * (n_s + n_f) + unknowns)), 3, 10))
+    leaves, structure = jax.tree.flatten((system, scheme, state))
+    unknowns = _unknowns(structure, tuple((np.shape(a), jnp.result_type(a)) for a in leaves))
+    variables = state.q_s.shape[0] + state.q_f.shape[0]
+    return 2 ** int(np.clip(np.log2(WORKING_SET / (8 * variables + unknowns)), 3, 10))
+
+
+@lru_cache
+def _unknowns(structure, leaves) -> int:
+    """Fast unknowns of a macro step that are solved for together; the functions of a system are traced for it."""
+    found = []
+
+    def count(system, scheme, state):
+        if split(system, scheme, state.q_s, state.q_f) is None:
+            n_g = system.num_constraints(state.q_s, state.q_f)[0]
+            found.append(scheme.num_micro * scheme.degree * (state.q_f.shape[0] + n_g))
+
+    jax.eval_shape(count, *jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*a) for a in leaves]))
+    return sum(found)
 
 
 def _in_chunks(system, scheme, macro_dt, newton, batch, *, chunk: int, devices: int, **static) -> Trajectory:
@@ -144,21 +159,30 @@ def _in_chunks(system, scheme, macro_dt, newton, batch, *, chunk: int, devices: 
             system, scheme, macro_dt, newton, jax.tree.map(lambda a, i=index: a[i], batch), devices, **static
         )
         pieces.append(piece)
+    return pieces[0] if lanes == together else _join(pieces, lanes)
+
+
+@partial(jax.jit, static_argnames="lanes")
+def _join(pieces, lanes: int) -> Trajectory:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:lanes], *pieces)
 
 
 @partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"))
 def _side_by_side(system, scheme, macro_dt, newton, batch, devices, *, num_saves, save_every, save_micro) -> Trajectory:
-    def lane(system, scheme, macro_dt, newton, save_every, batch):
-        state, macro_dt = batch["state"], batch.get("macro_dt", macro_dt)
-        system = system.replace(params=batch.get("params", system.params))
-        memory = run_memory(system, scheme, state, macro_dt, newton)
-        saves = num_saves, save_every, save_micro
-        return run(system, scheme, newton, macro_dt, state.t, state, memory, 0, *saves, lanes=True)[0]
+    def together(system, scheme, macro_dt, newton, save_every, batch):
+        def lane(batch):
+            state, dt = batch["state"], batch.get("macro_dt", macro_dt)
+            own = system.replace(params=batch.get("params", system.params))
+            memory = run_memory(own, scheme, state, dt, newton)
+            return run(own, scheme, newton, dt, state.t, state, memory, 0, num_saves, save_every, save_micro)[0]
 
-    lanes = jax.vmap(lane, in_axes=(None,) * 5 + (0,))
+        lanes = batch["state"].t.shape[0]
+        result = over_lanes(lane, lanes)(jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), batch))
+        return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), result)
+
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         shared, spread = PartitionSpec(), PartitionSpec("lanes")
-        lanes = jax.shard_map(lanes, mesh=mesh, in_specs=(shared,) * 5 + (spread,), out_specs=spread, check_vma=False)
-    return lanes(system, scheme, macro_dt, newton, save_every, batch)
+        specs = {"in_specs": (shared,) * 5 + (spread,), "out_specs": spread}
+        together = jax.shard_map(together, mesh=mesh, **specs, check_vma=False)
+    return together(system, scheme, macro_dt, newton, save_every, batch)

@@ -10,7 +10,6 @@ import numpy as np
 from vmri_jax import diagnostics
 from vmri_jax.checks import check_arrays, check_system, require_x64
 from vmri_jax.composition import Composition, stage_scheme
-from vmri_jax.lanes import contiguous_lanes
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Result, SimulationError
@@ -40,6 +39,7 @@ def simulate(
     Compiled once per system structure, scheme structure and number of saved nodes: step sizes, parameters, rule
     weights, initial states and `save_every` may vary without compiling again. Works under ``jax.vmap`` over state,
     params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised.
+    Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "march".
 
     Args:
         system, scheme: what moves, and how.
@@ -99,16 +99,13 @@ def simulate(
 
 
 def run(
-    system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro, lanes=False
+    system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro
 ) -> tuple[Trajectory, Memory | Stages]:
-    """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one.
-
-    With `lanes` batches are stored with the batch axis contiguous; that is not differentiable in reverse mode.
-    """
+    """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one."""
     n = scheme.num_micro
 
     def step(_, carry):
-        state, memory, k, (result, failed_at), worst, _ = contiguous_lanes(carry) if lanes else carry
+        state, memory, k, (result, failed_at), worst, _ = carry
         state, info, memory = advance(system, scheme, state, macro_dt, newton, memory)
         alive = failed_at < 0  # until the step before
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
@@ -119,8 +116,7 @@ def run(
         p_s, p_f = jnp.where(ok, state.p_s, jnp.nan), jnp.where(ok, state.p_f, jnp.nan)  # positions follow, see below
         state = State(t_start + (k + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
-        carry = state, memory, k + 1, status, worst, micro
-        return contiguous_lanes(carry) if lanes else carry
+        return state, memory, k + 1, status, worst, micro
 
     def save(carry, _):
         state, memory, k, status = carry

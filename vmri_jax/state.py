@@ -41,18 +41,18 @@ def project_momentum(system: System, q_s, q_f, p_s, p_f, guess=None):
         (p_s, p_f, v_s, v_f)
     """
     n_s = q_s.shape[0]
-    jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(0, 1))(q_s, q_f), axis=1)  # (n_g + n_gs, n)
     if isinstance(system.kinetic, ConstantMass):
-        v_s, v_f = system.kinetic.velocity(p_s, p_f)
-        if jacobian.shape[0]:
-            inverse_mass = jnp.concatenate(system.kinetic.velocity(jacobian[:, :n_s], jacobian[:, n_s:]), axis=1)
-            drift = algebra.matvec(jacobian, jnp.concatenate([v_s, v_f]))
-            mu = algebra.solve(algebra.matmul(inverse_mass, jacobian.T), drift[:, None])
-            correction = jnp.sum(mu * jacobian, axis=0)
-            p_s, p_f = p_s - correction[:n_s], p_f - correction[n_s:]
-            v_s, v_f = system.kinetic.velocity(p_s, p_f)
-        return p_s, p_f, v_s, v_f
+        velocity = system.kinetic.velocity
+        g, pull = jax.vjp(system.constraints, q_s, q_f)
+        if g.size:
+            push = jax.linearize(system.constraints, q_s, q_f)[1]
+            matrix = jax.vmap(lambda unit: push(*velocity(*pull(unit))))(jnp.eye(g.size))  # G M^-1 G^T
+            mu = algebra.solve(matrix, push(*velocity(p_s, p_f))[:, None])[:, 0]
+            pull_s, pull_f = pull(mu)
+            p_s, p_f = p_s - pull_s, p_f - pull_f
+        return p_s, p_f, *velocity(p_s, p_f)
 
+    jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(0, 1))(q_s, q_f), axis=1)  # (n_g + n_gs, n)
     p = jnp.concatenate([p_s, p_f])
     v = _velocity(system, q_s, q_f, jacobian, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
     if jacobian.shape[0]:

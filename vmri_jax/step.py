@@ -376,7 +376,7 @@ def _move_coupled(system, scheme, state, macro_dt, newton, memory):
         found.method,
         found.iterations,
         found.residual,
-        q_f_micro=(equations.path(x).fast_start + x.fast[:, -1]).at[-1].set(found.q_f),
+        q_f_micro=jnp.concatenate([equations.path(x).fast_start[1:], found.q_f[None]]),
         multiplier=x.multiplier,
         slow_multiplier=x.slow_multiplier,
     )

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 # fmt: off
-_ELEMENTWISE = frozenset([
+ELEMENTWISE_PRIMITIVES = frozenset([
     "abs", "acos", "acosh", "add", "add_any", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
     "clamp", "convert_element_type", "copy", "cos", "cosh", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2",
     "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p", "logistic", "lt",
@@ -61,7 +61,7 @@ def _classes(jaxpr, classes: list[int]) -> list[int]:
             outputs = [_CONSTANT] * len(eqn.outvars)
         elif eqn.primitive.name in ("jit", "pjit", "closed_call", "custom_jvp_call") and inner is not None:
             outputs = _classes(inner.jaxpr, inputs)
-        elif eqn.primitive.name in _ELEMENTWISE and _MIXED not in inputs:
+        elif eqn.primitive.name in ELEMENTWISE_PRIMITIVES and _MIXED not in inputs:
             outputs = [_ELEMENT] * len(eqn.outvars)
         else:
             outputs = [_MIXED] * len(eqn.outvars)

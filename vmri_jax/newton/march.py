@@ -4,13 +4,13 @@ A pass takes the slow path as known. It marches over the micro intervals; each c
 multipliers once, by a Newton step on its exact residual, and adds its impulse to the slow equations. Then the slow
 increments and slow multipliers are corrected from what is left of their equations. The matrices are cheap ones:
 
-* micro interval: ``[K, -G^T; G, 0]`` with the present constraint Jacobian G, and K from the start of the macro step
-  (`IntervalMatrix`: the mass alone where the fast equations are explicit, so that only the multipliers are solved for);
+* micro interval: ``[K, -G^T; G, 0]`` with K from the start of the macro step (`IntervalMatrix`: the mass alone where the
+  fast equations are explicit, so that only the multipliers are solved for), and ``G K^-1 G^T`` from the first pass;
 * slow equations: mass and slow constraint. What they miss, the response of the fast variables and the curvature of V,
   is learned from the passes (`Pairs`).
 
 The residual is exact, so all of this decides only how many passes there are. A pass costs one gradient of each term at
-each of its nodes, and stores nothing but the path.
+each of its nodes; Jacobians appear only in products, and nothing is stored but the path and those small matrices.
 """
 
 from typing import Any, NamedTuple
@@ -19,10 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import inverse, matmul
+from vmri_jax.algebra import inverse, matmul, matvec
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
-from vmri_jax.lanes import contiguous_lanes
 from vmri_jax.newton.interval import (
     IntervalMatrix,
     constant_mass,
@@ -30,7 +29,7 @@ from vmri_jax.newton.interval import (
     is_explicit_given_multipliers,
     solve_saddle,
 )
-from vmri_jax.newton.secant import Pairs
+from vmri_jax.newton.secant import SIZE, Pairs
 from vmri_jax.path import control_nodes
 from vmri_jax.results import Result
 
@@ -58,7 +57,8 @@ class Warm(NamedTuple):
         """The start of a run: straight motion with slow increments (r, n_s), no multipliers."""
         r, n_s = increments.shape
         slow = jnp.broadcast_to(increments, (3, r, n_s))
-        return cls(slow, jnp.zeros((2, r, n_gs)), jnp.zeros((2, r, n_g)), Pairs.none(r * (n_s + n_gs)))
+        pairs = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
+        return cls(slow, jnp.zeros((2, r, n_gs)), jnp.zeros((2, r, n_g)), pairs)
 
 
 class Pass(NamedTuple):
@@ -78,54 +78,68 @@ class Pass(NamedTuple):
     multiplier: Any
 
 
-def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multiplier, first) -> tuple[Unknowns, Pass]:
+def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multiplier, schur=None, linear=False):
     """One pass over the micro intervals: fast unknowns corrected for the given slow ones, and what they leave.
 
-    In the first pass fast increments start from straight motion, multipliers from the line through the last two.
+    Args:
+        multiplier: (2, r, n_g) multipliers lambda of the last two intervals of the macro step before.
+        schur: (num_micro, r n_g, r n_g) inverses of ``G K^-1 G^T``. In the first pass there are none: they are computed,
+            fast increments start from straight motion, multipliers from the line through the last two.
+        linear: one pass is exact, see `solve`.
+
+    Returns:
+        (x, what the pass leaves, schur)
     """
-    h, (n, r, _) = equations.micro_dt, x.fast.shape
+    h, (n, r, _), n_g = equations.micro_dt, x.fast.shape, multiplier.shape[2]
     system, scheme = interval_problem(equations.system, equations.scheme)
     kicks = lagrangian(system, scheme).kicks if n > 1 else ()
     explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
     basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # (n, r + 1, r): slow position at each node by increments
     inverse_mass = _inverse_mass(constant_mass(system).fast)
+    first = schur is None
+    constraints = jax.vmap(system.g)
 
     def interval(carry: Pass, at):
-        m, basis, scale, inside, inc, mu = at
-        carry, inc, mu = contiguous_lanes((carry, inc, mu))
+        m, basis, scale, inside, inc, mu, schur = at
         q_s, steps = equations.q_s + _along(basis[0], x.slow), _along(basis[1:] - basis[0], x.slow)
-        mu = jnp.where(first, scale * (2 * carry.multiplier[0] - carry.multiplier[1]), mu)
         none = jnp.zeros_like(q_s), jnp.zeros_like(carry.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, carry.q_f, *none, h)
         slow_nodes = jnp.concatenate([q_s[None], q_s + steps])
-
-        def jacobians(inc):
-            fast_nodes = jnp.concatenate([carry.q_f[None], carry.q_f + inc[:-1]])
-            return jax.vmap(jax.jacrev(system.g, argnums=(0, 1)))(slow_nodes[:-1], fast_nodes)
+        if first:
+            mu = scale * (2 * carry.multiplier[0] - carry.multiplier[1])
+            inc = jnp.zeros((r, carry.q_f.size))
+            if not linear:  # then any start does
+                inc += control_nodes(r)[1:, None] * inverse_mass(carry.p_f)
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
             return jax.grad(local.unconstrained)(path, path)
 
+        fast_nodes = jnp.concatenate([carry.q_f[None], carry.q_f + inc[:-1]])
+        pull = jax.vjp(constraints, slow_nodes[:-1], fast_nodes)[1]  # forces of multipliers at nodes 0..r-1
+        pull_s, pull_f = pull(mu)
         if explicit:  # the increment follows from the multipliers
-            g_s, g_f = jacobians(jnp.zeros((1, carry.q_f.size)))
-            inc = -matrix.solve((carry.p_f - _along(mu[0], g_f[0]))[None])
-        else:
-            inc = jnp.where(first, control_nodes(r)[1:, None] * inverse_mass(carry.p_f), inc)
-            g_s, g_f = jacobians(inc)
+            inc = -matrix.solve(carry.p_f - pull_f)
         d, change = jax.linearize(gradient, inc)
-        g, push = jax.linearize(lambda inc: jax.vmap(system.g)(slow_nodes[1:], carry.q_f + inc), inc)
-        rows = None
+        g, push = jax.linearize(lambda inc: constraints(slow_nodes[1:], carry.q_f + inc), inc)
+        dx, change_of_g = jnp.zeros_like(inc), g
         if not explicit:
             rows = jnp.concatenate([(d.fast_start - d.fast.sum(1)) + carry.p_f, d.fast[0, :-1]])
-            rows -= jnp.sum(mu[..., None] * g_f, axis=1)
-        dx, dmu = solve_saddle(matrix.solve, g_f, push, rows, g)
+            dx = -matrix.solve(rows - pull_f)
+            change_of_g = g + push(dx)
+        if first:
+            units = jnp.eye(r * n_g).reshape(r * n_g, r, n_g)
+            columns = jax.vmap(lambda unit: push(matrix.solve(pull(unit)[1])))(units)
+            schur = inverse(columns.reshape(r * n_g, r * n_g)).T
+        dmu = -matvec(schur, change_of_g.reshape(-1)).reshape(r, n_g)
+        more_s, more_f = pull(dmu)
+        dx += matrix.solve(more_f)
         inc, mu, coupling = inc + dx, mu + dmu, change(dx)
         q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
 
-        pull = -jnp.sum(mu[..., None] * g_s, axis=1)  # of the constraints on the slow path, at nodes 0..r-1
-        d_start = d.slow_start + coupling.slow_start + pull.sum(0)
-        d_steps = d.slow + coupling.slow + jnp.concatenate([pull[1:], jnp.zeros_like(pull[:1])])
+        pull_s = -(pull_s + more_s)
+        d_start = d.slow_start + coupling.slow_start + pull_s.sum(0)
+        d_steps = d.slow + coupling.slow + jnp.concatenate([pull_s[1:], jnp.zeros_like(pull_s[:1])])
         start = carry.start + d_start
         increments = carry.increments + basis[0][:, None] * d_start
         increments += jnp.sum((basis[1:] - basis[0])[..., None] * d_steps[:, None], axis=0)
@@ -137,18 +151,20 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
 
         g = jnp.maximum(carry.g, jnp.max(jnp.abs(g), axis=0, initial=0.0))
         multiplier = jnp.stack([mu / scale, carry.multiplier[0]])
-        return contiguous_lanes((Pass(q_f, p_f, start, increments, g, multiplier), (inc, mu)))
+        return Pass(q_f, p_f, start, increments, g, multiplier), (inc, mu, schur if first else None)
 
     zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(multiplier.shape[2])
-    carry = contiguous_lanes(Pass(equations.q_f, h * equations.p_f, *zero, multiplier))
+    carry = Pass(equations.q_f, h * equations.p_f, *zero, multiplier)
     scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
-    end, (fast, mu) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, x.fast, x.multiplier))
-    return x._replace(fast=fast, multiplier=mu), end
+    unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
+    end, (fast, mu, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
+    return x._replace(fast=fast, multiplier=mu), end, new if first else schur
 
 
 class March(NamedTuple):
     """State of the iteration: unknowns of this pass, what it left and moved, secant pairs, and how it stands.
 
+    schur: small matrices of the micro intervals, from the first pass.
     z, d: slow unknowns of the pass and the update they would get from mass and slow constraint alone.
     impulse: on the slow variables over the step, times h.
     residual: largest row of the momentum equations (times h) and largest constraint value.
@@ -156,6 +172,7 @@ class March(NamedTuple):
 
     x: Unknowns
     end: Pass
+    schur: Any
     z: Any
     d: Any
     pairs: Pairs
@@ -197,12 +214,14 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         return jnp.concatenate([d.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), end.start - pull.sum(0)
 
     def one_pass(last: March) -> March:
-        last = contiguous_lanes(last)
-        x, end = march(equations, matrix, last.x, warm.multiplier, last.passes == 0)
+        first = last.schur is None
+        x, end, schur = march(equations, matrix, last.x, warm.multiplier, last.schur, linear)
         d, (rows, g), impulse = slow_update(x, end)
         z = jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
-        noise = jnp.where(last.passes > 0, NOISE * eps * (_largest(equations.q_s) + _largest(x.slow)), jnp.inf)
-        pairs = last.pairs.add(z - last.z, d - last.d, noise, r * n_s)
+        pairs = last.pairs
+        if n_s and not first:
+            noise = NOISE * eps * (_largest(equations.q_s) + _largest(x.slow))
+            pairs = pairs.add(z - last.z, d - last.d, noise, r * n_s)
 
         motion = n * jnp.maximum(_largest(inverse_fast(last.end.p_f)), _largest(inverse_fast(end.p_f)))
         others = eps * jnp.maximum(_largest(x.slow), motion) + tiny  # variables at rest have no size of their own
@@ -210,7 +229,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
             _largest(d[: r * n_s]) / (newton.tolerance * _largest(x.slow) + accepted_slow + others),
             _largest(end.q_f - last.end.q_f) / (newton.tolerance * motion + accepted_fast + others),
         )
-        settled = (change <= 1) & (last.passes > 0)
+        settled = jnp.asarray(False) if first else change <= 1
         if newton.fixed_iterations is None:
             done, spent = settled, last.passes + 1 >= newton.max_iterations
             running = jnp.where(spent, Result.STAGNATED, RUNNING)
@@ -225,7 +244,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
             jnp.maximum(_largest(rows), _largest(end.p_f - last.end.p_f)),
             jnp.maximum(_largest(g), _largest(end.g)),
         )
-        return contiguous_lanes(March(x, end, z, d, pairs, impulse, residual, last.passes + 1, result))
+        return March(x, end, schur, z, d, pairs, impulse, residual, last.passes + 1, result)
 
     x = Unknowns(
         slow=3 * (warm.slow[0] - warm.slow[1]) + warm.slow[2],
@@ -233,21 +252,21 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         fast=jnp.zeros((n, r, n_f)),
         multiplier=jnp.zeros((n, *warm.multiplier.shape[1:])),
     )
-    zero, none = jnp.zeros_like(warm.pairs.moves[0]), jnp.zeros(())
+    zero, none = jnp.zeros(warm.pairs.moves.shape[1]), jnp.zeros(())
     end = Pass(
         equations.q_f, h * equations.p_f, equations.q_s, x.slow, jnp.zeros(x.multiplier.shape[2]), warm.multiplier
     )
-    start = contiguous_lanes(
-        March(x, end, zero, zero, warm.pairs, equations.p_s, (none, none), jnp.asarray(0), jnp.asarray(RUNNING))
+    start = March(
+        x, end, None, zero, zero, warm.pairs, equations.p_s, (none, none), jnp.asarray(0), jnp.asarray(RUNNING)
     )
+    done = one_pass(start)
     if linear:
-        done = one_pass(start)
         exact = np.zeros(()), np.zeros(())
         done = done._replace(residual=exact, passes=np.asarray(1), result=np.asarray(int(Result.CONVERGED)))
     elif newton.fixed_iterations is None:
-        done = jax.lax.while_loop(lambda at: at.result == RUNNING, one_pass, start)
+        done = jax.lax.while_loop(lambda at: at.result == RUNNING, one_pass, done)
     else:
-        done = jax.lax.fori_loop(0, newton.fixed_iterations, lambda _, at: one_pass(at), start)
+        done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: one_pass(at), done)
     slow = jnp.concatenate([done.x.slow[None], warm.slow[:-1]])
     slow_multiplier = jnp.stack([done.x.slow_multiplier, warm.slow_multiplier[0]])
     return done, Warm(slow, slow_multiplier, done.end.multiplier, done.pairs)

@@ -8,7 +8,6 @@ as in the interface quasi-Newton methods of fluid-structure interaction (Degroot
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 
 SIZE = 4
 """Pairs that are kept."""
@@ -17,7 +16,7 @@ FILTER = 1e-3
 
 
 class Pairs(NamedTuple):
-    """moves, changes (SIZE, n): of x and of d between two iterations, the last pair first, changes of length one.
+    """moves, changes (size, n): of x and of d between two iterations, the last pair first, changes of length one.
 
     Lengths and fits are those of the first `measured` entries: the others (multipliers) have another unit.
     """
@@ -26,8 +25,8 @@ class Pairs(NamedTuple):
     changes: Any
 
     @classmethod
-    def none(cls, n: int) -> "Pairs":
-        return cls(jnp.zeros((SIZE, n)), jnp.zeros((SIZE, n)))
+    def none(cls, n: int, size: int = SIZE) -> "Pairs":
+        return cls(jnp.zeros((size, n)), jnp.zeros((size, n)))
 
     def add(self, move, change, noise, measured: int) -> "Pairs":
         """With one more pair, unless its change is below the noise."""
@@ -41,9 +40,15 @@ class Pairs(NamedTuple):
 
     def corrected(self, d, measured: int):
         """The update d with what the pairs know: ``d - sum_j w_j (move_j + change_j)``, w the best fit to d."""
+        size = len(self.changes)
         seen = jnp.concatenate([self.changes, d[None]])[:, :measured]
-        rows = jnp.sum(seen[None] * seen[:SIZE, None], axis=-1)
-        for k in range(SIZE):  # normal equations; the pivot is what newer pairs do not contain
-            row = jnp.where(rows[k, k] > FILTER, rows[k] / rows[k, k], 0.0)
-            rows = jnp.where(np.eye(SIZE)[k, :, None] > 0, row, rows - rows[:, k, None] * row)
-        return d - jnp.sum(rows[:, SIZE:] * (self.moves + self.changes), axis=0)
+        rows = jnp.stack([jnp.sum(seen * pair, axis=-1) for pair in seen[:-1]])
+        eliminated = []
+        for _ in range(size):  # normal equations; the pivot is what newer pairs do not contain
+            row = jnp.where(rows[0, 0] > FILTER, rows[0, 1:] / rows[0, 0], 0.0)
+            rows = rows[1:, 1:] - rows[1:, :1] * row
+            eliminated.append(row)
+        w = jnp.zeros(0)
+        for row in eliminated[::-1]:
+            w = jnp.concatenate([row[-1:] - jnp.sum(row[:-1] * w, keepdims=True), w])
+        return d - jnp.sum(w[:, None] * (self.moves + self.changes), axis=0)
