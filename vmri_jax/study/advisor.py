@@ -5,7 +5,7 @@ error, giving up on a family as soon as it is much slower than the best so far. 
 families, uphill from where they stand. Stage 3 times the best settings in turn.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,8 @@ CLOSE = 1.1
 """The number of steps is found within this factor."""
 MARGIN = 10.0
 """A target must lie so many times above the error of the reference."""
+LUCK = 2.0
+"""A setting whose error from another start is so many times larger was lucky; the next one is tried."""
 LONGEST = 20.0
 """Seconds of a run after which a setting is given up, whatever the others take."""
 MAX_STEPS = 2**22
@@ -280,23 +282,35 @@ def recommend(
             f"{best.row.error_q:.1e}, with {best.row.scheme} and {best.num_steps} steps. Give a larger error.",
             search.rows(),
         )
-    checked = None
+    chosen, checked = found[0], None
     if verify:
         progress("another start", 1, 1)
-        checked = _verified(problem, t_end, found[0], reference.num_saves, newton)
+        verified = _from_another_start(problem, t_end, reference.num_saves, newton)
+        for setting in found[:KEPT]:  # an error that is small by chance at one time is not from another start
+            checked = verified(setting)
+            if checked.error_ratio <= LUCK:
+                chosen = setting
+                break
+        else:
+            checked = verified(chosen)
     progress("done", 1, 1)
-    return Recommendation(error, found[0], tuple(found[1:]), checked, search.rows())
+    others = tuple(setting for setting in found if setting is not chosen)
+    return Recommendation(error, chosen, others, checked, search.rows())
 
 
-def _verified(problem, t_end, setting: Setting, num_saves: int, newton) -> Verification:
-    """The setting from a start whose velocities differ by about a hundredth."""
+def _from_another_start(problem, t_end, num_saves: int, newton) -> Callable[[Setting], Verification]:
+    """Runs a setting from a start whose velocities differ by about a hundredth."""
     random = np.random.default_rng(1)
     size = 0.01 * max(np.abs(problem.v_s).max(initial=0), np.abs(problem.v_f).max(initial=0))
     changes = {name: getattr(problem, name) for name in ("v_s", "v_f")}
     changes = {name: v + size * random.normal(size=np.shape(v)) for name, v in changes.items()}
     other = replace(problem, **changes)
     reference = reference_solution(other, t_end, num_saves=num_saves)
-    program = Program(other, setting.scheme, t_end, num_saves, newton)
-    [seconds] = interleaved({"": program.timed(setting.num_steps)}, 5).values()
-    row = work_row(setting.row.scheme, program, setting.num_steps, reference, seconds)
-    return Verification(row.error_q, row.seconds, row.error_q / setting.row.error_q, row.seconds / setting.row.seconds)
+
+    def verified(setting: Setting) -> Verification:
+        program = Program(other, setting.scheme, t_end, num_saves, newton)
+        [seconds] = interleaved({"": program.timed(setting.num_steps)}, 5).values()
+        row, seen = work_row(setting.row.scheme, program, setting.num_steps, reference, seconds), setting.row
+        return Verification(row.error_q, row.seconds, row.error_q / seen.error_q, row.seconds / seen.seconds)
+
+    return verified
