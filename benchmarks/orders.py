@@ -19,6 +19,8 @@ TOLERANCE = 0.25
 COARSEST, FLOOR, OF_MULTIPLIERS = 1e-4, 4e-13, 5
 """Errors between the first two, relative to the largest position or momentum, are fitted: below is round-off, above the
 steps are not yet small. Round-off of the multipliers makes the floor of the momenta so many times higher."""
+ACCUMULATED = 200
+"""Round-off has doubled after so many steps."""
 RATIO, POINTS = 2**0.35, 3
 """From one number of steps to the next; so many of the smallest errors above the floor are fitted."""
 NODES = 5
@@ -108,7 +110,8 @@ def measure(case: Case) -> dict:
     row = {"system": case.system, "scheme": case.label, "num_micro": case.num_micro, "order": order}
     fits = []
     for error, floor in zip(np.transpose(errors), floors, strict=True):
-        fitted = np.flatnonzero((error > floor) & (error < COARSEST))[-POINTS:]
+        above = error > floor * (1 + np.array(steps) / ACCUMULATED)
+        fitted = np.flatnonzero(above & (error < COARSEST))[-POINTS:]
         if len(fitted) < 3:
             return row | {"points": len(fitted), "holds": "no"}
         fits.append(fit_order(1 / np.array(steps)[fitted], error[fitted], plateau=0.0))

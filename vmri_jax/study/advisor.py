@@ -34,6 +34,8 @@ LUCK = 2.0
 LONGEST = 20.0
 """Seconds of a run after which a setting is given up, whatever the others take."""
 MAX_STEPS = 2**22
+PROGRAMS = 64
+"""Compiled schemes that a search holds at once."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +83,22 @@ class Search:
         self.programs: dict[tuple[str, int], Program] = {}
         self.settings: dict[tuple[str, int, int], Setting] = {}
 
+    def program(self, family: Family, num_micro: int) -> Program:
+        """The compiled scheme; the last PROGRAMS of them are kept."""
+        key = (family.name, num_micro)
+        program = self.programs.pop(key, None)
+        if program is None:
+            program = Program(self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton)
+        self.programs[key] = program  # the last one now
+        if len(self.programs) > PROGRAMS:
+            self.programs.pop(next(iter(self.programs)))
+        return program
+
     def at(self, family: Family, num_micro: int, num_steps: int) -> Setting:
         """The run with these settings and a first idea of its time."""
         key = (family.name, num_micro, num_steps)
         if key not in self.settings:
-            if key[:2] not in self.programs:
-                made = Program(self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton)
-                self.programs[key[:2]] = made
-            program = self.programs[key[:2]]
+            program = self.program(family, num_micro)
             [seconds] = interleaved({"": program.timed(num_steps)}, 2, 0.0).values()
             row = work_row(family.label(num_micro), program, num_steps, self.reference, [min(seconds)])
             self.settings[key] = Setting(family, num_micro, num_steps, row)
@@ -162,7 +172,7 @@ class Search:
 
     def _timed(self, settings: Sequence[Setting]) -> list[Setting]:
         """The same with medians of runs that took turns."""
-        programs = [self.programs[s.family.name, s.num_micro] for s in settings]
+        programs = [self.program(s.family, s.num_micro) for s in settings]
         runs = {str(i): p.timed(s.num_steps) for i, (p, s) in enumerate(zip(programs, settings, strict=True))}
         timed = interleaved(runs, 5)
         found = []

@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -18,16 +18,24 @@ TRAJECTORY = jax.tree.structure(vm.Trajectory(*[0.0] * 7, info=RunInfo(0, 0, 0),
 """How a trajectory without micro nodes is made of its arrays."""
 
 
-@partial(jax.jit, static_argnames=("structure", "num_saves"))
-def _run(leaves, num_steps, save_every, *, structure, num_saves):
-    """The arrays of a trajectory; system, scheme, Newton, state and t_end come as arrays and their structure."""
-    system, scheme, newton, state, t_end = jax.tree.unflatten(structure, leaves)
-    macro_dt = t_end / num_steps
-    memory = start_memory(system, scheme, state, macro_dt, newton)
-    trajectory, _ = run(
-        system, scheme, newton, macro_dt, state.t, state, memory, 0, num_saves, save_every, save_micro=False
-    )
-    return jax.tree.leaves(trajectory)
+@lru_cache(maxsize=32)
+def _compiled_for(structure, num_saves: int):
+    """The compiled run of all problems of this structure: ``run_all(leaves, num_steps, save_every)``.
+
+    It takes system, scheme, Newton, state and t_end as arrays and gives the arrays of the trajectory: bare arrays make a
+    call cheap. Only the last programs are kept: thousands would exhaust the memory maps that a process may have.
+    """
+
+    @jax.jit
+    def run_all(leaves, num_steps, save_every):
+        system, scheme, newton, state, t_end = jax.tree.unflatten(structure, leaves)
+        macro_dt = t_end / num_steps
+        memory = start_memory(system, scheme, state, macro_dt, newton)
+        saves = 0, num_saves, save_every, False
+        trajectory, _ = run(system, scheme, newton, macro_dt, state.t, state, memory, *saves)
+        return jax.tree.leaves(trajectory)
+
+    return run_all
 
 
 class Program:
@@ -70,14 +78,14 @@ class Program:
         return self._compile(self.newton)
 
     def _compile(self, newton):
-        """``run(num_steps)`` that gives the arrays of the trajectory; bare arrays in and out make a call cheap."""
+        """``run(num_steps)`` that gives the arrays of the trajectory."""
         leaves, structure = jax.tree.flatten((self.problem.system, self.scheme, newton, self.state, self.t_end))
         leaves = jax.device_put([jnp.asarray(leaf) for leaf in leaves])
-        static = {"structure": structure, "num_saves": self.num_saves}
+        run_all = _compiled_for(structure, self.num_saves)
         start = time.perf_counter()
-        jax.block_until_ready(_run(leaves, self.num_saves, 1, **static))
+        jax.block_until_ready(run_all(leaves, self.num_saves, 1))
         self.compile_seconds = time.perf_counter() - start  # and a run of the fewest steps
-        return lambda num_steps: _run(leaves, num_steps, num_steps // self.num_saves, **static)
+        return lambda num_steps: run_all(leaves, num_steps, num_steps // self.num_saves)
 
     def _chosen(self, num_steps: int):
         """The program that solves this run, and its arrays."""
