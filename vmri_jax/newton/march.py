@@ -10,7 +10,7 @@ increments and slow multipliers are corrected from what is left of their equatio
   is learned from the passes (`Pairs`).
 
 The residual is exact, so all of this decides only how many passes there are. A pass costs one gradient of each term at
-each of its nodes; Jacobians appear only in products, and nothing is stored but the path and those small matrices.
+each of its nodes; nothing is stored but the path and those small matrices.
 """
 
 from typing import Any, NamedTuple
@@ -116,7 +116,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
             return jax.grad(local.unconstrained)(path, path)
 
         fast_nodes = jnp.concatenate([carry.q_f[None], carry.q_f + inc[:-1]])
-        pull = jax.vjp(constraints, slow_nodes[:-1], fast_nodes)[1]  # forces of multipliers at nodes 0..r-1
+        pull = _forces(system, slow_nodes[:-1], fast_nodes, stored=not explicit)
         pull_s, pull_f = pull(mu)
         if explicit:  # the increment follows from the multipliers
             inc = -matrix.solve(carry.p_f - pull_f)
@@ -159,6 +159,17 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
     unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
     end, (fast, mu, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
     return x._replace(fast=fast, multiplier=mu), end, new if first else schur
+
+
+def _forces(system, slow_nodes, fast_nodes, stored: bool):
+    """``G^T mu`` of multipliers at these nodes, slow and fast part; with stored Jacobians, or as products of derivatives.
+
+    Products are cheaper, unless what consumes them is a dense product, into which the compiler would copy them.
+    """
+    if not stored:
+        return jax.vjp(jax.vmap(system.g), slow_nodes, fast_nodes)[1]
+    g_s, g_f = jax.vmap(jax.jacrev(system.g, argnums=(0, 1)))(slow_nodes, fast_nodes)
+    return lambda mu: (jnp.sum(mu[..., None] * g_s, axis=1), jnp.sum(mu[..., None] * g_f, axis=1))
 
 
 class March(NamedTuple):
