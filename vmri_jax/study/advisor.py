@@ -5,6 +5,7 @@ error, giving up on a family as soon as it is much slower than the best so far. 
 families, uphill from where they stand. Stage 3 times the best settings in turn.
 """
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -130,18 +131,23 @@ class Search:
             n = max(n, too_few + 1)
         return best
 
-    def cheapest(self, error: float, progress: Progress = silent, exhaustive: bool = False) -> list[Setting]:
+    def cheapest(
+        self, error: float, progress: Progress = silent, exhaustive: bool = False, budget: float = np.inf
+    ) -> list[Setting]:
         """Settings that keep the error, the fastest first, the first KEPT of them timed in turn.
 
         Args:
             exhaustive: try every num_micro of every family, to check the staged search.
+            budget: seconds after which nothing more is compiled, once something has kept the error.
         """
         reached: dict[tuple[str, int], Setting] = {}
-        limit = LONGEST
+        limit, deadline = LONGEST, time.monotonic() + budget
 
         def attempt(family: Family, num_micro: int, done: int, total: int) -> Setting | None:
             nonlocal limit
             key = (family.name, num_micro)
+            if reached and key not in self.programs and time.monotonic() > deadline:
+                return None
             progress(f"{family.label(num_micro)} at {error:.0e}", done, total)
             setting = self.reach(family, num_micro, error, limit)
             if setting is not None:

@@ -26,6 +26,8 @@ PERIODS = 30
 """Simulated by default: so many periods of the fastest vibration."""
 RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 """Errors asked for by default, relative to how far the system moves."""
+BUDGET = 150.0
+"""Seconds of search after which no more schemes are compiled, shared by the errors."""
 SHOWN = 8
 """Schemes in the figure."""
 
@@ -104,7 +106,7 @@ def cost_page(
     search = Search(problem, t_end, families() if menu is None else menu, reference)
     answers, page = [], None
     for i, error in enumerate(sorted(errors, reverse=True)):
-        found = search.cheapest(error, part(progress, i, len(errors)))
+        found = search.cheapest(error, part(progress, i, len(errors)), budget=BUDGET / len(errors))
         answers.append(Answer(error, found[0] if found else None, tuple(found)))
         page = _write(search, answers, problem, name, out)
     progress("measuring times", 1, 1)
