@@ -32,7 +32,7 @@ MARGIN = 10.0
 """A target must lie so many times above the error of the reference."""
 LUCK = 2.0
 """A setting whose error from another start is so many times larger was lucky; the next one is tried."""
-LONGEST = 20.0
+LONGEST = 5.0
 """Seconds of a run after which a setting is given up, whatever the others take."""
 MAX_STEPS = 2**22
 PROGRAMS = 64
@@ -156,7 +156,7 @@ class Search:
             return setting
 
         total = len(self.menu) + KEPT
-        for i, family in enumerate(self.menu):
+        for i, family in enumerate(sorted(self.menu, key=lambda family: -family.make(FIRST).order)):  # slow ones last
             for num_micro in NUM_MICRO if exhaustive else (FIRST,):
                 attempt(family, num_micro, i, total)
         if not exhaustive:
