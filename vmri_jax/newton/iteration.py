@@ -100,15 +100,20 @@ def solve(
 
     The solution is differentiable in both modes, twice, with respect to everything in `equations`.
     """
+    marches = newton.marches(equations.system, equations.scheme)
+    if marches and is_linear(equations.system, equations.scheme, equations.q_s, equations.q_f):
+        done, warm = march.solve(equations, matrix, warm, newton, linear=True)  # one pass: differentiable as it is
+        end = done.end.q_f, *_momenta_after(equations, done)
+        status = np.zeros(()), done.result, done.passes, np.asarray(int(Method.LINEAR))
+        return Solution(done.x, *end, *status), warm
+
     fixed, guess, matrix, warm = jax.lax.stop_gradient((equations, guess, matrix, warm))
-    if newton.marches(equations.system, equations.scheme):
-        linear = is_linear(equations.system, equations.scheme, equations.q_s, equations.q_f)
-        done, warm = march.solve(fixed, matrix, warm, newton, linear)
+    if marches:
+        done, warm = march.solve(fixed, matrix, warm, newton, linear=False)
         p_s, p_f = _momenta_after(fixed, done)
-        residual = np.zeros(()) if linear else relative_residual(fixed, *done.residual)
-        method = np.asarray(int(Method.LINEAR if linear else Method.MARCH))
+        residual, method = relative_residual(fixed, *done.residual), np.asarray(int(Method.MARCH))
         found = Solution(done.x, done.end.q_f, p_s, p_f, residual, done.result, done.passes, method)
-        if newton.falls_back and not linear:
+        if newton.falls_back:
             found = jax.lax.cond(
                 done.result <= Result.CONVERGED_AT_ROUNDOFF,
                 lambda: found,
