@@ -175,7 +175,9 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
     last of them, see `discrete_legendre`.
     """
     if scheme.slow.mollified:
-        raise ValueError("discrete_lagrangian: a mollified potential depends on more than the control points of a step.")
+        raise ValueError(
+            "discrete_lagrangian: a mollified potential depends on more than the control points of a step."
+        )
     terms = lagrangian(system, scheme)
 
     def L_d(slow, fast, macro_dt):

@@ -2,6 +2,9 @@
 
 from enum import IntEnum
 
+CONSTRAINT_TOLERANCE = 1e-6
+"""Largest constraint value, in the constraint's own unit, that counts as kept; more where the Newton tolerance is loose."""
+
 
 class Result(IntEnum):
     """Status of a macro step. `CONVERGED` and `CONVERGED_AT_ROUNDOFF` are successes."""
@@ -56,9 +59,8 @@ _MESSAGES = {
         "Remove rows, make the variables they need fast, or start elsewhere."
     ),
     Result.CONSTRAINT_VIOLATED: (
-        "the equations converged, but a saved node is off the constraints by more than CONSTRAINT_TOLERANCE or the Newton tolerance allows. Likely "
-        "causes: a loose Newton(tolerance=...), or constraints of very different size. Tighten the tolerance, or scale the "
-        "rows of the constraint to order one."
+        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or rows of "
+        "very different size (scale them to order one)."
     ),
 }
 

@@ -10,6 +10,7 @@ import numpy as np
 from vmri_jax import algebra
 from vmri_jax.checks import check_arrays, check_system, require_x64
 from vmri_jax.quadrature import is_concrete
+from vmri_jax.results import CONSTRAINT_TOLERANCE
 from vmri_jax.system import ConstantMass, System
 
 
@@ -170,7 +171,12 @@ def _constraint_values(system, q_s, q_f):
 
 
 def check_constraints(
-    system: System, q_s, q_f, what: str, tolerance: float = 1e-6, advice: str = "start from initial_state(...)."
+    system: System,
+    q_s,
+    q_f,
+    what: str,
+    tolerance: float = CONSTRAINT_TOLERANCE,
+    advice: str = "start from initial_state(...).",
 ) -> None:
     """Refuse positions off the constraints, and constraints that cannot be kept where they are held."""
     if system.constraint is system.slow_constraint is None:

@@ -139,7 +139,9 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton, method: str, lim
         result = jnp.where(damping < LEAST_DAMPING, Result.DIVERGED, running)
         result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, result)
         result = jnp.where(error <= 1, Result.CONVERGED, result)
-        broken = jnp.where(jnp.isfinite(_largest(residual.slow) + _largest(residual.fast)), Result.SINGULAR, Result.NON_FINITE)
+        broken = jnp.where(
+            jnp.isfinite(_largest(residual.slow) + _largest(residual.fast)), Result.SINGULAR, Result.NON_FINITE
+        )
         result = jnp.where(jnp.isfinite(update) | (back & (result == RUNNING)), result, broken)
         before, d = jax.tree.map(partial(jnp.where, back), (at.before, at.direction), (at.x, d))
         x = jax.tree.map(lambda a, b: a + damping * b, before, d)

@@ -11,7 +11,7 @@ from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
 from vmri_jax.newton import arrowhead, full, march
 from vmri_jax.newton.interval import can_be_cut, is_linear
-from vmri_jax.results import Method, Result
+from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result
 
 Choice = Literal["auto", "march", "frozen", "decoupled", "arrowhead", "dense"]
 
@@ -112,10 +112,11 @@ def solve(
         done, warm = march.solve(fixed, matrix, warm, newton, linear=False)
         p_s, p_f = _momenta_after(fixed, done)
         residual, method = relative_residual(fixed, *done.residual), np.asarray(int(Method.MARCH))
-        found = Solution(done.x, done.end.q_f, p_s, p_f, residual, done.result, done.passes, method)
+        result = _kept(done.result, done.residual[1], newton)
+        found = Solution(done.x, done.end.q_f, p_s, p_f, residual, result, done.passes, method)
         if newton.falls_back:
             found = jax.lax.cond(
-                done.result <= Result.CONVERGED_AT_ROUNDOFF,
+                result <= Result.CONVERGED_AT_ROUNDOFF,
                 lambda: found,
                 lambda: _over_all_unknowns(fixed, guess, newton, "arrowhead"),
             )
@@ -139,16 +140,23 @@ def _end(equations: StepEquations, x: Unknowns):
 
 def _over_all_unknowns(equations: StepEquations, guess: Unknowns, newton: Newton, method: str) -> Solution:
     x, result, iterations = full.solve(equations, guess, newton, method)
-    if equations.system.constraint is not None or equations.system.slow_constraint is not None:
-        failed = result > Result.CONVERGED_AT_ROUNDOFF
-        dependent = jax.lax.cond(failed, lambda: full.has_dependent_constraints(equations), lambda: jnp.asarray(False))
-        result = jnp.where(dependent, Result.RANK_DEFICIENT, result)
     residual, (p_s, p_f) = equations.evaluate(x)
     rows = jnp.maximum(_largest(residual.slow), _largest(residual.fast))
     g = jnp.maximum(_largest(residual.multiplier), _largest(residual.slow_multiplier))
     q_f = equations.q_f + x.fast[:, -1].sum(0)
     code = jnp.asarray(int(Method[method.upper()]))
+    result = _kept(result, g, newton)
+    if not (equations.system.constraint is equations.system.slow_constraint is None):
+        failed = result > Result.CONVERGED_AT_ROUNDOFF
+        dependent = jax.lax.cond(failed, lambda: full.has_dependent_constraints(equations), lambda: jnp.asarray(False))
+        result = jnp.where(dependent, Result.RANK_DEFICIENT, result)
     return Solution(x, q_f, p_s, p_f, relative_residual(equations, rows, g), result, iterations, code)
+
+
+def _kept(result, g, newton: Newton):
+    """The status, unless the increments converged and the constraints are violated: by contradicting rows."""
+    violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, 100 * newton.tolerance)
+    return jnp.where((result <= Result.CONVERGED_AT_ROUNDOFF) & violated, Result.CONSTRAINT_VIOLATED, result)
 
 
 def _largest(a):
