@@ -112,7 +112,7 @@ def solve(
         done, warm = march.solve(fixed, matrix, warm, newton, linear=False)
         p_s, p_f = _momenta_after(fixed, done)
         residual, method = relative_residual(fixed, *done.residual), np.asarray(int(Method.MARCH))
-        result = _kept(done.result, done.residual[1], newton)
+        result = _kept(done.result, equations, done.residual[1], newton)
         found = Solution(done.x, done.end.q_f, p_s, p_f, residual, result, done.passes, method)
         if newton.falls_back:
             found = jax.lax.cond(
@@ -145,16 +145,22 @@ def _over_all_unknowns(equations: StepEquations, guess: Unknowns, newton: Newton
     g = jnp.maximum(_largest(residual.multiplier), _largest(residual.slow_multiplier))
     q_f = equations.q_f + x.fast[:, -1].sum(0)
     code = jnp.asarray(int(Method[method.upper()]))
-    result = _kept(result, g, newton)
-    if not (equations.system.constraint is equations.system.slow_constraint is None):
+    result = _kept(result, equations, g, newton)
+    if _is_constrained(equations):
         failed = result > Result.CONVERGED_AT_ROUNDOFF
         dependent = jax.lax.cond(failed, lambda: full.has_dependent_constraints(equations), lambda: jnp.asarray(False))
         result = jnp.where(dependent, Result.RANK_DEFICIENT, result)
     return Solution(x, q_f, p_s, p_f, relative_residual(equations, rows, g), result, iterations, code)
 
 
-def _kept(result, g, newton: Newton):
+def _is_constrained(equations: StepEquations) -> bool:
+    return not (equations.system.constraint is equations.system.slow_constraint is None)
+
+
+def _kept(result, equations: StepEquations, g, newton: Newton):
     """The status, unless the increments converged and the constraints are violated: by contradicting rows."""
+    if not _is_constrained(equations):
+        return result
     violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, 100 * newton.tolerance)
     return jnp.where((result <= Result.CONVERGED_AT_ROUNDOFF) & violated, Result.CONSTRAINT_VIOLATED, result)
 
