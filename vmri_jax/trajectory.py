@@ -137,14 +137,17 @@ class Trajectory(eqx.Module):
 
 def join(pieces: list[Trajectory]) -> Trajectory:
     """Consecutive trajectories, each starting where the one before ends, as one."""
+    if len(pieces) == 1:
+        return pieces[0]
     flat = [_flat(piece) for piece in pieces]
-    failed = next((f for f in flat if int(f["failed_at"]) >= 0), flat[-1])
+    worst = max(flat, key=lambda f: int(f["result"]))
+    status = next((f for f in flat if int(f["failed_at"]) >= 0), worst)
 
     def joined(name, first):
         if first is None:
             return None
         if name in STATUS:
-            return jnp.asarray(failed[name])
+            return jnp.asarray(status[name])
         skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
         return jnp.concatenate([first] + [f[name][skip:] for f in flat[1:]])
 
