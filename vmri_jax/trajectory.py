@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.checks import require_x64
 from vmri_jax.files import replaced
 from vmri_jax.results import Result
 
@@ -90,6 +91,7 @@ class Trajectory(eqx.Module):
             FileNotFoundError: no such file.
             ValueError: a file that is damaged or not a trajectory.
         """
+        require_x64()
         path = FilePath(path)
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist; give the .npz file of a saved trajectory.")

@@ -32,6 +32,8 @@ from vmri_jax.simulate import Checkpoint
 from vmri_jax.trajectory import NODES, STATUS, Trajectory, named_arrays
 
 FORMAT = "vmri_jax trajectory store 1"
+CHECKPOINT = Path("checkpoint", "c", "0")
+"""File of the checkpoint within a store."""
 FILL = {"f": np.nan, "i": 0}
 """Values of rows that are not there yet, by kind of number."""
 
@@ -144,7 +146,7 @@ class Writer:
 
 def commit(path: Path, record: Record) -> None:
     """From now on the rows of this record count."""
-    file = path / "checkpoint" / "c" / "0"
+    file = path / CHECKPOINT
     file.parent.mkdir(exist_ok=True)
     with replaced(file) as out:
         out.write(_packed(record))
@@ -175,7 +177,7 @@ def read_record(path: Path) -> Record:
         ValueError: it is missing or damaged.
     """
     try:
-        with np.load(io.BytesIO((path / "checkpoint" / "c" / "0").read_bytes()), allow_pickle=False) as data:
+        with np.load(io.BytesIO((path / CHECKPOINT).read_bytes()), allow_pickle=False) as data:
             saved, result, failed_at, step, fell_back = data["counts"].tolist()
             leaves = [data[f"leaf_{k}"] for k in range(len(data.files) - 1)]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:

@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.checks import require_x64
 from vmri_jax.results import Result, SimulationError
 from vmri_jax.state import State
 from vmri_jax.store.layout import Record, read_attributes, read_record, read_rows
@@ -103,6 +104,7 @@ class StoredTrajectory:
     def __getitem__(self, nodes: slice) -> Trajectory:
         if not isinstance(nodes, slice):
             raise TypeError(f"StoredTrajectory: the index is {nodes!r}; take nodes by a slice, e.g. stored[:100].")
+        require_x64()
         first, stop, stride = nodes.indices(len(self))
         if stride < 1 or first >= stop:
             raise ValueError(
