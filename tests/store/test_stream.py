@@ -3,14 +3,26 @@
 import errno
 import os
 import signal
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.store.conftest import CHUNK, EVERY, STEPS, H, assert_identical
-from vmri_jax import Interrupted, Newton, Result, SimulationError, StoredTrajectory, fully_explicit, simulate
+from tests.store.conftest import CHUNK, EVERY, STEPS, H, Runs, assert_identical
+from tests.user_systems import two_oscillators
+from vmri_jax import (
+    Interrupted,
+    Method,
+    Newton,
+    Result,
+    SimulationError,
+    StoredTrajectory,
+    fully_explicit,
+    fully_implicit,
+    simulate,
+)
 from vmri_jax.simulate import Simulation
 from vmri_jax.store import layout
 from vmri_jax.trajectory import join
@@ -36,9 +48,24 @@ def stop_after(monkeypatch, chunks: int, where, name: str, error: BaseException)
     monkeypatch.setattr(where, name, fails)
 
 
+def dies_after(monkeypatch, chunks: int, run, out, **changes) -> StoredTrajectory:
+    """The store of a run that died with so many chunks."""
+    with monkeypatch.context() as patch:
+        stop_after(patch, chunks, Simulation, "advance", SystemExit())
+        with pytest.raises(SystemExit):
+            run(out, **changes)
+    return StoredTrajectory(out)
+
+
 def test_what_is_streamed_is_what_simulate_returns(run, uninterrupted):
     expected = simulate(
-        run.problem.system, run.scheme, run.problem.state(), macro_dt=H, num_steps=STEPS, save_every=EVERY, save_micro=True
+        run.problem.system,
+        run.scheme,
+        run.problem.state(),
+        macro_dt=H,
+        num_steps=STEPS,
+        save_every=EVERY,
+        save_micro=True,
     )
     assert_identical(uninterrupted.load(), expected)
     assert uninterrupted.complete
@@ -99,6 +126,16 @@ def test_a_complete_run_is_returned_at_once(run, uninterrupted, monkeypatch):
     assert run(uninterrupted.path, resume=True).complete
 
 
+def test_a_run_that_has_fallen_back_goes_on_so(tmp_path, monkeypatch):
+    """At this step the march does not converge, see test_march."""
+    changes = {"scheme": fully_implicit(20), "macro_dt": 40.0, "num_steps": 12, "save_every": 1}
+    run = partial(Runs(two_oscillators(kappa=25.0)), newton=Newton(max_iterations=6), **changes)
+    whole, out = run(tmp_path / "whole.zarr").load(), tmp_path / "run.zarr"
+    assert np.all(np.asarray(whole.info.method) == Method.ARROWHEAD)
+    assert dies_after(monkeypatch, 1, run, out).record.fell_back
+    assert_identical(run(out, resume=True).load(), whole)
+
+
 def test_ctrl_c_finishes_the_chunk(run, uninterrupted, out, monkeypatch):
     real, calls = Simulation.advance, []
 
@@ -122,7 +159,9 @@ def test_a_full_disk_keeps_what_was_written(run, uninterrupted, out, monkeypatch
     with monkeypatch.context() as patch:
         full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         stop_after(patch, 1, layout.Writer, "append", full)
-        with pytest.raises(OSError, match=r"No space left on device. The run is kept up to macro step 8: resume") as caught:
+        with pytest.raises(
+            OSError, match=r"No space left on device. The run is kept up to macro step 8: resume it"
+        ) as caught:
             run(out)
     assert caught.value.errno == errno.ENOSPC
     assert_identical(StoredTrajectory(out).load(), uninterrupted[: CHUNK + 1])
@@ -214,10 +253,7 @@ def test_another_system_is_not_resumed(run, uninterrupted, out):
 
 
 def test_another_version_is_told(run, out, monkeypatch):
-    with monkeypatch.context() as patch:
-        stop_after(patch, 1, Simulation, "advance", SystemExit())
-        with pytest.raises(SystemExit):
-            run(out)
+    dies_after(monkeypatch, 1, run, out)
     layout.change_attributes(out, made_with={**StoredTrajectory(out).attributes["made_with"], "jax": "0.1"})
     with pytest.warns(UserWarning, match=r"last digits may differ .*jax .* \(0.1 then\)"):
         run(out, resume=True)
@@ -225,7 +261,9 @@ def test_another_version_is_told(run, out, monkeypatch):
 
 def test_nothing_is_overwritten_unless_asked(run, uninterrupted, out):
     run(out, num_steps=PER_CHUNK)
-    with pytest.raises(FileExistsError, match=r"holds a run of 8 macro steps, 8 of them done. Go on with it \(resume\)"):
+    with pytest.raises(
+        FileExistsError, match=r"holds a run of 8 macro steps, 8 of them done. Go on with it \(resume\)"
+    ):
         run(out)
     with pytest.raises(ValueError, match=r"both resume and overwrite"):
         run(out, resume=True, overwrite=True)

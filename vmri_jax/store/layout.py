@@ -36,6 +36,8 @@ CHECKPOINT = Path("checkpoint", "c", "0")
 """File of the checkpoint within a store."""
 FILL = {"f": np.nan, "i": 0}
 """Values of rows that are not there yet, by kind of number."""
+CONFIG: Any = {"write_empty_chunks": True}
+"""Of arrays that are written to: every chunk has its file, so that one that is missing is noticed."""
 
 
 class Record(NamedTuple):
@@ -138,7 +140,7 @@ class Writer:
         import zarr
 
         for name, value in values.items():
-            array = zarr.open_array(self._path / name, mode="r+")
+            array = zarr.open_array(self._path / name, mode="r+").with_config(CONFIG)
             if array.shape[0] != self._rows:
                 array.resize((self._rows, *value.shape[1:]))
             self._arrays[name] = array
@@ -246,7 +248,7 @@ def _create_array(group, name: str, like: np.ndarray, rows: int, chunk: int):
         dtype=like.dtype,
         fill_value=FILL[like.dtype.kind],
         compressors=Crc32cCodec(),
-        config={"write_empty_chunks": True},
+        config=CONFIG,
         chunk_key_encoding={"name": "default", "separator": "."},
         overwrite=True,
     )

@@ -135,7 +135,9 @@ def _explained(path: Path, step: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        kept = f"The run is kept up to macro step {step}: resume it when that is mended." if step else "Mend that."
+        kept = (
+            f"The run is kept up to macro step {step}: resume it when there is room." if step else "Give another place."
+        )
         raise OSError(error.errno, f"{path} cannot be written: {error.strerror or error}. {kept}") from error
 
 
