@@ -1,7 +1,10 @@
 """The command line: what it prints, what it writes, and how it refuses."""
 
 import dataclasses
+import errno
+import os
 import re
+import signal
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from typer.testing import CliRunner
 import vmri_jax as vm
 from vmri_jax import cli
 from vmri_jax.catalogue import find_problem
+from vmri_jax.simulate import Simulation
 from vmri_jax.study import families, reference, reference_solution
 
 USER_FILE = """
@@ -42,6 +46,7 @@ def vmri(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "user.py").write_text(USER_FILE)
     (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "folder.zarr").mkdir()
 
     def run(*arguments):
         result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
@@ -126,9 +131,77 @@ def test_a_failed_run_keeps_what_was_computed(vmri, tmp_path):
     assert np.isnan(trajectory.q_s[-1]).all()
 
 
+STREAM = ["simulate", "fpu", *RUN, "--out", "run.zarr"]
+
+
+def test_simulate_streams_and_resumes(vmri, tmp_path):
+    code, text = vmri(*STREAM)
+    assert code == 0
+    assert "simulated time 0 to 0.4" in text
+    assert "saved run.zarr" in text
+    code, text = vmri(*STREAM)
+    assert code == 2
+    assert "run.zarr holds a run of 4 macro steps, 4 of them done" in text
+    code, text = vmri(*STREAM, "--resume", "--plot", "run.png")
+    assert code == 0
+    assert "per micro step" not in text
+    longer = [{"4": "8"}.get(argument, argument) for argument in STREAM]
+    code, text = vmri(*longer, "--resume")
+    assert code == 0
+    assert "macro steps 8" in text
+    stored = vm.StoredTrajectory(tmp_path / "run.zarr")
+    expected = vm.simulate(
+        (problem := vm.systems.fermi_pasta_ulam()).system,
+        vm.fully_explicit(10),
+        problem.state(),
+        macro_dt=0.1,
+        num_steps=8,
+    )
+    np.testing.assert_array_equal(stored.load().q_f, expected.q_f)
+    assert vmri(*STREAM, "--overwrite")[0] == 0
+    assert vm.StoredTrajectory(tmp_path / "run.zarr").num_steps == 4
+
+
+@pytest.mark.parametrize(("out", "again"), [("run.zarr", True), ("run.npz", False)])
+def test_ctrl_c_says_how_to_go_on(vmri, tmp_path, monkeypatch, out, again):
+    real = Simulation.advance
+
+    def advance(self, at, saves):
+        os.kill(os.getpid(), signal.SIGINT)
+        return real(self, at, saves)
+
+    command = ["simulate", "fpu", *RUN[:2], "--steps", "100", *RUN[4:], "--out", out]
+    monkeypatch.setattr("sys.argv", ["vmri", *command])
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulation, "advance", advance)
+        code, text = vmri(*command)
+    assert code == 130
+    assert f"The trajectory up to there is in {out}." in text
+    assert ("Go on with it: vmri simulate fpu" in text) == again
+    assert ("--out run.zarr --resume" in text) == again
+    assert (tmp_path / out).exists()
+
+
+def test_a_full_disk_is_told(vmri, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("vmri_jax.store.layout.commit", full)
+    code, text = vmri(*STREAM)
+    assert code == 1
+    assert "Not written run.zarr cannot be written: No space left on device." in text
+    monkeypatch.setattr("vmri_jax.trajectory.replaced", full)
+    code, text = vmri(*STREAM[:-1], "run.npz")
+    assert code == 1
+    assert "No space left on device" in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["fpu", *RUN, "--out", "run.npz", "--resume"], "--resume is for a run that is written all along; give --out"),
+        (["fpu", *RUN, "--out", "folder.zarr", "--resume"], "folder.zarr is not a stored trajectory"),
+        (["fpu", *RUN, "--out", "nowhere/run.zarr"], "the folder nowhere does not exist; make it first"),
         (["fpuu", *RUN], "there is no system 'fpuu'. Did you mean fpu? There are fpu, tsp, sam."),
         (["fpu", *RUN[:4], "--scheme", "fully_explict"], "Did you mean fully-explicit? There are fully-implicit"),
         (["none.py:x", *RUN], "the file none.py does not exist"),
@@ -176,7 +249,7 @@ def test_a_file_that_fails_to_run_says_where(vmri, tmp_path, source, message):
 
 @pytest.mark.parametrize(("steps", "save_every"), [(1, 1), (1000, 1), (2000, 2), (100_000, 100), (2003, 1), (3001, 1)])
 def test_about_a_thousand_nodes_are_saved(steps, save_every):
-    assert cli._default_save_every(steps) == save_every
+    assert cli.run.default_save_every(steps) == save_every
 
 
 def test_reproduce_one_figure(vmri, tmp_path, monkeypatch):

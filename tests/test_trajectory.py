@@ -1,9 +1,13 @@
 """Trajectories on disk and as xarray datasets."""
 
+import errno
+
+import equinox as eqx
 import numpy as np
 import pytest
 
-from vmri_jax import State, Trajectory, explicit_slow, simulate
+from vmri_jax import Result, State, Trajectory, explicit_slow, simulate
+from vmri_jax.trajectory import join
 
 FIELDS = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 
@@ -24,6 +28,19 @@ def test_save_and_load_keep_everything(trajectory, tmp_path):
         assert np.array_equal(a, b)
     assert loaded.success
     assert isinstance(loaded.final_state, State)
+
+
+def test_a_file_is_not_lost_to_a_full_disk(trajectory, tmp_path, monkeypatch):
+    def full(file, **_):
+        file.write(b"a part")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    trajectory.save(tmp_path / "run.npz")
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match="No space left"):
+        trajectory.first(2).save(tmp_path / "run.npz")
+    assert Trajectory.load(tmp_path / "run.npz").t.shape == (5,)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
 
 
 def test_a_run_without_micro_nodes_loads_without_them(tsp, tmp_path):
@@ -95,3 +112,11 @@ def test_xarray_dataset(trajectory):
     assert np.array_equal(data.coords["t_end"], trajectory.t[1:])
     assert float(data["q_s"].sel(t=0.12, method="nearest")[1]) == float(trajectory.q_s[2, 1])
     assert data.attrs == {"result": "CONVERGED", "failed_at": -1}
+
+
+@pytest.mark.parametrize("at", [0, 1])
+def test_the_status_of_all_pieces(trajectory, at):
+    pieces = [trajectory, trajectory]
+    roundoff = np.asarray(int(Result.CONVERGED_AT_ROUNDOFF))
+    pieces[at] = eqx.tree_at(lambda piece: piece.result, trajectory, roundoff)
+    assert int(join(pieces).result) == Result.CONVERGED_AT_ROUNDOFF
