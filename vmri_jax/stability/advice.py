@@ -26,6 +26,8 @@ WIDTHS = 3.0
 """but no further than so many times their width, which grows with the coupling as their distance does."""
 FASTER = 2.0
 """Slow variables that vibrate so many times faster than the fast ones are wrongly labelled."""
+BEYOND = 0.01
+"""Causes are looked for in steps longer by so much: V and W together reach a limit before each alone."""
 SCANS = 5
 """Scans downwards, each over smaller steps, until there is a safe one."""
 
@@ -109,8 +111,8 @@ def advise(
     Everything called unstable was measured: the derivative of the step of the frozen problem (see `small_motions`) has
     a multiplier outside the unit circle, at macro_dt or in a window of steps near it. Formulas only name the cause:
 
-    * stability limit: ``omega h`` of the fast potential, ``omega H`` of the slow one, beyond what its rule bears (2 for
-      kicks at the ends), for the longest stage of a composition;
+    * stability limit: the step is unstable for the fast or the slow potential alone; ``omega h`` or ``omega H`` is beyond
+      what its rule bears (2 for kicks at the ends);
     * impulse resonance: slow potential on the macro grid, two vibrations (or one twice) that turn together by a
       multiple of 2 pi per macro step, as the micro steps turn them (midpoint rule: 2 atan(omega h / 2) each);
     * combination resonance: the same with V on the micro grid, through the slow path that is one polynomial per macro step;
@@ -197,17 +199,18 @@ def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float)
     """Kind and description of an instability at this step."""
     stage = stage_scheme(scheme)
     parts = np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)
-    longest, h = np.abs(parts).max() * macro_dt, macro_dt / stage.num_micro
+    h, longest = macro_dt / stage.num_micro, np.abs(parts).max()
     of = " of the longest stage" if isinstance(scheme, Composition) else ""
-    for name, frequency, step, limit in (
-        ("fast", motions.fast_frequencies[0], longest / stage.num_micro, fast_limit(stage)),
-        ("slow", motions.slow_frequencies[0], longest, slow_limit(stage)),
+    for name, frequencies, grid, step, limit in (
+        ("fast", motions.fast_frequencies, "micro", longest * h, fast_limit(stage)),
+        ("slow", motions.slow_frequencies, "macro", longest * macro_dt, slow_limit(stage)),
     ):
-        if frequency * step >= limit * (1 - 1e-6):
-            grid = "micro" if name == "fast" else "macro"
+        alone = multipliers(motions.only(name), scheme, [macro_dt * (1 + BEYOND)])
+        if alone.radius[0] > 1 + TOLERANCE:
+            bears = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
             return "stability limit", (
-                f"The {name} potential's frequency {frequency:.4g} times the {grid} step{of} is {frequency * step:.4g}; its "
-                f"quadrature rule is stable below {limit:.4g}."
+                f"The step is unstable for the {name} potential alone: its frequency {frequencies[0]:.4g} times the {grid} "
+                f"step{of} is {frequencies[0] * step:.4g}{bears}."
             )
     found = multipliers(motions, scheme, [macro_dt])
     worst = np.argmax(np.where(found.own[0], 0.0, np.abs(found.values[0])))
@@ -270,7 +273,7 @@ def _stages(scheme: Scheme | Composition) -> list[Finding]:
             "note",
             "stages",
             f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
-            f"backwards: stability limits of the scheme hold for the longest, so for {longest:.3g} macro_dt.",
+            f"backwards: it meets the stability limits of its scheme at steps about {longest:.3g} times shorter.",
             longest,
         )
     ]

@@ -52,7 +52,9 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
             axes.set(xlabel=r"$\omega H / \pi$")
         if mesh is not None:
             figure.colorbar(mesh, ax=panels.tolist(), label="growth per macro step", aspect=30, pad=0.01)
-        figure.legend(handles=[Patch(facecolor=theme.paper, edgecolor=theme.ink, label="stable")], loc="outside lower right")
+        figure.legend(
+            handles=[Patch(facecolor=theme.paper, edgecolor=theme.ink, label="stable")], loc="outside lower right"
+        )
         figure.suptitle(title, x=0.01, ha="left")
     return figure
 

@@ -5,7 +5,7 @@ expansion there; elsewhere the expansion stands for the *frozen* problem: the co
 forces. Either way it is a `System` like any other, so that every scheme applies to it unchanged.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import jax
@@ -106,6 +106,14 @@ class SmallMotions:
         """The fastest frequency of W alone; where W has none, of everything."""
         fast = self.fast_frequencies.max(initial=0.0)
         return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
+
+    def only(self, name: str) -> "SmallMotions":
+        """The same without the slow or without the fast potential; `name` says which one stays, "slow" or "fast"."""
+        other = "slow" if name == "fast" else "fast"
+        removed = getattr(self, other)
+        none = jax.tree.map(np.zeros_like, self.system.params[other])
+        system = self.system.replace(params=self.system.params | {other: none})
+        return replace(self, system=system, stiffness=self.stiffness - removed, **{other: np.zeros_like(removed)})
 
 
 def _frequencies(stiffness) -> np.ndarray:

@@ -165,7 +165,11 @@ def stability_map(
 
 
 def measure(
-    motions: SmallMotions, scheme: Scheme | Composition, macro_dt, tolerance: float = TOLERANCE, resolution: float = EDGE
+    motions: SmallMotions,
+    scheme: Scheme | Composition,
+    macro_dt,
+    tolerance: float = TOLERANCE,
+    resolution: float = EDGE,
 ) -> tuple[np.ndarray, list[tuple[float, float]]]:
     """Spectral radius (n,) at each of n increasing macro steps, and the unstable intervals between first and last."""
 
