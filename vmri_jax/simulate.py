@@ -14,7 +14,7 @@ from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.interrupts import Interrupted, interrupts_noted
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import is_concrete
-from vmri_jax.results import Result, SimulationError
+from vmri_jax.results import Method, Result, SimulationError
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
 from vmri_jax.step import Memory, Stages, advance, start_memory
@@ -128,7 +128,8 @@ class Simulation:
             cheap = dataclasses.replace(self.newton, method="march")
         piece, end = self._advance(at, saves, cheap)
         failed = int(piece.failed_at)
-        if failed < 0 or cheap is self.newton:
+        nothing_solved = int(jnp.max(piece.info.method)) < Method.MARCH  # explicit or linear: no other method helps
+        if failed < 0 or cheap is self.newton or nothing_solved:
             return piece, end
         kept = (failed - at.step) // self.save_every
         good = [piece.first(kept)] if kept else []

@@ -9,7 +9,7 @@ import jax
 import typer
 
 from vmri_jax import runtime
-from vmri_jax.cli import lists, run, study
+from vmri_jax.cli import lists, run, stability, study
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -17,7 +17,7 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for part in (lists, run, study):
+for part in (lists, run, stability, study):
     app.add_typer(part.app)
 
 

@@ -16,6 +16,7 @@ from rich.table import Table
 import vmri_jax as vm
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scheme
+from vmri_jax.cli import options
 from vmri_jax.cli.common import BadInput, check_target_file, console, print_failure
 
 SAVED_NODES = 1000
@@ -34,20 +35,16 @@ app = typer.Typer()
     "vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400"
 )
 def simulate(
-    system: Annotated[str, typer.Argument(help="fpu, tsp, sam, or my_file.py:my_problem.")],
+    system: options.System,
     steps: Annotated[int, typer.Option(help="Number of macro steps.")],
-    macro_dt: Annotated[float | None, typer.Option(help="Macro step H; or give --micro-dt.")] = None,
-    micro_dt: Annotated[float | None, typer.Option(help="Micro step h = H / num_micro.")] = None,
-    scheme: Annotated[str, typer.Option(help="See [bold]vmri schemes[/bold].")] = "fully-implicit",
-    num_micro: Annotated[int, typer.Option(help="Micro steps per macro step.")] = 10,
-    alpha: Annotated[
-        float | None, typer.Option(help="Weight of the left node, explicit schemes. [dim]0.5[/dim]")
-    ] = None,
-    degree: Annotated[int | None, typer.Option(help="Degree of the path, galerkin.")] = None,
-    rule: Annotated[str | None, typer.Option(help="gauss or lobatto, galerkin. [dim]gauss[/dim]")] = None,
-    compose: Annotated[
-        str | None, typer.Option(help="Compose the scheme to a higher order, e.g. suzuki4, kahan-li8.")
-    ] = None,
+    macro_dt: options.MacroStep = None,
+    micro_dt: options.MicroStep = None,
+    scheme: options.Scheme = "fully-implicit",
+    num_micro: options.NumMicro = 10,
+    alpha: options.Alpha = None,
+    degree: options.Degree = None,
+    rule: options.Rule = None,
+    compose: options.Compose = None,
     save_every: Annotated[
         int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
     ] = None,

@@ -1,0 +1,98 @@
+"""`vmri advise` and `vmri stability`: is a step stable, and which steps are."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from vmri_jax import plots
+from vmri_jax.catalogue import find_problem, find_scheme
+from vmri_jax.cli import options
+from vmri_jax.cli.common import BadInput, check_target_file, console
+from vmri_jax.stability import advise as advise_on
+from vmri_jax.stability import linear_model, plot_stability, stability_map
+
+app = typer.Typer()
+
+
+@app.command(
+    epilog="Examples:\n\n"
+    "vmri advise fpu --scheme explicit-slow --num-micro 30 --macro-dt 0.0628\n\n"
+    "vmri advise my_file.py:my_problem --macro-dt 0.02"
+)
+def advise(
+    system: options.System,
+    macro_dt: options.MacroStep = None,
+    micro_dt: options.MicroStep = None,
+    scheme: options.Scheme = "fully-implicit",
+    num_micro: options.NumMicro = 10,
+    alpha: options.Alpha = None,
+    degree: options.Degree = None,
+    rule: options.Rule = None,
+    compose: options.Compose = None,
+) -> None:
+    """Judge a step before a long run: resonances, limits, labels, and the nearest safe step.
+
+    Exit code 1 where the step is unstable at the start of the run, or close to it.
+    """
+    try:
+        problem = find_problem(system)
+        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
+        if (macro_dt is None) == (micro_dt is None):
+            raise ValueError("give exactly one of --macro-dt and --micro-dt.")
+        step = macro_dt if micro_dt is None else chosen.num_micro * micro_dt
+        with console.status("looking at the steps around it"):
+            advice = advise_on(problem.system, chosen, problem.state(), step)  # pyright: ignore[reportArgumentType]
+    except (ValueError, TypeError) as error:
+        raise BadInput(str(error)) from error
+    if advice.findings:
+        console.print(advice.table())
+    else:
+        console.print(escape(advice.verdict))
+    if not advice.ok:
+        raise typer.Exit(1)
+
+
+@app.command(
+    epilog="Examples:\n\nvmri stability --scheme explicit-slow --num-micro 2 --num-micro 5 --num-micro 10 --out map.png\n\n"
+    "vmri stability tsp --scheme fully-explicit"
+)
+def stability(
+    system: Annotated[
+        str | None, typer.Argument(help="A system at its start. [dim]one slow and one stiff spring, kappa = 25[/dim]")
+    ] = None,
+    scheme: options.Scheme = "explicit-slow",
+    num_micro: Annotated[
+        list[int] | None, typer.Option(help="Micro steps per macro step; may be repeated. [dim]2 5 10 20[/dim]")
+    ] = None,
+    alpha: options.Alpha = None,
+    degree: options.Degree = None,
+    rule: options.Rule = None,
+    compose: options.Compose = None,
+    until: Annotated[float, typer.Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
+    out: Annotated[Path | None, typer.Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
+) -> None:
+    """Which macro steps are stable with a scheme, in units of the fastest vibration."""
+    try:
+        check_target_file("--out", out, (".png", ".svg", ".pdf"))
+        problem = linear_model() if system is None else find_problem(system)
+        schemes = {
+            n: find_scheme(scheme, n, compose, alpha=alpha, degree=degree, rule=rule)
+            for n in num_micro or (2, 5, 10, 20)
+        }
+        grid = np.linspace(0.02, until, max(2, round(50 * until))) * np.pi
+        with console.status("multipliers of the steps"):
+            found = stability_map(problem, schemes, grid)
+    except (ValueError, TypeError) as error:
+        raise BadInput(str(error)) from error
+    table = Table("num_micro", "unstable where omega H / pi is in", box=None, pad_edge=False)
+    for n in schemes:
+        windows = [f"{start / np.pi:.4g} to {stop / np.pi:.4g}" for start, stop in found.windows(n)]
+        table.add_row(str(n), ", ".join(windows) or "nowhere")
+    console.print(table)
+    if out is not None:
+        plots.save(plot_stability({scheme: found}, system or "one slow and one stiff spring"), out)
+        console.print(f"Figure: [bold]{escape(str(out))}[/bold]", soft_wrap=True)
