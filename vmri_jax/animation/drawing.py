@@ -1,0 +1,291 @@
+"""What a picture of a system is made of: bodies and what joins them, as plain data that can be stored next to a run."""
+
+import difflib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+KEYS = ("bodies", "links", "springs", "anchors", "planes", "spheres", "up", "caption")
+BODY_KEYS = ("name", "coordinates", "offset", "radius", "color")
+KINDS = ("link", "spring")
+
+
+@dataclass(frozen=True)
+class Body:
+    """A point of 1 to 3 coordinates, each a linear form ``sum_k weight_k q[index_k]`` over q_s and q_f; none is zero.
+
+    Attributes:
+        name: unique in a drawing.
+        forms: per coordinate its terms (weight, "s" or "f", index).
+        offset: added to the coordinates: where the body is at q = 0.
+        radius: in the unit of the coordinates; None for one that suits the picture.
+        color: as in CSS, ``#rrggbb``; None for that of its pace.
+    """
+
+    name: str
+    forms: tuple[tuple[tuple[float, str, int], ...], ...]
+    offset: tuple[float, ...]
+    radius: float | None = None
+    color: str | None = None
+
+    @property
+    def pace(self) -> str:
+        """ "slow" if all its coordinates are, else "fast"."""
+        return "slow" if all(part == "s" for form in self.forms for _, part, _ in form) else "fast"
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A link or spring (`kind`) from a body to a fixed point."""
+
+    body: str
+    point: tuple[float, ...]
+    kind: str
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A wall or ground through `point`; bodies stay on the side of `normal`."""
+
+    point: tuple[float, ...]
+    normal: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A fixed sphere."""
+
+    center: tuple[float, ...]
+    radius: float
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Bodies, what joins them (pairs of names), fixed things around them.
+
+    Attributes:
+        up: the direction that is shown upwards, in coordinates of the bodies; None for the last coordinate (bodies of one
+            coordinate move sideways).
+        caption: a line that is shown with the picture.
+    """
+
+    bodies: tuple[Body, ...]
+    links: tuple[tuple[str, str], ...] = ()
+    springs: tuple[tuple[str, str], ...] = ()
+    anchors: tuple[Anchor, ...] = ()
+    planes: tuple[Plane, ...] = ()
+    spheres: tuple[Sphere, ...] = ()
+    up: tuple[float, ...] | None = None
+    caption: str = ""
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "Drawing":
+        """A drawing from plain data, checked.
+
+        Args:
+            data: a dict (or its JSON text) of
+
+                - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
+                  ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``.
+                - ``links``, ``springs``: pairs of names.
+                - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring").
+                - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
+                - ``up``, ``caption``: see above.
+
+        Raises:
+            ValueError: anything else, with the entry that is wrong.
+        """
+        if isinstance(data, str):
+            try:
+                data = json.loads(data)
+            except json.JSONDecodeError as error:
+                raise ValueError(f"drawing: not valid JSON ({error}).") from error
+        _check_keys(data, KEYS, ("bodies",), "drawing")
+        bodies = tuple(_body(entry, f"bodies[{i}]") for i, entry in enumerate(_list(data, "bodies")))
+        names = [body.name for body in bodies]
+        if not bodies:
+            raise ValueError("drawing: bodies is empty; there must be at least one.")
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"drawing: {names.count(name)} bodies are named {name!r}; names must be unique.")
+        drawing = cls(
+            bodies,
+            *(
+                tuple(_pair(pair, names, f"{key}[{i}]") for i, pair in enumerate(_list(data, key)))
+                for key in ("links", "springs")
+            ),
+            tuple(_anchor(entry, names, f"anchors[{i}]") for i, entry in enumerate(_list(data, "anchors"))),
+            tuple(_plane(entry, f"planes[{i}]") for i, entry in enumerate(_list(data, "planes"))),
+            tuple(_sphere(entry, f"spheres[{i}]") for i, entry in enumerate(_list(data, "spheres"))),
+            None if data.get("up") is None else _direction(data["up"], "up"),
+            str(data.get("caption") or ""),
+        )
+        drawing.frame()
+        return drawing
+
+    @property
+    def dimension(self) -> int:
+        """Coordinates of a point: 1, 2 or 3, the most of any body."""
+        return max(max(len(body.forms), len(body.offset)) for body in self.bodies)
+
+    def frame(self) -> np.ndarray:
+        """(3, dimension) matrix from coordinates of the bodies to those of the picture, where z points upwards."""
+        d = self.dimension
+        if self.up is None:
+            return np.array([[1.0], [0.0], [0.0]]) if d == 1 else _upright(np.eye(d)[-1])
+        if len(self.up) > d:
+            raise ValueError(f"drawing: up has {len(self.up)} components; the bodies have {d}.")
+        up = np.pad(self.up, (0, d - len(self.up)))
+        return _upright(up / np.linalg.norm(up))
+
+    def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
+        """(n, 3) points of the picture of given points or directions; missing coordinates are zero."""
+        d = self.dimension
+        for point in points:
+            if len(point) > d:
+                raise ValueError(f"drawing: the point {list(point)} has {len(point)} coordinates; the bodies have {d}.")
+        padded = np.array([np.pad(point, (0, d - len(point))) for point in points]).reshape(-1, d)
+        return padded @ self.frame().T
+
+    def maps(self, n_s: int, n_f: int) -> tuple[np.ndarray, np.ndarray]:
+        """Offset (n, 3) and matrix (n, 3, n_s + n_f): where the bodies are in the picture, ``offset + matrix @ q``.
+
+        Raises:
+            ValueError: a body uses a coordinate that q does not have.
+        """
+        sizes, first = {"s": n_s, "f": n_f}, {"s": 0, "f": n_s}
+        matrix = np.zeros((len(self.bodies), self.dimension, n_s + n_f))
+        for i, body in enumerate(self.bodies):
+            for axis, form in enumerate(body.forms):
+                for weight, part, index in form:
+                    if index >= sizes[part]:
+                        pace = "slow" if part == "s" else "fast"
+                        raise ValueError(
+                            f"drawing: the body {body.name!r} uses [{part!r}, {index}], but the run has {sizes[part]} "
+                            f"{pace} coordinates; is this the drawing of another system?"
+                        )
+                    matrix[i, axis, first[part] + index] += weight
+        return self.place([body.offset for body in self.bodies]), np.einsum("ad,idq->iaq", self.frame(), matrix)
+
+
+def _upright(up: np.ndarray) -> np.ndarray:
+    """Matrix of a rotation that takes the unit vector `up` to z, and keeps x where it can."""
+    if up.size == 1:
+        return np.array([[0.0], [0.0], [up[0]]])
+    if up.size == 2:
+        return np.array([[up[1], -up[0]], [0.0, 0.0], up])
+    x = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
+    x = x - (x @ up) * up
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(up, x), up])
+
+
+def _check_keys(data: Any, known: Sequence[str], needed: Sequence[str], where: str) -> None:
+    if not isinstance(data, dict):
+        raise ValueError(f"{where} is {type(data).__name__}; it must be a dict with {', '.join(known)}.")
+    for key in data:
+        if key not in known:
+            raise ValueError(f"{where} has no entry {key!r}.{_near(str(key), known)} There are {', '.join(known)}.")
+    for key in needed:
+        if key not in data:
+            raise ValueError(f"{where} lacks the entry {key!r}.")
+
+
+def _list(data: dict, key: str) -> list:
+    entries = data.get(key, [])
+    if not isinstance(entries, list | tuple):
+        raise ValueError(f"drawing: {key} is {type(entries).__name__}; it must be a list.")
+    return list(entries)
+
+
+def _body(data: Any, where: str) -> Body:
+    where = f"drawing: {where}"
+    _check_keys(data, BODY_KEYS, ("name", "coordinates"), where)
+    coordinates = data["coordinates"]
+    if not isinstance(coordinates, list | tuple) or not 1 <= len(coordinates) <= 3:
+        raise ValueError(f"{where}: coordinates is {coordinates!r}; it must be a list of 1 to 3 entries.")
+    radius = None if data.get("radius") is None else _positive(data["radius"], f"{where}: radius")
+    color = data.get("color")
+    if color is not None and not (isinstance(color, str) and len(color) == 7 and color.startswith("#")):
+        raise ValueError(f"{where}: color is {color!r}; it must be like '#0072b2'.")
+    forms = tuple(_form(entry, where) for entry in coordinates)
+    offset = _numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
+    return Body(str(data["name"]), forms, offset, radius, color)
+
+
+def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
+    single = isinstance(entry, list | tuple) and len(entry) == 2 and isinstance(entry[0], str)
+    try:
+        terms = [(1.0, *entry)] if single else [(float(w), part, i) for w, part, i in entry]
+        assert all(part in ("s", "f") and int(i) == i >= 0 and np.isfinite(w) for w, part, i in terms)
+    except (TypeError, ValueError, AssertionError) as error:
+        raise ValueError(
+            f"{where}: the coordinate {entry!r} must be ['s' or 'f', index] or a list of [weight, 's' or 'f', index]."
+        ) from error
+    return tuple((w, part, int(i)) for w, part, i in terms)
+
+
+def _pair(pair: Any, names: Sequence[str], where: str) -> tuple[str, str]:
+    if not isinstance(pair, list | tuple) or len(pair) != 2:
+        raise ValueError(f"drawing: {where} is {pair!r}; it must be a pair of names.")
+    a, b = (_known(name, names, where) for name in pair)
+    if a == b:
+        raise ValueError(f"drawing: {where} joins {a!r} with itself.")
+    return a, b
+
+
+def _known(name: Any, names: Sequence[str], where: str) -> str:
+    if name not in names:
+        hint, listed = _near(str(name), names), ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise ValueError(f"drawing: {where} names the body {name!r}, which does not exist.{hint} There are {listed}.")
+    return name
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    return f" Did you mean {near[0]}?" if near else ""
+
+
+def _anchor(data: Any, names: Sequence[str], where: str) -> Anchor:
+    _check_keys(data, ("body", "point", "kind"), ("body", "point", "kind"), f"drawing: {where}")
+    if data["kind"] not in KINDS:
+        raise ValueError(f"drawing: {where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
+    point = _numbers(data["point"], f"drawing: {where}: point")
+    return Anchor(_known(data["body"], names, where), point, data["kind"])
+
+
+def _plane(data: Any, where: str) -> Plane:
+    _check_keys(data, ("point", "normal"), ("point", "normal"), f"drawing: {where}")
+    return Plane(_numbers(data["point"], f"drawing: {where}: point"), _direction(data["normal"], f"{where}: normal"))
+
+
+def _sphere(data: Any, where: str) -> Sphere:
+    _check_keys(data, ("center", "radius"), ("center", "radius"), f"drawing: {where}")
+    center = _numbers(data["center"], f"drawing: {where}: center")
+    return Sphere(center, _positive(data["radius"], f"drawing: {where}: radius"))
+
+
+def _direction(value: Any, where: str) -> tuple[float, ...]:
+    numbers = _numbers(value, f"drawing: {where}")
+    if not any(numbers):
+        raise ValueError(f"drawing: {where} is {list(numbers)}; it must not be zero.")
+    return numbers
+
+
+def _numbers(value: Any, where: str) -> tuple[float, ...]:
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.ndim != 1 or not 1 <= array.size <= 3 or not np.isfinite(array).all():
+        raise ValueError(f"{where} is {value!r}; it must be a list of 1 to 3 finite numbers.")
+    return tuple(array.tolist())
+
+
+def _positive(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+        raise ValueError(f"{where} is {value!r}; it must be a positive number.")
+    return float(value)
