@@ -1,6 +1,7 @@
 """Drawings of the built-in systems, and of any system without a drawing: every coordinate as a bar."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -8,23 +9,24 @@ import vmri_jax as vm
 
 MAGNIFIED = 10.0
 """The stiff springs of the Fermi-Pasta-Ulam chain stretch by a few percent: their elongations are drawn so much larger."""
+STEEL = "#8a97a1"
 
 
 def fermi_pasta_ulam(num_springs: int) -> dict:
     """The chain between two walls: masses at ``(s_i - f_i) / sqrt 2`` and ``(s_i + f_i) / sqrt 2`` from their rest."""
-    bodies, springs, w = [], [], 1 / math.sqrt(2)
+    bodies, w = [], 1 / math.sqrt(2)
     for i in range(num_springs):
         for sign, rest in ((-1.0, 4.5 * i + 3.0), (1.0, 4.5 * i + 4.5)):
             form = [[w, "s", i], [sign * MAGNIFIED * w, "f", i]]
-            body = {"name": f"mass {len(bodies) + 1}", "coordinates": [form], "offset": [rest], "radius": 0.3}
+            body = {"name": f"mass {len(bodies) + 1}", "coordinates": [form], "offset": [rest], "radius": 0.3, "color": STEEL}
             bodies.append(body)
     names = [body["name"] for body in bodies]
-    springs = [list(pair) for pair in zip(names[:-1], names[1:], strict=True)]
+    springs = [[a, b, "slow" if i % 2 else "fast"] for i, (a, b) in enumerate(pairwise(names))]
     walls = [(names[0], 0.0), (names[-1], 4.5 * num_springs + 3.0)]
     return {
         "bodies": bodies,
         "springs": springs,
-        "anchors": [{"body": name, "point": [x], "kind": "spring"} for name, x in walls],
+        "anchors": [{"body": name, "point": [x], "kind": "spring", "pace": "slow"} for name, x in walls],
         "planes": [
             {"point": [x], "normal": [normal]} for (_, x), normal in zip(walls, (1.0, -1.0), strict=True)
         ],
@@ -48,8 +50,8 @@ def triple_spherical_pendulum() -> dict:
 
 def simple_atomic_model() -> dict:
     """Two heavy atoms and four light ones, rigid bonds as links."""
-    atoms = [_point("atom 1", "s", 0, 1.7), _point("atom 2", "s", 1, 1.4)]
-    atoms += [_point(f"atom {i + 3}", "f", i, 0.8) for i in range(4)]
+    atoms = [_point("atom 1", "s", 0, 2.6), _point("atom 2", "s", 1, 2.0)]
+    atoms += [_point(f"atom {i + 3}", "f", i, 1.3) for i in range(4)]
     springs, bonds = [(1, 2), (2, 3), (3, 4), (4, 5), (5, 3)], [(2, 4), (2, 5), (3, 6)]
     return {
         "bodies": atoms,
@@ -84,7 +86,7 @@ def bars(trajectory: vm.Trajectory) -> dict:
             captions.append(f"{q.shape[1]} {pace} {'coordinate' if q.shape[1] == 1 else 'coordinates'} times {scale:g}")
         for i in range(q.shape[1]):
             name = f"{part}{i + 1}"
-            bodies.append({"name": name, "coordinates": [[], [[scale, part, i]]], "offset": [x, 0.0], "radius": 0.3})
+            bodies.append({"name": name, "coordinates": [[], [[scale, part, i]]], "offset": [x, 0.0], "radius": 0.24})
             anchors.append({"body": name, "point": [x, 0.0], "kind": "link"})
             x += 1.0
         x += 1.0

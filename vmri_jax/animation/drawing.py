@@ -11,6 +11,7 @@ import numpy as np
 KEYS = ("bodies", "links", "springs", "anchors", "planes", "spheres", "up", "caption")
 BODY_KEYS = ("name", "coordinates", "offset", "radius", "color")
 KINDS = ("link", "spring")
+PACES = ("slow", "fast")
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,21 @@ class Body:
 
 
 @dataclass(frozen=True)
+class Joint:
+    """A link or spring between two bodies; `pace` "slow" or "fast" colours a spring, None for that of the bodies."""
+
+    bodies: tuple[str, str]
+    pace: str | None = None
+
+
+@dataclass(frozen=True)
 class Anchor:
     """A link or spring (`kind`) from a body to a fixed point."""
 
     body: str
     point: tuple[float, ...]
     kind: str
+    pace: str | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Bodies, what joins them (pairs of names), fixed things around them.
+    """Bodies, what joins them, fixed things around them.
 
     Attributes:
         up: the direction that is shown upwards, in coordinates of the bodies; None for the last coordinate (bodies of one
@@ -73,8 +83,8 @@ class Drawing:
     """
 
     bodies: tuple[Body, ...]
-    links: tuple[tuple[str, str], ...] = ()
-    springs: tuple[tuple[str, str], ...] = ()
+    links: tuple[Joint, ...] = ()
+    springs: tuple[Joint, ...] = ()
     anchors: tuple[Anchor, ...] = ()
     planes: tuple[Plane, ...] = ()
     spheres: tuple[Sphere, ...] = ()
@@ -90,8 +100,8 @@ class Drawing:
 
                 - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
                   ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``.
-                - ``links``, ``springs``: pairs of names.
-                - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring").
+                - ``links``, ``springs``: pairs of names, and a third entry "slow" or "fast" if wanted.
+                - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), and if wanted ``pace``.
                 - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
                 - ``up``, ``caption``: see above.
 
@@ -114,7 +124,7 @@ class Drawing:
         drawing = cls(
             bodies,
             *(
-                tuple(_pair(pair, names, f"{key}[{i}]") for i, pair in enumerate(_list(data, key)))
+                tuple(_joint(entry, names, f"{key}[{i}]") for i, entry in enumerate(_list(data, key)))
                 for key in ("links", "springs")
             ),
             tuple(_anchor(entry, names, f"anchors[{i}]") for i, entry in enumerate(_list(data, "anchors"))),
@@ -125,6 +135,12 @@ class Drawing:
         )
         drawing.frame()
         return drawing
+
+    def pace(self, joint: Joint | Anchor) -> str:
+        """ "slow" or "fast": as it says, else "fast" if all its bodies are."""
+        ends = joint.bodies if isinstance(joint, Joint) else (joint.body,)
+        fast = all(body.pace == "fast" for body in self.bodies if body.name in ends)
+        return joint.pace or ("fast" if fast else "slow")
 
     @property
     def dimension(self) -> int:
@@ -228,13 +244,19 @@ def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
     return tuple((w, part, int(i)) for w, part, i in terms)
 
 
-def _pair(pair: Any, names: Sequence[str], where: str) -> tuple[str, str]:
-    if not isinstance(pair, list | tuple) or len(pair) != 2:
-        raise ValueError(f"drawing: {where} is {pair!r}; it must be a pair of names.")
-    a, b = (_known(name, names, where) for name in pair)
+def _joint(entry: Any, names: Sequence[str], where: str) -> Joint:
+    if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
+        raise ValueError(f"drawing: {where} is {entry!r}; it must be a pair of names, or one and 'slow' or 'fast'.")
+    a, b = (_known(name, names, where) for name in entry[:2])
     if a == b:
         raise ValueError(f"drawing: {where} joins {a!r} with itself.")
-    return a, b
+    return Joint((a, b), _pace(entry[2] if len(entry) == 3 else None, where))
+
+
+def _pace(pace: Any, where: str) -> str | None:
+    if pace is not None and pace not in PACES:
+        raise ValueError(f"drawing: {where}: the pace is {pace!r}; it must be {' or '.join(PACES)}.")
+    return pace
 
 
 def _known(name: Any, names: Sequence[str], where: str) -> str:
@@ -250,11 +272,11 @@ def _near(name: str, known: Sequence[str]) -> str:
 
 
 def _anchor(data: Any, names: Sequence[str], where: str) -> Anchor:
-    _check_keys(data, ("body", "point", "kind"), ("body", "point", "kind"), f"drawing: {where}")
+    _check_keys(data, ("body", "point", "kind", "pace"), ("body", "point", "kind"), f"drawing: {where}")
     if data["kind"] not in KINDS:
         raise ValueError(f"drawing: {where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
     point = _numbers(data["point"], f"drawing: {where}: point")
-    return Anchor(_known(data["body"], names, where), point, data["kind"])
+    return Anchor(_known(data["body"], names, where), point, data["kind"], _pace(data.get("pace"), where))
 
 
 def _plane(data: Any, where: str) -> Plane:

@@ -7,6 +7,7 @@ import jinja2
 import numpy as np
 
 from vmri_jax import plots
+from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.layout import Layout, layout, nice
 from vmri_jax.animation.motion import Motion
 
@@ -37,7 +38,7 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     text = environment.get_template("page.html.j2").render(
         title=title or "Motion",
         description=_description(motion),
-        paces=sorted({body.pace for body in drawing.bodies if body.color is None}, reverse=True),
+        paces=sorted(_paces(drawing), reverse=True),
         constrained=data["residual"] is not None,
         data=data,
         light=plots.LIGHT,
@@ -55,9 +56,6 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
     turns = {key: iter(counts) for key, counts in sizes.turns.items()}
 
-    def pace(*names: str) -> str:
-        return "fast" if all(drawing.bodies[index[name]].pace == "fast" for name in names) else "slow"
-
     return {
         "t": _packed(t, np.float64),
         "points": _packed(motion.points),
@@ -69,17 +67,17 @@ def _data(motion: Motion, sizes: Layout) -> dict:
             {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius)}
             for body, radius in zip(drawing.bodies, sizes.radii, strict=True)
         ],
-        "links": [[index[a], index[b]] for a, b in drawing.links],
+        "links": [[index[name] for name in link.bodies] for link in drawing.links],
         "springs": [
-            {"joined": [index[a], index[b]], "pace": pace(a, b), "turns": next(turns["springs"])}
-            for a, b in drawing.springs
+            {"joined": [index[name] for name in joint.bodies], "pace": drawing.pace(joint), "turns": next(turns["springs"])}
+            for joint in drawing.springs
         ],
         "anchors": [
             {
                 "body": index[anchor.body],
                 "point": point.tolist(),
                 "kind": anchor.kind,
-                "pace": pace(anchor.body),
+                "pace": drawing.pace(anchor),
                 "turns": next(turns[f"{anchor.kind} anchors"]),
             }
             for anchor, point in zip(drawing.anchors, sizes.anchors, strict=True)
@@ -111,6 +109,12 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "caption": drawing.caption,
         "ending": motion.ending,
     }
+
+
+def _paces(drawing: Drawing) -> set[str]:
+    """Those whose colours are seen."""
+    springs = [*drawing.springs, *(anchor for anchor in drawing.anchors if anchor.kind == "spring")]
+    return {body.pace for body in drawing.bodies if body.color is None} | {drawing.pace(joint) for joint in springs}
 
 
 def _packed(array: np.ndarray, dtype=np.float32) -> str:

@@ -10,6 +10,8 @@ from vmri_jax.animation.motion import Motion
 
 TURNS = (4, 14)
 """Fewest and most turns of a spring."""
+LEVEL = 0.9
+"""Least vertical part of the unit normal of a plane that counts as level."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +72,23 @@ def layout(motion: Motion) -> Layout:
     given = [body.radius for body in drawing.bodies]
     radii = np.array([min(0.02 * size, room) if radius is None else radius for radius in given])
     sprung = [length for key in ("springs", "spring anchors") for length in lengths[key] if length > 0]
-    coil = min(0.016 * size, 0.2 * min(sprung, default=size))
+    coil = min(0.015 * size, 0.16 * min(sprung, default=size))
     turns = {key: [_turns(length, coil) for length in joints] for key, joints in lengths.items()}
     grounds = _grounds(drawing, moving, float(radii.max()), size)
-    seen = np.concatenate([moving, spheres - reach, spheres + reach])
+    corners = [
+        ground.center + 0.6 * sign * half * side
+        for ground in grounds
+        for side, half in zip(ground.sides, ground.halves, strict=True)
+        for sign in (-1, 1)
+    ]
+    seen = np.concatenate([moving, spheres - reach, spheres + reach, np.array(corners)])
     flat = drawing.dimension < 3
     return Layout(
         size,
         radii,
         rod=min(0.0048 * size, 0.4 * float(radii.min())),
         coil=coil,
-        wire=0.13 * coil,
+        wire=0.11 * coil,
         anchors=anchors,
         spheres=spheres,
         turns=turns,
@@ -99,8 +107,8 @@ def _median_lengths(drawing: Drawing, points: np.ndarray, anchors: np.ndarray) -
         return float(np.median(np.linalg.norm(a - b, axis=-1)))
 
     found = {
-        key: [length(points[:, index[a]], points[:, index[b]]) for a, b in pairs]
-        for key, pairs in (("links", drawing.links), ("springs", drawing.springs))
+        key: [length(*(points[:, index[name]] for name in joint.bodies)) for joint in joints]
+        for key, joints in (("links", drawing.links), ("springs", drawing.springs))
     }
     for kind in ("link", "spring"):
         found[f"{kind} anchors"] = [
@@ -116,26 +124,27 @@ def _turns(length: float, coil: float) -> int:
 
 
 def _grounds(drawing: Drawing, moving: np.ndarray, radius: float, size: float) -> list[Ground]:
-    """Given planes, as far as the scene goes; a floor below it if there are none."""
-    if not drawing.planes:
-        point = moving.mean(axis=0)
-        point[2] = moving[:, 2].min() - radius - 0.03 * size
-        return [_ground(point, np.array([0.0, 0.0, 1.0]), moving, size, solid=False)]
+    """Given planes, as far as the scene goes, and a floor below it if none of them is level."""
     points = drawing.place([plane.point for plane in drawing.planes])
     normals = drawing.place([plane.normal for plane in drawing.planes])
-    return [_ground(p, n / np.linalg.norm(n), moving, size, solid=True) for p, n in zip(points, normals, strict=True)]
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    given = [_ground(p, n, moving, size, solid=True) for p, n in zip(points, normals, strict=True)]
+    if np.any(np.abs(normals[:, 2]) > LEVEL):
+        return given
+    point = np.array([0.0, 0.0, moving[:, 2].min() - radius - 0.03 * size])
+    return [_ground(point, np.array([0.0, 0.0, 1.0]), moving, size, solid=False), *given]
 
 
 def _ground(point, normal, moving, size: float, *, solid: bool) -> Ground:
     low, high = moving.min(axis=0), moving.max(axis=0)
     middle = (low + high) / 2
-    level = abs(normal[2]) > 0.9
+    level = abs(normal[2]) > LEVEL
     first = np.cross(normal, [0.0, 1.0, 0.0] if level else [0.0, 0.0, 1.0])
     first /= np.linalg.norm(first)
     sides = np.array([first, np.cross(normal, first)])
-    margin = (0.16 if level else 0.05) * size
+    margin = (0.12 if level else 0.05) * size
     extent = np.ptp(moving @ sides.T, axis=0) / 2 + margin
-    step = nice(float(extent.max()) / 6)
+    step = nice(float(extent.max()) / (6 if level else 2))
     center = middle - ((middle - point) @ normal) * normal
     return Ground(center, sides, (float(extent[0]), float(extent[1])), normal, step, solid)
 

@@ -12,7 +12,7 @@ function drawPlane(painter, plane, positions) {
   }
   context.strokeStyle = painter.tone(mix(colors.faint, colors.ink, 0.12));
   context.lineWidth = 1;
-  const strength = (u, v) => (solid ? 1 : clamped(1.15 - Math.hypot(u / halves[0], v / halves[1])));
+  const strength = (u, v) => (solid ? 1 : clamped(1 - Math.hypot(u / halves[0], v / halves[1])));
   for (const across of [0, 1]) {
     const [along, beside] = [halves[1 - across], halves[across]], count = Math.floor(beside / step);
     for (let k = -count; k <= count; k++) {
@@ -41,7 +41,7 @@ function shadows(painter, plane, positions) {
   const { context, camera, colors, data } = painter, { bodies, links, springs, anchors } = data;
   const at = (i) => positions.subarray(3 * i, 3 * i + 3);
   context.strokeStyle = painter.tone(colors.shadow);
-  context.globalAlpha = 0.09;
+  context.globalAlpha = 0.09 * painter.shade;
   const line = (a, b) => {
     const [from, to] = [a, b].map((p) => camera.project(dropped(plane, p)));
     if (Math.min(from[2], to[2]) < 0.02 * camera.distance) return;
@@ -62,7 +62,7 @@ function spot(painter, plane, center, radius) {
   const { context, camera, colors } = painter, below = dropped(plane, center);
   if (center[2] < below[2]) return;
   context.fillStyle = painter.tone(colors.shadow);
-  context.globalAlpha = 0.05;
+  context.globalAlpha = 0.05 * painter.shade;
   for (const grown of [0.8, 1, 1.2, 1.4]) {
     const ring = Array.from({ length: 28 }, (_, k) => {
       const angle = (2 * Math.PI * k) / 28, [u, v] = [grown * radius * Math.cos(angle), grown * radius * Math.sin(angle)];

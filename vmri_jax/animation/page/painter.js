@@ -18,6 +18,7 @@ class Painter {
       this.colors[name] = rgb(style.getPropertyValue(`--${name}`));
     }
     this.bodies = this.data.bodies.map((body) => (body.color ? rgb(body.color) : this.colors[body.pace]));
+    this.shade = this.colors.paper[0] < 100 ? 2 : 1; // on dark paper they need more
     this.tones = new Map();
   }
 
@@ -65,7 +66,7 @@ class Painter {
       const reach = bodies[body].radius;
       if (kind === "link") rod(this, at(body), point, reach, 0);
       else spring(this, at(body), point, reach, 0, this.colors[pace], turns);
-      ball(this, point, 1.9 * data.rod, this.colors.rod);
+      ball(this, point, 1.5 * data.rod, this.colors.rod);
     }
     bodies.forEach((body, i) => ball(this, at(i), body.radius, this.bodies[i]));
     this.items.sort((a, b) => b[0] - a[0]);

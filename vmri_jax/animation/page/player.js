@@ -77,6 +77,7 @@ function fit() {
   painter.resize(width, height);
   if (!camera.moved) camera.fit(data.fitted, data.margin, width, height);
   recolor();
+  draw(); // at once: a resized canvas is empty
 }
 
 function recolor() {

@@ -100,7 +100,8 @@ function drawTrail(painter, trail, i) {
     if (!from) return;
     const depth = (from[2] + to[2]) / 2;
     painter.add(depth + 0.002 * camera.distance, (context) => {
-      context.globalAlpha = 0.6 * (1 - age) ** 1.5;
+      context.globalAlpha = 0.7 * (1 - age) ** 1.5;
+      context.lineCap = "butt"; // round ends would show as dots where they overlap
       context.strokeStyle = painter.tone(color, 0, depth);
       context.lineWidth = 0.6 + 1.6 * (1 - age);
       context.beginPath();
@@ -108,6 +109,7 @@ function drawTrail(painter, trail, i) {
       context.lineTo(to[0], to[1]);
       context.stroke();
       context.globalAlpha = 1;
+      context.lineCap = "round";
     });
   });
 }

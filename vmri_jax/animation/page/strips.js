@@ -3,7 +3,8 @@
 // A power of ten as the page shows it: 1.2 × 10 with a raised exponent.
 function shown(x) {
   if (!Number.isFinite(x)) return "not finite";
-  if (x === 0 || (Math.abs(x) >= 0.01 && Math.abs(x) < 1000)) return x.toPrecision(3).replace("-", "−");
+  if (x === 0) return "0";
+  if (Math.abs(x) >= 0.01 && Math.abs(x) < 1000) return x.toPrecision(3).replace("-", "−");
   const [digits, power] = x.toExponential(1).split("e"), raised = power.replace("+", "").replace(/./g, (c) => "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"["0123456789-".indexOf(c)]);
   return `${digits.replace("-", "−")} × 10${raised}`;
 }
@@ -73,9 +74,9 @@ class Strip {
     this.line(context, [[x, 0], [x, this.height]], "ink", 1);
     const i = this.motion.interval(time), parts = this.curves.map(([name, values, color], k) => {
       const key = name ? `<i style="background: var(--${color})"></i>${name} ` : "";
-      return `${key}<b>${shown(values[i])}</b>, largest ${shown(this.largest[k])}`;
+      return `<span>${key}<b>${shown(values[i])}</b>, largest ${shown(this.largest[k])}</span>`;
     });
-    this.text.innerHTML = `<span>${this.title}</span><span>${parts.join("")}</span>`;
+    this.text.innerHTML = `<span>${this.title}</span>${parts.join("")}`;
   }
 }
 
