@@ -1,6 +1,7 @@
 """What a run returns: saved nodes, what the solver did, conserved quantities, and where it stopped."""
 
 import dataclasses
+import json
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -74,9 +75,11 @@ class Trajectory(eqx.Module):
         }
         return _from_flat(flat | {"result": jnp.asarray(int(Result.CONVERGED)), "failed_at": jnp.asarray(-1)})
 
-    def save(self, path) -> None:
-        """Write all arrays to a .npz file (no pickled objects)."""
+    def save(self, path, drawing: dict | None = None) -> None:
+        """Write all arrays to a .npz file (no pickled objects), next to them a `vmri_jax.animation.Drawing` as plain data."""
         arrays = {name: np.asarray(value) for name, value in _flat(self).items() if value is not None}
+        if drawing is not None:
+            arrays["drawing"] = np.array(json.dumps(drawing))
         with FilePath(path).open("wb") as file:  # an open file, or numpy appends .npz to other names
             np.savez_compressed(file, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
@@ -100,6 +103,7 @@ class Trajectory(eqx.Module):
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
+        arrays.pop("drawing", None)
         fields = {field.name for field in dataclasses.fields(cls)} - {"info"} | set(RunInfo._fields)
         missing = fields - set(arrays) - {"t_micro", "q_f_micro"}
         if missing or set(arrays) - fields:
