@@ -18,7 +18,13 @@ def fermi_pasta_ulam(num_springs: int) -> dict:
     for i in range(num_springs):
         for sign, rest in ((-1.0, 4.5 * i + 3.0), (1.0, 4.5 * i + 4.5)):
             form = [[w, "s", i], [sign * MAGNIFIED * w, "f", i]]
-            body = {"name": f"mass {len(bodies) + 1}", "coordinates": [form], "offset": [rest], "radius": 0.3, "color": STEEL}
+            body = {
+                "name": f"mass {len(bodies) + 1}",
+                "coordinates": [form],
+                "offset": [rest],
+                "radius": 0.3,
+                "color": STEEL,
+            }
             bodies.append(body)
     names = [body["name"] for body in bodies]
     springs = [[a, b, "slow" if i % 2 else "fast"] for i, (a, b) in enumerate(pairwise(names))]
@@ -27,9 +33,7 @@ def fermi_pasta_ulam(num_springs: int) -> dict:
         "bodies": bodies,
         "springs": springs,
         "anchors": [{"body": name, "point": [x], "kind": "spring", "pace": "slow"} for name, x in walls],
-        "planes": [
-            {"point": [x], "normal": [normal]} for (_, x), normal in zip(walls, (1.0, -1.0), strict=True)
-        ],
+        "planes": [{"point": [x], "normal": [normal]} for (_, x), normal in zip(walls, (1.0, -1.0), strict=True)],
         "caption": f"Elongations of the stiff springs are drawn {MAGNIFIED:g} times as large as they are.",
     }
 

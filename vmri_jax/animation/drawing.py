@@ -1,12 +1,15 @@
 """What a picture of a system is made of: bodies and what joins them, as plain data that can be stored next to a run."""
 
-import difflib
 import json
-from collections.abc import Sequence
+import operator
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from vmri_jax.animation.checks import check_keys, direction, entries, near, numbers, positive
 
 KEYS = ("bodies", "links", "springs", "anchors", "planes", "spheres", "up", "caption")
 BODY_KEYS = ("name", "coordinates", "offset", "radius", "color")
@@ -113,15 +116,120 @@ class Drawing:
                 data = json.loads(data)
             except json.JSONDecodeError as error:
                 raise ValueError(f"drawing: not valid JSON ({error}).") from error
-        _check_keys(data, KEYS, ("bodies",), "drawing")
-        bodies = tuple(_body(entry, f"bodies[{i}]") for i, entry in enumerate(_list(data, "bodies")))
+        check_keys(data, KEYS, ("bodies",), "drawing")
+        bodies = tuple(_body(e, f"drawing: bodies[{i}]") for i, e in enumerate(entries(data, "bodies", "drawing")))
         names = [body.name for body in bodies]
         if not bodies:
             raise ValueError("drawing: bodies is empty; there must be at least one.")
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"drawing: {names.count(name)} bodies are named {name!r}; names must be unique.")
-        drawing = cls(
+
+        def all_of(key: str, read: Callable) -> tuple:
+            return tuple(
+                read(entry, names, f"drawing: {key}[{i}]") for i, entry in enumerate(entries(data, key, "drawing"))
+            )
+
+        return cls(
+            bodies=bodies,
+            links=all_of("links", _joint),
+            springs=all_of("springs", _joint),
+            anchors=all_of("anchors", _anchor),
+            planes=all_of("planes", _plane),
+            spheres=all_of("spheres", _sphere),
+            up=None if data.get("up") is None else direction(data["up"], "drawing: up"),
+            caption=str(data.get("caption") or ""),
+        )
+
+    def pace(self) -> str:
+        """ "slow" if all its coordinates are, else "fast"."""
+        return "slow" if all(part == "s" for form in self.forms for _, part, _ in form) else "fast"
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A link or spring between two bodies; `pace` "slow" or "fast" colours a spring, None for that of the bodies."""
+
+    bodies: tuple[str, str]
+    pace: str | None = None
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A link or spring (`kind`) from a body to a fixed point."""
+
+    body: str
+    point: tuple[float, ...]
+    kind: str
+    pace: str | None = None
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A wall or ground through `point`; bodies stay on the side of `normal`."""
+
+    point: tuple[float, ...]
+    normal: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A fixed sphere."""
+
+    center: tuple[float, ...]
+    radius: float
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Bodies, what joins them, fixed things around them.
+
+    Attributes:
+        up: the direction that is shown upwards, in coordinates of the bodies; None for the last coordinate (bodies of one
+            coordinate move sideways).
+        caption: a line that is shown with the picture.
+    """
+
+    bodies: tuple[Body, ...]
+    links: tuple[Joint, ...] = ()
+    springs: tuple[Joint, ...] = ()
+    anchors: tuple[Anchor, ...] = ()
+    planes: tuple[Plane, ...] = ()
+    spheres: tuple[Sphere, ...] = ()
+    up: tuple[float, ...] | None = None
+    caption: str = ""
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "Drawing":
+        """A drawing from plain data, checked.
+
+        Args:
+            data: a dict (or its JSON text) of
+
+                - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
+                  ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``.
+                - ``links``, ``springs``: pairs of names, and a third entry "slow" or "fast" if wanted.
+                - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), and if wanted ``pace``.
+                - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
+                - ``up``, ``caption``: see above.
+
+        Raises:
+            ValueError: anything else, with the entry that is wrong.
+        """
+        if isinstance(data, str):
+            try:
+                data = json.loads(data)
+            except json.JSONDecodeError as error:
+                raise ValueError(f"drawing: not valid JSON ({error}).") from error
+        check_keys(data, KEYS, ("bodies",), "drawing")
+        bodies = tuple(_body(e, f"drawing: bodies[{i}]") for i, e in enumerate(entries(data, "bodies", "drawing")))
+        names = [body.name for body in bodies]
+        if not bodies:
+            raise ValueError("drawing: bodies is empty; there must be at least one.")
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"drawing: {names.count(name)} bodies are named {name!r}; names must be unique.")
+        return cls(
             bodies,
             *(
                 tuple(_joint(entry, names, f"{key}[{i}]") for i, entry in enumerate(_list(data, key)))
@@ -133,8 +241,6 @@ class Drawing:
             None if data.get("up") is None else _direction(data["up"], "up"),
             str(data.get("caption") or ""),
         )
-        drawing.frame()
-        return drawing
 
     def pace(self, joint: Joint | Anchor) -> str:
         """ "slow" or "fast": as it says, else "fast" if all its bodies are."""
@@ -144,25 +250,23 @@ class Drawing:
 
     @property
     def dimension(self) -> int:
-        """Coordinates of a point: 1, 2 or 3, the most of any body."""
-        return max(max(len(body.forms), len(body.offset)) for body in self.bodies)
+        """Coordinates of a point: 1, 2 or 3, the most of any body or given point."""
+        points = [anchor.point for anchor in self.anchors] + [sphere.center for sphere in self.spheres]
+        points += [vector for plane in self.planes for vector in (plane.point, plane.normal)]
+        points += [vector for body in self.bodies for vector in (body.forms, body.offset)] + [self.up or ()]
+        return max(len(point) for point in points)
 
     def frame(self) -> np.ndarray:
         """(3, dimension) matrix from coordinates of the bodies to those of the picture, where z points upwards."""
         d = self.dimension
         if self.up is None:
             return np.array([[1.0], [0.0], [0.0]]) if d == 1 else _upright(np.eye(d)[-1])
-        if len(self.up) > d:
-            raise ValueError(f"drawing: up has {len(self.up)} components; the bodies have {d}.")
         up = np.pad(self.up, (0, d - len(self.up)))
         return _upright(up / np.linalg.norm(up))
 
     def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
         """(n, 3) points of the picture of given points or directions; missing coordinates are zero."""
         d = self.dimension
-        for point in points:
-            if len(point) > d:
-                raise ValueError(f"drawing: the point {list(point)} has {len(point)} coordinates; the bodies have {d}.")
         padded = np.array([np.pad(point, (0, d - len(point))) for point in points]).reshape(-1, d)
         return padded @ self.frame().T
 
@@ -199,115 +303,71 @@ def _upright(up: np.ndarray) -> np.ndarray:
     return np.array([x, np.cross(up, x), up])
 
 
-def _check_keys(data: Any, known: Sequence[str], needed: Sequence[str], where: str) -> None:
-    if not isinstance(data, dict):
-        raise ValueError(f"{where} is {type(data).__name__}; it must be a dict with {', '.join(known)}.")
-    for key in data:
-        if key not in known:
-            raise ValueError(f"{where} has no entry {key!r}.{_near(str(key), known)} There are {', '.join(known)}.")
-    for key in needed:
-        if key not in data:
-            raise ValueError(f"{where} lacks the entry {key!r}.")
-
-
-def _list(data: dict, key: str) -> list:
-    entries = data.get(key, [])
-    if not isinstance(entries, list | tuple):
-        raise ValueError(f"drawing: {key} is {type(entries).__name__}; it must be a list.")
-    return list(entries)
-
-
 def _body(data: Any, where: str) -> Body:
-    where = f"drawing: {where}"
-    _check_keys(data, BODY_KEYS, ("name", "coordinates"), where)
+    check_keys(data, BODY_KEYS, ("name", "coordinates"), where)
     coordinates = data["coordinates"]
     if not isinstance(coordinates, list | tuple) or not 1 <= len(coordinates) <= 3:
         raise ValueError(f"{where}: coordinates is {coordinates!r}; it must be a list of 1 to 3 entries.")
-    radius = None if data.get("radius") is None else _positive(data["radius"], f"{where}: radius")
+    radius = None if data.get("radius") is None else positive(data["radius"], f"{where}: radius")
     color = data.get("color")
-    if color is not None and not (isinstance(color, str) and len(color) == 7 and color.startswith("#")):
+    if color is not None and not (isinstance(color, str) and re.fullmatch("#[0-9a-fA-F]{6}", color)):
         raise ValueError(f"{where}: color is {color!r}; it must be like '#0072b2'.")
     forms = tuple(_form(entry, where) for entry in coordinates)
-    offset = _numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
+    offset = numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
     return Body(str(data["name"]), forms, offset, radius, color)
 
 
 def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
+    """The terms of ``["s", 0]`` or ``[[weight, "s", 0], ...]``."""
     single = isinstance(entry, list | tuple) and len(entry) == 2 and isinstance(entry[0], str)
     try:
-        terms = [(1.0, *entry)] if single else [(float(w), part, i) for w, part, i in entry]
-        assert all(part in ("s", "f") and int(i) == i >= 0 and np.isfinite(w) for w, part, i in terms)
-    except (TypeError, ValueError, AssertionError) as error:
+        terms = [(float(weight), part, operator.index(i)) for weight, part, i in ([(1.0, *entry)] if single else entry)]
+    except (TypeError, ValueError):
+        terms = [(np.nan, "", 0)]
+    if not all(part in ("s", "f") and i >= 0 and np.isfinite(weight) for weight, part, i in terms):
         raise ValueError(
             f"{where}: the coordinate {entry!r} must be ['s' or 'f', index] or a list of [weight, 's' or 'f', index]."
-        ) from error
-    return tuple((w, part, int(i)) for w, part, i in terms)
+        )
+    return tuple(terms)
 
 
 def _joint(entry: Any, names: Sequence[str], where: str) -> Joint:
     if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
-        raise ValueError(f"drawing: {where} is {entry!r}; it must be a pair of names, or one and 'slow' or 'fast'.")
-    a, b = (_known(name, names, where) for name in entry[:2])
+        raise ValueError(f"{where} is {entry!r}; it must be a pair of names, or one and 'slow' or 'fast'.")
+    a, b = (_body_name(name, names, where) for name in entry[:2])
     if a == b:
-        raise ValueError(f"drawing: {where} joins {a!r} with itself.")
+        raise ValueError(f"{where} joins {a!r} with itself.")
     return Joint((a, b), _pace(entry[2] if len(entry) == 3 else None, where))
+
+
+def _anchor(data: Any, names: Sequence[str], where: str) -> Anchor:
+    check_keys(data, ("body", "point", "kind", "pace"), ("body", "point", "kind"), where)
+    if data["kind"] not in KINDS:
+        raise ValueError(f"{where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
+    point = numbers(data["point"], f"{where}: point")
+    return Anchor(_body_name(data["body"], names, where), point, data["kind"], _pace(data.get("pace"), where))
+
+
+def _plane(data: Any, _: Sequence[str], where: str) -> Plane:
+    check_keys(data, ("point", "normal"), ("point", "normal"), where)
+    return Plane(numbers(data["point"], f"{where}: point"), direction(data["normal"], f"{where}: normal"))
+
+
+def _sphere(data: Any, _: Sequence[str], where: str) -> Sphere:
+    check_keys(data, ("center", "radius"), ("center", "radius"), where)
+    return Sphere(numbers(data["center"], f"{where}: center"), positive(data["radius"], f"{where}: radius"))
+
+
+def _body_name(name: Any, names: Sequence[str], where: str) -> str:
+    if name not in names:
+        listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise ValueError(
+            f"{where} names the body {name!r}, which does not exist.{near(str(name), names)} There are {listed}."
+        )
+    return name
 
 
 def _pace(pace: Any, where: str) -> str | None:
     if pace is not None and pace not in PACES:
-        raise ValueError(f"drawing: {where}: the pace is {pace!r}; it must be {' or '.join(PACES)}.")
+        raise ValueError(f"{where}: the pace is {pace!r}; it must be {' or '.join(PACES)}.")
     return pace
-
-
-def _known(name: Any, names: Sequence[str], where: str) -> str:
-    if name not in names:
-        hint, listed = _near(str(name), names), ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-        raise ValueError(f"drawing: {where} names the body {name!r}, which does not exist.{hint} There are {listed}.")
-    return name
-
-
-def _near(name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return f" Did you mean {near[0]}?" if near else ""
-
-
-def _anchor(data: Any, names: Sequence[str], where: str) -> Anchor:
-    _check_keys(data, ("body", "point", "kind", "pace"), ("body", "point", "kind"), f"drawing: {where}")
-    if data["kind"] not in KINDS:
-        raise ValueError(f"drawing: {where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
-    point = _numbers(data["point"], f"drawing: {where}: point")
-    return Anchor(_known(data["body"], names, where), point, data["kind"], _pace(data.get("pace"), where))
-
-
-def _plane(data: Any, where: str) -> Plane:
-    _check_keys(data, ("point", "normal"), ("point", "normal"), f"drawing: {where}")
-    return Plane(_numbers(data["point"], f"drawing: {where}: point"), _direction(data["normal"], f"{where}: normal"))
-
-
-def _sphere(data: Any, where: str) -> Sphere:
-    _check_keys(data, ("center", "radius"), ("center", "radius"), f"drawing: {where}")
-    center = _numbers(data["center"], f"drawing: {where}: center")
-    return Sphere(center, _positive(data["radius"], f"drawing: {where}: radius"))
-
-
-def _direction(value: Any, where: str) -> tuple[float, ...]:
-    numbers = _numbers(value, f"drawing: {where}")
-    if not any(numbers):
-        raise ValueError(f"drawing: {where} is {list(numbers)}; it must not be zero.")
-    return numbers
-
-
-def _numbers(value: Any, where: str) -> tuple[float, ...]:
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        array = np.array(np.nan)
-    if array.ndim != 1 or not 1 <= array.size <= 3 or not np.isfinite(array).all():
-        raise ValueError(f"{where} is {value!r}; it must be a list of 1 to 3 finite numbers.")
-    return tuple(array.tolist())
-
-
-def _positive(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
-        raise ValueError(f"{where} is {value!r}; it must be a positive number.")
-    return float(value)

@@ -17,6 +17,7 @@ from vmri_jax.animation.shapes import draw_moment
 FRAMES_PER_SECOND = 20
 WIDTH = 9.0
 """Of a strip, in inches."""
+TITLE = 0.3
 GIF_WIDTH = 640
 
 
@@ -38,22 +39,23 @@ def plot_strip(
     if moments.ndim != 1 or not moments.size:
         raise ValueError(f"plot_strip: times is {times!r}; give at least one.")
     sizes = layout(motion)
-    camera, aspect = _view(sizes)
+    camera, aspect = view(sizes)
     columns = len(moments) if aspect < 1.3 else 3 if aspect < 2.5 else 1
     columns = min(columns, len(moments), 6)
     rows = -(-len(moments) // columns)
     trail = 0.5 * (motion.t[-1] - motion.t[0]) / max(len(moments), 4)
     with plots.style(theme):
         width = WIDTH / columns
-        figure = plots.NotebookFigure(figsize=(WIDTH, rows * width / aspect + (0.35 if title else 0.0)))
-        panels = figure.subplots(rows, columns, squeeze=False).reshape(-1)
-        figure.get_layout_engine().set(w_pad=0, h_pad=0, wspace=0, hspace=0)  # pyright: ignore[reportOptionalMemberAccess]
-        for panel in panels:
+        height = rows * width / aspect + (TITLE if title else 0.0)
+        figure = plots.NotebookFigure(figsize=(WIDTH, height), layout="none")
+        for k, time in enumerate(moments):
+            row, column = divmod(k, columns)
+            bottom = (rows - 1 - row) * width / aspect / height
+            panel = figure.add_axes((column / columns, bottom, 1 / columns, width / aspect / height))
             panel.set_axis_off()
-        for panel, time in zip(panels, moments, strict=False):
             draw_moment(panel, motion, sizes, camera, aspect, width, time, trail, theme)
         if title:
-            figure.suptitle(title, x=0.01, ha="left", color=theme.ink)
+            figure.text(0.1 / WIDTH, 1 - 0.1 / height, title, va="top", fontsize=11, color=theme.ink)
     return figure
 
 
@@ -81,12 +83,12 @@ def write_gif(
     count = max(2, round(FRAMES_PER_SECOND * seconds))
     times = np.linspace(motion.t[0], motion.t[-1], count)
     trail, sizes = 1.2 * (motion.t[-1] - motion.t[0]) / seconds, layout(motion)
-    camera, aspect = _view(sizes)
+    camera, aspect = view(sizes)
     width = GIF_WIDTH / 100
     images = []
     with plots.style(theme):
         for i, time in enumerate(times):
-            figure = Figure(figsize=(width, width / aspect), dpi=100)
+            figure = Figure(figsize=(width, width / aspect), dpi=100, layout="none")
             panel = figure.add_axes((0.0, 0.0, 1.0, 1.0))
             panel.set_axis_off()
             draw_moment(panel, motion, sizes, camera, aspect, width, time, trail, theme)
@@ -94,15 +96,15 @@ def write_gif(
             canvas.draw()
             images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
             progress(i + 1, count)
-    palette = images[count // 2].quantize(128)  # one for all: colours must not flicker
+    palette = images[count // 2].quantize(255)  # one for all: colours must not flicker
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     first.save(path, save_all=True, append_images=others, duration=1000 // FRAMES_PER_SECOND, loop=0, optimize=True)
 
 
-def _view(sizes: Layout) -> tuple[Camera, float]:
+def view(sizes: Layout) -> tuple[Camera, float]:
     """The first view, in a frame as wide as the scene asks for."""
     radius = float(sizes.radii.max())
     start = Camera(sizes.azimuth, sizes.elevation, np.zeros(3), 1.0)
     low, high = start.fitted(sizes.hull, radius, 1.0).bounds(sizes.hull, radius)
-    aspect = float(np.clip((high[0] - low[0]) / (high[1] - low[1]), 0.5, 5.0))
+    aspect = float(np.clip((high[0] - low[0]) / (high[1] - low[1]), 0.5, 8.0))
     return start.fitted(sizes.hull, radius, aspect), aspect

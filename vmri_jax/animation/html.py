@@ -31,7 +31,8 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     data = _data(motion.thinned(-(-len(motion.t) // every)), layout(motion))
     drawing = motion.drawing
     if every > 1:
-        data["caption"] = f"{drawing.caption} Drawn from every {every}th node.".strip()
+        ending = {2: "nd", 3: "rd"}.get(every, "th")
+        data["caption"] = f"{drawing.caption} Drawn from every {every}{ending} node.".strip()
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("vmri_jax.animation", "page"), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
@@ -69,7 +70,11 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         ],
         "links": [[index[name] for name in link.bodies] for link in drawing.links],
         "springs": [
-            {"joined": [index[name] for name in joint.bodies], "pace": drawing.pace(joint), "turns": next(turns["springs"])}
+            {
+                "joined": [index[name] for name in joint.bodies],
+                "pace": drawing.pace(joint),
+                "turns": next(turns["springs"]),
+            }
             for joint in drawing.springs
         ],
         "anchors": [
@@ -117,7 +122,7 @@ def _paces(drawing: Drawing) -> set[str]:
     return {body.pace for body in drawing.bodies if body.color is None} | {drawing.pace(joint) for joint in springs}
 
 
-def _packed(array: np.ndarray, dtype=np.float32) -> str:
+def _packed(array: np.ndarray, dtype: type = np.float32) -> str:
     """Little-endian bytes in base 64."""
     return base64.b64encode(np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
 

@@ -38,6 +38,23 @@ class Motion:
         """(len(times), n_bodies, 3) positions at times, those of the ends beyond them."""
         return hermite(self.t, self.points, self.velocities, np.clip(times, self.t[0], self.t[-1]))
 
+    def between(self, start: float | None = None, end: float | None = None) -> "Motion":
+        """The part between the nodes around two times; None for the start or the end of the run.
+
+        Raises:
+            ValueError: times outside of the run, or no time between them.
+        """
+        first, last = float(self.t[0]), float(self.t[-1])
+        start, end = (first if start is None else start), (last if end is None else end)
+        if not first <= start < end <= last and (start, end) != (first, last):
+            raise ValueError(
+                f"from {start:g} to {end:g} is no part of the run, which goes from t = {first:g} to {last:g}."
+            )
+        low = int(np.searchsorted(self.t, start, side="right")) - 1
+        part = slice(low, int(np.searchsorted(self.t, end)) + 1)
+        names = ("t", "points", "velocities", "energy", "residual")
+        return replace(self, **{name: getattr(self, name)[part] for name in names})
+
     def thinned(self, most: int) -> "Motion":
         """With at most about `most` nodes; energy and residuals keep the largest of those left out."""
         every = -(-len(self.t) // most)
@@ -71,7 +88,9 @@ def motion(trajectory: vm.Trajectory, drawing: Drawing, system: vm.System | None
         ValueError: a batch of runs, no node that is finite, a drawing or system of other coordinates.
     """
     if np.ndim(trajectory.t) != 1:
-        raise ValueError(f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it.")
+        raise ValueError(
+            f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
+        )
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.q_s, trajectory.q_f, trajectory.t))
     offset, matrix = drawing.maps(q_s.shape[1], q_f.shape[1])
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
@@ -113,17 +132,26 @@ def hermite(t, values, velocities, times) -> np.ndarray:
 
 def _differences(t, values) -> np.ndarray:
     """Central differences, of second order at the ends too; zero for a single node."""
-    return np.gradient(values, t, axis=0, edge_order=min(2, len(t) - 1)) if len(t) > 1 else np.zeros_like(values)
+    if len(t) == 1:
+        return np.zeros_like(values)
+    return np.gradient(values, t, axis=0, edge_order=2 if len(t) > 2 else 1)
 
 
 def _velocities(system: vm.System, trajectory: vm.Trajectory, count: int) -> np.ndarray:
     """(count, n_s + n_f) velocities of the momenta."""
     phase = [jnp.asarray(a)[:count] for a in (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)]
     try:
+        start = float(vm.diagnostics.energy(system, *(a[0] for a in phase)))
         v_s, v_f = jax.jit(jax.vmap(partial(vm.diagnostics.velocity, system)))(*phase)
     except (TypeError, ValueError, IndexError) as error:
         sizes = f"{phase[0].shape[1]} slow and {phase[1].shape[1]} fast coordinates"
         raise ValueError(f"motion: the system does not go with a run of {sizes}: {error}") from error
+    known = float(trajectory.energy[0])
+    if abs(start - known) > 1e-6 * max(1.0, abs(known)):
+        raise ValueError(
+            f"motion: the system has the energy {start:.6g} at the start, the run {known:.6g}; give the system, with the "
+            "parameters, that was simulated."
+        )
     return np.concatenate([v_s, v_f], axis=1)
 
 

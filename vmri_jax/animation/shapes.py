@@ -1,5 +1,7 @@
 """One moment of a motion in a matplotlib panel, the farthest things first, as in the script of the page."""
 
+import math
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
@@ -55,7 +57,7 @@ def draw_moment(
             pen.shadows(ground, points, sizes.radii, [(a, b) for _, a, b, *_ in joints], sizes.rod)
     for center, sphere in zip(sizes.spheres, drawing.spheres, strict=True):
         pen.ball(center, sphere.radius, theme.faint)
-    past = motion.at(np.linspace(max(motion.t[0], time - trail), time, 60))
+    past = motion.at(np.linspace(max(motion.t[0], time - trail), time, 160))
     for i, color in enumerate(colors):
         pen.trail(past[:, i], color)
     for kind, a, b, reach, color, count in joints:
@@ -67,7 +69,10 @@ def draw_moment(
         pen.ball(point, 1.5 * sizes.rod, ROD[theme])
     for point, radius, color in zip(points, sizes.radii, colors, strict=True):
         pen.ball(point, radius, color)
-    axes.text(-0.97 * aspect, -0.97, f"$t = {time:.4g}$", va="bottom", fontsize=9, color=theme.ink, zorder=ON_TOP)
+    span = float(motion.t[-1] - motion.t[0])
+    digits = max(0, 2 - math.floor(math.log10(span))) if span > 0 else 2
+    label = f"{time:.{digits}f}"
+    axes.text(-0.97 * aspect, -0.97, f"$t = {label}$", va="bottom", fontsize=9, color=theme.ink, zorder=ON_TOP)
 
 
 class _Pen:
@@ -82,10 +87,10 @@ class _Pen:
         ends = np.where(shade < 0, 0.06, 1.0)
         return np.array(to_rgb(color)) * (1 - np.abs(shade)) + ends * np.abs(shade)
 
-    def lines(self, ends, colors, widths, zorder, alpha=None) -> None:
+    def lines(self, ends, colors, widths, zorder, alpha=None, capstyle="round") -> None:
         """Segments (n, 2, 2); widths in units of the view."""
         widths = np.maximum(0.5, self.points * np.asarray(widths))
-        lines = LineCollection(ends, colors=colors, linewidths=widths, zorder=zorder, alpha=alpha, capstyle="round")
+        lines = LineCollection(ends, colors=colors, linewidths=widths, zorder=zorder, alpha=alpha, capstyle=capstyle)
         self.axes.add_collection(lines, autolim=False)
 
     def ball(self, center, radius: float, color) -> None:
@@ -114,8 +119,11 @@ class _Pen:
         for k in range(pieces):
             w = radius * (scale[k] + scale[k + 1])
             middle = float(scale[k] + scale[k + 1]) / 2
+            piece = places[[k, k + 1]] + 0.3 / self.points * np.array([[-1.0], [1.0]]) * along / max(
+                np.hypot(*along), 1e-12
+            )
             shifts = np.array([0.0, 0.12, 0.25])[:, None, None] * w * side
-            self.lines(places[[k, k + 1]] + shifts, tones, np.array([1.0, 0.72, 0.25]) * w, middle)
+            self.lines(piece + shifts, tones, np.array([1.0, 0.72, 0.25]) * w, middle, capstyle="butt")
 
     def spring(self, a, b, reach, coil: float, wire: float, color, turns: int) -> None:
         """A helix with straight ends."""
@@ -145,7 +153,11 @@ class _Pen:
         segments = np.stack([places[:-1], places[1:]], axis=1)
         widths = (0.6 + 1.2 * (1 - age)) / self.points
         lines = LineCollection(
-            segments.tolist(), colors=color, linewidths=self.points * widths, alpha=0.7 * (1 - age) ** 1.5, capstyle="butt"
+            segments.tolist(),
+            colors=color,
+            linewidths=self.points * widths,
+            alpha=0.7 * (1 - age) ** 1.5,
+            capstyle="butt",
         )
         lines.set_zorder(0.998 * float(scale.mean()))
         self.axes.add_collection(lines, autolim=False)
@@ -189,7 +201,7 @@ class _Pen:
             self.polygons(rings, color, 0.05 * strength, -2)
         for a, b in joints:
             places, scale = self.camera.project(np.array([_dropped(ground, a), _dropped(ground, b)]))
-            self.lines([places], color, [2.6 * rod * scale.mean()], -2, alpha=0.08 * strength)
+            self.lines([places], color, [2 * rod * scale.mean()], -2, alpha=0.06 * strength)
 
     def polygons(self, corners, color, alpha: float, zorder: float) -> None:
         places = [self.camera.project(each)[0] for each in corners]

@@ -41,11 +41,11 @@ function shadows(painter, plane, positions) {
   const { context, camera, colors, data } = painter, { bodies, links, springs, anchors } = data;
   const at = (i) => positions.subarray(3 * i, 3 * i + 3);
   context.strokeStyle = painter.tone(colors.shadow);
-  context.globalAlpha = 0.09 * painter.shade;
+  context.globalAlpha = 0.06 * painter.shade;
   const line = (a, b) => {
     const [from, to] = [a, b].map((p) => camera.project(dropped(plane, p)));
     if (Math.min(from[2], to[2]) < 0.02 * camera.distance) return;
-    context.lineWidth = Math.max(1, (2.6 * camera.scale * data.rod) / ((from[2] + to[2]) / 2));
+    context.lineWidth = Math.max(1, (2 * camera.scale * data.rod) / ((from[2] + to[2]) / 2));
     context.beginPath();
     context.moveTo(from[0], from[1]);
     context.lineTo(to[0], to[1]);
