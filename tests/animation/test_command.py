@@ -82,7 +82,7 @@ def test_pictures_by_their_suffix(vmri):
     assert light > 200
     assert dark < 90
     with Image.open("run.GIF") as image:
-        assert image.n_frames == 4
+        assert getattr(image, "n_frames", 1) == 4
 
 
 def test_a_failed_run_is_drawn_up_to_there_and_says_so(vmri):

@@ -78,7 +78,7 @@ def test_a_gif_moves_and_takes_its_time(pendulum, tmp_path):
     done = []
     write_gif(pendulum, tmp_path / "run.gif", 0.4, progress=lambda *at: done.append(at))
     with Image.open(tmp_path / "run.gif") as image:
-        assert image.n_frames == 8
+        assert getattr(image, "n_frames", 1) == 8
         assert image.info["duration"] == 50
         assert image.info["loop"] == 0
         frames = []

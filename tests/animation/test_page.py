@@ -26,7 +26,7 @@ def data_of(page: str) -> dict:
     return json.loads(text)
 
 
-def unpacked(text: str, dtype=np.float32) -> np.ndarray:
+def unpacked(text: str, dtype: type = np.float32) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), dtype)
 
 
@@ -90,7 +90,7 @@ def test_the_script_interpolates_as_python_does(pendulum, tmp_path):
         + f"const motion = new Motion({json.dumps(data)});"
         + f"console.log(JSON.stringify({times}.map((time) => Array.from(motion.at(time)))));"
     )
-    seen = subprocess.run([NODE, "-e", program], capture_output=True, text=True, check=True).stdout
+    seen = subprocess.run([str(NODE), "-e", program], capture_output=True, text=True, check=True).stdout
     np.testing.assert_allclose(np.array(json.loads(seen)).reshape(-1, 2, 3), pendulum.at(times), atol=1e-6)
 
 

@@ -47,7 +47,8 @@ def plot_strip(
     with plots.style(theme):
         width = WIDTH / columns
         height = rows * width / aspect + (TITLE if title else 0.0)
-        figure = plots.NotebookFigure(figsize=(WIDTH, height), layout="none")
+        figure = plots.NotebookFigure(figsize=(WIDTH, height))
+        figure.set_layout_engine("none")
         for k, time in enumerate(moments):
             row, column = divmod(k, columns)
             bottom = (rows - 1 - row) * width / aspect / height
@@ -88,7 +89,8 @@ def write_gif(
     images = []
     with plots.style(theme):
         for i, time in enumerate(times):
-            figure = Figure(figsize=(width, width / aspect), dpi=100, layout="none")
+            figure = Figure(figsize=(width, width / aspect), dpi=100)
+            figure.set_layout_engine("none")
             panel = figure.add_axes((0.0, 0.0, 1.0, 1.0))
             panel.set_axis_off()
             draw_moment(panel, motion, sizes, camera, aspect, width, time, trail, theme)
