@@ -53,7 +53,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     drawing, t = motion.drawing, motion.t
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
     duration = float(t[-1] - t[0])
-    speed = 1.0 if 0.4 * WATCHED <= duration <= 3 * WATCHED or duration == 0 else nice(duration / WATCHED)
+    speed = 1.0 if 0.15 * WATCHED <= duration <= 3 * WATCHED or duration == 0 else nice(duration / WATCHED)
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
     turns = {key: iter(counts) for key, counts in sizes.turns.items()}
 
@@ -109,6 +109,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "view": {"azimuth": sizes.azimuth, "elevation": sizes.elevation},
         "fitted": sizes.hull.tolist(),
         "margin": float(sizes.radii.max()),
+        "trails": any(sum(bool(form) for form in body.forms) > 1 for body in drawing.bodies),  # not along one line
         "speed": speed,
         "speeds": [float(f"{speed * factor:.1g}") for factor in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10)],
         "caption": drawing.caption,

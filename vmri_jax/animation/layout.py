@@ -10,6 +10,8 @@ from vmri_jax.animation.motion import Motion
 
 TURNS = (4, 14)
 """Fewest and most turns of a spring."""
+FADED = 0.45
+"""A floor fades away outwards: so much of it must be seen."""
 LEVEL = 0.9
 """Least vertical part of the unit normal of a plane that counts as level."""
 
@@ -65,7 +67,7 @@ def layout(motion: Motion) -> Layout:
     anchors = drawing.place([anchor.point for anchor in drawing.anchors])
     spheres = drawing.place([sphere.center for sphere in drawing.spheres])
     reach = np.array([sphere.radius for sphere in drawing.spheres]).reshape(-1, 1)
-    moving = np.concatenate([points.reshape(-1, 3), anchors])
+    moving = np.concatenate([points.reshape(-1, 3), anchors, spheres - reach, spheres + reach])
     size = float(np.linalg.norm(np.ptp(moving, axis=0))) or 1.0
     lengths = _median_lengths(drawing, points, anchors)
     room = min([0.3 * length for joints in lengths.values() for length in joints if length > 0], default=math.inf)
@@ -75,13 +77,9 @@ def layout(motion: Motion) -> Layout:
     coil = min(0.015 * size, 0.16 * min(sprung, default=size))
     turns = {key: [_turns(length, coil) for length in joints] for key, joints in lengths.items()}
     grounds = _grounds(drawing, moving, float(radii.max()), size)
-    corners = [
-        ground.center + 0.6 * sign * half * side
-        for ground in grounds
-        for side, half in zip(ground.sides, ground.halves, strict=True)
-        for sign in (-1, 1)
-    ]
-    seen = np.concatenate([moving, spheres - reach, spheres + reach, np.array(corners)])
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    corners = [g.center + (1.0 if g.solid else FADED) * signs * g.halves @ g.sides for g in grounds]
+    seen = np.concatenate([moving, *corners])
     flat = drawing.dimension < 3
     return Layout(
         size,
@@ -144,7 +142,7 @@ def _ground(point, normal, moving, size: float, *, solid: bool) -> Ground:
     sides = np.array([first, np.cross(normal, first)])
     margin = (0.12 if level else 0.05) * size
     extent = np.ptp(moving @ sides.T, axis=0) / 2 + margin
-    step = nice(float(extent.max()) / (6 if level else 2))
+    step = nice(max(float(extent.max()) / (6 if level else 2), size / 16))
     center = middle - ((middle - point) @ normal) * normal
     return Ground(center, sides, (float(extent[0]), float(extent[1])), normal, step, solid)
 

@@ -54,12 +54,14 @@ def draw_moment(
     for ground in sizes.grounds:
         pen.ground(ground)
         if ground.normal[2] > 0.5:
-            pen.shadows(ground, points, sizes.radii, [(a, b) for _, a, b, *_ in joints], sizes.rod)
+            centers = np.concatenate([points, sizes.spheres])
+            radii = [*sizes.radii, *(sphere.radius for sphere in drawing.spheres)]
+            pen.shadows(ground, centers, radii, [(a, b) for _, a, b, *_ in joints], sizes.rod)
     for center, sphere in zip(sizes.spheres, drawing.spheres, strict=True):
         pen.ball(center, sphere.radius, theme.faint)
     past = motion.at(np.linspace(max(motion.t[0], time - trail), time, 160))
     for i, color in enumerate(colors):
-        pen.trail(past[:, i], color)
+        pen.trail(past[:, i], color, sizes.radii[i])
     for kind, a, b, reach, color, count in joints:
         if kind == "link":
             pen.rod(a, b, reach, sizes.rod, sizes.size)
@@ -146,8 +148,12 @@ class _Pen:
         widths = wire * (scale[:-1] + scale[1:])
         self.lines(segments[order], self.tone(color, shades)[order], widths[order], float(scale.mean()))
 
-    def trail(self, path, color) -> None:
-        """Fading into the past."""
+    def trail(self, path, color, radius: float) -> None:
+        """Fading into the past, from the surface of the ball on."""
+        outside = np.linalg.norm(path - path[-1], axis=1) >= 0.9 * radius
+        path = path[: len(path) - int(np.argmax(outside[::-1]))] if outside.any() else path[:0]
+        if len(path) < 2:
+            return
         places, scale = self.camera.project(path)
         age = np.linspace(1, 0, len(path) - 1)
         segments = np.stack([places[:-1], places[1:]], axis=1)
@@ -192,13 +198,13 @@ class _Pen:
         angle = np.linspace(0, 2 * np.pi, 25)[:-1]
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ ground.sides
         color, strength = "#000000", 1.0 if self.theme is plots.LIGHT else 2.0
-        for grown in (0.8, 1.0, 1.2, 1.4):
+        for grown in np.arange(0.7, 1.5, 0.1):
             rings = [
                 _dropped(ground, point) + grown * radius * circle
                 for point, radius in zip(points, radii, strict=True)
                 if (point - ground.center) @ ground.normal > 0
             ]
-            self.polygons(rings, color, 0.05 * strength, -2)
+            self.polygons(rings, color, 0.026 * strength, -2)
         for a, b in joints:
             places, scale = self.camera.project(np.array([_dropped(ground, a), _dropped(ground, b)]))
             self.lines([places], color, [2 * rod * scale.mean()], -2, alpha=0.06 * strength)

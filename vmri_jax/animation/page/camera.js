@@ -43,8 +43,8 @@ class Camera {
     ];
   }
 
-  // Target and distance such that all points are seen, with room around them.
-  fit(points, radius, width, height) {
+  // Target and distance such that all points are seen, with room around them and below what is covered at the top.
+  fit(points, radius, width, height, covered) {
     const low = [0, 1, 2].map((k) => points.reduce((least, p) => Math.min(least, p[k]), Infinity));
     const high = [0, 1, 2].map((k) => points.reduce((most, p) => Math.max(most, p[k]), -Infinity));
     this.target = low.map((x, k) => (x + high[k]) / 2);
@@ -60,8 +60,8 @@ class Camera {
       }
       const per = this.distance / this.scale;
       this.target = plus(this.target, this.right, ((left + right) / 2 - this.center[0]) * per);
-      this.target = plus(this.target, this.up, (this.center[1] - (top + bottom) / 2) * per);
-      this.distance *= Math.max((right - left) / (0.86 * width), (bottom - top) / (0.84 * height));
+      this.target = plus(this.target, this.up, (this.center[1] + covered / 2 - (top + bottom) / 2) * per);
+      this.distance *= Math.max((right - left) / (0.86 * width), (bottom - top) / (0.88 * (height - covered)));
     }
     this.aim(width, height);
   }

@@ -62,8 +62,8 @@ function spot(painter, plane, center, radius) {
   const { context, camera, colors } = painter, below = dropped(plane, center);
   if (center[2] < below[2]) return;
   context.fillStyle = painter.tone(colors.shadow);
-  context.globalAlpha = 0.05 * painter.shade;
-  for (const grown of [0.8, 1, 1.2, 1.4]) {
+  context.globalAlpha = 0.026 * painter.shade;
+  for (let grown = 0.7; grown < 1.5; grown += 0.1) {
     const ring = Array.from({ length: 28 }, (_, k) => {
       const angle = (2 * Math.PI * k) / 28, [u, v] = [grown * radius * Math.cos(angle), grown * radius * Math.sin(angle)];
       return camera.project(plus(plus(below, plane.sides[0], u), plane.sides[1], v));
@@ -86,16 +86,12 @@ function obstacle(painter, { center, radius }) {
   const { camera, colors } = painter, [x, y, depth] = camera.project(center), r = (camera.scale * radius) / depth;
   painter.add(depth, (context) => {
     const shine = context.createRadialGradient(x - 0.4 * r, y - 0.5 * r, 0.1 * r, x, y, r);
-    shine.addColorStop(0, painter.tone(colors.paper));
-    shine.addColorStop(1, painter.tone(mix(colors.faint, colors.ink, 0.1), 0, depth));
+    [[0, 0.5], [0.5, 0.1], [1, -0.15]].forEach(([at, shade]) => shine.addColorStop(at, painter.tone(colors.faint, shade, depth)));
     context.fillStyle = shine;
-    context.strokeStyle = painter.tone(colors.rod, 0, depth);
-    context.lineWidth = 1;
-    context.globalAlpha = 0.85;
+    context.globalAlpha = 0.92;
     context.beginPath();
     context.arc(x, y, r, 0, 2 * Math.PI);
     context.fill();
-    context.stroke();
     context.globalAlpha = 1;
   });
 }

@@ -59,7 +59,7 @@ class Painter {
     context.lineCap = context.lineJoin = "round";
     for (const plane of data.planes) drawPlane(this, plane, positions);
     for (const sphere of data.spheres) obstacle(this, sphere);
-    bodies.forEach((_, i) => drawTrail(this, trail, i));
+    bodies.forEach((body, i) => drawTrail(this, trail, i, at(i), body.radius));
     for (const [a, b] of links) rod(this, ...ends(a, b));
     for (const { joined: [a, b], pace, turns } of springs) spring(this, ...ends(a, b), this.colors[pace], turns);
     for (const { body, point, kind, pace, turns } of anchors) {

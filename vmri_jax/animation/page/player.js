@@ -8,7 +8,7 @@ const asked = new URLSearchParams(location.hash.slice(1)); // #t=3.5&theme=dark:
 const TRAIL = 1.6; // seconds of watching
 const INSET = 9; // half the thumb of the slider: time 0 of the strips is below it
 
-const state = { time: motion.first, playing: false, speed: data.speed, trails: true, stale: true, before: 0 };
+const state = { time: motion.first, playing: false, speed: data.speed, trails: data.trails, stale: true, before: 0 };
 const strips = [new Strip(find("energy"), find("energy-text"), data.energy_title, motion, [["", decoded(data.energy, Float32Array), "slow"]], false)];
 if (data.residual) {
   const [position, velocity] = data.residual.map((text) => decoded(text, Float32Array));
@@ -71,11 +71,17 @@ function home() {
   changed();
 }
 
+// Height of the view that lies under the title.
+function covered() {
+  const header = document.querySelector("header");
+  return getComputedStyle(header).position === "absolute" ? 0.7 * header.offsetHeight : 0;
+}
+
 // All that depends on the size of the window.
 function fit() {
   const { clientWidth: width, clientHeight: height } = painter.canvas;
   painter.resize(width, height);
-  if (!camera.moved) camera.fit(data.fitted, data.margin, width, height);
+  if (!camera.moved) camera.fit(data.fitted, data.margin, width, height, covered());
   recolor();
   draw(); // at once: a resized canvas is empty
 }

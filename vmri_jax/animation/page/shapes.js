@@ -91,13 +91,14 @@ function spring(painter, a, b, reachA, reachB, color, turns) {
 }
 
 // Fading and thinning into the past.
-function drawTrail(painter, trail, i) {
+function drawTrail(painter, trail, i, now, radius) {
   const { camera } = painter, color = painter.bodies[i];
   let last = null;
   trail.forEach((positions, k) => {
-    const from = last, to = camera.project(positions.subarray(3 * i, 3 * i + 3)), age = 1 - (k + 1) / trail.length;
+    const point = positions.subarray(3 * i, 3 * i + 3), hidden = Math.hypot(...plus(point, now, -1)) < 0.9 * radius;
+    const from = last, to = camera.project(point), age = 1 - (k + 1) / trail.length;
     last = to;
-    if (!from) return;
+    if (!from || hidden) return;
     const depth = (from[2] + to[2]) / 2;
     painter.add(depth + 0.002 * camera.distance, (context) => {
       context.globalAlpha = 0.7 * (1 - age) ** 1.5;
