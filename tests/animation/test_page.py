@@ -49,8 +49,10 @@ def test_numbers_of_the_page_are_those_of_the_motion(pendulum, tmp_path):
     np.testing.assert_allclose(unpacked(data["energy"]), pendulum.energy, rtol=1e-6)
     assert data["residual"] is None
     assert [body["name"] for body in data["bodies"]] == ["bob", "tip"]
-    assert data["links"] == [[0, 1]]
-    assert (data["anchors"][0]["kind"], data["anchors"][0]["pace"]) == ("spring", "slow")
+    link, spring = data["connections"]
+    assert (link["kind"], link["body"], link["other"], link["point"]) == ("link", 0, 1, None)
+    assert (spring["kind"], spring["body"], spring["point"]) == ("spring", 0, [0.0, 0.0, 0.0])
+    assert spring["pace"] == "slow"
     assert data["planes"][0]["solid"]
 
 

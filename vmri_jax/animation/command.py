@@ -87,8 +87,6 @@ def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
     description = _read(drawing) if drawing is not None else _stored(run)
     if not description and problem is not None:
         description = getattr(problem, "drawing", None) or built_in(system or "", np.size(problem.q_s))
-    if np.ndim(trajectory.t) != 1:
-        raise ValueError(f"{run} holds a batch of runs; save one of them.")
     found = Drawing.from_dict(description or bars(trajectory))
     return motion(trajectory, found, None if problem is None else problem.system)
 

@@ -40,7 +40,7 @@ def plot_strip(
         raise ValueError(f"plot_strip: times is {times!r}; give at least one.")
     sizes = layout(motion)
     camera, aspect = view(sizes)
-    columns = len(moments) if aspect < 1.3 else 3 if aspect < 2.5 else 1
+    columns = len(moments) if aspect < 1.3 else 3 if aspect < 3.5 else 1
     columns = min(columns, len(moments), 6)
     rows = -(-len(moments) // columns)
     trail = 0.5 * (motion.t[-1] - motion.t[0]) / max(len(moments), 4)

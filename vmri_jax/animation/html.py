@@ -28,8 +28,8 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
         title: over the picture.
     """
     every = -(-motion.points.size // MOST_NUMBERS)
-    data = _data(motion.thinned(-(-len(motion.t) // every)), layout(motion))
-    drawing = motion.drawing
+    drawing, sizes = motion.drawing, layout(motion)
+    data = _data(motion.thinned(-(-len(motion.t) // every)), sizes)
     if every > 1:
         ending = {2: "nd", 3: "rd"}.get(every, "th")
         data["caption"] = f"{drawing.caption} Drawn from every {every}{ending} node.".strip()
@@ -39,7 +39,7 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     text = environment.get_template("page.html.j2").render(
         title=title or "Motion",
         description=_description(motion),
-        paces=sorted(_paces(drawing), reverse=True),
+        paces=sorted(_paces(drawing, sizes), reverse=True),
         constrained=data["residual"] is not None,
         data=data,
         light=plots.LIGHT,
@@ -51,12 +51,9 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
 def _data(motion: Motion, sizes: Layout) -> dict:
     """What the script reads; names as in its files."""
     drawing, t = motion.drawing, motion.t
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
     duration = float(t[-1] - t[0])
     speed = 1.0 if 0.15 * WATCHED <= duration <= 3 * WATCHED or duration == 0 else nice(duration / WATCHED)
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
-    turns = {key: iter(counts) for key, counts in sizes.turns.items()}
-
     return {
         "t": _packed(t, np.float64),
         "points": _packed(motion.points),
@@ -68,24 +65,9 @@ def _data(motion: Motion, sizes: Layout) -> dict:
             {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius)}
             for body, radius in zip(drawing.bodies, sizes.radii, strict=True)
         ],
-        "links": [[index[name] for name in link.bodies] for link in drawing.links],
-        "springs": [
-            {
-                "joined": [index[name] for name in joint.bodies],
-                "pace": drawing.pace(joint),
-                "turns": next(turns["springs"]),
-            }
-            for joint in drawing.springs
-        ],
-        "anchors": [
-            {
-                "body": index[anchor.body],
-                "point": point.tolist(),
-                "kind": anchor.kind,
-                "pace": drawing.pace(anchor),
-                "turns": next(turns[f"{anchor.kind} anchors"]),
-            }
-            for anchor, point in zip(drawing.anchors, sizes.anchors, strict=True)
+        "connections": [
+            {**vars(connection), "point": None if connection.point is None else connection.point.tolist()}
+            for connection in sizes.connections
         ],
         "planes": [
             {
@@ -117,10 +99,10 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     }
 
 
-def _paces(drawing: Drawing) -> set[str]:
+def _paces(drawing: Drawing, sizes: Layout) -> set[str]:
     """Those whose colours are seen."""
-    springs = [*drawing.springs, *(anchor for anchor in drawing.anchors if anchor.kind == "spring")]
-    return {body.pace for body in drawing.bodies if body.color is None} | {drawing.pace(joint) for joint in springs}
+    springs = {connection.pace for connection in sizes.connections if connection.kind == "spring"}
+    return springs | {body.pace for body in drawing.bodies if body.color is None}
 
 
 def _packed(array: np.ndarray, dtype: type = np.float32) -> str:

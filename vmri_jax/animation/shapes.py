@@ -37,44 +37,34 @@ def draw_moment(
     axes.set(xlim=(-aspect, aspect), ylim=(-1, 1), aspect="equal")
     pen = _Pen(axes, camera, theme, 72 * width / (2 * aspect))
     drawing, points = motion.drawing, motion.at([time])[0]
-    index = {body.name: i for i, body in enumerate(drawing.bodies)}
     paces = {"slow": theme.curves[0], "fast": theme.curves[1]}
     colors = [body.color or paces[body.pace] for body in drawing.bodies]
-    joints = []
-    for kind, group in (("link", drawing.links), ("spring", drawing.springs)):
-        turns = sizes.turns[f"{kind}s"]
-        for joint, count in zip(group, turns, strict=True):
-            a, b = (index[name] for name in joint.bodies)
-            reach = (sizes.radii[a], sizes.radii[b])
-            joints.append((kind, points[a], points[b], reach, paces[drawing.pace(joint)], count))
-    turns = {kind: iter(sizes.turns[f"{kind} anchors"]) for kind in ("link", "spring")}
-    for anchor, point in zip(drawing.anchors, sizes.anchors, strict=True):
-        i, color = index[anchor.body], paces[drawing.pace(anchor)]
-        joints.append((anchor.kind, points[i], point, (sizes.radii[i], 0.0), color, next(turns[anchor.kind])))
+    ends = [(points[c.body], points[c.other] if c.point is None else c.point) for c in sizes.connections]
     for ground in sizes.grounds:
         pen.ground(ground)
         if ground.normal[2] > 0.5:
             centers = np.concatenate([points, sizes.spheres])
             radii = [*sizes.radii, *(sphere.radius for sphere in drawing.spheres)]
-            pen.shadows(ground, centers, radii, [(a, b) for _, a, b, *_ in joints], sizes.rod)
+            pen.shadows(ground, centers, radii, ends, sizes.rod)
     for center, sphere in zip(sizes.spheres, drawing.spheres, strict=True):
         pen.ball(center, sphere.radius, theme.faint)
     past = motion.at(np.linspace(max(motion.t[0], time - trail), time, 160))
     for i, color in enumerate(colors):
         pen.trail(past[:, i], color, sizes.radii[i])
-    for kind, a, b, reach, color, count in joints:
-        if kind == "link":
+    for connection, (a, b) in zip(sizes.connections, ends, strict=True):
+        reach = (sizes.radii[connection.body], 0.0 if connection.other is None else sizes.radii[connection.other])
+        if connection.kind == "link":
             pen.rod(a, b, reach, sizes.rod, sizes.size)
         else:
-            pen.spring(a, b, reach, sizes.coil, sizes.wire, color, count)
-    for point in sizes.anchors:
-        pen.ball(point, 1.5 * sizes.rod, ROD[theme])
+            pen.spring(a, b, reach, sizes.coil, sizes.wire, paces[connection.pace], connection.turns)
+        if connection.point is not None:
+            pen.ball(connection.point, 1.5 * sizes.rod, ROD[theme])
     for point, radius, color in zip(points, sizes.radii, colors, strict=True):
         pen.ball(point, radius, color)
     span = float(motion.t[-1] - motion.t[0])
     digits = max(0, 2 - math.floor(math.log10(span))) if span > 0 else 2
-    label = f"{time:.{digits}f}"
-    axes.text(-0.97 * aspect, -0.97, f"$t = {label}$", va="bottom", fontsize=9, color=theme.ink, zorder=ON_TOP)
+    label = f"$t = {time:.{digits}f}$"
+    axes.text(-0.97 * aspect, -0.97, label, va="bottom", fontsize=9, color=theme.ink, zorder=ON_TOP)
 
 
 class _Pen:
@@ -89,16 +79,15 @@ class _Pen:
         ends = np.where(shade < 0, 0.06, 1.0)
         return np.array(to_rgb(color)) * (1 - np.abs(shade)) + ends * np.abs(shade)
 
-    def lines(self, ends, colors, widths, zorder, alpha=None, capstyle="round") -> None:
-        """Segments (n, 2, 2); widths in units of the view."""
-        widths = np.maximum(0.5, self.points * np.asarray(widths))
-        lines = LineCollection(ends, colors=colors, linewidths=widths, zorder=zorder, alpha=alpha, capstyle=capstyle)
+    def lines(self, ends, colors, widths, zorder: float, **style) -> None:
+        """Segments (n, 2, 2); widths in points of print."""
+        lines = LineCollection(list(ends), colors=colors, linewidths=np.maximum(0.5, widths), zorder=zorder, **style)
         self.axes.add_collection(lines, autolim=False)
 
     def ball(self, center, radius: float, color) -> None:
         """Discs that grow lighter towards the lamp; nearer things have a larger scale, and are drawn later."""
         (x, y), scale = self.camera.project(center)
-        share = np.linspace(0, 1, 12)
+        share = np.linspace(0, 1, int(np.clip(2 * self.points * scale * radius, 12, 60)))
         r = scale * radius * (1 - 0.93 * share)
         shades = np.interp(share, [0, 0.45, 0.8, 1], [-0.42, 0.0, 0.4, 0.75])
         shift = scale * radius * share
@@ -115,17 +104,17 @@ class _Pen:
         pieces = int(np.clip(np.ceil(10 * np.linalg.norm(end - start) / size), 1, 12))
         places, scale = self.camera.project(start + np.linspace(0, 1, pieces + 1)[:, None] * (end - start))
         along = places[-1] - places[0]
-        side = np.array([along[1], -along[0]]) / max(float(np.linalg.norm(along)), 1e-12)
+        along /= max(float(np.linalg.norm(along)), 1e-12)
+        side = np.array([along[1], -along[0]])
         side *= 1.0 if side @ LAMP[:2] > 0 else -1.0
+        overlap = 0.3 / self.points * np.array([-along, along])  # or seams would show
         tones = self.tone(ROD[self.theme], [-0.35, 0.05, 0.5])
         for k in range(pieces):
             w = radius * (scale[k] + scale[k + 1])
             middle = float(scale[k] + scale[k + 1]) / 2
-            piece = places[[k, k + 1]] + 0.3 / self.points * np.array([[-1.0], [1.0]]) * along / max(
-                np.hypot(*along), 1e-12
-            )
             shifts = np.array([0.0, 0.12, 0.25])[:, None, None] * w * side
-            self.lines(piece + shifts, tones, np.array([1.0, 0.72, 0.25]) * w, middle, capstyle="butt")
+            widths = self.points * np.array([1.0, 0.72, 0.25]) * w
+            self.lines(places[[k, k + 1]] + overlap + shifts, tones, widths, middle, capstyle="butt")
 
     def spring(self, a, b, reach, coil: float, wire: float, color, turns: int) -> None:
         """A helix with straight ends."""
@@ -145,8 +134,9 @@ class _Pen:
         shades = np.concatenate([[0.0], bright[1:], [0.0]])
         order = np.argsort(scale[:-1] + scale[1:])
         segments = np.stack([places[:-1], places[1:]], axis=1)
-        widths = wire * (scale[:-1] + scale[1:])
-        self.lines(segments[order], self.tone(color, shades)[order], widths[order], float(scale.mean()))
+        widths = self.points * wire * (scale[:-1] + scale[1:])
+        tones = self.tone(color, shades)
+        self.lines(segments[order], tones[order], widths[order], float(scale.mean()), capstyle="round")
 
     def trail(self, path, color, radius: float) -> None:
         """Fading into the past, from the surface of the ball on."""
@@ -155,18 +145,10 @@ class _Pen:
         if len(path) < 2:
             return
         places, scale = self.camera.project(path)
-        age = np.linspace(1, 0, len(path) - 1)
+        young = np.linspace(0, 1, len(path) - 1)
         segments = np.stack([places[:-1], places[1:]], axis=1)
-        widths = (0.6 + 1.2 * (1 - age)) / self.points
-        lines = LineCollection(
-            segments.tolist(),
-            colors=color,
-            linewidths=self.points * widths,
-            alpha=0.7 * (1 - age) ** 1.5,
-            capstyle="butt",
-        )
-        lines.set_zorder(0.998 * float(scale.mean()))
-        self.axes.add_collection(lines, autolim=False)
+        behind = 0.998 * float(scale.mean())
+        self.lines(segments, color, 0.6 + 1.2 * young, behind, alpha=0.7 * young**1.5, capstyle="butt")
 
     def ground(self, ground: Ground) -> None:
         """A grid that fades outwards; a solid plane is tinted too."""
@@ -184,11 +166,7 @@ class _Pen:
                 strengths.append(np.ones(16) if ground.solid else fade)
         places, scale = self.camera.project(np.concatenate(segments))
         seen = (scale > 0).all(axis=1)
-        lines = LineCollection(
-            places[seen].tolist(), colors=self.theme.faint, linewidths=0.7, alpha=np.concatenate(strengths)[seen]
-        )
-        lines.set_zorder(-3)
-        self.axes.add_collection(lines, autolim=False)
+        self.lines(places[seen], self.theme.faint, 0.7, -3, alpha=np.concatenate(strengths)[seen])
         if ground.solid:
             corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * ground.halves
             self.polygons([ground.center + corners @ ground.sides], self.theme.faint, 0.4, -4)
@@ -207,7 +185,8 @@ class _Pen:
             self.polygons(rings, color, 0.026 * strength, -2)
         for a, b in joints:
             places, scale = self.camera.project(np.array([_dropped(ground, a), _dropped(ground, b)]))
-            self.lines([places], color, [2 * rod * scale.mean()], -2, alpha=0.06 * strength)
+            width = 2 * self.points * rod * scale.mean()
+            self.lines([places], color, width, -2, alpha=0.06 * strength, capstyle="round")
 
     def polygons(self, corners, color, alpha: float, zorder: float) -> None:
         places = [self.camera.project(each)[0] for each in corners]

@@ -38,7 +38,7 @@ function drawPlane(painter, plane, positions) {
 const dropped = ({ center, normal }, p) => plus(p, [0, 0, 1], dot(plus(center, p, -1), normal) / normal[2]);
 
 function shadows(painter, plane, positions) {
-  const { context, camera, colors, data } = painter, { bodies, links, springs, anchors } = data;
+  const { context, camera, colors, data } = painter, { bodies, connections } = data;
   const at = (i) => positions.subarray(3 * i, 3 * i + 3);
   context.strokeStyle = painter.tone(colors.shadow);
   context.globalAlpha = 0.06 * painter.shade;
@@ -51,9 +51,7 @@ function shadows(painter, plane, positions) {
     context.lineTo(to[0], to[1]);
     context.stroke();
   };
-  for (const [a, b] of links) line(at(a), at(b));
-  for (const { joined: [a, b] } of springs) line(at(a), at(b));
-  for (const { body, point } of anchors) line(at(body), point);
+  for (const { body, other, point } of connections) line(at(body), point ?? at(other));
   bodies.forEach((body, i) => spot(painter, plane, at(i), body.radius));
 }
 

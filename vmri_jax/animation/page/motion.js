@@ -24,6 +24,12 @@ class Motion {
     return low;
   }
 
+  // Index of the node that is nearest to a time.
+  nearest(time) {
+    const i = this.interval(time);
+    return i + 1 < this.t.length && this.t[i + 1] - time < time - this.t[i] ? i + 1 : i;
+  }
+
   // Positions of all bodies: x, y, z of the first, then of the second ...
   at(time, out = new Float32Array(this.size)) {
     const { points, velocities, size } = this;
@@ -35,14 +41,5 @@ class Motion {
       out[k] = points[a] + u * (left + u * (3 * d - 2 * left - right + u * (left + right - 2 * d)));
     }
     return out;
-  }
-
-  // A few hundred positions of all bodies over the whole time: what the view must hold.
-  samples(most = 300) {
-    const every = Math.max(1, Math.floor(this.t.length / most)), found = [];
-    for (let i = 0; i < this.t.length; i += every) {
-      for (let k = i * this.size; k < (i + 1) * this.size; k += 3) found.push(this.points.slice(k, k + 3));
-    }
-    return found;
   }
 }

@@ -51,22 +51,19 @@ class Painter {
 
   // positions: x, y, z of all bodies; trail: such positions at times up to now, the oldest first.
   draw(camera, positions, trail) {
-    const { data, context } = this, { bodies, links, springs, anchors } = data;
+    const { data, context } = this, { bodies } = data;
     const at = (i) => positions.subarray(3 * i, 3 * i + 3);
-    const ends = (a, b) => [at(a), at(b), bodies[a].radius, bodies[b].radius];
     Object.assign(this, { camera, items: [] });
     context.clearRect(0, 0, this.width, this.height);
     context.lineCap = context.lineJoin = "round";
     for (const plane of data.planes) drawPlane(this, plane, positions);
     for (const sphere of data.spheres) obstacle(this, sphere);
     bodies.forEach((body, i) => drawTrail(this, trail, i, at(i), body.radius));
-    for (const [a, b] of links) rod(this, ...ends(a, b));
-    for (const { joined: [a, b], pace, turns } of springs) spring(this, ...ends(a, b), this.colors[pace], turns);
-    for (const { body, point, kind, pace, turns } of anchors) {
-      const reach = bodies[body].radius;
-      if (kind === "link") rod(this, at(body), point, reach, 0);
-      else spring(this, at(body), point, reach, 0, this.colors[pace], turns);
-      ball(this, point, 1.5 * data.rod, this.colors.rod);
+    for (const { kind, body, other, point, pace, turns } of data.connections) {
+      const ends = [at(body), point ?? at(other), bodies[body].radius, point ? 0 : bodies[other].radius];
+      if (kind === "link") rod(this, ...ends);
+      else spring(this, ...ends, this.colors[pace], turns);
+      if (point) ball(this, point, 1.5 * data.rod, this.colors.rod);
     }
     bodies.forEach((body, i) => ball(this, at(i), body.radius, this.bodies[i]));
     this.items.sort((a, b) => b[0] - a[0]);

@@ -61,7 +61,7 @@ function spring(painter, a, b, reachA, reachB, color, turns) {
   if (!ends) return;
   const { camera, data } = painter, [start, end, along] = ends, gap = plus(end, start, -1);
   const sideways = unit(cross(along, [0.36, 0.48, 0.8])), third = cross(along, sideways);
-  const perTurn = data.springs.length > 20 ? 10 : 16, steps = turns * perTurn, lead = 0.1;
+  const perTurn = data.connections.length > 20 ? 10 : 16, steps = turns * perTurn, lead = 0.1;
   const place = (i) => {
     const angle = (2 * Math.PI * i) / perTurn, grown = Math.min(1, i / perTurn, (steps - i) / perTurn);
     const radial = plus(plus([0, 0, 0], sideways, Math.cos(angle)), third, Math.sin(angle));

@@ -72,7 +72,7 @@ class Strip {
     context.drawImage(this.still, 0, 0);
     context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     this.line(context, [[x, 0], [x, this.height]], "ink", 1);
-    const i = this.motion.interval(time), parts = this.curves.map(([name, values, color], k) => {
+    const i = this.motion.nearest(time), parts = this.curves.map(([name, values, color], k) => {
       const key = name ? `<i style="background: var(--${color})"></i>${name} ` : "";
       return `<span>${key}<b>${shown(values[i])}</b>, largest ${shown(this.largest[k])}</span>`;
     });
@@ -89,6 +89,7 @@ function drawAxis(canvas, motion, colors, inset) {
   context.fillStyle = context.strokeStyle = colors.ink;
   context.globalAlpha = 0.74;
   context.font = "12px system-ui, sans-serif";
+  if (!span) return;
   const rough = (span / width) * 90, power = 10 ** Math.floor(Math.log10(rough)), step = power * [1, 2, 5, 10].find((k) => k * power >= rough);
   for (let k = Math.ceil(motion.first / step - 1e-9); k * step <= motion.last + 1e-9 * span; k++) {
     const x = inset + ((k * step - motion.first) / span) * (width - 2 * inset), text = `${k ? "" : "t = "}${+(k * step).toPrecision(8)}`;
