@@ -148,7 +148,7 @@ class _Pen:
         young = np.linspace(0, 1, len(path) - 1)
         segments = np.stack([places[:-1], places[1:]], axis=1)
         behind = 0.998 * float(scale.mean())
-        self.lines(segments, color, 0.6 + 1.2 * young, behind, alpha=0.7 * young**1.5, capstyle="butt")
+        self.lines(segments, color, 0.5 + 0.9 * young, behind, alpha=0.7 * young**1.5, capstyle="butt")
 
     def ground(self, ground: Ground) -> None:
         """A grid that fades outwards; a solid plane is tinted too."""
