@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks import batch, compilation, cost, floor, orders, peers
+from benchmarks import batch, compilation, cost, floor, kills, orders, peers
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -62,6 +62,13 @@ def peers_command(full: Full = False, core: Core = None, out: Out = OUT, only: O
     """Time to reach an error, against other integrators; the extra `peers` installs them."""
     prepare(core)
     _measure("peers", peers, full, out, only=only or (), peers=peer or ())
+
+
+@app.command("kills")
+def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 100, out: Out = OUT) -> None:
+    """A streaming run killed at random moments, and resumed to the last bit."""
+    prepare(cache=False)
+    _measure("kills", kills, False, out, count=count)
 
 
 @app.command("all")

@@ -176,7 +176,7 @@ def test_a_file_that_fails_to_run_says_where(vmri, tmp_path, source, message):
 
 @pytest.mark.parametrize(("steps", "save_every"), [(1, 1), (1000, 1), (2000, 2), (100_000, 100), (2003, 1), (3001, 1)])
 def test_about_a_thousand_nodes_are_saved(steps, save_every):
-    assert cli._default_save_every(steps) == save_every
+    assert cli.run.default_save_every(steps) == save_every
 
 
 def test_reproduce_one_figure(vmri, tmp_path, monkeypatch):

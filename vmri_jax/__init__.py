@@ -4,6 +4,7 @@ from vmri_jax import diagnostics, quadrature, runtime
 from vmri_jax.batch import simulate_batch
 from vmri_jax.composition import Composition, compose
 from vmri_jax.discrete_lagrangian import discrete_lagrangian, discrete_legendre
+from vmri_jax.interrupts import Interrupted
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import macro, micro
 from vmri_jax.results import Method, Result, SimulationError
@@ -11,6 +12,7 @@ from vmri_jax.scheme import Scheme, explicit_slow, fully_explicit, fully_implici
 from vmri_jax.simulate import simulate
 from vmri_jax.state import State, initial_state
 from vmri_jax.step import StepInfo, macro_step
+from vmri_jax.store import StoredTrajectory, stream
 from vmri_jax.system import ConstantMass, Problem, System
 from vmri_jax.trajectory import Trajectory
 
@@ -19,6 +21,7 @@ from vmri_jax import systems  # isort: skip  (written with the names above)
 __all__ = [
     "Composition",
     "ConstantMass",
+    "Interrupted",
     "Method",
     "Newton",
     "Problem",
@@ -27,6 +30,7 @@ __all__ = [
     "SimulationError",
     "State",
     "StepInfo",
+    "StoredTrajectory",
     "System",
     "Trajectory",
     "compose",
@@ -45,5 +49,6 @@ __all__ = [
     "runtime",
     "simulate",
     "simulate_batch",
+    "stream",
     "systems",
 ]

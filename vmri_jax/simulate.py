@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import numpy as np
 from vmri_jax import diagnostics
 from vmri_jax.checks import check_arrays, check_system, require_x64
 from vmri_jax.composition import Composition, stage_scheme
+from vmri_jax.interrupts import Interrupted, interrupts_noted
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Result, SimulationError
@@ -60,42 +62,94 @@ def simulate(
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
         SimulationError: a step failed.
+        Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
     """
-    macro_dt = jnp.asarray(
-        check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every), dtype=float
-    )
-    start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
-    newton, num_saves = newton or Newton(), num_steps // save_every
-    memory = run_memory(system, scheme, start, macro_dt, newton)
-    if not is_concrete((system, scheme, start, macro_dt, newton)):
-        compiled = partial(_run_static, system, scheme, newton, macro_dt, start.t)
-        return compiled(start, memory, 0, num_saves, save_every, save_micro)[0]
+    simulation, start = prepare(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    at, num_saves = simulation.start(start), num_steps // save_every
+    if not simulation.is_concrete(start):
+        return simulation.all(at, num_saves)
 
     check_constraints(system, start.q_s, start.q_f, "simulate: the state")
-    compiled = partial(_run_traced, system, scheme)
-    cheap = newton
-    if newton.falls_back and newton.marches(system, stage_scheme(scheme)):
-        cheap = dataclasses.replace(newton, method="march")  # "auto" compiles its fallback too: only if it is needed
-    pieces, state, first_step = [], start, 0
-    for saves in _chunks(num_saves, progress):
-        piece, memory = compiled(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
-        failed = int(piece.failed_at)
-        if failed >= 0 and cheap is not newton:
-            cheap, kept = newton, (failed - first_step) // save_every
-            if kept:
-                pieces.append(piece.first(kept))
-                state, memory = pieces[-1].final_state, None
-                first_step, saves = first_step + kept * save_every, saves - kept
-            memory = run_memory(system, scheme, state, macro_dt, newton)
-            piece, memory = compiled(cheap, macro_dt, start.t, state, memory, first_step, saves, save_every, save_micro)
-        pieces.append(piece)
-        first_step += saves * save_every
-        if first_step < num_steps:
-            state = piece.final_state
-    trajectory = pieces[0] if len(pieces) == 1 else join(pieces)
-    if throw and is_concrete(trajectory.failed_at) and int(trajectory.failed_at) >= 0:
-        raise simulation_error(trajectory, macro_dt, save_every)
+    pieces = []
+    with interrupts_noted(progress) as interrupted:
+        for saves in _sizes(num_saves, progress):
+            piece, at = simulation.advance(at, saves)
+            pieces.append(piece)
+            if interrupted():
+                raise Interrupted(join(pieces), at.step, num_steps)
+    trajectory = join(pieces)
+    if throw and int(trajectory.failed_at) >= 0:
+        raise simulation_error(trajectory, simulation.macro_dt, save_every)
     return trajectory
+
+
+class Checkpoint(NamedTuple):
+    """Where a run stands: all that its next steps depend on, to the last bit.
+
+    step: macro steps done.
+    state, memory: at the node reached, and what the last step hands on.
+    fell_back: whether the nested march has given way to its fallback.
+    """
+
+    step: int
+    state: State
+    memory: Memory | Stages
+    fell_back: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulation:
+    """What stays the same all along a run, whose pieces are computed one after the other from a `Checkpoint`."""
+
+    system: System
+    scheme: Scheme | Composition
+    newton: Newton
+    macro_dt: Any
+    t_start: Any
+    save_every: int
+    save_micro: bool
+
+    def is_concrete(self, start: State) -> bool:
+        """Whether there are only numbers, no tracers of a transformation."""
+        return is_concrete((self.system, self.scheme, start, self.macro_dt, self.newton))
+
+    def start(self, state: State) -> Checkpoint:
+        """Before the first step."""
+        return Checkpoint(0, state, run_memory(self.system, self.scheme, state, self.macro_dt, self.newton))
+
+    def advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
+        """The next `saves` saved intervals, compiled once per number of them.
+
+        "auto" is first the march alone (its fallback takes long to compile); where that fails the run goes on from the
+        last saved node before with the fallback.
+        """
+        cheap = self.newton
+        if not at.fell_back and self.newton.falls_back and self.newton.marches(self.system, stage_scheme(self.scheme)):
+            cheap = dataclasses.replace(self.newton, method="march")
+        piece, end = self._advance(at, saves, cheap)
+        failed = int(piece.failed_at)
+        if failed < 0 or cheap is self.newton:
+            return piece, end
+        kept = (failed - at.step) // self.save_every
+        good = [piece.first(kept)] if kept else []
+        state = good[0].final_state if kept else at.state
+        at = self.start(state)._replace(step=at.step + kept * self.save_every, fell_back=True)
+        rest, end = self._advance(at, saves - kept, self.newton)
+        return join([*good, rest]), end
+
+    def _advance(self, at: Checkpoint, saves: int, newton: Newton) -> tuple[Trajectory, Checkpoint]:
+        piece, state, memory = _run_traced(
+            self.system, self.scheme, newton, self.macro_dt, self.t_start, at.state, at.memory, at.step, saves,
+            self.save_every, self.save_micro,
+        )  # fmt: skip
+        return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
+
+    def all(self, start: Checkpoint, saves: int) -> Trajectory:
+        """The whole run as one piece, under transformations of JAX."""
+        return _run_static(
+            self.system, self.scheme, self.newton, self.macro_dt, self.t_start, start.state, start.memory, 0, saves,
+            self.save_every, self.save_micro,
+        )[0]  # fmt: skip
 
 
 def run(
@@ -157,8 +211,16 @@ def run(
 
 # A traced save_every lets a sweep over step sizes compile once; under a transformation it is static instead, so that
 # the trip count of the loop is known and reverse mode works.
-_run_traced = jax.jit(run, static_argnames=("num_saves", "save_micro"))
 _run_static = jax.jit(run, static_argnames=("num_saves", "save_micro", "save_every"))
+
+
+@partial(jax.jit, static_argnames=("num_saves", "save_micro"))
+def _run_traced(system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro):
+    """Also the state at the end."""
+    piece, memory = run(
+        system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro
+    )
+    return piece, piece.final_state, memory
 
 
 @jax.jit
@@ -168,7 +230,7 @@ def run_memory(system, scheme, state, macro_dt, newton):
     return start_memory(system, scheme, state, macro_dt, newton)
 
 
-def _chunks(num_saves: int, progress: bool):
+def _sizes(num_saves: int, progress: bool):
     """Numbers of saved nodes per compiled call; one call, or about 50 equal ones with a progress bar around them."""
     if not progress:
         yield num_saves
@@ -178,6 +240,16 @@ def _chunks(num_saves: int, progress: bool):
     size = -(-num_saves // 50)
     sizes = [size] * (num_saves // size) + ([num_saves % size] if num_saves % size else [])
     yield from track(sizes, description="simulating", transient=True)
+
+
+def prepare(
+    system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro
+) -> tuple[Simulation, State]:
+    """The simulation that these arguments of `simulate` ask for, and its start; bad ones are refused."""
+    macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every)
+    start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
+    macro_dt = jnp.asarray(macro_dt, dtype=float)
+    return Simulation(system, scheme, newton or Newton(), macro_dt, start.t, save_every, save_micro), start
 
 
 def _vectors(state: State) -> dict:

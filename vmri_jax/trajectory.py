@@ -9,6 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.checks import require_x64
+from vmri_jax.files import replaced
 from vmri_jax.results import Result
 
 FORMAT = "vmri_jax trajectory 2"
@@ -71,16 +73,22 @@ class Trajectory(eqx.Module):
         """The first `count` saved intervals of a run that had not failed by then."""
         stops = dict.fromkeys(NODES, count + 1)
         flat = {
-            name: a if a is None or name in STATUS else a[: stops.get(name, count)] for name, a in _flat(self).items()
+            name: a if a is None or name in STATUS else a[: stops.get(name, count)]
+            for name, a in named_arrays(self).items()
         }
-        return _from_flat(flat | {"result": jnp.asarray(int(Result.CONVERGED)), "failed_at": jnp.asarray(-1)})
+        return from_named_arrays(flat | {"result": jnp.asarray(int(Result.CONVERGED)), "failed_at": jnp.asarray(-1)})
 
     def save(self, path, drawing: dict | None = None) -> None:
-        """Write all arrays to a .npz file (no pickled objects), next to them a `vmri_jax.animation.Drawing` as plain data."""
-        arrays = {name: np.asarray(value) for name, value in _flat(self).items() if value is not None}
+        """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
+
+        Args:
+            path: of the file.
+            drawing: plain data of a `vmri_jax.animation.Drawing`, kept next to the arrays.
+        """
+        arrays = {name: np.asarray(value) for name, value in named_arrays(self).items() if value is not None}
         if drawing is not None:
             arrays["drawing"] = np.array(json.dumps(drawing))
-        with FilePath(path).open("wb") as file:  # an open file, or numpy appends .npz to other names
+        with replaced(path) as file:
             np.savez_compressed(file, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
     @classmethod
@@ -91,6 +99,7 @@ class Trajectory(eqx.Module):
             FileNotFoundError: no such file.
             ValueError: a file that is damaged or not a trajectory.
         """
+        require_x64()
         path = FilePath(path)
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist; give the .npz file of a saved trajectory.")
@@ -110,7 +119,7 @@ class Trajectory(eqx.Module):
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
-        return _from_flat({name: jnp.asarray(value) for name, value in arrays.items()})
+        return from_named_arrays({name: jnp.asarray(value) for name, value in arrays.items()})
 
     def to_xarray(self):
         """The trajectory as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``)."""
@@ -141,26 +150,30 @@ class Trajectory(eqx.Module):
 
 def join(pieces: list[Trajectory]) -> Trajectory:
     """Consecutive trajectories, each starting where the one before ends, as one."""
-    flat = [_flat(piece) for piece in pieces]
-    failed = next((f for f in flat if int(f["failed_at"]) >= 0), flat[-1])
+    if len(pieces) == 1:
+        return pieces[0]
+    flat = [named_arrays(piece) for piece in pieces]
+    worst = max(flat, key=lambda f: int(f["result"]))
+    status = next((f for f in flat if int(f["failed_at"]) >= 0), worst)
 
     def joined(name, first):
         if first is None:
             return None
         if name in STATUS:
-            return jnp.asarray(failed[name])
+            return jnp.asarray(status[name])
         skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
         return jnp.concatenate([first] + [f[name][skip:] for f in flat[1:]])
 
-    return _from_flat({name: joined(name, first) for name, first in flat[0].items()})
+    return from_named_arrays({name: joined(name, first) for name, first in flat[0].items()})
 
 
-def _flat(trajectory: Trajectory) -> dict:
-    """All arrays of a trajectory by name."""
+def named_arrays(trajectory: Trajectory) -> dict:
+    """All arrays of a trajectory by name, those of `info` among them; None for what was not asked for."""
     fields = dict(vars(trajectory))
     return fields | fields.pop("info")._asdict()
 
 
-def _from_flat(arrays: dict) -> Trajectory:
+def from_named_arrays(arrays: dict) -> Trajectory:
+    """The inverse of `named_arrays`; those that may be None may be absent."""
     info = RunInfo(**{name: arrays.pop(name) for name in RunInfo._fields})
     return Trajectory(**arrays, info=info)

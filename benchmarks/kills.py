@@ -1,0 +1,150 @@
+"""A streaming run killed at random moments: every completed chunk readable, every resumed run the same to the last bit."""
+
+import multiprocessing
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+import vmri_jax as vm
+from benchmarks.measure import Tell, silent
+from benchmarks.report import Report
+from vmri_jax import runtime
+from vmri_jax.store.layout import CHECKPOINT
+from vmri_jax.trajectory import STATUS, named_arrays
+
+COLUMNS = ("kill", "after, s", "chunks", "new", "moment", "identical")
+CHUNKS, PER_CHUNK = 40, 5
+EARLY = 5
+"""Every so many kills come at any time after the start of the process, the others after its first chunk."""
+PATIENCE = 300.0
+
+
+@dataclass(frozen=True)
+class Size:
+    """Kills, and the seed of their moments."""
+
+    count: int
+    seed: int = 0
+
+
+def sizes(name: str, count: int = 100) -> Size:
+    """So many kills, whatever the name."""
+    return Size(count)
+
+
+def programs_of(size: Size) -> int:
+    """How many processes are killed."""
+    return size.count
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Report:
+    """Kill, look at what is there, resume, kill ..., each completed run compared with one that nobody killed."""
+    with TemporaryDirectory() as folder:
+        rows, runs = kill_often(size, Path(folder), tell)
+    identical = sum(row["identical"] == "yes" for row in rows)
+    moments = {row["moment"] for row in rows}
+    counts = ", ".join(f"{sum(row['moment'] == m for row in rows)} {m}" for m in sorted(moments))
+    notes = [
+        f"{len(rows)} kills ({counts}), each resumed: {identical} times everything on disk identical to the uninterrupted run.",
+        f"{sum(runs)} of {len(runs)} completed runs identical in every array.",
+    ]
+    return Report("kills", name, rows, [], notes, {})
+
+
+def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict], list[bool]]:
+    """One row per kill; and whether the runs that were completed meanwhile are identical to the uninterrupted one."""
+    context = multiprocessing.get_context("forkserver")  # children start from a process that has imported everything
+    context.set_forkserver_preload(["benchmarks.kills"])
+    random = np.random.default_rng(size.seed)
+    first, path = folder / "uninterrupted.zarr", folder / "run.zarr"
+
+    def start(out: Path):
+        child = context.Process(target=_child, args=(str(out), str(folder / "cache")), daemon=True)
+        child.start()
+        return child
+
+    for _ in range(2):  # the second one finds the programs compiled
+        shutil.rmtree(first, ignore_errors=True)
+        begin = time.perf_counter()
+        child = start(first)
+        _wait_for_chunk(child, first, 0)
+        to_first_chunk = time.perf_counter() - begin
+        child.join(PATIENCE)
+        whole = time.perf_counter() - begin - to_first_chunk
+        if child.exitcode != 0:
+            raise RuntimeError(f"kills: the uninterrupted run ended with exit code {child.exitcode}.")
+    expected = vm.StoredTrajectory(first).load()
+
+    rows, runs = [], []
+    while len(rows) < size.count:
+        tell(f"kill {len(rows) + 1}")
+        before = _chunks(path)
+        child, begin = start(path), time.perf_counter()
+        if len(rows) % EARLY == 0:
+            child.join(random.uniform(0, to_first_chunk))
+        else:
+            _wait_for_chunk(child, path, before)
+            child.join(random.uniform(0, whole / 3))
+        if child.exitcode is None:
+            child.kill()
+            child.join(PATIENCE)
+            after = _chunks(path)
+            moment = "before there is a store" if not path.exists() else "before" if after == before else "after"
+            moment += "" if moment.endswith("store") else " its first chunk"
+            same = "yes" if after == 0 or _identical(vm.StoredTrajectory(path).load(), expected) else "no"
+            row = {
+                "kill": len(rows) + 1,
+                "after, s": time.perf_counter() - begin,
+                "chunks": after,
+                "new": after - before,
+            }
+            rows.append(row | {"moment": moment, "identical": same})
+        else:
+            runs.append(child.exitcode == 0 and _complete(path, expected))
+            shutil.rmtree(path)
+    child = start(path)
+    child.join(PATIENCE)
+    runs.append(child.exitcode == 0 and _complete(path, expected))
+    return rows, runs
+
+
+def _child(out: str, cache: str) -> None:
+    """Start the run, or go on with it."""
+    runtime.configure(cache=cache)
+    problem = vm.systems.fermi_pasta_ulam()
+    scheme, steps = vm.fully_implicit(3), CHUNKS * PER_CHUNK * 2
+    arguments = {"macro_dt": 0.01, "num_steps": steps, "save_every": 2, "save_micro": True, "chunk": PER_CHUNK}
+    vm.stream(problem.system, scheme, problem.state(), out=out, resume=True, **arguments)
+
+
+def _chunks(path: Path) -> int:
+    """Completed chunks."""
+    return (len(vm.StoredTrajectory(path)) - 1) // PER_CHUNK if path.exists() and len(vm.StoredTrajectory(path)) else 0
+
+
+def _wait_for_chunk(child, path: Path, known: int) -> None:
+    """Until there are more chunks, or the run has ended."""
+    deadline = time.monotonic() + PATIENCE
+    file, seen = path / CHECKPOINT, None
+    while child.is_alive() and time.monotonic() < deadline:
+        if file.exists() and (now := file.stat().st_mtime_ns) != seen:
+            seen = now
+            if _chunks(path) > known:
+                return
+        time.sleep(0.002)
+
+
+def _complete(path: Path, expected: vm.Trajectory) -> bool:
+    stored = vm.StoredTrajectory(path)
+    return stored.complete and len(stored) == len(expected.t) and _identical(stored.load(), expected)
+
+
+def _identical(part: vm.Trajectory, expected: vm.Trajectory) -> bool:
+    """Whether every array is the beginning of the expected one, bit by bit."""
+    whole = {name: np.asarray(a) for name, a in named_arrays(expected).items() if name not in STATUS}
+    begun = {name: np.asarray(a) for name, a in named_arrays(part).items() if name not in STATUS}
+    return all(a.tobytes() == whole[name][: len(a)].tobytes() for name, a in begun.items())

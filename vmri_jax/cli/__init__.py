@@ -1,0 +1,34 @@
+"""The command line ``vmri``: systems, schemes, one run, what accuracy costs, the reference study.
+
+Each module has an ``app`` of its own with its commands; here they become one.
+"""
+
+import os
+
+import jax
+import typer
+
+from vmri_jax import runtime
+from vmri_jax.cli import lists, run, study
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_show_locals=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for part in (lists, run, study):
+    app.add_typer(part.app)
+
+
+def main() -> None:
+    """Entry point."""
+    runtime.configure(cache=runtime.cache_folder())
+    app()
+
+
+@app.callback()
+def start() -> None:
+    """Variational multirate integrators: simulate stiff mechanical systems, slow and fast parts at their own step."""
+    jax.config.update("jax_enable_x64", True)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices here are small: threads only make times scatter

@@ -1,0 +1,47 @@
+"""What all commands share: the console, refusals and failures, a progress bar, files to be written."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.panel import Panel
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.text import Text
+
+from vmri_jax.study.table import Progress as StudyProgress
+
+console = Console()
+
+
+class BadInput(typer.BadParameter):
+    """Something the user typed: shown in a panel, exit code 2."""
+
+    def format_message(self) -> str:
+        return self.message
+
+
+@contextmanager
+def progress_bar() -> Iterator[StudyProgress]:
+    """A bar; yields the function that moves it."""
+    columns = (BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True) as bars:
+        task = bars.add_task("starting")
+        yield lambda what, done, total: bars.update(task, description=what, completed=done, total=total)
+
+
+def print_failure(title: str, text: str) -> None:
+    Console(stderr=True).print(Panel(Text(text), title=title, title_align="left", border_style="red"))
+
+
+def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
+    if path is None:
+        return
+    if path.suffix not in endings:
+        raise ValueError(f"{option} {path}: the file must end in {' or '.join(endings)}.")
+    if not path.resolve().parent.is_dir():
+        raise ValueError(f"{option} {path}: the folder {path.parent} does not exist; make it first.")
+    if path.is_dir() or not os.access(path if path.exists() else path.resolve().parent, os.W_OK):
+        raise ValueError(f"{option} {path} cannot be written; give another file.")

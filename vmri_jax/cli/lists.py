@@ -1,0 +1,56 @@
+"""`vmri systems` and `vmri schemes`: what there is by name."""
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from vmri_jax.catalogue import SCHEMES, SYSTEMS
+from vmri_jax.cli.common import console
+from vmri_jax.composition import COMPOSITIONS
+
+app = typer.Typer()
+
+
+@app.command()
+def systems() -> None:
+    """List the built-in systems."""
+    table = Table("name", "system", "slow", "fast", "constraints", "parameters", box=None, pad_edge=False)
+    for name, entry in SYSTEMS.items():
+        problem = entry.factory()
+        n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
+        parameters = ", ".join(f"{key} = {_short(value)}" for key, value in problem.system.params.items())
+        table.add_row(
+            f"[bold]{name}[/bold]",
+            entry.title,
+            f"{problem.q_s.size}: {entry.slow}",
+            f"{problem.q_f.size}: {entry.fast}",
+            f"{n_g + n_gs}" if n_g + n_gs else "none",
+            parameters,
+        )
+    console.print(table)
+    console.print("\nYour own: [bold]vmri simulate my_file.py:my_problem[/bold], a vmri_jax.Problem in that file.")
+
+
+@app.command()
+def schemes() -> None:
+    """List the built-in schemes."""
+    table = Table("name", "order", "options", "what", box=None, pad_edge=False)
+    for name, entry in SCHEMES.items():
+        options = " ".join(f"--{option}" for option in entry.options)
+        table.add_row(f"[bold]{name}[/bold]", entry.order, options, entry.title)
+    console.print(table)
+    console.print(
+        "\nOf higher order, [bold]--compose[/bold] NAME: several steps of a scheme of order 2, some backwards.\n"
+    )
+    table = Table("name", "order", "stages", "source", box=None, pad_edge=False)
+    for name, entry in COMPOSITIONS.items():
+        table.add_row(f"[bold]{name}[/bold]", f"{entry.order}", f"{len(entry.coefficients)}", entry.source)
+    console.print(table)
+
+
+def _short(value) -> str:
+    return (
+        ", ".join(f"{x:g}" for x in np.ravel(value))
+        if np.ndim(value) == 0
+        else f"({', '.join(f'{x:g}' for x in value)})"
+    )

@@ -1,0 +1,196 @@
+"""`vmri simulate`: one run and how it went."""
+
+import shlex
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+import vmri_jax as vm
+from vmri_jax import plots
+from vmri_jax.catalogue import find_problem, find_scheme
+from vmri_jax.cli.common import BadInput, check_target_file, console, print_failure
+
+SAVED_NODES = 1000
+"""About as many nodes are saved by default."""
+DRAWN = 10_000
+"""At most so many nodes of a run on disk are drawn."""
+
+app = typer.Typer()
+
+
+@app.command(
+    epilog="Examples:\n\n"
+    "vmri simulate fpu --macro-dt 0.1 --steps 2000 --out run.npz --plot run.png\n\n"
+    "vmri simulate fpu --macro-dt 0.1 --steps 10000000 --out run.zarr\n\n"
+    "vmri simulate tsp --scheme fully-explicit --alpha 0.5 --num-micro 5 --micro-dt 0.002 --steps 1000\n\n"
+    "vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400"
+)
+def simulate(
+    system: Annotated[str, typer.Argument(help="fpu, tsp, sam, or my_file.py:my_problem.")],
+    steps: Annotated[int, typer.Option(help="Number of macro steps.")],
+    macro_dt: Annotated[float | None, typer.Option(help="Macro step H; or give --micro-dt.")] = None,
+    micro_dt: Annotated[float | None, typer.Option(help="Micro step h = H / num_micro.")] = None,
+    scheme: Annotated[str, typer.Option(help="See [bold]vmri schemes[/bold].")] = "fully-implicit",
+    num_micro: Annotated[int, typer.Option(help="Micro steps per macro step.")] = 10,
+    alpha: Annotated[
+        float | None, typer.Option(help="Weight of the left node, explicit schemes. [dim]0.5[/dim]")
+    ] = None,
+    degree: Annotated[int | None, typer.Option(help="Degree of the path, galerkin.")] = None,
+    rule: Annotated[str | None, typer.Option(help="gauss or lobatto, galerkin. [dim]gauss[/dim]")] = None,
+    compose: Annotated[
+        str | None, typer.Option(help="Compose the scheme to a higher order, e.g. suzuki4, kahan-li8.")
+    ] = None,
+    save_every: Annotated[
+        int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
+    ] = None,
+    method: Annotated[str, typer.Option(help="auto, march, frozen, decoupled, arrowhead or dense.")] = "auto",
+    out: Annotated[
+        Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr all along the run.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, a .zarr.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out, a .zarr.")] = False,
+    plot: Annotated[Path | None, typer.Option(help="Draw it here: .png, .svg or .pdf.")] = None,
+) -> None:
+    """Simulate a system and say how it went."""
+    try:
+        streamed = _check_out(out, resume, overwrite)
+        check_target_file("--plot", plot, (".png", ".svg", ".pdf"))
+        problem = find_problem(system)
+        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
+        before = vm.StoredTrajectory(out) if out is not None and resume and out.exists() else None
+        if save_every is None:
+            save_every = default_save_every(steps) if before is None else before.save_every
+        arguments = {
+            "macro_dt": macro_dt,
+            "micro_dt": micro_dt,
+            "num_steps": steps,
+            "save_every": save_every,
+            "newton": vm.Newton(method=method),  # pyright: ignore[reportArgumentType]
+            "progress": True,
+        }
+        if streamed:
+            arguments |= {"out": out, "resume": resume, "overwrite": overwrite}
+        compiling = _compile_clock()
+        start = time.perf_counter()
+        trajectory, stopped = _run(vm.stream if streamed else vm.simulate, problem, chosen, arguments)
+        seconds = time.perf_counter() - start
+        saved = [str(out)] if out is not None else []
+        if out is not None and isinstance(trajectory, vm.Trajectory):
+            trajectory.save(out)
+        if plot is not None:
+            nodes = trajectory if isinstance(trajectory, vm.Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
+            plots.save(plots.plot_trajectory(nodes, f"{system}, {scheme}, {num_micro} micro steps"), plot)
+            saved.append(str(plot))
+    except (ValueError, TypeError, FileExistsError, FileNotFoundError) as error:
+        raise BadInput(str(error)) from error
+    except OSError as error:
+        print_failure("Not written", error.strerror or str(error))
+        raise typer.Exit(1) from error
+    if stopped is not None:
+        raise typer.Exit(_print_stop(stopped, saved, streamed))
+    pieces = [trajectory] if isinstance(trajectory, vm.Trajectory) else trajectory.chunks()
+    now = steps - (0 if before is None else before.step)
+    console.print(_summary(pieces, steps, chosen.num_micro, now, seconds, sum(compiling), saved))
+
+
+def _run(run, problem, scheme, arguments: dict):
+    """The trajectory, and what stopped the run before its end, if anything did."""
+    try:
+        return jax.block_until_ready(run(problem.system, scheme, problem.state(), **arguments)), None
+    except (vm.SimulationError, vm.Interrupted) as stopped:
+        return stopped.trajectory, stopped
+
+
+def _print_stop(stopped: vm.SimulationError | vm.Interrupted, saved: list[str], streamed: bool) -> int:
+    """Say how far a run came, and where that is; returns the exit code."""
+    kept = f"\n\nThe trajectory up to there is in {' and '.join(saved)}." if saved else ""
+    if isinstance(stopped, vm.SimulationError):
+        reason = f"Macro step {stopped.step} at t = {stopped.time:.6g}: {stopped.result.message}{kept}"
+        print_failure("The run failed", reason)
+        return 1
+    print_failure("Interrupted", f"After {stopped.step} of {stopped.num_steps} macro steps.{kept}")
+    if streamed:
+        again = [word for word in sys.argv[1:] if word not in ("--resume", "--overwrite")]
+        console.print(
+            f"Go on with it:\n[bold]{escape(shlex.join(['vmri', *again, '--resume']))}[/bold]", soft_wrap=True
+        )
+    return 130
+
+
+def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
+    """Whether the run is to be streamed."""
+    streamed = out is not None and out.suffix == ".zarr"
+    if (resume or overwrite) and not streamed:
+        option = "--resume" if resume else "--overwrite"
+        raise ValueError(f"{option} is for a run that is written all along; give --out with a file that ends in .zarr.")
+    if not streamed:
+        check_target_file("--out", out, (".npz", ".zarr"))
+    return streamed
+
+
+def _compile_clock() -> list[float]:
+    """A list to which JAX adds the seconds of every compilation from now on."""
+    seconds: list[float] = []
+
+    def listen(event: str, duration_secs: float, **_) -> None:
+        if event.startswith("/jax/core/compile/"):
+            seconds.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    return seconds
+
+
+def _summary(
+    pieces: Iterable[vm.Trajectory],
+    steps: int,
+    num_micro: int,
+    now: int,
+    seconds: float,
+    compiling: float,
+    saved: list[str],
+) -> Table:
+    """About a run, read piece by piece, of which `now` macro steps took these seconds."""
+    found = np.array([_extremes(piece) for piece in pieces])
+    t_start, energy = found[0, :2]
+    t_end = found[-1, 2]
+    position, velocity, method, iterations = found[:, 5:].max(axis=0)
+    absolute = abs(energy) <= 1e-12
+    error = max(found[:, 4].max() - energy, energy - found[:, 3].min()) / (1.0 if absolute else abs(energy))
+    rows = {
+        "macro steps": f"{steps}, of {num_micro} micro steps each",
+        "simulated time": f"{t_start:g} to {t_end:g}",
+        "wall time": f"{seconds:.2f} s, of which {compiling:.2f} s compiling",
+        "per micro step": f"{1e6 * max(seconds - compiling, 0.0) / (now * num_micro):.3g} µs" if now else "",
+        "Newton iterations": f"at most {int(iterations)} per step, {vm.Method(int(method)).name.lower()}",
+        "energy error": f"{error:.2e}{'' if absolute else ' of the energy at the start'}",
+        "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if position > 0 else "",
+        "saved": ", ".join(saved) if saved else "nothing; give --out run.npz or --plot run.png",
+    }
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, value in rows.items():
+        if value:
+            table.add_row(f"[dim]{name}[/dim]", escape(value))
+    return table
+
+
+def _extremes(piece: vm.Trajectory) -> tuple:
+    """Start time and energy; end time; least and largest energy; largest residuals, dearest method, most iterations."""
+    energy, residual = np.asarray(piece.energy), np.asarray(piece.constraint_residual)
+    dearest = int(np.max(piece.info.method)), int(np.max(piece.info.iterations))
+    return float(piece.t[0]), energy[0], float(piece.t[-1]), energy.min(), energy.max(), *residual.max(axis=0), *dearest
+
+
+def default_save_every(steps: int) -> int:
+    """The divisor of `steps` that saves a number of nodes nearest to SAVED_NODES, every node of a short run."""
+    if steps <= SAVED_NODES:
+        return 1
+    divisors = [d for d in range(1, steps + 1) if steps % d == 0]
+    return min(divisors, key=lambda d: abs(np.log(steps / d / SAVED_NODES)))

@@ -1,0 +1,144 @@
+"""`vmri tune`, `vmri cost` and `vmri reproduce`: what accuracy costs, and the reference study."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+import vmri_jax as vm
+from vmri_jax.catalogue import find_problem
+from vmri_jax.cli.common import BadInput, check_target_file, console, print_failure, progress_bar
+from vmri_jax.study import (
+    Recommendation,
+    WorkPrecision,
+    WorkRow,
+    choose_figures,
+    cost_page,
+    recommend,
+    reference_figures,
+    reproduce,
+)
+from vmri_jax.study.advisor import NothingReached, check_target
+from vmri_jax.study.work import rows_table
+
+app = typer.Typer()
+
+
+@app.command(
+    epilog="Examples:\n\nvmri tune fpu --error 1e-4 --t-end 10\n\nvmri tune my_file.py:my_problem --error 1e-3 --t-end 2"
+)
+def tune(
+    system: Annotated[str, typer.Argument(help="fpu, tsp, sam, or my_file.py:my_problem.")],
+    error: Annotated[float, typer.Option(help="Largest accepted error of a position at the end, in its unit.")],
+    t_end: Annotated[float, typer.Option(help="Simulated time.")],
+    exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Search without shortcuts.")] = False,
+    out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv or .json.")] = None,
+) -> None:
+    """Find the scheme, num_micro and macro step that reach an error in the least time on this machine."""
+    try:
+        check_target_file("--out", out, (".csv", ".json"))
+        problem = find_problem(system)
+        check_target(error, t_end, problem)
+        with progress_bar() as tell:
+            found = recommend(problem, error, t_end, exhaustive=exhaustive, progress=tell)
+    except NothingReached as failure:
+        _write_runs(failure.runs, out)
+        console.print(failure.runs.table())
+        print_failure("Nothing reached the error", f"{failure} The best runs are above.")
+        raise typer.Exit(1) from failure
+    except vm.SimulationError as failure:
+        print_failure("No reference solution", str(failure))
+        raise typer.Exit(1) from failure
+    except (ValueError, TypeError) as wrong:
+        raise BadInput(str(wrong)) from wrong
+    _write_runs(found.runs, out)
+    console.print("[bold]Errors against time[/bold], the best of all runs\n", found.runs.table())
+    console.print(f"\n[bold]For an error of {error:g}[/bold], the fastest\n", rows_table(_rows_of(found)))
+    seen = found.verification
+    if seen is not None:
+        console.print(
+            f"\nFrom another start the first of them has {seen.error_ratio:.2g} times this error and takes "
+            f"{seen.time_ratio:.2g} times as long."
+        )
+    console.print(f"\n[bold]{escape(found.setting.command(system))}[/bold]", soft_wrap=True)
+
+
+@app.command(epilog="Examples:\n\nvmri cost tsp --out out/tsp\n\nvmri cost my_file.py:my_problem --t-end 5")
+def cost(
+    system: Annotated[str, typer.Argument(help="fpu, tsp, sam, or my_file.py:my_problem.")],
+    t_end: Annotated[
+        float | None, typer.Option(help="Simulated time. [dim]8 periods of the fastest vibration[/dim]")
+    ] = None,
+    error: Annotated[
+        list[float] | None, typer.Option(help="Error asked for; may be repeated. [dim]1e-2 to 1e-8 of the motion[/dim]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the page.")] = Path("out/cost"),
+) -> None:
+    """One page: what accuracy costs, which scheme to take for which error, where the time goes."""
+    try:
+        problem = find_problem(system)
+        for asked in error or [np.finfo(float).max]:
+            check_target(asked, 1.0 if t_end is None else t_end, problem)
+        out.mkdir(parents=True, exist_ok=True)
+        with progress_bar() as tell:
+            page = cost_page(problem, system, out, t_end=t_end, errors=error, progress=tell)
+    except OSError as wrong:
+        raise BadInput(f"--out {out}: {wrong.strerror}; give a folder that can be written.") from wrong
+    except vm.SimulationError as failure:
+        print_failure("No reference solution", str(failure))
+        raise typer.Exit(1) from failure
+    except (ValueError, TypeError) as wrong:
+        raise BadInput(str(wrong)) from wrong
+    console.print(rows_table([answer.setting.row for answer in page.answers if answer.setting is not None]))
+    console.print(f"\nPage: [bold]{escape(str(page.path))}[/bold]", soft_wrap=True)
+
+
+@app.command(
+    name="reproduce",
+    epilog="Examples:\n\nvmri reproduce\n\nvmri reproduce --only fig6 --only fig9 --out study\n\nvmri reproduce --full",
+)
+def reproduce_command(
+    full: Annotated[
+        bool, typer.Option("--full/--quick", help="The lists of the paper (an hour), or few values.")
+    ] = False,
+    only: Annotated[list[str] | None, typer.Option(help="Only this figure, e.g. fig6; may be repeated.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for figures, tables and the report.")] = Path("out"),
+) -> None:
+    """Run the reference study: figures, tables and out/report.html."""
+    size = "full" if full else "quick"
+    try:
+        choose_figures(reference_figures(size), only or [])
+    except ValueError as error:
+        raise BadInput(str(error)) from error
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadInput(f"--out {out}: {error.strerror}; give a folder that can be written.") from error
+    with progress_bar() as show:
+
+        def figure_done(result) -> None:
+            mark = (
+                "[red]failed[/red]"
+                if result.error
+                else f"{sum(c.agrees for c in result.checks)} of {len(result.checks)}"
+            )
+            console.print(f"{result.name:<11} {mark}  {result.title}  [dim]{result.seconds:.0f} s[/dim]")
+
+        report = reproduce(out, size, only or [], show, figure_done)
+    console.print(f"\nReport: [bold]{escape(str(report.path))}[/bold]", soft_wrap=True)
+    if report.failed:
+        reasons = "\n".join(f"{figure.name}: {figure.error}" for figure in report.failed)
+        print_failure("Figures that failed", reasons)
+        raise typer.Exit(1)
+
+
+def _rows_of(found: Recommendation, count: int = 5) -> list[WorkRow]:
+    """The setting recommended and the next ones."""
+    return [setting.row for setting in (found.setting, *found.others)[:count]]
+
+
+def _write_runs(runs: WorkPrecision, out: Path | None) -> None:
+    if out is not None:
+        runs.to_csv(out) if out.suffix == ".csv" else runs.to_json(out)
