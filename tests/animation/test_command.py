@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,11 @@ import typer
 from PIL import Image
 from typer.testing import CliRunner
 
+import vmri_jax as vm
 from tests.animation.support import PENDULUM, reference_run, swinging
 from vmri_jax.animation.command import animate
+from vmri_jax.store import stream
+from vmri_jax.store.layout import change_attributes
 
 RUN = swinging()
 
@@ -74,6 +78,16 @@ def test_a_built_in_system_gives_its_drawing_and_its_velocities(vmri):
     assert data["speed"] == 0.01
 
 
+def test_a_streamed_run_as_far_as_it_is_on_disk(vmri, fpu):
+    scheme, run = vm.fully_explicit(2), {"macro_dt": 0.01, "num_steps": 12, "chunk": 4}
+    stream(fpu.system, scheme, fpu.state(), out="run.zarr", **run)
+    assert vmri("run.zarr", "--system", "fpu")[0] == 0
+    assert len(names(page())) == 6
+    change_attributes(Path("run.zarr"), drawing={"bodies": [{"name": "first", "coordinates": [["s", 0]]}]})
+    assert vmri("run.zarr")[0] == 0
+    assert names(page()) == ["first"]
+
+
 def test_pictures_by_their_suffix(vmri):
     assert vmri("drawn.npz", "--out", "run.png", "--frames", 2)[0] == 0
     assert vmri("drawn.npz", "--out", "dark.png", "--frames", 2, "--dark")[0] == 0
@@ -99,6 +113,7 @@ def test_a_failed_run_is_drawn_up_to_there_and_says_so(vmri):
     ("arguments", "pieces"),
     [
         (["none.npz"], ["none.npz does not exist"]),
+        (["none.zarr"], ["none.zarr"]),
         (["text.npz"], ["text.npz cannot be read"]),
         (["plain.npz", "--out", "run.mp4"], ["--out run.mp4", ".html", ".gif"]),
         (["plain.npz", "--out", "no/run.html"], ["--out no/run.html", "does not exist"]),

@@ -38,7 +38,13 @@ def stop_after(monkeypatch, chunks: int, where, name: str, error: BaseException)
 
 def test_what_is_streamed_is_what_simulate_returns(run, uninterrupted):
     expected = simulate(
-        run.problem.system, run.scheme, run.problem.state(), macro_dt=H, num_steps=STEPS, save_every=EVERY, save_micro=True
+        run.problem.system,
+        run.scheme,
+        run.problem.state(),
+        macro_dt=H,
+        num_steps=STEPS,
+        save_every=EVERY,
+        save_micro=True,
     )
     assert_identical(uninterrupted.load(), expected)
     assert uninterrupted.complete
@@ -122,7 +128,9 @@ def test_a_full_disk_keeps_what_was_written(run, uninterrupted, out, monkeypatch
     with monkeypatch.context() as patch:
         full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         stop_after(patch, 1, layout.Writer, "append", full)
-        with pytest.raises(OSError, match=r"No space left on device. The run is kept up to macro step 8: resume") as caught:
+        with pytest.raises(
+            OSError, match=r"No space left on device. The run is kept up to macro step 8: resume"
+        ) as caught:
             run(out)
     assert caught.value.errno == errno.ENOSPC
     assert_identical(StoredTrajectory(out).load(), uninterrupted[: CHUNK + 1])
@@ -225,7 +233,9 @@ def test_another_version_is_told(run, out, monkeypatch):
 
 def test_nothing_is_overwritten_unless_asked(run, uninterrupted, out):
     run(out, num_steps=PER_CHUNK)
-    with pytest.raises(FileExistsError, match=r"holds a run of 8 macro steps, 8 of them done. Go on with it \(resume\)"):
+    with pytest.raises(
+        FileExistsError, match=r"holds a run of 8 macro steps, 8 of them done. Go on with it \(resume\)"
+    ):
         run(out)
     with pytest.raises(ValueError, match=r"both resume and overwrite"):
         run(out, resume=True, overwrite=True)

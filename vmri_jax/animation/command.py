@@ -18,7 +18,10 @@ from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
 from vmri_jax.catalogue import SYSTEMS, find_problem
+from vmri_jax.store import StoredTrajectory
 
+MOST_NODES = 100_000
+"""Read from a store; of longer runs every k-th node is."""
 SUFFIXES = (".html", ".png", ".svg", ".pdf", ".gif")
 
 console = Console()
@@ -32,7 +35,7 @@ class _BadInput(typer.BadParameter):
 
 
 def animate(
-    run: Annotated[Path, typer.Argument(help="A saved trajectory, run.npz.")],
+    run: Annotated[Path, typer.Argument(help="A saved trajectory, run.npz or run.zarr.")],
     out: Annotated[
         Path | None, typer.Option(help="Write it here: .html, a strip .png/.svg/.pdf, or .gif. [dim]run.html[/dim]")
     ] = None,
@@ -77,24 +80,29 @@ def _check_out(out: Path) -> None:
 
 def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
     """Of a saved run, with the first drawing there is."""
-    trajectory, problem = vm.Trajectory.load(run), None if system is None else find_problem(system)
+    (trajectory, description), problem = _load(run), None if system is None else find_problem(system)
     sizes = [np.shape(a)[-1] for a in (trajectory.q_s, trajectory.q_f)]
     if problem is not None and sizes != [np.size(problem.q_s), np.size(problem.q_f)]:
         raise ValueError(
             f"--system {system} has {np.size(problem.q_s)} slow and {np.size(problem.q_f)} fast coordinates, the run "
             f"{sizes[0]} and {sizes[1]}; give the system that was simulated."
         )
-    description = _read(drawing) if drawing is not None else _stored(run)
+    if drawing is not None:
+        description = _read(drawing)
     if not description and problem is not None:
         description = getattr(problem, "drawing", None) or built_in(system or "", np.size(problem.q_s))
     found = Drawing.from_dict(description or bars(trajectory))
     return motion(trajectory, found, None if problem is None else problem.system)
 
 
-def _stored(run: Path) -> str:
-    """The JSON text of the drawing stored next to a run; empty if there is none."""
+def _load(run: Path) -> tuple[vm.Trajectory, str | dict]:
+    """A saved run, of a long store every k-th node, and the drawing stored with it; empty if there is none."""
+    if run.suffix.lower() == ".zarr":
+        stored = StoredTrajectory.open(run)
+        return stored[:: max(1, len(stored) // MOST_NODES)], stored.attributes.get("drawing", "")
+    trajectory = vm.Trajectory.load(run)
     with np.load(run, allow_pickle=False) as arrays:
-        return str(arrays["drawing"]) if "drawing" in arrays else ""
+        return trajectory, str(arrays["drawing"]) if "drawing" in arrays else ""
 
 
 def _read(path: Path) -> dict:
