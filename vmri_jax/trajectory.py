@@ -1,6 +1,7 @@
 """What a run returns: saved nodes, what the solver did, conserved quantities, and where it stopped."""
 
 import dataclasses
+import json
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -77,9 +78,16 @@ class Trajectory(eqx.Module):
         }
         return from_named_arrays(flat | {"result": jnp.asarray(int(Result.CONVERGED)), "failed_at": jnp.asarray(-1)})
 
-    def save(self, path) -> None:
-        """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk."""
+    def save(self, path, drawing: dict | None = None) -> None:
+        """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
+
+        Args:
+            path: of the file.
+            drawing: plain data of a `vmri_jax.animation.Drawing`, kept next to the arrays.
+        """
         arrays = {name: np.asarray(value) for name, value in named_arrays(self).items() if value is not None}
+        if drawing is not None:
+            arrays["drawing"] = np.array(json.dumps(drawing))
         with replaced(path) as file:
             np.savez_compressed(file, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
@@ -104,6 +112,7 @@ class Trajectory(eqx.Module):
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
+        arrays.pop("drawing", None)
         fields = {field.name for field in dataclasses.fields(cls)} - {"info"} | set(RunInfo._fields)
         missing = fields - set(arrays) - {"t_micro", "q_f_micro"}
         if missing or set(arrays) - fields:

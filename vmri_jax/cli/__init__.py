@@ -9,6 +9,7 @@ import jax
 import typer
 
 from vmri_jax import runtime
+from vmri_jax.animation.command import animate
 from vmri_jax.cli import lists, run, stability, study
 
 app = typer.Typer(
@@ -19,6 +20,7 @@ app = typer.Typer(
 )
 for part in (lists, run, stability, study):
     app.add_typer(part.app)
+app.command()(animate)
 
 
 def main() -> None:

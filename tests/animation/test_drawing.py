@@ -1,0 +1,160 @@
+"""Drawings: what they say, where bodies are, and how wrong ones are refused."""
+
+import copy
+import json
+
+import numpy as np
+import pytest
+
+from tests.animation.support import PENDULUM, reference_run, swinging
+from vmri_jax.animation import Anchor, Drawing, Joint, bars, built_in, motion
+from vmri_jax.animation import defaults as defaults_module
+
+
+def positions(drawing: Drawing, q_s, q_f):
+    offset, matrix = drawing.maps(len(q_s), len(q_f))
+    return offset + matrix @ np.concatenate([q_s, q_f])
+
+
+def test_plain_data_and_its_json_text_give_the_same_drawing():
+    drawing = Drawing.from_dict(PENDULUM)
+    assert drawing == Drawing.from_dict(json.dumps(PENDULUM))
+    assert [body.pace for body in drawing.bodies] == ["slow", "fast"]
+    assert drawing.links == (Joint(("bob", "tip")),)
+    assert drawing.anchors == (Anchor("bob", (0.0, 0.0), "spring"),)
+    assert drawing.dimension == 2
+
+
+def test_pace_of_a_joint_is_its_own_or_that_of_its_bodies():
+    drawing = Drawing.from_dict(PENDULUM)
+    assert drawing.pace(Joint(("bob", "tip"))) == "slow"
+    assert drawing.pace(Joint(("tip", "tip"))) == "fast"
+    assert drawing.pace(Joint(("bob", "tip"), "fast")) == "fast"
+
+
+def test_linear_forms_and_offsets():
+    form = [[2.0, "s", 1], [-0.5, "f", 0], [1.0, "f", 0]]
+    body = {"name": "a", "coordinates": [[], form, ["f", 1]], "offset": [7.0, 1.0, 0.0]}
+    drawing = Drawing.from_dict({"bodies": [body]})
+    np.testing.assert_allclose(positions(drawing, [3.0, 4.0], [10.0, -2.0]), [[7.0, 1.0 + 8.0 + 5.0, -2.0]])
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "up", "expected"),
+    [
+        (3, None, [1.0, 2.0, 3.0]),
+        (3, [0.0, 5.0, 0.0], [1.0, -3.0, 2.0]),
+        (3, [1.0, 0.0, 0.0], [2.0, 3.0, 1.0]),
+        (3, [0.0, 0.0, -1.0], [1.0, -2.0, -3.0]),
+        (2, None, [1.0, 0.0, 2.0]),
+        (2, [1.0, 0.0], [-2.0, 0.0, 1.0]),
+        (1, None, [1.0, 0.0, 0.0]),
+        (1, [-2.0], [0.0, 0.0, -1.0]),
+    ],
+)
+def test_up_is_shown_upwards_without_mirroring(coordinates, up, expected):
+    body = {"name": "a", "coordinates": [["s", i] for i in range(coordinates)]}
+    drawing = Drawing.from_dict({"bodies": [body], "up": up})
+    np.testing.assert_allclose(positions(drawing, [1.0, 2.0, 3.0], []), [expected], atol=1e-15)
+    if coordinates == 3:
+        assert np.linalg.det(drawing.frame()) == pytest.approx(1.0)
+
+
+def changed(path, value):
+    data = copy.deepcopy(PENDULUM)
+    *way, last = path
+    entry = data
+    for key in way:
+        entry = entry[key]
+    entry[last] = value
+    return data
+
+
+@pytest.mark.parametrize(
+    ("data", "pieces"),
+    [
+        ("{", ["not valid JSON"]),
+        ([], ["is list", "must be a dict"]),
+        ({}, ["lacks the entry 'bodies'"]),
+        ({"bodies": []}, ["bodies is empty"]),
+        (changed(["spring"], []), ["no entry 'spring'", "Did you mean springs?"]),
+        (changed(["links"], [["bob", "tipp"]]), ["links[0]", "'tipp'", "does not exist", "Did you mean tip?"]),
+        (changed(["links"], [["bob", "bob"]]), ["links[0]", "with itself"]),
+        (changed(["links"], [["bob"]]), ["links[0]", "pair of names"]),
+        (changed(["links"], [["bob", "tip", "quick"]]), ["links[0]", "'quick'", "slow or fast"]),
+        (changed(["links"], "bob"), ["links is str", "list"]),
+        (changed(["anchors", 0, "kind"], "glue"), ["anchors[0]", "'glue'", "link or spring"]),
+        (changed(["anchors", 0, "body"], "bo"), ["anchors[0]", "'bo'", "Did you mean bob?"]),
+        (changed(["anchors", 0, "point"], [0.0, np.nan]), ["anchors[0]: point", "finite"]),
+        (changed(["planes", 0, "normal"], [0.0, 0.0]), ["planes[0]: normal", "must not be zero"]),
+        (changed(["spheres", 0, "radius"], -1.0), ["spheres[0]: radius", "-1.0", "positive"]),
+        (changed(["bodies", 1, "name"], "bob"), ["2 bodies are named 'bob'"]),
+        (changed(["bodies", 0, "color"], "red"), ["bodies[0]: color", "'red'", "#0072b2"]),
+        (changed(["bodies", 0, "radius"], True), ["bodies[0]: radius", "True", "positive"]),
+        (changed(["bodies", 0, "coordinates"], []), ["bodies[0]: coordinates", "1 to 3"]),
+        (changed(["bodies", 0, "coordinates"], [["q", 0]]), ["bodies[0]", "['q', 0]", "'s' or 'f'"]),
+        (changed(["bodies", 0, "coordinates"], [["s", -1]]), ["bodies[0]", "['s', -1]"]),
+        (changed(["bodies", 0, "coordinates"], [[["x", "s", 1]]]), ["bodies[0]", "weight"]),
+        (changed(["up"], [0.0, 0.0, 0.0]), ["up is", "must not be zero"]),
+    ],
+)
+def test_wrong_drawings_are_refused(data, pieces):
+    with pytest.raises(ValueError, match="drawing") as caught:
+        Drawing.from_dict(data)
+    for piece in pieces:
+        assert piece in str(caught.value)
+
+
+def test_coordinates_that_the_run_does_not_have():
+    with pytest.raises(ValueError, match=r"'tip' uses \['f', 1\], but the run has 1 fast"):
+        Drawing.from_dict(PENDULUM).maps(2, 1)
+
+
+def test_missing_coordinates_are_zero():
+    drawing = Drawing.from_dict(PENDULUM | {"spheres": [{"center": [1.0, 2.0, 3.0], "radius": 1.0}]})
+    assert drawing.dimension == 3
+    np.testing.assert_allclose(positions(drawing, [5.0, 6.0], [7.0, 8.0]), [[5.0, 6.0, 0.0], [7.0, 8.0, 0.0]])
+
+
+@pytest.mark.parametrize(("name", "macro_dt"), [("tsp_fully_implicit_p1", 0.01), ("sam_fully_implicit_a05_p4", 0.008)])
+def test_links_of_built_in_drawings_keep_their_length_along_a_run(name, macro_dt):
+    run = reference_run(name, macro_dt)
+    drawing = Drawing.from_dict(built_in(name[:3], run.q_s.shape[1]))
+    points = motion(run, drawing).points
+    index = {body.name: i for i, body in enumerate(drawing.bodies)}
+    ends = [(points[:, index[a]], points[:, index[b]]) for a, b in (link.bodies for link in drawing.links)]
+    fixed = zip(drawing.anchors, drawing.place([anchor.point for anchor in drawing.anchors]), strict=True)
+    ends += [(points[:, index[anchor.body]], point) for anchor, point in fixed if anchor.kind == "link"]
+    lengths = np.array([np.linalg.norm(a - b, axis=-1) for a, b in ends])
+    assert np.ptp(lengths, axis=1).max() < 1e-9  # measured 2e-13
+    assert np.ptp(points, axis=0).max() > 0.01
+
+
+def test_the_drawn_chain_stretches_as_its_potentials_say(fpu, monkeypatch):
+    monkeypatch.setattr(defaults_module, "MAGNIFIED", 1.0)
+    run = reference_run("fpu3_fully_implicit_p1", 0.05)
+    drawing = Drawing.from_dict(built_in("fpu", 3))
+    x = motion(run, drawing).points[..., 0]
+    walls = [point[0] for point in drawing.place([anchor.point for anchor in drawing.anchors])]
+    x = np.concatenate([np.full((len(x), 1), walls[0]), x, np.full((len(x), 1), walls[1])], axis=1)
+    stretch = np.diff(x, axis=1) - np.diff([walls[0], *(body.offset[0] for body in drawing.bodies), walls[1]])
+    system, q_s, q_f = fpu.system, run.q_s[-1], run.q_f[-1]
+    soft, stiff = stretch[-1, ::2], stretch[-1, 1::2]
+    np.testing.assert_allclose(np.sum((np.sqrt(2) * soft) ** 4) / 4, system.slow_potential(q_s, q_f, system.params))
+    np.testing.assert_allclose(stiff, np.sqrt(2) * q_f, atol=1e-14)
+    assert [drawing.pace(spring) for spring in drawing.springs] == ["fast", "slow", "fast", "slow", "fast"]
+
+
+def test_without_a_drawing_every_coordinate_is_a_bar_at_its_scale():
+    run = swinging()
+    drawing = Drawing.from_dict(bars(run))
+    moved = motion(run, drawing)
+    assert [body.name for body in drawing.bodies] == ["s1", "s2", "f1", "f2"]
+    np.testing.assert_allclose(moved.points[:, 0, 2], 2.0 * run.q_s[:, 0], atol=1e-14)
+    np.testing.assert_allclose(moved.points[:, 3, 2], 0.5 * run.q_f[:, 1], atol=1e-14)
+    assert drawing.caption == "Heights are 2 slow coordinates times 2 and 2 fast coordinates times 0.5."
+    assert len({float(x) for x in moved.points[0, :, 0]}) == 4
+
+
+def test_there_are_drawings_of_built_in_systems_only():
+    assert built_in("my_file.py:mine", 3) is None

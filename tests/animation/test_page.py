@@ -1,0 +1,114 @@
+"""The page: one file without a network, the same motion as in Python, and no error in a browser."""
+
+import base64
+import dataclasses
+import html
+import json
+import re
+import shutil
+import subprocess
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from tests.animation.support import PENDULUM, swinging
+from vmri_jax.animation import Drawing, motion, write_html
+from vmri_jax.animation.html import MOST_NUMBERS
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+NODE = shutil.which("node")
+SCRIPTS = files("vmri_jax.animation") / "page"
+
+
+def data_of(page: str) -> dict:
+    [text] = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    return json.loads(text)
+
+
+def unpacked(text: str, dtype: type = np.float32) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), dtype)
+
+
+def page_of(moved, path, title="Pendulum") -> str:
+    write_html(moved, path, title)
+    return path.read_text(encoding="utf-8")
+
+
+def test_the_page_asks_for_nothing_outside_of_it(pendulum, tmp_path):
+    page = page_of(pendulum, tmp_path / "run.html")
+    assert not re.findall(r"(?:https?:)?//[a-z]", re.sub(r"(?m)//.*$", "", page))
+    assert not re.findall(r"<script[^>]+src|<link[^>]+stylesheet|@import|fetch\(|XMLHttpRequest", page)
+
+
+def test_numbers_of_the_page_are_those_of_the_motion(pendulum, tmp_path):
+    data = data_of(page_of(pendulum, tmp_path / "run.html"))
+    np.testing.assert_array_equal(unpacked(data["t"], np.float64), pendulum.t)
+    np.testing.assert_allclose(unpacked(data["points"]), pendulum.points.reshape(-1), atol=1e-7)
+    np.testing.assert_allclose(unpacked(data["velocities"]), pendulum.velocities.reshape(-1), atol=1e-6)
+    np.testing.assert_allclose(unpacked(data["energy"]), pendulum.energy, rtol=1e-6)
+    assert data["residual"] is None
+    assert [body["name"] for body in data["bodies"]] == ["bob", "tip"]
+    link, spring = data["connections"]
+    assert (link["kind"], link["body"], link["other"], link["point"]) == ("link", 0, 1, None)
+    assert (spring["kind"], spring["body"], spring["point"]) == ("spring", 0, [0.0, 0.0, 0.0])
+    assert spring["pace"] == "slow"
+    assert data["planes"][0]["solid"]
+
+
+def test_constraints_have_a_strip_only_where_there_are_some(pendulum, tmp_path):
+    free = page_of(pendulum, tmp_path / "free.html")
+    held = page_of(dataclasses.replace(pendulum, residual=np.full((41, 2), 1e-14)), tmp_path / "held.html")
+    assert 'id="residual"' not in free
+    assert 'id="residual"' in held
+    assert unpacked(data_of(held)["residual"][1]).max() == pytest.approx(1e-14)
+
+
+def test_text_from_the_user_cannot_become_code(tmp_path):
+    evil = "</script><script>alert(1)</script>"
+    drawing = Drawing.from_dict(
+        PENDULUM | {"bodies": [{"name": evil, "coordinates": [["s", 0]]}], "links": [], "anchors": []}
+    )
+    page = page_of(motion(swinging(), drawing), tmp_path / "run.html", evil)
+    assert "alert(1)</script>" not in page
+    assert data_of(page)["bodies"][0]["name"] == evil
+
+
+def test_long_runs_are_thinned_and_the_page_says_so(tmp_path):
+    count = MOST_NUMBERS // 6 + 10
+    moved = motion(swinging(count, end=300.0), Drawing.from_dict(PENDULUM))
+    data = data_of(page_of(moved, tmp_path / "run.html"))
+    assert len(unpacked(data["points"])) <= MOST_NUMBERS
+    assert data["caption"] == "Drawn from every 2nd node."
+    assert data["speed"] == 20.0
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node")
+def test_the_script_interpolates_as_python_does(pendulum, tmp_path):
+    data = data_of(page_of(pendulum, tmp_path / "run.html"))
+    times = [-1.0, 0.0, 0.123, 1.0, 2.345, 3.999, 9.0]
+    program = (
+        (SCRIPTS / "motion.js").read_text()
+        + f"const motion = new Motion({json.dumps(data)});"
+        + f"console.log(JSON.stringify({times}.map((time) => Array.from(motion.at(time)))));"
+    )
+    seen = subprocess.run([str(NODE), "-e", program], capture_output=True, text=True, check=True).stdout
+    np.testing.assert_allclose(np.array(json.loads(seen)).reshape(-1, 2, 3), pendulum.at(times), atol=1e-6)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="needs chromium")
+def test_a_browser_shows_it_without_errors(pendulum, tmp_path):
+    held = dataclasses.replace(pendulum, residual=np.full((41, 2), 1e-14), ending="It failed.")
+    page_of(held, tmp_path / "run.html", "Swing & <tip>")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--virtual-time-budget=1000"]
+    command = [str(BROWSER), *options, "--dump-dom", (tmp_path / "run.html").as_uri() + "#t=2.5&theme=dark"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert "CONSOLE" not in done.stderr
+    shown = html.unescape(re.sub(r"<script.*?</script>", "", done.stdout, flags=re.DOTALL))
+    assert 'data-theme="dark"' in shown
+    assert "Swing & <tip>" in shown
+    assert ">t = 2.500<" in shown
+    assert "It failed." in shown
+    assert re.search(r"largest 5\.0 × 10⁻⁴", shown)
+    assert re.search(r"position <b>1\.0 × 10⁻¹⁴</b>", shown)
+    assert 'aria-valuetext="t = 2.500 of 4"' in shown

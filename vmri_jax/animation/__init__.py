@@ -1,0 +1,23 @@
+"""Seeing a run: a self-contained page, strips of pictures and GIFs from a trajectory and a drawing of its bodies."""
+
+from vmri_jax.animation.defaults import bars, built_in
+from vmri_jax.animation.drawing import Anchor, Body, Drawing, Joint, Plane, Sphere
+from vmri_jax.animation.frames import plot_strip, write_gif
+from vmri_jax.animation.html import write_html
+from vmri_jax.animation.motion import Motion, motion
+
+__all__ = [
+    "Anchor",
+    "Body",
+    "Drawing",
+    "Joint",
+    "Motion",
+    "Plane",
+    "Sphere",
+    "bars",
+    "built_in",
+    "motion",
+    "plot_strip",
+    "write_gif",
+    "write_html",
+]

@@ -1,0 +1,59 @@
+"""Checks of plain data that a user wrote: what came, what was expected, and where."""
+
+import difflib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+
+def check_keys(data: Any, known: Sequence[str], needed: Sequence[str], where: str) -> None:
+    """Refuse what is no dict, entries that do not exist, and missing ones."""
+    if not isinstance(data, dict):
+        raise ValueError(f"{where} is {type(data).__name__}; it must be a dict with {', '.join(known)}.")
+    for key in data:
+        if key not in known:
+            raise ValueError(f"{where} has no entry {key!r}.{near(str(key), known)} There are {', '.join(known)}.")
+    for key in needed:
+        if key not in data:
+            raise ValueError(f"{where} lacks the entry {key!r}.")
+
+
+def entries(data: dict, key: str, where: str) -> list:
+    """The list at a key, empty if there is none."""
+    found = data.get(key, [])
+    if not isinstance(found, list | tuple):
+        raise ValueError(f"{where}: {key} is {type(found).__name__}; it must be a list.")
+    return list(found)
+
+
+def near(name: str, known: Sequence[str]) -> str:
+    """A question with the known name that is most like it; empty if none is."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return f" Did you mean {close[0]}?" if close else ""
+
+
+def numbers(value: Any, where: str) -> tuple[float, ...]:
+    """1 to 3 finite numbers."""
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.ndim != 1 or not 1 <= array.size <= 3 or not np.isfinite(array).all():
+        raise ValueError(f"{where} is {value!r}; it must be a list of 1 to 3 finite numbers.")
+    return tuple(array.tolist())
+
+
+def direction(value: Any, where: str) -> tuple[float, ...]:
+    """1 to 3 finite numbers that are not all zero."""
+    found = numbers(value, where)
+    if not any(found):
+        raise ValueError(f"{where} is {list(found)}; it must not be zero.")
+    return found
+
+
+def positive(value: Any, where: str) -> float:
+    """A positive number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+        raise ValueError(f"{where} is {value!r}; it must be a positive number.")
+    return float(value)

@@ -1,0 +1,103 @@
+"""Drawings of the built-in systems, and of any system without a drawing: every coordinate as a bar."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+import vmri_jax as vm
+
+MAGNIFIED = 10.0
+"""The stiff springs of the Fermi-Pasta-Ulam chain stretch by a few percent: their elongations are drawn so much larger."""
+STEEL = "#8a97a1"
+
+
+def fermi_pasta_ulam(num_springs: int) -> dict:
+    """The chain between two walls: masses at ``(s_i - f_i) / sqrt 2`` and ``(s_i + f_i) / sqrt 2`` from their rest."""
+    bodies, w = [], 1 / math.sqrt(2)
+    for i in range(num_springs):
+        for sign, rest in ((-1.0, 4.5 * i + 3.0), (1.0, 4.5 * i + 4.5)):
+            form = [[w, "s", i], [sign * MAGNIFIED * w, "f", i]]
+            body = {
+                "name": f"mass {len(bodies) + 1}",
+                "coordinates": [form],
+                "offset": [rest],
+                "radius": 0.3,
+                "color": STEEL,
+            }
+            bodies.append(body)
+    names = [body["name"] for body in bodies]
+    springs = [[a, b, "slow" if i % 2 else "fast"] for i, (a, b) in enumerate(pairwise(names))]
+    walls = [(names[0], 0.0), (names[-1], 4.5 * num_springs + 3.0)]
+    return {
+        "bodies": bodies,
+        "springs": springs,
+        "anchors": [{"body": name, "point": [x], "kind": "spring", "pace": "slow"} for name, x in walls],
+        "planes": [{"point": [x], "normal": [normal]} for (_, x), normal in zip(walls, (1.0, -1.0), strict=True)],
+        "caption": f"Elongations of the stiff springs are drawn {MAGNIFIED:g} times as large as they are.",
+    }
+
+
+def triple_spherical_pendulum() -> dict:
+    """The heavy bob on a rod, two light ones on a rod and a stiff spring."""
+    return {
+        "bodies": [
+            _point("heavy bob", "s", 0, 0.9),
+            _point("light bob", "f", 0, 0.4),
+            _point("last bob", "f", 1, 0.4),
+        ],
+        "links": [["heavy bob", "light bob"]],
+        "springs": [["light bob", "last bob"]],
+        "anchors": [{"body": "heavy bob", "point": [0.0, 0.0, 0.0], "kind": "link"}],
+    }
+
+
+def simple_atomic_model() -> dict:
+    """Two heavy atoms and four light ones, rigid bonds as links."""
+    atoms = [_point("atom 1", "s", 0, 2.6), _point("atom 2", "s", 1, 2.0)]
+    atoms += [_point(f"atom {i + 3}", "f", i, 1.3) for i in range(4)]
+    springs, bonds = [(1, 2), (2, 3), (3, 4), (4, 5), (5, 3)], [(2, 4), (2, 5), (3, 6)]
+    return {
+        "bodies": atoms,
+        "links": [[f"atom {i}", f"atom {j}"] for i, j in bonds],
+        "springs": [[f"atom {i}", f"atom {j}"] for i, j in springs],
+        "anchors": [{"body": "atom 1", "point": [0.0, 0.0, 0.0], "kind": "link"}],
+    }
+
+
+def _point(name: str, part: str, number: int, radius: float) -> dict:
+    coordinates = [[part, 3 * number + axis] for axis in range(3)]
+    return {"name": name, "coordinates": coordinates, "radius": radius}
+
+
+def built_in(name: str, n_s: int) -> dict | None:
+    """The drawing of a built-in system with n_s slow variables; None if it is not one."""
+    if name == "fpu":
+        return fermi_pasta_ulam(n_s)
+    return {"tsp": triple_spherical_pendulum, "sam": simple_atomic_model}.get(name, lambda: None)()
+
+
+def bars(trajectory: vm.Trajectory) -> dict:
+    """Every coordinate of q as a point at its height over a base line, slow ones first, each pace in its own scale."""
+    bodies, anchors, captions = [], [], []
+    parts = {"s": ("slow", np.asarray(trajectory.q_s)), "f": ("fast", np.asarray(trajectory.q_f))}
+    count = sum(q.shape[1] for _, q in parts.values())
+    height, x = max(2.0, 0.22 * count), 0.0
+    for part, (pace, q) in parts.items():
+        size = np.nanmax(np.abs(q), initial=0.0)
+        scale = _round(height / size) if size > 0 else 1.0
+        if q.shape[1]:
+            captions.append(f"{q.shape[1]} {pace} {'coordinate' if q.shape[1] == 1 else 'coordinates'} times {scale:g}")
+        for i in range(q.shape[1]):
+            name = f"{part}{i + 1}"
+            bodies.append({"name": name, "coordinates": [[], [[scale, part, i]]], "offset": [x, 0.0], "radius": 0.24})
+            anchors.append({"body": name, "point": [x, 0.0], "kind": "link"})
+            x += 1.0
+        x += 1.0
+    return {"bodies": bodies, "anchors": anchors, "caption": f"Heights are {' and '.join(captions)}."}
+
+
+def _round(x: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above x."""
+    power = 10.0 ** math.floor(math.log10(x))
+    return max(digit * power for digit in (1, 2, 5) if digit * power <= x * (1 + 1e-12))

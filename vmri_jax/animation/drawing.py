@@ -1,0 +1,272 @@
+"""What a picture of a system is made of: bodies and what joins them, as plain data that can be stored next to a run."""
+
+import json
+import operator
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vmri_jax.animation.checks import check_keys, direction, entries, near, numbers, positive
+
+KEYS = ("bodies", "links", "springs", "anchors", "planes", "spheres", "up", "caption")
+BODY_KEYS = ("name", "coordinates", "offset", "radius", "color")
+KINDS = ("link", "spring")
+PACES = ("slow", "fast")
+
+
+@dataclass(frozen=True)
+class Body:
+    """A point of 1 to 3 coordinates, each a linear form ``sum_k weight_k q[index_k]`` over q_s and q_f; none is zero.
+
+    Attributes:
+        name: unique in a drawing.
+        forms: per coordinate its terms (weight, "s" or "f", index).
+        offset: added to the coordinates: where the body is at q = 0.
+        radius: in the unit of the coordinates; None for one that suits the picture.
+        color: as in CSS, ``#rrggbb``; None for that of its pace.
+    """
+
+    name: str
+    forms: tuple[tuple[tuple[float, str, int], ...], ...]
+    offset: tuple[float, ...]
+    radius: float | None = None
+    color: str | None = None
+
+    @property
+    def pace(self) -> str:
+        """ "slow" if all its coordinates are, else "fast"."""
+        return "slow" if all(part == "s" for form in self.forms for _, part, _ in form) else "fast"
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A link or spring between two bodies; `pace` "slow" or "fast" colours a spring, None for that of the bodies."""
+
+    bodies: tuple[str, str]
+    pace: str | None = None
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A link or spring (`kind`) from a body to a fixed point."""
+
+    body: str
+    point: tuple[float, ...]
+    kind: str
+    pace: str | None = None
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A wall or ground through `point`; bodies stay on the side of `normal`."""
+
+    point: tuple[float, ...]
+    normal: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A fixed sphere."""
+
+    center: tuple[float, ...]
+    radius: float
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Bodies, what joins them, fixed things around them.
+
+    Attributes:
+        up: the direction that is shown upwards, in coordinates of the bodies; None for the last coordinate (bodies of one
+            coordinate move sideways).
+        caption: a line that is shown with the picture.
+    """
+
+    bodies: tuple[Body, ...]
+    links: tuple[Joint, ...] = ()
+    springs: tuple[Joint, ...] = ()
+    anchors: tuple[Anchor, ...] = ()
+    planes: tuple[Plane, ...] = ()
+    spheres: tuple[Sphere, ...] = ()
+    up: tuple[float, ...] | None = None
+    caption: str = ""
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "Drawing":
+        """A drawing from plain data, checked.
+
+        Args:
+            data: a dict (or its JSON text) of
+
+                - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
+                  ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``.
+                - ``links``, ``springs``: pairs of names, and a third entry "slow" or "fast" if wanted.
+                - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), and if wanted ``pace``.
+                - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
+                - ``up``, ``caption``: see above.
+
+        Raises:
+            ValueError: anything else, with the entry that is wrong.
+        """
+        if isinstance(data, str):
+            try:
+                data = json.loads(data)
+            except json.JSONDecodeError as error:
+                raise ValueError(f"drawing: not valid JSON ({error}).") from error
+        check_keys(data, KEYS, ("bodies",), "drawing")
+        bodies = tuple(_body(e, f"drawing: bodies[{i}]") for i, e in enumerate(entries(data, "bodies", "drawing")))
+        names = [body.name for body in bodies]
+        if not bodies:
+            raise ValueError("drawing: bodies is empty; there must be at least one.")
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"drawing: {names.count(name)} bodies are named {name!r}; names must be unique.")
+
+        def all_of(key: str, read: Callable) -> tuple:
+            return tuple(
+                read(entry, names, f"drawing: {key}[{i}]") for i, entry in enumerate(entries(data, key, "drawing"))
+            )
+
+        return cls(
+            bodies=bodies,
+            links=all_of("links", _joint),
+            springs=all_of("springs", _joint),
+            anchors=all_of("anchors", _anchor),
+            planes=all_of("planes", _plane),
+            spheres=all_of("spheres", _sphere),
+            up=None if data.get("up") is None else direction(data["up"], "drawing: up"),
+            caption=str(data.get("caption") or ""),
+        )
+
+    def pace(self, joint: Joint | Anchor) -> str:
+        """ "slow" or "fast": as it says, else "fast" if all its bodies are."""
+        ends = joint.bodies if isinstance(joint, Joint) else (joint.body,)
+        fast = all(body.pace == "fast" for body in self.bodies if body.name in ends)
+        return joint.pace or ("fast" if fast else "slow")
+
+    @property
+    def dimension(self) -> int:
+        """Coordinates of a point: 1, 2 or 3, the most of any body or given point."""
+        points = [anchor.point for anchor in self.anchors] + [sphere.center for sphere in self.spheres]
+        points += [vector for plane in self.planes for vector in (plane.point, plane.normal)]
+        points += [vector for body in self.bodies for vector in (body.forms, body.offset)] + [self.up or ()]
+        return max(len(point) for point in points)
+
+    def frame(self) -> np.ndarray:
+        """(3, dimension) matrix from coordinates of the bodies to those of the picture, where z points upwards."""
+        d = self.dimension
+        if self.up is None:
+            return np.array([[1.0], [0.0], [0.0]]) if d == 1 else _upright(np.eye(d)[-1])
+        up = np.pad(self.up, (0, d - len(self.up)))
+        return _upright(up / np.linalg.norm(up))
+
+    def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
+        """(n, 3) points of the picture of given points or directions; missing coordinates are zero."""
+        d = self.dimension
+        padded = np.array([np.pad(point, (0, d - len(point))) for point in points]).reshape(-1, d)
+        return padded @ self.frame().T
+
+    def maps(self, n_s: int, n_f: int) -> tuple[np.ndarray, np.ndarray]:
+        """Offset (n, 3) and matrix (n, 3, n_s + n_f): where the bodies are in the picture, ``offset + matrix @ q``.
+
+        Raises:
+            ValueError: a body uses a coordinate that q does not have.
+        """
+        sizes, first = {"s": n_s, "f": n_f}, {"s": 0, "f": n_s}
+        matrix = np.zeros((len(self.bodies), self.dimension, n_s + n_f))
+        for i, body in enumerate(self.bodies):
+            for axis, form in enumerate(body.forms):
+                for weight, part, index in form:
+                    if index >= sizes[part]:
+                        pace = "slow" if part == "s" else "fast"
+                        raise ValueError(
+                            f"drawing: the body {body.name!r} uses [{part!r}, {index}], but the run has {sizes[part]} "
+                            f"{pace} coordinates; is this the drawing of another system?"
+                        )
+                    matrix[i, axis, first[part] + index] += weight
+        return self.place([body.offset for body in self.bodies]), np.einsum("ad,idq->iaq", self.frame(), matrix)
+
+
+def _upright(up: np.ndarray) -> np.ndarray:
+    """Matrix of a rotation that takes the unit vector `up` to z, and keeps x where it can."""
+    if up.size == 1:
+        return np.array([[0.0], [0.0], [up[0]]])
+    if up.size == 2:
+        return np.array([[up[1], -up[0]], [0.0, 0.0], up])
+    x = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
+    x = x - (x @ up) * up
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(up, x), up])
+
+
+def _body(data: Any, where: str) -> Body:
+    check_keys(data, BODY_KEYS, ("name", "coordinates"), where)
+    coordinates = data["coordinates"]
+    if not isinstance(coordinates, list | tuple) or not 1 <= len(coordinates) <= 3:
+        raise ValueError(f"{where}: coordinates is {coordinates!r}; it must be a list of 1 to 3 entries.")
+    radius = None if data.get("radius") is None else positive(data["radius"], f"{where}: radius")
+    color = data.get("color")
+    if color is not None and not (isinstance(color, str) and re.fullmatch("#[0-9a-fA-F]{6}", color)):
+        raise ValueError(f"{where}: color is {color!r}; it must be like '#0072b2'.")
+    forms = tuple(_form(entry, where) for entry in coordinates)
+    offset = numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
+    return Body(str(data["name"]), forms, offset, radius, color)
+
+
+def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
+    """The terms of ``["s", 0]`` or ``[[weight, "s", 0], ...]``."""
+    single = isinstance(entry, list | tuple) and len(entry) == 2 and isinstance(entry[0], str)
+    try:
+        terms = [(float(weight), part, operator.index(i)) for weight, part, i in ([(1.0, *entry)] if single else entry)]
+    except (TypeError, ValueError):
+        terms = [(np.nan, "", 0)]
+    if not all(part in ("s", "f") and i >= 0 and np.isfinite(weight) for weight, part, i in terms):
+        raise ValueError(
+            f"{where}: the coordinate {entry!r} must be ['s' or 'f', index] or a list of [weight, 's' or 'f', index]."
+        )
+    return tuple(terms)
+
+
+def _joint(entry: Any, names: Sequence[str], where: str) -> Joint:
+    if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
+        raise ValueError(f"{where} is {entry!r}; it must be a pair of names, or one and 'slow' or 'fast'.")
+    a, b = (_body_name(name, names, where) for name in entry[:2])
+    if a == b:
+        raise ValueError(f"{where} joins {a!r} with itself.")
+    return Joint((a, b), _pace(entry[2] if len(entry) == 3 else None, where))
+
+
+def _anchor(data: Any, names: Sequence[str], where: str) -> Anchor:
+    check_keys(data, ("body", "point", "kind", "pace"), ("body", "point", "kind"), where)
+    if data["kind"] not in KINDS:
+        raise ValueError(f"{where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
+    point = numbers(data["point"], f"{where}: point")
+    return Anchor(_body_name(data["body"], names, where), point, data["kind"], _pace(data.get("pace"), where))
+
+
+def _plane(data: Any, _: Sequence[str], where: str) -> Plane:
+    check_keys(data, ("point", "normal"), ("point", "normal"), where)
+    return Plane(numbers(data["point"], f"{where}: point"), direction(data["normal"], f"{where}: normal"))
+
+
+def _sphere(data: Any, _: Sequence[str], where: str) -> Sphere:
+    check_keys(data, ("center", "radius"), ("center", "radius"), where)
+    return Sphere(numbers(data["center"], f"{where}: center"), positive(data["radius"], f"{where}: radius"))
+
+
+def _body_name(name: Any, names: Sequence[str], where: str) -> str:
+    if name not in names:
+        listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise ValueError(
+            f"{where} names the body {name!r}, which does not exist.{near(str(name), names)} There are {listed}."
+        )
+    return name
+
+
+def _pace(pace: Any, where: str) -> str | None:
+    if pace is not None and pace not in PACES:
+        raise ValueError(f"{where}: the pace is {pace!r}; it must be {' or '.join(PACES)}.")
+    return pace

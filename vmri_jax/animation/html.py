@@ -1,0 +1,119 @@
+"""A self-contained page: the motion as packed numbers, and a script that draws it on a canvas."""
+
+import base64
+from pathlib import Path
+
+import jinja2
+import numpy as np
+
+from vmri_jax import plots
+from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.layout import Layout, layout, nice
+from vmri_jax.animation.motion import Motion
+
+MOST_NUMBERS = 600_000
+"""Coordinates in a page; of longer runs every k-th node is taken."""
+WATCHED = 20.0
+"""Seconds that a run takes at the first speed, about."""
+
+
+def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
+    """Write one HTML file that shows the motion in a browser: no network, nothing to install.
+
+    ``page.html#t=3.5`` opens it at rest at that time, ``#theme=dark`` in dark colours.
+
+    Args:
+        motion: from `vmri_jax.animation.motion`.
+        path: of the file.
+        title: over the picture.
+    """
+    every = -(-motion.points.size // MOST_NUMBERS)
+    drawing, sizes = motion.drawing, layout(motion)
+    data = _data(motion.thinned(-(-len(motion.t) // every)), sizes)
+    if every > 1:
+        ending = {2: "nd", 3: "rd"}.get(every, "th")
+        data["caption"] = f"{drawing.caption} Drawn from every {every}{ending} node.".strip()
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("vmri_jax.animation", "page"), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    text = environment.get_template("page.html.j2").render(
+        title=title or "Motion",
+        description=_description(motion),
+        paces=sorted(_paces(drawing, sizes), reverse=True),
+        constrained=data["residual"] is not None,
+        data=data,
+        light=plots.LIGHT,
+        dark=plots.DARK,
+    )
+    Path(path).write_text(text, encoding="utf-8")
+
+
+def _data(motion: Motion, sizes: Layout) -> dict:
+    """What the script reads; names as in its files."""
+    drawing, t = motion.drawing, motion.t
+    duration = float(t[-1] - t[0])
+    speed = 1.0 if 0.15 * WATCHED <= duration <= 3 * WATCHED or duration == 0 else nice(duration / WATCHED)
+    constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
+    return {
+        "t": _packed(t, np.float64),
+        "points": _packed(motion.points),
+        "velocities": _packed(motion.velocities),
+        "energy": _packed(motion.energy),
+        "energy_title": "energy change" + (" ΔE / |E₀|" if motion.relative else " ΔE"),
+        "residual": [_packed(column) for column in motion.residual.T] if constrained else None,
+        "bodies": [
+            {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius)}
+            for body, radius in zip(drawing.bodies, sizes.radii, strict=True)
+        ],
+        "connections": [
+            {**vars(connection), "point": None if connection.point is None else connection.point.tolist()}
+            for connection in sizes.connections
+        ],
+        "planes": [
+            {
+                "center": ground.center.tolist(),
+                "sides": ground.sides.tolist(),
+                "halves": ground.halves,
+                "normal": ground.normal.tolist(),
+                "step": ground.step,
+                "solid": ground.solid,
+            }
+            for ground in sizes.grounds
+        ],
+        "spheres": [
+            {"center": center.tolist(), "radius": sphere.radius}
+            for center, sphere in zip(sizes.spheres, drawing.spheres, strict=True)
+        ],
+        "size": sizes.size,
+        "rod": sizes.rod,
+        "coil": sizes.coil,
+        "wire": sizes.wire,
+        "view": {"azimuth": sizes.azimuth, "elevation": sizes.elevation},
+        "fitted": sizes.hull.tolist(),
+        "margin": float(sizes.radii.max()),
+        "trails": any(sum(bool(form) for form in body.forms) > 1 for body in drawing.bodies),  # not along one line
+        "speed": speed,
+        "speeds": [float(f"{speed * factor:.1g}") for factor in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10)],
+        "caption": drawing.caption,
+        "ending": motion.ending,
+    }
+
+
+def _paces(drawing: Drawing, sizes: Layout) -> set[str]:
+    """Those whose colours are seen."""
+    springs = {connection.pace for connection in sizes.connections if connection.kind == "spring"}
+    return springs | {body.pace for body in drawing.bodies if body.color is None}
+
+
+def _packed(array: np.ndarray, dtype: type = np.float32) -> str:
+    """Little-endian bytes in base 64."""
+    return base64.b64encode(np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
+
+
+def _description(motion: Motion) -> str:
+    drawing = motion.drawing
+    names = [body.name for body in drawing.bodies]
+    counts = {"link": len(drawing.links), "spring": len(drawing.springs), "fixed point": len(drawing.anchors)}
+    joints = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]
+    bodies = f"{len(names)} bodies" if len(names) > 6 else ", ".join(names)
+    return f"Animation of {', '.join([bodies, *joints])} from t = {motion.t[0]:g} to {motion.t[-1]:g}."

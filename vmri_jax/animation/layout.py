@@ -1,0 +1,166 @@
+"""How large things are drawn, where the ground lies, and from where one looks: shared by pages and pictures."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.motion import Motion
+
+TURNS = (4, 14)
+"""Fewest and most turns of a spring."""
+FADED = 0.45
+"""A floor fades away outwards: so much of it must be seen."""
+LEVEL = 0.9
+"""Least vertical part of the unit normal of a plane that counts as level."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A rectangle of a plane: `center`, two unit `sides` with half lengths `halves`, `normal`, width `step` of its grid.
+
+    solid: given by the drawing; else a floor below the scene that shows depth only.
+    """
+
+    center: np.ndarray
+    sides: np.ndarray
+    halves: tuple[float, float]
+    normal: np.ndarray
+    step: float
+    solid: bool
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A "link" or "spring" (`kind`) from a body to another one, or to a fixed point; numbers of bodies.
+
+    turns: of a spring.
+    """
+
+    kind: str
+    body: int
+    other: int | None
+    point: np.ndarray | None
+    pace: str
+    turns: int
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Sizes in the unit of the coordinates, and places in those of the picture.
+
+    Attributes:
+        size: diagonal of the box around all there is.
+        radii: of the bodies.
+        rod, coil, wire: radius of links, of springs, and of their wire.
+        connections: links, springs and anchors.
+        spheres: (n_spheres, 3) centres.
+        grounds: given planes, or a floor.
+        hull: (n, 3) points that must be seen.
+        azimuth, elevation: of the first view.
+    """
+
+    size: float
+    radii: np.ndarray
+    rod: float
+    coil: float
+    wire: float
+    connections: list[Connection]
+    spheres: np.ndarray
+    grounds: list[Ground]
+    hull: np.ndarray
+    azimuth: float
+    elevation: float
+
+
+def layout(motion: Motion) -> Layout:
+    """Sizes that suit the picture: balls do not touch their neighbours, springs keep inside the space they have."""
+    drawing, points = motion.drawing, motion.thinned(500).points
+    connections = _connections(drawing)
+    anchors = drawing.place([anchor.point for anchor in drawing.anchors])
+    spheres = drawing.place([sphere.center for sphere in drawing.spheres])
+    reach = np.array([sphere.radius for sphere in drawing.spheres]).reshape(-1, 1)
+    box = np.concatenate([points.reshape(-1, 3), anchors, spheres - reach, spheres + reach])
+    size = float(np.linalg.norm(np.ptp(box, axis=0))) or 1.0
+    lengths = [_median_length(connection, points) or size for connection in connections]
+    small = min(0.02 * size, 0.3 * min(lengths, default=size))
+    radii = np.array([small if body.radius is None else body.radius for body in drawing.bodies])
+    sprung = [length for c, length in zip(connections, lengths, strict=True) if c.kind == "spring"]
+    coil = min(0.015 * size, 0.16 * min(sprung, default=size))
+    turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS).astype(int).tolist()
+    grounds = _grounds(drawing, box, float(radii.max()), size)
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    corners = [g.center + (1.0 if g.solid else FADED) * signs * g.halves @ g.sides for g in grounds]
+    flat = drawing.dimension < 3
+    return Layout(
+        size,
+        radii,
+        rod=min(0.0048 * size, 0.4 * float(radii.min())),
+        coil=coil,
+        wire=0.11 * coil,
+        connections=[replace(c, turns=count) for c, count in zip(connections, turns, strict=True)],
+        spheres=spheres,
+        grounds=grounds,
+        hull=_hull(np.concatenate([box, *corners])),
+        azimuth=math.radians(-88 if flat else -62),
+        elevation=math.radians(7 if flat else 14),
+    )
+
+
+def _connections(drawing: Drawing) -> list[Connection]:
+    index = {body.name: i for i, body in enumerate(drawing.bodies)}
+    found = []
+    for kind, joints in (("link", drawing.links), ("spring", drawing.springs)):
+        for joint in joints:
+            a, b = joint.bodies
+            found.append(Connection(kind, index[a], index[b], None, drawing.pace(joint), 0))
+    points = drawing.place([anchor.point for anchor in drawing.anchors])
+    for anchor, point in zip(drawing.anchors, points, strict=True):
+        found.append(Connection(anchor.kind, index[anchor.body], None, point, drawing.pace(anchor), 0))
+    return found
+
+
+def _median_length(connection: Connection, points: np.ndarray) -> float:
+    end = connection.point if connection.other is None else points[:, connection.other]
+    return float(np.median(np.linalg.norm(points[:, connection.body] - end, axis=-1)))
+
+
+def _grounds(drawing: Drawing, box: np.ndarray, radius: float, size: float) -> list[Ground]:
+    """Given planes, as far as the scene goes, and a floor below it if none of them is level."""
+    points = drawing.place([plane.point for plane in drawing.planes])
+    normals = drawing.place([plane.normal for plane in drawing.planes])
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    given = [_ground(p, n, box, size, solid=True) for p, n in zip(points, normals, strict=True)]
+    if np.any(np.abs(normals[:, 2]) > LEVEL):
+        return given
+    point = np.array([0.0, 0.0, box[:, 2].min() - radius - 0.03 * size])
+    return [_ground(point, np.array([0.0, 0.0, 1.0]), box, size, solid=False), *given]
+
+
+def _ground(point, normal, box, size: float, *, solid: bool) -> Ground:
+    low, high = box.min(axis=0), box.max(axis=0)
+    middle = (low + high) / 2
+    level = abs(normal[2]) > LEVEL
+    first = np.cross(normal, [0.0, 1.0, 0.0] if level else [0.0, 0.0, 1.0])
+    first /= np.linalg.norm(first)
+    sides = np.array([first, np.cross(normal, first)])
+    margin = (0.12 if level else 0.05) * size
+    extent = np.ptp(box @ sides.T, axis=0) / 2 + margin
+    step = nice(max(float(extent.max()) / (6 if level else 2), size / 16))
+    center = middle - ((middle - point) @ normal) * normal
+    return Ground(center, sides, (float(extent[0]), float(extent[1])), normal, step, solid)
+
+
+def _hull(points: np.ndarray, count: int = 200) -> np.ndarray:
+    """The points farthest out in directions spread over the sphere (a Fibonacci spiral)."""
+    k = np.arange(count) + 0.5
+    z, angle = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
+    directions = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z])
+    return points[np.unique(np.argmax(points @ directions, axis=0))]
+
+
+def nice(x: float) -> float:
+    """The one of 1, 2, 5 times a power of ten that is nearest to x in ratio."""
+    power = 10.0 ** math.floor(math.log10(x))
+    return min((digit * power for digit in (1, 2, 5, 10)), key=lambda y: abs(math.log(y / x)))

@@ -1,0 +1,183 @@
+"""From a trajectory to where every body is at any time: nodes, velocities at them, and a cubic between two of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.animation.drawing import Drawing
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where the bodies of a drawing are, as a cubic Hermite polynomial between nodes.
+
+    Attributes:
+        t: (k,) times of the nodes.
+        points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
+        energy: (k,) change of the energy since the start, relative to the start where that is not zero.
+        relative: whether it is.
+        residual: (k, 2) largest constraint value and largest rate of one.
+        ending: why the run stopped early; empty if it did not.
+    """
+
+    drawing: Drawing
+    t: np.ndarray
+    points: np.ndarray
+    velocities: np.ndarray
+    energy: np.ndarray
+    relative: bool
+    residual: np.ndarray
+    ending: str = ""
+
+    def at(self, times: Sequence[float] | np.ndarray) -> np.ndarray:
+        """(len(times), n_bodies, 3) positions at times, those of the ends beyond them."""
+        return hermite(self.t, self.points, self.velocities, np.clip(times, self.t[0], self.t[-1]))
+
+    def between(self, start: float | None = None, end: float | None = None) -> "Motion":
+        """The part between the nodes around two times; None for the start or the end of the run.
+
+        Raises:
+            ValueError: times outside of the run, or no time between them.
+        """
+        first, last = float(self.t[0]), float(self.t[-1])
+        start, end = (first if start is None else start), (last if end is None else end)
+        if not first <= start < end <= last and (start, end) != (first, last):
+            raise ValueError(
+                f"from {start:g} to {end:g} is no part of the run, which goes from t = {first:g} to {last:g}."
+            )
+        low = int(np.searchsorted(self.t, start, side="right")) - 1
+        part = slice(low, int(np.searchsorted(self.t, end)) + 1)
+        names = ("t", "points", "velocities", "energy", "residual")
+        return replace(self, **{name: getattr(self, name)[part] for name in names})
+
+    def thinned(self, most: int) -> "Motion":
+        """With at most about `most` nodes; energy and residuals keep the largest of those left out."""
+        every = -(-len(self.t) // most)
+        if every == 1:
+            return self
+        kept = np.append(np.arange(0, len(self.t) - 1, every), len(self.t) - 1)
+        largest = np.maximum.reduceat(np.abs(self.energy), kept)
+        signs = np.sign(self.energy[[k + np.argmax(np.abs(self.energy[k : k + every])) for k in kept]])
+        return replace(
+            self,
+            t=self.t[kept],
+            points=self.points[kept],
+            velocities=self.velocities[kept],
+            energy=signs * largest,
+            residual=np.maximum.reduceat(self.residual, kept),
+        )
+
+
+def motion(trajectory: vm.Trajectory, drawing: Drawing, system: vm.System | None = None) -> Motion:
+    """The motion of a drawing along a run, up to where it failed.
+
+    Velocities at the nodes are those of the momenta if the system is given, else central differences. Where the run kept
+    the micro nodes of all its macro steps, these are nodes too.
+
+    Args:
+        trajectory: one run, of at least one node.
+        drawing: its bodies name coordinates of the run.
+        system: what was simulated.
+
+    Raises:
+        ValueError: a batch of runs, no node that is finite, a drawing or system of other coordinates.
+    """
+    if np.ndim(trajectory.t) != 1:
+        raise ValueError(
+            f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
+        )
+    q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.q_s, trajectory.q_f, trajectory.t))
+    offset, matrix = drawing.maps(q_s.shape[1], q_f.shape[1])
+    finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
+    count = len(t) if finite.all() else int(np.argmin(finite))
+    if count == 0:
+        raise ValueError("motion: the trajectory has no node with finite positions; there is nothing to draw.")
+    nodes, q = t[:count], np.concatenate([q_s, q_f], axis=1)[:count]
+    v = _differences(nodes, q) if system is None else _velocities(system, trajectory, count)
+    t, q, v = _with_micro_nodes(trajectory, nodes, q, v)
+    energy = np.asarray(trajectory.energy, dtype=float)[:count]
+    relative = bool(abs(energy[0]) > 1e-12)
+    residual = np.asarray(trajectory.constraint_residual, dtype=float)[:count].reshape(count, -1)
+    return Motion(
+        drawing,
+        t,
+        offset + np.einsum("iaq,kq->kia", matrix, q),
+        np.einsum("iaq,kq->kia", matrix, v),
+        np.interp(t, nodes, (energy - energy[0]) / (abs(energy[0]) if relative else 1.0)),
+        relative,
+        np.stack([np.interp(t, nodes, column) for column in residual.T], axis=1),
+        _ending(trajectory, count),
+    )
+
+
+def hermite(t, values, velocities, times) -> np.ndarray:
+    """Cubic Hermite interpolation, shape ``(len(times), ...)``, of `values` (k, ...) with `velocities` at nodes t.
+
+    With ``u = (time - t_i) / h`` on ``[t_i, t_i + h]``: ``x_i + u h v_i + u^2 (3 d - h (2 v_i + v_j)) + u^3 (h (v_i + v_j) -
+    2 d)``, ``d = x_j - x_i``.
+    """
+    if len(t) == 1:
+        return np.repeat(values, len(times), axis=0)
+    i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
+    h = (t[i + 1] - t[i]).reshape(-1, *[1] * (np.ndim(values) - 1))
+    u = (times - t[i]).reshape(h.shape) / h
+    left, right, d = h * velocities[i], h * velocities[i + 1], values[i + 1] - values[i]
+    return values[i] + u * (left + u * (3 * d - 2 * left - right + u * (left + right - 2 * d)))
+
+
+def _differences(t, values) -> np.ndarray:
+    """Central differences, of second order at the ends too; zero for a single node."""
+    if len(t) == 1:
+        return np.zeros_like(values)
+    return np.gradient(values, t, axis=0, edge_order=2 if len(t) > 2 else 1)
+
+
+def _velocities(system: vm.System, trajectory: vm.Trajectory, count: int) -> np.ndarray:
+    """(count, n_s + n_f) velocities of the momenta."""
+    phase = [jnp.asarray(a)[:count] for a in (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)]
+    try:
+        start = float(vm.diagnostics.energy(system, *(a[0] for a in phase)))
+        v_s, v_f = jax.jit(jax.vmap(partial(vm.diagnostics.velocity, system)))(*phase)
+    except (TypeError, ValueError, IndexError) as error:
+        sizes = f"{phase[0].shape[1]} slow and {phase[1].shape[1]} fast coordinates"
+        raise ValueError(f"motion: the system does not go with a run of {sizes}: {error}") from error
+    known = float(trajectory.energy[0])
+    if abs(start - known) > 1e-6 * max(1.0, abs(known)):
+        raise ValueError(
+            f"motion: the system has the energy {start:.6g} at the start, the run {known:.6g}; give the system, with the "
+            "parameters, that was simulated."
+        )
+    return np.concatenate([v_s, v_f], axis=1)
+
+
+def _ending(trajectory: vm.Trajectory, count: int) -> str:
+    failed = int(trajectory.failed_at)
+    if failed < 0 and count == len(trajectory.t):
+        return ""
+    result = vm.Result(int(trajectory.result))
+    where = f"in macro step {failed}, " if failed >= 0 else ""
+    return f"The run failed {where}after t = {float(trajectory.t[count - 1]):.6g} ({result.name}); it is drawn up to there."
+
+
+def _with_micro_nodes(trajectory: vm.Trajectory, t, q, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes with the micro nodes between them, if the run kept those of all its macro steps and they are in order.
+
+    There the slow positions are those of the cubic between macro nodes, and velocities central differences.
+    """
+    if trajectory.t_micro is None or len(t) < 2:
+        return t, q, v
+    t_micro, q_f = (np.asarray(a, dtype=float)[: len(t) - 1] for a in (trajectory.t_micro, trajectory.q_f_micro))
+    step = np.diff(t) / t_micro.shape[1]
+    fine = np.concatenate([t[:1], t_micro.reshape(-1)])
+    steps_left_out = np.any(t_micro[:, 0] - t[:-1] > 1.5 * step)  # save_every > 1
+    if t_micro.shape[1] == 1 or steps_left_out or np.any(np.diff(fine) <= 0):
+        return t, q, v
+    n_s = q.shape[1] - q_f.shape[-1]
+    slow = hermite(t, q[:, :n_s], v[:, :n_s], fine)
+    fine_q = np.concatenate([slow, np.concatenate([q[:1, n_s:], q_f.reshape(-1, q_f.shape[-1])])], axis=1)
+    return fine, fine_q, _differences(fine, fine_q)

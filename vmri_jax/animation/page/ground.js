@@ -1,0 +1,95 @@
+// Planes with a grid that fades outwards, shadows on those that bear, and fixed spheres.
+
+function drawPlane(painter, plane, positions) {
+  const { context, camera, colors, data } = painter, { center, sides, halves, step, normal, solid } = plane;
+  const place = (u, v) => camera.project(plus(plus(center, sides[0], u), sides[1], v));
+  const near = 0.02 * camera.distance;
+  if (solid) {
+    outline(context, [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([u, v]) => place(u * halves[0], v * halves[1])), near);
+    context.fillStyle = painter.tone(colors.faint);
+    context.globalAlpha = 0.45;
+    context.fill();
+  }
+  context.strokeStyle = painter.tone(mix(colors.faint, colors.ink, 0.12));
+  context.lineWidth = 1;
+  const strength = (u, v) => (solid ? 1 : clamped(1 - Math.hypot(u / halves[0], v / halves[1])));
+  for (const across of [0, 1]) {
+    const [along, beside] = [halves[1 - across], halves[across]], count = Math.floor(beside / step);
+    for (let k = -count; k <= count; k++) {
+      for (let i = 0; i < 16; i++) {
+        const [low, high] = [i, i + 1].map((j) => along * (j / 8 - 1)), corner = (w) => (across ? [w, k * step] : [k * step, w]);
+        const [from, to] = [place(...corner(low)), place(...corner(high))];
+        if (Math.min(from[2], to[2]) < near) continue;
+        context.globalAlpha = strength(...corner((low + high) / 2));
+        if (!context.globalAlpha) continue;
+        context.beginPath();
+        context.moveTo(from[0], from[1]);
+        context.lineTo(to[0], to[1]);
+        context.stroke();
+      }
+    }
+  }
+  context.globalAlpha = 1;
+  if (normal[2] > 0.5) shadows(painter, plane, positions);
+  for (const sphere of data.spheres) if (normal[2] > 0.5) spot(painter, plane, sphere.center, sphere.radius);
+}
+
+// Straight down onto the plane.
+const dropped = ({ center, normal }, p) => plus(p, [0, 0, 1], dot(plus(center, p, -1), normal) / normal[2]);
+
+function shadows(painter, plane, positions) {
+  const { context, camera, colors, data } = painter, { bodies, connections } = data;
+  const at = (i) => positions.subarray(3 * i, 3 * i + 3);
+  context.strokeStyle = painter.tone(colors.shadow);
+  context.globalAlpha = 0.06 * painter.shade;
+  const line = (a, b) => {
+    const [from, to] = [a, b].map((p) => camera.project(dropped(plane, p)));
+    if (Math.min(from[2], to[2]) < 0.02 * camera.distance) return;
+    context.lineWidth = Math.max(1, (2 * camera.scale * data.rod) / ((from[2] + to[2]) / 2));
+    context.beginPath();
+    context.moveTo(from[0], from[1]);
+    context.lineTo(to[0], to[1]);
+    context.stroke();
+  };
+  for (const { body, other, point } of connections) line(at(body), point ?? at(other));
+  bodies.forEach((body, i) => spot(painter, plane, at(i), body.radius));
+}
+
+// A round shadow with a soft edge.
+function spot(painter, plane, center, radius) {
+  const { context, camera, colors } = painter, below = dropped(plane, center);
+  if (center[2] < below[2]) return;
+  context.fillStyle = painter.tone(colors.shadow);
+  context.globalAlpha = 0.026 * painter.shade;
+  for (let grown = 0.7; grown < 1.5; grown += 0.1) {
+    const ring = Array.from({ length: 28 }, (_, k) => {
+      const angle = (2 * Math.PI * k) / 28, [u, v] = [grown * radius * Math.cos(angle), grown * radius * Math.sin(angle)];
+      return camera.project(plus(plus(below, plane.sides[0], u), plane.sides[1], v));
+    });
+    outline(context, ring, 0.02 * camera.distance);
+    context.fill();
+  }
+  context.globalAlpha = 1;
+}
+
+// The path of a polygon; empty if a corner lies behind the eye.
+function outline(context, corners, near) {
+  context.beginPath();
+  if (corners.some((corner) => corner[2] < near)) return;
+  corners.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+  context.closePath();
+}
+
+function obstacle(painter, { center, radius }) {
+  const { camera, colors } = painter, [x, y, depth] = camera.project(center), r = (camera.scale * radius) / depth;
+  painter.add(depth, (context) => {
+    const shine = context.createRadialGradient(x - 0.4 * r, y - 0.5 * r, 0.1 * r, x, y, r);
+    [[0, 0.5], [0.5, 0.1], [1, -0.15]].forEach(([at, shade]) => shine.addColorStop(at, painter.tone(colors.faint, shade, depth)));
+    context.fillStyle = shine;
+    context.globalAlpha = 0.92;
+    context.beginPath();
+    context.arc(x, y, r, 0, 2 * Math.PI);
+    context.fill();
+    context.globalAlpha = 1;
+  });
+}
