@@ -67,16 +67,7 @@ def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict
         child.start()
         return child
 
-    for _ in range(2):  # the second one finds the programs compiled
-        shutil.rmtree(first, ignore_errors=True)
-        begin = time.perf_counter()
-        child = start(first)
-        _wait_for_chunk(child, first, 0)
-        to_first_chunk = time.perf_counter() - begin
-        child.join(PATIENCE)
-        whole = time.perf_counter() - begin - to_first_chunk
-        if child.exitcode != 0:
-            raise RuntimeError(f"kills: the uninterrupted run ended with exit code {child.exitcode}.")
+    to_first_chunk, whole = [_timed(start, first) for _ in range(2)][1]  # the second one finds the programs compiled
     expected = vm.StoredTrajectory(first).load()
 
     rows, runs = [], []
@@ -93,16 +84,9 @@ def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict
             child.kill()
             child.join(PATIENCE)
             after = _chunks(path)
-            moment = "before there is a store" if not path.exists() else "before" if after == before else "after"
-            moment += "" if moment.endswith("store") else " its first chunk"
             same = "yes" if after == 0 or _identical(vm.StoredTrajectory(path).load(), expected) else "no"
-            row = {
-                "kill": len(rows) + 1,
-                "after, s": time.perf_counter() - begin,
-                "chunks": after,
-                "new": after - before,
-            }
-            rows.append(row | {"moment": moment, "identical": same})
+            row = {"kill": len(rows) + 1, "after, s": time.perf_counter() - begin, "chunks": after}
+            rows.append(row | {"new": after - before, "moment": _moment(path, after), "identical": same})
         else:
             runs.append(child.exitcode == 0 and _complete(path, expected))
             shutil.rmtree(path)
@@ -110,6 +94,19 @@ def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict
     child.join(PATIENCE)
     runs.append(child.exitcode == 0 and _complete(path, expected))
     return rows, runs
+
+
+def _timed(start, path: Path) -> tuple[float, float]:
+    """Seconds of a run to its first chunk, and from there to its end."""
+    shutil.rmtree(path, ignore_errors=True)
+    begin = time.perf_counter()
+    child = start(path)
+    _wait_for_chunk(child, path, 0)
+    to_first_chunk = time.perf_counter() - begin
+    child.join(PATIENCE)
+    if child.exitcode != 0:
+        raise RuntimeError(f"kills: the uninterrupted run ended with exit code {child.exitcode}.")
+    return to_first_chunk, time.perf_counter() - begin - to_first_chunk
 
 
 def _child(out: str, cache: str) -> None:
@@ -124,6 +121,14 @@ def _child(out: str, cache: str) -> None:
 def _chunks(path: Path) -> int:
     """Completed chunks."""
     return (len(vm.StoredTrajectory(path)) - 1) // PER_CHUNK if path.exists() and len(vm.StoredTrajectory(path)) else 0
+
+
+def _moment(path: Path, chunks: int) -> str:
+    """What the process was at; files beyond the completed chunks are what it was writing."""
+    if not path.exists():
+        return "before there was a store"
+    torn = any(path.rglob("*.partial")) or any(path.glob(f"*/c.{chunks}*"))
+    return "while writing" if torn else "starting or computing"
 
 
 def _wait_for_chunk(child, path: Path, known: int) -> None:

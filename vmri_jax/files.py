@@ -30,6 +30,8 @@ def replaced(path: str | Path) -> Iterator[IO[bytes]]:
 
 def synchronize(path: Path) -> None:
     """Wait until a file, or the entries of a folder, are on disk."""
+    if os.name == "nt":  # folders cannot be opened there, files only for writing
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -13,12 +13,14 @@ import pytest
 from tests.store.conftest import CHUNK, EVERY, STEPS, H, Runs, assert_identical
 from tests.user_systems import two_oscillators
 from vmri_jax import (
+    ConstantMass,
     Interrupted,
     Method,
     Newton,
     Result,
     SimulationError,
     StoredTrajectory,
+    System,
     fully_explicit,
     fully_implicit,
     simulate,
@@ -85,9 +87,11 @@ def test_a_run_that_died_goes_on_to_the_last_bit(run, uninterrupted, out, monkey
             run(out)
     died = StoredTrajectory(out)
     assert died.step == chunks * PER_CHUNK
+    (out / "q_f" / "c.1.0.partial").touch()
     assert not died.complete
     assert_identical(died.load(), uninterrupted[: len(died)])
     assert_identical(run(out, resume=True).load(), uninterrupted.load())
+    assert not list(out.rglob("*.partial"))
 
 
 def test_death_before_there_is_a_store(run, uninterrupted, out, monkeypatch):
@@ -213,6 +217,10 @@ def steeper(q_s, q_f, params):
     return 2 * jnp.sum(q_f**2)
 
 
+def of_two(q_s, q_f, params):
+    return q_f[:2]
+
+
 def same_name(power):
     def steeper(q_f, params):
         return jnp.sum(q_f**power)
@@ -259,6 +267,14 @@ def test_another_version_is_told(run, out, monkeypatch):
         run(out, resume=True)
 
 
+def test_a_checkpoint_of_another_version(run, out, monkeypatch):
+    died = dies_after(monkeypatch, 1, run, out)
+    layout.commit(out, died.record._replace(leaves=died.record.leaves[:-1]))
+    with pytest.raises(ValueError, match=r"can be read, but its run cannot go on: .* remember something else"):
+        run(out, resume=True)
+    assert_identical(StoredTrajectory(out).load(), died.load())
+
+
 def test_nothing_is_overwritten_unless_asked(run, uninterrupted, out):
     run(out, num_steps=PER_CHUNK)
     with pytest.raises(
@@ -297,6 +313,7 @@ def test_two_processes_do_not_write_at_once(run, uninterrupted):
     [
         ({"chunk": 0}, r"chunk is 0; it must be an integer of at least 1"),
         ({"chunk": 2.5}, r"chunk is 2.5"),
+        ({"system": System(ConstantMass(np.ones(3), np.ones(3)), of_two)}, r"slow_potential returns shape \(2,\)"),
         ({"num_steps": 23}, r"not a multiple of save_every"),
         ({"out": "nowhere/run.zarr"}, r"out is nowhere/run.zarr, but the folder nowhere does not exist; make it first"),
     ],

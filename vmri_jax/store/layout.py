@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.files import replaced, synchronize
@@ -32,6 +33,7 @@ from vmri_jax.simulate import Checkpoint
 from vmri_jax.trajectory import NODES, STATUS, Trajectory, named_arrays
 
 FORMAT = "vmri_jax trajectory store 1"
+METADATA = "zarr.json"
 CHECKPOINT = Path("checkpoint", "c", "0")
 """File of the checkpoint within a store."""
 FILL = {"f": np.nan, "i": 0}
@@ -61,9 +63,15 @@ class Record(NamedTuple):
         return cls(saved, result, failed_at, at.step, at.fell_back, leaves)
 
     def checkpoint(self, like: Checkpoint) -> Checkpoint:
-        """The checkpoint, with the structure of another one of the same run."""
-        structure = jax.tree.structure((like.state, like.memory))
-        state, memory = jax.tree.unflatten(structure, [jax.numpy.asarray(leaf) for leaf in self.leaves])
+        """The checkpoint, with the structure of another one of the same run (shapes alone will do).
+
+        Raises:
+            ValueError: the arrays are not those of this structure.
+        """
+        expected, structure = jax.tree.flatten((like.state, like.memory))
+        if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
+            raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
+        state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
         return Checkpoint(self.step, state, memory, self.fell_back)
 
 
@@ -78,7 +86,7 @@ def create(path: Path, attributes: dict[str, Any], record: Record) -> None:
         size = len(_packed(record))
         group.create_array("checkpoint", shape=(size,), dtype="uint8", chunks=(size,), compressors=None)
         commit(partial, record)
-        synchronize(partial)
+        _synchronize(_files(partial))
         if path.exists():
             old = path.with_name(f".{path.name}.{os.getpid()}.old")
             with locked(path):
@@ -95,9 +103,16 @@ def create(path: Path, attributes: dict[str, Any], record: Record) -> None:
 
 def change_attributes(path: Path, **changes) -> None:
     """Set attributes of a store."""
-    import zarr
+    metadata = json.loads((path / METADATA).read_text())
+    metadata["attributes"] |= changes
+    with replaced(path / METADATA) as file:
+        file.write(json.dumps(metadata, indent=2).encode())
 
-    zarr.open_group(path, mode="r+").attrs.update(changes)
+
+def clear(path: Path) -> None:
+    """Remove files whose writing did not come to its end."""
+    for file in path.rglob("*.partial"):
+        file.unlink()
 
 
 class Writer:
@@ -112,20 +127,17 @@ class Writer:
         values = {k: np.asarray(a) for k, a in named_arrays(piece).items() if k not in STATUS and a is not None}
         files = []
         if saved == 0:
-            files += self._make(values)
+            files = self._make(values)
         elif not self._arrays:
-            self._open(values)
+            files = self._open(values)
         for name, value in values.items():
             rows = value[1:] if name in NODES else value
             self._arrays[name][saved : saved + len(rows)] = rows
             files.append(_chunk_file(self._path / name, value.ndim, saved // self._chunk))
-        for file in files:  # after all have been written: the first wait is one for most of the others
-            if file.exists():  # a vector of no coordinates has none
-                synchronize(file)
-            synchronize(file.parent)
+        _synchronize(files)  # after all have been written: the first wait is one for most of the others
 
     def _make(self, values: dict[str, np.ndarray]) -> list[Path]:
-        """Make all arrays and write the start; returns the files of the start."""
+        """Make all arrays and write the start; returns the files there are."""
         import zarr
 
         group = zarr.open_group(self._path, mode="r+")
@@ -133,10 +145,10 @@ class Writer:
         for name in NODES:
             _create_array(start, name, values[name], 1, 1)[:] = values[name][:1]
         self._arrays = {name: _create_array(group, name, v, self._rows, self._chunk) for name, v in values.items()}
-        return [_chunk_file(self._path / "start" / name, values[name].ndim, 0) for name in NODES]
+        return _files(self._path)
 
-    def _open(self, values: dict[str, np.ndarray]) -> None:
-        """Open all arrays; those of a run that is made longer get more rows."""
+    def _open(self, values: dict[str, np.ndarray]) -> list[Path]:
+        """Open all arrays; those of a run that is made longer get more rows. Returns their metadata."""
         import zarr
 
         for name, value in values.items():
@@ -144,6 +156,7 @@ class Writer:
             if array.shape[0] != self._rows:
                 array.resize((self._rows, *value.shape[1:]))
             self._arrays[name] = array
+        return [self._path / name / METADATA for name in values]
 
 
 def commit(path: Path, record: Record) -> None:
@@ -164,7 +177,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give the folder of a stored trajectory.")
     try:
-        attributes = json.loads((path / "zarr.json").read_text())["attributes"]
+        attributes = json.loads((path / METADATA).read_text())["attributes"]
         if attributes["format"] != FORMAT:
             raise ValueError(f"its format is {attributes['format']!r}, not {FORMAT!r}")
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -256,3 +269,16 @@ def _create_array(group, name: str, like: np.ndarray, rows: int, chunk: int):
 
 def _chunk_file(array: Path, dimensions: int, k: int) -> Path:
     return array / ".".join(["c", str(k)] + ["0"] * (dimensions - 1))
+
+
+def _files(path: Path) -> list[Path]:
+    return [file for file in path.rglob("*") if file.is_file()]
+
+
+def _synchronize(files: list[Path]) -> None:
+    """Wait until these files, and that they are there, are on disk."""
+    for file in files:
+        if file.exists():  # a vector of no coordinates has none
+            synchronize(file)
+    for folder in {file.parent for file in files}:
+        synchronize(folder)

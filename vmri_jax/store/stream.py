@@ -4,10 +4,14 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 
+from vmri_jax.checks import check_system
 from vmri_jax.composition import Composition
 from vmri_jax.interrupts import Interrupted, interrupts_noted
 from vmri_jax.newton import Newton
@@ -78,16 +82,26 @@ def stream(
     simulation, start = prepare(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
     if not simulation.is_concrete(start):
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
+    check_system(system, start.q_s, start.q_f)
     check_constraints(system, start.q_s, start.q_f, "stream: the state")
     _check_place(path, resume, overwrite)
-    size = _chunk(simulation, start, num_steps) if chunk is None else _given(chunk)
+    attributes = {
+        "num_steps": num_steps,
+        "save_every": save_every,
+        "save_micro": save_micro,
+        "chunk": _chunk(simulation, start, num_steps) if chunk is None else _given(chunk),
+        "identity": identity(simulation, start),
+        "made_with": environment(),
+    }
     with interrupts_noted() as interrupted:
         if overwrite or not path.exists():
-            _create(path, simulation, start, num_steps, size)
+            with _explained(path, 0):
+                layout.create(path, attributes, Record.of(simulation.start(start)))
         with layout.locked(path):
             stored = StoredTrajectory(path)
-            _check_same_run(stored, simulation, start, chunk)
+            _check_same_run(stored, attributes, chunk)
             _lengthen(stored, num_steps)
+            layout.clear(path)
             for step in _go_on(StoredTrajectory(path), simulation, start, progress):
                 if interrupted():
                     raise Interrupted(StoredTrajectory(path), step, num_steps)
@@ -103,9 +117,13 @@ def _go_on(stored: StoredTrajectory, simulation: Simulation, start: State, progr
     rows = stored.num_steps // simulation.save_every
     if record.saved == rows or not stored.success:
         return
+    try:
+        at = record.checkpoint(like=jax.eval_shape(simulation.start, start))
+    except ValueError as error:
+        raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
     writer = layout.Writer(path, rows, chunk)
-    at = record.checkpoint(like=simulation.start(start))
-    sizes = [min(chunk - at_row % chunk, rows - at_row) for at_row in _starts(record.saved, rows, chunk)]
+    ends = [*range((record.saved // chunk + 1) * chunk, rows, chunk), rows]
+    sizes = [end - begin for begin, end in pairwise([record.saved, *ends])]
     for size in _shown(sizes, -(-rows // chunk)) if progress else sizes:
         piece, at = simulation.advance(at, size)
         with _explained(path, at.step - size * simulation.save_every):
@@ -116,11 +134,6 @@ def _go_on(stored: StoredTrajectory, simulation: Simulation, start: State, progr
         yield at.step
         if record.failed_at >= 0:
             return
-
-
-def _starts(saved: int, rows: int, chunk: int) -> list[int]:
-    """First rows of the pieces to come: the next one, then at every chunk."""
-    return [saved, *range((saved // chunk + 1) * chunk, rows, chunk)]
 
 
 def _shown(sizes: list[int], chunks: int):
@@ -157,22 +170,9 @@ def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
         )
 
 
-def _create(path: Path, simulation: Simulation, start: State, num_steps: int, chunk: int) -> None:
-    attributes = {
-        "num_steps": num_steps,
-        "save_every": simulation.save_every,
-        "save_micro": simulation.save_micro,
-        "chunk": chunk,
-        "identity": identity(simulation, start),
-        "made_with": environment(),
-    }
-    with _explained(path, 0):
-        layout.create(path, attributes, Record.of(simulation.start(start)))
-
-
-def _check_same_run(stored: StoredTrajectory, simulation: Simulation, start: State, chunk: int | None) -> None:
-    there, here = stored.attributes["made_with"], environment()
-    found = differences(identity(simulation, start), stored.attributes["identity"], there["jax"] == here["jax"])
+def _check_same_run(stored: StoredTrajectory, attributes: dict[str, Any], chunk: int | None) -> None:
+    there, here = stored.attributes["made_with"], attributes["made_with"]
+    found = differences(attributes["identity"], stored.attributes["identity"], there["jax"] == here["jax"])
     if chunk not in (None, stored.chunk):
         found.append(f"chunk: {chunk} here, {stored.chunk} in the store")
     if found:
