@@ -1,0 +1,20 @@
+"""Stability of a step: maps of stable and unstable steps, multipliers along a trajectory, advice before a long run."""
+
+from vmri_jax.stability.figures import plot_stability
+from vmri_jax.stability.linear import SmallMotions, linear_model, small_motions
+from vmri_jax.stability.map import StabilityMap, stability_map
+from vmri_jax.stability.monodromy import Monodromy, monodromy
+from vmri_jax.stability.multipliers import Multipliers, multipliers
+
+__all__ = [
+    "Monodromy",
+    "Multipliers",
+    "SmallMotions",
+    "StabilityMap",
+    "linear_model",
+    "monodromy",
+    "multipliers",
+    "plot_stability",
+    "small_motions",
+    "stability_map",
+]

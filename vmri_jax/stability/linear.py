@@ -1,0 +1,269 @@
+"""Linear models: the one of two oscillators, and the small motions of any system about a configuration.
+
+The stability of a step is that of its derivative. At an equilibrium it is exactly the step of the system's second-order
+expansion there; elsewhere the expansion stands for the *frozen* problem: the configuration held at rest by constant
+forces. Either way it is a `System` like any other, so that every scheme applies to it unchanged.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax import ConstantMass, Problem, State, System
+from vmri_jax.diagnostics import velocity
+
+GROWING = 1e-6
+"""Growth rates below this part of the fastest rate are round-off of motions that do not grow."""
+
+
+def soft_spring(q_s, q_f, params):
+    """``V = kappa / 2 |q_s - q_f|^2``."""
+    return params["kappa"] / 2 * jnp.sum((q_s - q_f) ** 2)
+
+
+def stiff_spring(q_f, params):
+    """``W = omega^2 / 2 |q_f|^2``."""
+    return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
+
+
+def linear_model(omega=50.0, kappa=25.0) -> Problem:
+    """One slow and one fast variable of unit mass, ``V = kappa/2 (q_s - q_f)^2`` and ``W = omega^2/2 q_f^2``.
+
+    Starts at ``q_s = 1, q_f = 1 / omega`` with unit velocity of the fast variable.
+
+    Args:
+        omega: frequency of the fast variable alone.
+        kappa: stiffness of the spring between the two.
+    """
+    system = System(
+        ConstantMass([1.0], [1.0]),
+        soft_spring,
+        stiff_spring,
+        params={"omega": jnp.asarray(omega, dtype=float), "kappa": jnp.asarray(kappa, dtype=float)},
+    )
+    one = jnp.ones(1)
+    return Problem(system, one, one / omega, 0 * one, one)
+
+
+@dataclass(frozen=True)
+class SmallMotions:
+    """Small motions about a configuration, in d canonical coordinates (eta, pi) of the constraint manifold.
+
+    Displacements are ``N eta`` with ``N^T M N = 1`` and ``G N = 0``.
+
+    system: the expansion to second order; its equilibrium is zero, its `params` are the coefficients.
+    shapes: N, (n_s + n_f, d).
+    embed, read: (2 n, 2 d) from (eta, pi) to (q_s, q_f, p_s, p_f), and (2 d, 2 n) back.
+    slow, fast, stiffness: (d, d) Hessians of V with its own share of the constraint forces, of W, and of all together.
+    damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
+    rest: the state zero of the expansion.
+    """
+
+    system: System
+    shapes: np.ndarray
+    embed: np.ndarray
+    read: np.ndarray
+    slow: np.ndarray
+    fast: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+    rest: State
+
+    @cached_property
+    def rates(self) -> np.ndarray:
+        """(2 d,) rates s of the motions ``exp(s t)``: imaginary for vibrations."""
+        zero, one = np.zeros_like(self.stiffness), np.eye(len(self.stiffness))
+        return np.linalg.eigvals(np.block([[zero, one], [-self.stiffness, -self.damping]]))
+
+    @property
+    def growing(self) -> np.ndarray:
+        """The rates of motions that grow by themselves, whatever the scheme."""
+        return self.rates[self.rates.real > GROWING * np.abs(self.rates).max(initial=0.0)]
+
+    @property
+    def slow_frequencies(self) -> np.ndarray:
+        """(d,) frequencies of the slow potential alone, the largest first; zero where it is not convex."""
+        return _frequencies(self.slow)
+
+    @property
+    def fast_frequencies(self) -> np.ndarray:
+        """(d,) frequencies of the fast potential alone, the largest first: what a micro step must resolve."""
+        return _frequencies(self.fast)
+
+    @cached_property
+    def modes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies (d,) of all potentials together, the largest first, and mode shapes (d, d), one per column."""
+        values, vectors = np.linalg.eigh((self.stiffness + self.stiffness.T) / 2)
+        return np.sqrt(np.maximum(values[::-1], 0.0)), vectors[:, ::-1]
+
+    @property
+    def omega(self) -> float:
+        """The fastest frequency of W alone; where W has none, of everything."""
+        fast = self.fast_frequencies.max(initial=0.0)
+        return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
+
+
+def _frequencies(stiffness) -> np.ndarray:
+    return np.sqrt(np.maximum(np.linalg.eigvalsh((stiffness + stiffness.T) / 2)[::-1], 0.0))
+
+
+def small_motions(system: System, state: State) -> SmallMotions:
+    """Second-order expansion of a system about the configuration of a state, held at rest there.
+
+    Every term is expanded for itself, ``V(q + d) ~ d^T V'' d / 2`` and so on, and keeps its place in the scheme. Constraints
+    are ``G d + d^T g'' d / 2``, and their forces ``lambda`` (those of the moving state, so that a swinging rod is under
+    tension) act through ``lambda . g''``. V pulls at the constraints with its own share of lambda, a constant force on the
+    micro grid with the rest; at an equilibrium that is what the terms do. The kinetic energy is expanded at rest, forces
+    at the velocity of the state.
+
+    Args:
+        system: any; its potentials, constraints, kinetic energy and forces must have second derivatives there.
+        state: where; its velocity enters through lambda and through the derivatives of the force.
+
+    Raises:
+        ValueError: derivatives that are not finite there.
+    """
+    e = {name: np.asarray(value) for name, value in _expansion(system, state).items()}
+    broken = [name for name, value in e.items() if not np.isfinite(value).all()]
+    if broken:
+        raise ValueError(
+            f"small_motions: the expansion of {', '.join(broken)} is not finite at the state (a norm at zero, a point "
+            "outside a function's domain?). Give a state where second derivatives exist."
+        )
+    n, n_s, n_g = len(e["slow_gradient"]), state.q_s.size, system.num_constraints(state.q_s, state.q_f)[0]
+    mass, coupling = e["kinetic"][n:, n:], e["kinetic"][n:, :n]
+    G, curvature = e["jacobian"], e["curvature"]
+
+    inverse_mass = np.linalg.inv(mass)
+    gram = np.linalg.pinv(G @ inverse_mass @ G.T, rcond=1e-12, hermitian=True)
+    multiplier = gram @ (G @ inverse_mass @ e["impetus"] + e["centripetal"])
+    own = -gram @ (G @ inverse_mass @ e["slow_gradient"])  # the share of V
+    rest = G.T @ (multiplier - own)
+
+    held = np.abs(rest).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
+    params = {
+        "kinetic": e["kinetic"],
+        "slow": (-G.T @ own, e["slow"]),
+        "fast": e["fast"][n_s:, n_s:],
+        "constraint": (G[:n_g], curvature[:n_g]),
+        "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
+        "force": (rest, e["force_q"], e["force_v"]),
+    }
+    expanded = System(
+        system.kinetic if isinstance(system.kinetic, ConstantMass) else _kinetic,
+        None if system.slow_potential is None else _slow_potential,
+        None if system.fast_potential is None else _fast_potential,
+        None if system.constraint is None else _constraint,
+        None if system.slow_constraint is None else _slow_constraint,
+        _force if held or e["force_q"].any() or e["force_v"].any() else None,
+        params,
+    )
+
+    tangents = np.eye(n)
+    if len(G):
+        _, sizes, rows = np.linalg.svd(G)
+        tangents = rows[np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :].T
+    shapes = np.linalg.solve(np.linalg.cholesky(tangents.T @ mass @ tangents), tangents.T).T
+    bent = np.tensordot(multiplier, curvature, 1)
+    bent_by_slow = np.tensordot(own, curvature, 1)
+    gyroscopic = shapes.T @ coupling @ shapes
+    zero = np.zeros_like(shapes)
+    embed = np.block([[shapes, zero], [coupling @ shapes - mass @ shapes @ gyroscopic, mass @ shapes]])
+    read = np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]])
+
+    def reduced(matrix):
+        return shapes.T @ matrix @ shapes
+
+    return SmallMotions(
+        system=expanded,
+        shapes=shapes,
+        embed=embed,
+        read=read,
+        slow=reduced(e["slow"] + bent_by_slow),
+        fast=reduced(e["fast"]),
+        stiffness=reduced(e["slow"] + e["fast"] + bent - e["kinetic"][:n, :n] - e["force_q"]),
+        damping=gyroscopic - gyroscopic.T - reduced(e["force_v"]),
+        rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), (n_s, n, n + n_s))),
+    )
+
+
+@jax.jit
+def _expansion(system: System, state: State) -> dict:
+    """Derivatives of every term by the positions (n,), slow first, and velocities.
+
+    impetus: forces without those of the constraints. centripetal: ``v^T g'' v``, the acceleration of g at constant v.
+    """
+    n_s = state.q_s.size
+    q = jnp.concatenate([state.q_s, state.q_f])
+    v = jnp.concatenate(velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
+    params = system.params
+
+    def slow(q):
+        return jnp.zeros(()) if system.slow_potential is None else system.slow_potential(q[:n_s], q[n_s:], params)
+
+    def fast(q):
+        return jnp.zeros(()) if system.fast_potential is None else system.fast_potential(q[n_s:], params)
+
+    def kinetic(z):
+        q, v = jnp.split(z, 2)
+        return system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], params)
+
+    def constraints(q):
+        return system.constraints(q[:n_s], q[n_s:])
+
+    def force(q, v):
+        return jnp.concatenate(system.forces(state.t, q[:n_s], q[n_s:], v[:n_s], v[n_s:]))
+
+    z = jnp.concatenate([q, v])
+    slope, along = jax.jvp(jax.grad(kinetic), (z,), (jnp.concatenate([v, jnp.zeros_like(v)]),))
+    curvature = jax.jacfwd(jax.jacrev(constraints))(q)
+    force_q, force_v = jax.jacfwd(force, argnums=(0, 1))(q, v)
+    return {
+        "kinetic": jax.hessian(kinetic)(z.at[q.size :].set(0.0)),
+        "slow_gradient": jax.grad(slow)(q),
+        "slow": jax.hessian(slow)(q),
+        "fast": jax.hessian(fast)(q),
+        "jacobian": jax.jacrev(constraints)(q),
+        "curvature": curvature,
+        "centripetal": jnp.einsum("gij,i,j->g", curvature, v, v),
+        "force_q": force_q,
+        "force_v": force_v,
+        "impetus": slope[: q.size] - along[q.size :] - jax.grad(lambda q: slow(q) + fast(q))(q) + force(q, v),
+    }
+
+
+def _kinetic(q_s, q_f, v_s, v_f, params):
+    z = jnp.concatenate([q_s, q_f, v_s, v_f])
+    return z @ params["kinetic"] @ z / 2
+
+
+def _slow_potential(q_s, q_f, params):
+    q = jnp.concatenate([q_s, q_f])
+    gradient, hessian = params["slow"]
+    return gradient @ q + q @ hessian @ q / 2
+
+
+def _fast_potential(q_f, params):
+    return q_f @ params["fast"] @ q_f / 2
+
+
+def _constraint(q_s, q_f, params):
+    return _quadratic(jnp.concatenate([q_s, q_f]), *params["constraint"])
+
+
+def _slow_constraint(q_s, params):
+    return _quadratic(q_s, *params["slow_constraint"])
+
+
+def _quadratic(q, jacobian, curvature):
+    return jacobian @ q + jnp.einsum("gij,i,j->g", curvature, q, q) / 2
+
+
+def _force(t, q_s, q_f, v_s, v_f, params):
+    constant, by_q, by_v = params["force"]
+    n_s = q_s.size
+    force = constant + by_q @ jnp.concatenate([q_s, q_f]) + by_v @ jnp.concatenate([v_s, v_f])
+    return force[:n_s], force[n_s:]

@@ -1,0 +1,193 @@
+"""Stability maps: where a step with a scheme is stable, over ``omega H`` and over schemes or coupling strengths."""
+
+import csv
+import json
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vmri_jax import Composition, Problem, Scheme, State, System
+from vmri_jax.checks import require_x64
+from vmri_jax.stability.linear import SmallMotions, small_motions
+from vmri_jax.stability.multipliers import multipliers
+from vmri_jax.stability.windows import find_windows
+
+TOLERANCE = 1e-6
+"""Growth per step that counts as instability.
+
+Two equal multipliers (free motion, the end of a window) split under round-off by the square root of it: up to 2e-8 was
+seen on our systems, up to 1e-7 in compositions of many stages. Growth by less than 1e-6 takes a million macro steps to
+be a factor of e.
+"""
+EDGE = 1e-7
+"""Ends of windows are refined to this part of the range of omega H; narrower windows are left out."""
+
+
+@dataclass(frozen=True)
+class StabilityMap:
+    """Largest multipliers of a macro step over a grid, and the windows of instability.
+
+    axis: "scheme" or "kappa", what the rows are.
+    rows: (m,) their labels.
+    omega: frequency that scales the grid, the fastest one of the fast potential alone.
+    omega_H: (n,) grid, macro step times omega.
+    radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions that grow by
+        themselves; infinite where the step failed.
+    edges: per row, the intervals of omega_H in which radius > 1 + tolerance; they may be far narrower than the grid.
+    tolerance: growth per step that counts.
+    """
+
+    axis: str
+    rows: tuple
+    omega: float
+    omega_H: np.ndarray
+    radius: np.ndarray
+    edges: tuple[tuple[tuple[float, float], ...], ...]
+    tolerance: float
+
+    @property
+    def macro_dt(self) -> np.ndarray:
+        """(n,) macro steps."""
+        return self.omega_H / self.omega
+
+    @property
+    def growth(self) -> np.ndarray:
+        """(m, n) growth per macro step, ``radius - 1``, zero where stable."""
+        return np.where(self.radius > 1 + self.tolerance, self.radius - 1, 0.0)
+
+    def windows(self, row=None) -> list[tuple[float, float]]:
+        """Intervals of omega H that are unstable, for one row (the first by default)."""
+        if row is None:
+            return list(self.edges[0])
+        if row not in self.rows:
+            raise ValueError(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
+        return list(self.edges[self.rows.index(row)])
+
+    def first_unstable(self, row=None) -> float:
+        """Smallest unstable omega H of one row (the first by default); infinite where there is none on the grid."""
+        return next((start for start, _ in self.windows(row)), np.inf)
+
+    def to_json(self, path: str | Path) -> None:
+        """Write everything to a JSON file; `from_json` reads it."""
+        content = asdict(replace(self, omega_H=self.omega_H.tolist(), radius=self.radius.tolist()))  # pyright: ignore[reportArgumentType]
+        Path(path).write_text(json.dumps(content, indent=1))
+
+    @classmethod
+    def from_json(cls, path: str | Path) -> "StabilityMap":
+        """A map written by `to_json`."""
+        content = json.loads(Path(path).read_text())
+        edges = tuple(tuple((start, stop) for start, stop in row) for row in content.pop("edges"))
+        arrays = {name: np.array(content.pop(name)) for name in ("omega_H", "radius")}
+        return cls(**content | arrays | {"rows": tuple(content["rows"]), "edges": edges})
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write one line per row and grid point: label, omega_H, macro_dt, radius."""
+        with open(path, "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow([self.axis, "omega_H", "macro_dt", "radius"])
+            for label, radius in zip(self.rows, self.radius, strict=True):
+                writer.writerows(zip([label] * len(radius), self.omega_H, self.macro_dt, radius, strict=True))
+
+    def plot(self, title: str = ""):
+        """Stable and unstable regions, see `vmri_jax.stability.plot_stability`."""
+        from vmri_jax.stability.figures import plot_stability
+
+        return plot_stability({"": self}, title)
+
+
+def stability_map(
+    model: Problem | tuple[System, State],
+    scheme: Scheme | Composition | Mapping[Hashable, Scheme | Composition],
+    omega_H: Sequence[float] | np.ndarray,
+    *,
+    kappa: Sequence[float] | None = None,
+    tolerance: float = TOLERANCE,
+) -> StabilityMap:
+    """Where macro steps of length H are stable: multipliers of the step of small motions about the model's state.
+
+    At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere those of the frozen problem
+    (see `small_motions`). Windows between grid points are found where multipliers of opposite Krein signature have
+    passed each other, and refined by bisection.
+
+    Args:
+        model: `linear_model()`, any other `Problem`, or a system and a state. The unit of the grid is its omega: the
+            fastest frequency of the fast potential alone, or of everything where that has none.
+        scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
+            num_micro and structure is compiled once.
+        omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
+            windows; multipliers that pass several others from one point to the next hide some.
+        kappa: values of ``params["kappa"]`` of the system, one row each, for a single scheme.
+        tolerance: growth per macro step above which a step is unstable.
+
+    Raises:
+        TypeError: a model or scheme of the wrong kind.
+        ValueError: a grid that is not increasing and positive; kappa for several schemes, or for a system without it.
+    """
+    require_x64()
+    system, state = _system_and_state(model)
+    grid = np.asarray(omega_H, dtype=float)
+    if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
+        raise ValueError(
+            f"stability_map: omega_H has shape {grid.shape} and values {_ends(grid)}; give two or more positive values, "
+            "increasing, e.g. numpy.linspace(0.05, 12, 240)."
+        )
+    schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
+    if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
+        raise TypeError(
+            f"stability_map: scheme is {scheme!r}; give a Scheme or Composition, e.g. explicit_slow(10), or a dict of them."
+        )
+    if kappa is None:
+        motions = small_motions(system, state)
+        rows = {label: (motions, s) for label, s in schemes.items()}
+    else:
+        [only] = schemes.values() if len(schemes) == 1 else [None]
+        if only is None or not isinstance(system.params, Mapping) or "kappa" not in system.params:
+            raise ValueError(
+                "stability_map: kappa goes with a single scheme and a system whose params are a dict with an entry 'kappa'; "
+                f"got {len(schemes)} scheme(s) and params {system.params!r}. Make one map per scheme."
+            )
+        rows = {float(k): (small_motions(_with_kappa(system, k), state), only) for k in kappa}
+    omega = next(iter(rows.values()))[0].omega
+    if omega == 0:
+        raise ValueError("stability_map: the model has no frequency that could scale omega_H; nothing vibrates there.")
+    measured = [measure(motions, s, grid / omega, tolerance) for motions, s in rows.values()]
+    return StabilityMap(
+        axis="scheme" if kappa is None else "kappa",
+        rows=tuple(rows),
+        omega=omega,
+        omega_H=grid,
+        radius=np.array([radius for radius, _ in measured]),
+        edges=tuple(tuple((omega * a, omega * b) for a, b in windows) for _, windows in measured),
+        tolerance=tolerance,
+    )
+
+
+def measure(
+    motions: SmallMotions, scheme: Scheme | Composition, macro_dt, tolerance: float = TOLERANCE, resolution: float = EDGE
+) -> tuple[np.ndarray, list[tuple[float, float]]]:
+    """Spectral radius (n,) at each of n increasing macro steps, and the unstable intervals between first and last."""
+
+    def label(macro_dt):
+        return multipliers(motions, scheme, macro_dt).words(tolerance)
+
+    found = multipliers(motions, scheme, macro_dt)
+    windows = find_windows(label, macro_dt, found.words(tolerance), resolution * (macro_dt[-1] - macro_dt[0]))
+    return found.radius, windows
+
+
+def _system_and_state(model) -> tuple[System, State]:
+    if isinstance(model, Problem):
+        return model.system, model.state()
+    if isinstance(model, tuple) and len(model) == 2 and isinstance(model[0], System) and isinstance(model[1], State):
+        return model
+    raise TypeError(f"stability_map: model is {type(model).__name__}; give a Problem, or (system, state).")
+
+
+def _with_kappa(system: System, kappa) -> System:
+    return system.replace(params={**system.params, "kappa": np.asarray(kappa, dtype=float)})
+
+
+def _ends(grid) -> str:
+    return f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"

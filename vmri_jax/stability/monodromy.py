@@ -1,0 +1,141 @@
+"""Monodromy: the derivative of many steps along a trajectory, and its multipliers."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax import Composition, Newton, Result, Scheme, State, System, macro_step
+from vmri_jax.checks import require_x64
+from vmri_jax.diagnostics import velocity
+from vmri_jax.quadrature import is_concrete
+
+
+@dataclass(frozen=True)
+class Monodromy:
+    """Derivative of the end of a trajectory by its start, between the tangent spaces of the constraint manifold there.
+
+    matrix: (k, k), k = 2 (n_s + n_f - n_g - n_gs), in the orthonormal bases `start_basis` and `end_basis` (k, 2 n) of
+        tangent vectors (q_s, q_f, p_s, p_f).
+    start, end: states.
+    closure: distance of the end from the start, relative to the larger size of the two.
+    symplectic_defect: largest entry of ``M^T J M - J`` on the tangent spaces, relative to the largest of ``|M|^2``.
+    """
+
+    matrix: np.ndarray
+    start_basis: np.ndarray
+    end_basis: np.ndarray
+    start: State
+    end: State
+    closure: float
+    symplectic_defect: float
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """(k,) Floquet multipliers, the largest first.
+
+        They mean what they should where the trajectory closes, or stays near where it began (small `closure`): there
+        both ends share one tangent space.
+        """
+        values = np.linalg.eigvals(self.start_basis @ self.end_basis.T @ self.matrix)
+        return values[np.argsort(-np.abs(values), kind="stable")]
+
+    @property
+    def stretch(self) -> np.ndarray:
+        """(k,) singular values, the largest first: how much disturbances of the start have grown, closed or not."""
+        return np.linalg.svd(self.matrix, compute_uv=False)
+
+
+def monodromy(
+    system: System,
+    scheme: Scheme | Composition,
+    state: State,
+    macro_dt,
+    num_steps: int,
+    newton: Newton | None = None,
+) -> Monodromy:
+    """Product of the step's derivatives along a trajectory, ``M = DPhi(z_(N-1)) ... DPhi(z_0)``.
+
+    With constraints, every factor is taken between the tangent spaces of ``{g = 0, G v = 0}`` at its two ends.
+
+    Args:
+        system, scheme, macro_dt, newton: as in `macro_step`.
+        state: start, consistent.
+        num_steps: macro steps; one period of a periodic orbit gives its Floquet multipliers.
+
+    Raises:
+        ValueError: num_steps below 1, a macro step that is not positive.
+        RuntimeError: a step failed; says which and why.
+    """
+    require_x64()
+    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer) or num_steps < 1:
+        raise ValueError(f"monodromy: num_steps is {num_steps!r}; it must be an integer of at least 1.")
+    if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
+        raise ValueError(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
+    start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
+    z, matrix, bases, results = _product(system, scheme, start, macro_dt, newton or Newton(), num_steps)
+    if not all(Result(int(r)).success for r in np.unique(results)):
+        step = next(k for k, r in enumerate(results) if not Result(int(r)).success)
+        raise RuntimeError(f"monodromy: macro step {step} failed: {Result(int(results[step])).message}")
+    first, last = np.asarray(_vector(start)), np.asarray(z)
+    M, (at_start, at_end) = np.asarray(matrix), (np.asarray(b) for b in bases)
+    n = first.size // 2
+    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    defect = M.T @ (at_end @ J @ at_end.T) @ M - at_start @ J @ at_start.T
+    return Monodromy(
+        matrix=M,
+        start_basis=at_start,
+        end_basis=at_end,
+        start=start,
+        end=State(start.t + num_steps * macro_dt, *jnp.split(z, _splits(start))),
+        closure=float(np.linalg.norm(last - first) / max(np.linalg.norm(first), np.linalg.norm(last))),
+        symplectic_defect=float(np.abs(defect).max() / max(1.0, np.abs(M).max() ** 2)),
+    )
+
+
+@partial(jax.jit, static_argnames="num_steps")
+def _product(system, scheme, state, macro_dt, newton, num_steps: int):
+    """End (2 n,), product of the derivatives, tangent bases at both ends, status of every step."""
+    splits = _splits(state)
+
+    def step(z, t):
+        end, info = macro_step(system, scheme, State(t, *jnp.split(z, splits)), macro_dt, newton)
+        z = _vector(end)
+        return z, (z, info.result)
+
+    def along(carry, k):
+        z, basis, matrix = carry
+        t = state.t + k * macro_dt
+        derivative, (z, result) = jax.jacfwd(lambda z: step(z, t), has_aux=True)(z)
+        end_basis = _tangents(system, z, splits)
+        return (z, end_basis, end_basis @ derivative @ (basis.T @ matrix)), result
+
+    z = _vector(state)
+    basis = _tangents(system, z, splits)
+    carry, results = jax.lax.scan(along, (z, basis, jnp.eye(basis.shape[0])), jnp.arange(num_steps))
+    return carry[0], carry[2], (basis, carry[1]), results
+
+
+def _tangents(system, z, splits):
+    """Orthonormal basis, one row each, of the tangent vectors of ``{g = 0, G v = 0}`` at z."""
+
+    def manifold(z):
+        q_s, q_f, p_s, p_f = jnp.split(z, splits)
+        values, rate = jax.jvp(system.constraints, (q_s, q_f), velocity(system, q_s, q_f, p_s, p_f))
+        return jnp.concatenate([values, rate])
+
+    if system.constraint is system.slow_constraint is None:
+        return jnp.eye(z.size)
+    normals = jax.jacfwd(manifold)(z)
+    return jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :]
+
+
+def _vector(state: State):
+    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
+
+
+def _splits(state: State) -> tuple[int, int, int]:
+    n_s, n = state.q_s.size, state.q_s.size + state.q_f.size
+    return n_s, n, n + n_s

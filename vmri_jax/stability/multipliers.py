@@ -1,0 +1,94 @@
+"""Multipliers of a macro step: the eigenvalues of its derivative, and which of them may meet.
+
+A symplectic map has its multipliers in pairs (a, 1/a). They stay on the unit circle, and motion bounded, until two of
+opposite Krein signature meet; those of equal signature pass through each other (Krein, Gelfand and Lidskii; Arnold,
+*Mathematical Methods of Classical Mechanics*, 42). So the signatures in the order of the angles change only across a
+meeting, however narrow the instability it leaves.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax import Composition, Newton, Scheme, State, System, macro_step
+from vmri_jax.stability.linear import SmallMotions
+
+LANES = 64
+"""Step sizes that one compiled call does side by side, where the system is small."""
+AT_ONE = 1e-5
+"""Multipliers closer to 1 belong to free motions, which have no signature."""
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """Multipliers of small motions at k step sizes.
+
+    values: (k, 2 d) eigenvalues of the derivative of the step; NaN where the step itself failed.
+    vectors: (k, 2 d, 2 d) eigenvectors in the coordinates of `SmallMotions`, one per column.
+    own: (k, 2 d) whether the multiplier is one of the motion itself, which grows without the scheme's help.
+    """
+
+    values: np.ndarray
+    vectors: np.ndarray
+    own: np.ndarray
+
+    @property
+    def radius(self) -> np.ndarray:
+        """(k,) largest modulus of the multipliers that should not grow; infinite where the step failed."""
+        sizes = np.where(self.own, 0.0, np.abs(self.values))
+        return np.where(np.isnan(sizes).any(axis=1), np.inf, sizes.max(axis=1, initial=0.0))
+
+    def words(self, tolerance: float) -> list[bytes | None]:
+        """Krein signatures along the upper half circle, by angle; None where a multiplier has left the circle outwards."""
+        d = self.values.shape[1] // 2
+        words: list[bytes | None] = []
+        for values, x, radius in zip(self.values, self.vectors, self.radius, strict=True):
+            if radius > 1 + tolerance:
+                words.append(None)
+                continue
+            signs = np.imag(np.sum(np.conj(x[:d]) * x[d:], axis=0)) > 0
+            angles = np.angle(values)
+            upper = np.flatnonzero((angles > AT_ONE) & (np.abs(np.abs(values) - 1) <= tolerance))
+            words.append(signs[upper[np.argsort(angles[upper])]].tobytes())
+        return words
+
+
+def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -> Multipliers:
+    """Multipliers of one macro step of the given lengths (k,).
+
+    The derivative of the step is exact, ``jax.jacfwd(macro_step)`` of the expansion at rest on the tangent space of the
+    constraint manifold; Newton's one iteration solves its linear equations.
+    """
+    macro_dt = np.asarray(macro_dt, dtype=float)
+    size = motions.read.shape[0]
+    lanes = int(np.clip(LANES * 36 // max(size, 1), 4, LANES))
+    padded = np.concatenate([macro_dt, np.full(-len(macro_dt) % lanes, macro_dt[0])]).reshape(-1, lanes)
+    pieces = [
+        np.asarray(_step_matrices(motions.system, scheme, motions.rest, motions.embed, motions.read, part))
+        for part in padded
+    ]
+    matrices = np.concatenate(pieces)[: len(macro_dt)]
+    failed = ~np.isfinite(matrices).all(axis=(1, 2))
+    values, vectors = np.linalg.eig(np.where(failed[:, None, None], np.eye(size), matrices))
+    values = np.where(failed[:, None], np.nan, values.astype(complex))
+    own = np.zeros(values.shape, dtype=bool)
+    for rate in motions.growing:
+        distance = np.where(own, np.inf, np.abs(values - np.exp(rate * macro_dt)[:, None]))
+        own[np.arange(len(own)), np.argmin(distance, axis=1)] = True
+    return Multipliers(values, vectors.astype(complex), own)
+
+
+@jax.jit
+def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
+    """(k, 2 d, 2 d) derivatives of the macro step at rest for k lengths of it."""
+    n_s, n = rest.q_s.size, rest.q_s.size + rest.q_f.size
+    newton = Newton(method="arrowhead", fixed_iterations=1)
+
+    def step(coordinates, macro_dt):
+        state = State(rest.t, *jnp.split(embed @ coordinates, (n_s, n, n + n_s)))
+        end = macro_step(system, scheme, state, macro_dt, newton)[0]
+        return read @ jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
+
+    return jax.vmap(lambda dt: jax.jacfwd(step)(jnp.zeros(embed.shape[1]), dt))(macro_dt)

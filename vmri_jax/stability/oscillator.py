@@ -1,0 +1,76 @@
+"""The test equation ``q'' = -omega^2 q`` under one rule: the phase of a step, and where the rule ceases to be stable.
+
+A step of length tau with a path of degree r has the discrete Lagrangian ``q^T S q / (2 tau)`` in the control points,
+``S = D - x^2 B``, x = omega tau, with D and B the sums of the rules over ``l_i' l_j'`` and ``l_i l_j``. Eliminating the
+control points inside leaves a symmetric 2 x 2 matrix, and the step turns by the phase phi per tau,
+
+    cos(phi) = -(S_00 + S_11) / (2 S_01),          unstable where |cos(phi)| > 1.
+
+Midpoint rule: ``phi = 2 atan(x / 2)``; kicks at the ends (Verlet): ``2 asin(x / 2)``, stable for x < 2.
+"""
+
+import numpy as np
+
+from vmri_jax import Scheme
+from vmri_jax.path import lagrange_basis, lagrange_derivative
+from vmri_jax.quadrature import Rule
+
+RESOLUTION = 0.05
+"""Spacing of x over which the phase is followed."""
+FARTHEST = 30.0
+"""Limits beyond this x are called infinite."""
+
+
+def phase(scheme: Scheme, x: float) -> float:
+    """Phase by which a fast vibration turns in a micro step, ``x = omega h``; NaN where the step is unstable.
+
+    Needs the fast potential on the micro grid; else NaN.
+    """
+    if scheme.fast.grid != "micro":
+        return np.nan
+    at = np.linspace(0.0, x, 2 + int(abs(x) / RESOLUTION))
+    cosine, direction = _turn(scheme.degree, scheme.kinetic.rule, scheme.fast.rule, at)
+    if abs(cosine[-1]) > 1:
+        return np.nan
+    return float(np.sign(x) * np.unwrap(np.arctan2(direction * np.sqrt(np.maximum(1 - cosine**2, 0)), cosine))[-1])
+
+
+def fast_limit(scheme: Scheme) -> float:
+    """The smallest ``omega h`` at which the micro step is unstable for a fast vibration; infinite if there is none."""
+    if scheme.fast.grid != "micro":
+        return np.inf
+    return _limit(scheme.degree, scheme.kinetic.rule, scheme.fast.rule)
+
+
+def slow_limit(scheme: Scheme) -> float:
+    """The smallest ``omega H`` at which the macro step is unstable for a vibration of the slow variables under V."""
+    n = scheme.num_micro
+    return _limit(scheme.degree, scheme.kinetic.composite(n), scheme.slow.composite(n))
+
+
+def _limit(degree: int, kinetic: Rule, potential: Rule) -> float:
+    def first_unstable(x):
+        unstable = np.flatnonzero(np.abs(_turn(degree, kinetic, potential, x)[0]) > 1 + 1e-12)
+        return unstable[0] if unstable.size else None
+
+    x = np.arange(0.0, FARTHEST, RESOLUTION)
+    while x[1] - x[0] > 1e-9:
+        at = first_unstable(x)
+        if at is None:
+            return np.inf
+        x = np.linspace(x[at - 1], x[at], 30)
+    return float(x[-1])
+
+
+def _turn(degree: int, kinetic: Rule, potential: Rule, x):
+    """cos(phi) and the sign of sin(phi), at each x."""
+    slopes, values = lagrange_derivative(degree, kinetic.nodes), lagrange_basis(degree, potential.nodes)
+    D = slopes.T @ (np.asarray(kinetic.weights)[:, None] * slopes)
+    B = values.T @ (np.asarray(potential.weights)[:, None] * values)
+    S = D - np.asarray(x)[:, None, None] ** 2 * B
+    ends, inside = np.ix_([0, -1], [0, -1]), slice(1, -1)
+    across = S[:, inside][:, :, [0, -1]]
+    two = S[:, *ends] - np.swapaxes(across, 1, 2) @ np.linalg.solve(S[:, inside, inside], across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = -(two[:, 0, 0] + two[:, 1, 1]) / (2 * two[:, 0, 1])
+    return cosine, np.sign(-two[:, 0, 1])
