@@ -62,7 +62,7 @@ def bad_lane(problem: vm.Problem, scheme, macro_dt, num_steps: int, newton: vm.N
 
 
 def one_bad_lane(full: bool) -> Outcome:
-    problem = vm.systems.triple_spherical_pendulum()
+    problem = vm.systems.fermi_pasta_ulam()
     newton = vm.Newton() if full else vm.Newton(method="march")  # by default a lane that fails is tried again, exactly
     return bad_lane(problem, vm.fully_implicit(5), 0.01, 100, newton, compared=256 if full else 4)
 
@@ -78,7 +78,7 @@ GUARDS = (
     Case(
         28,
         "one bad lane in a batch",
-        "256 starts of the triple pendulum, one of them absurd",
+        "256 starts of the FPU chain, one of them absurd",
         "the bad lane reports its failure, the others equal their single runs to 1e-12",
         one_bad_lane,
     ),
