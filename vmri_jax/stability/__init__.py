@@ -1,5 +1,6 @@
 """Stability of a step: maps of stable and unstable steps, multipliers along a trajectory, advice before a long run."""
 
+from vmri_jax.stability.advice import Advice, Finding, advise
 from vmri_jax.stability.figures import plot_stability
 from vmri_jax.stability.linear import SmallMotions, linear_model, small_motions
 from vmri_jax.stability.map import StabilityMap, stability_map
@@ -7,10 +8,13 @@ from vmri_jax.stability.monodromy import Monodromy, monodromy
 from vmri_jax.stability.multipliers import Multipliers, multipliers
 
 __all__ = [
+    "Advice",
+    "Finding",
     "Monodromy",
     "Multipliers",
     "SmallMotions",
     "StabilityMap",
+    "advise",
     "linear_model",
     "monodromy",
     "multipliers",

@@ -44,6 +44,8 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
             shown = y[:: -(-len(y) // 14)]
             axes.set_yticks(shown, [_label(stability.rows[i]) for i in shown])
             axes.grid(axis="y", visible=False)
+            if stability.axis == "kappa" or all(isinstance(row, int) for row in stability.rows):
+                axes.set(ylabel="kappa" if stability.axis == "kappa" else "micro steps per macro step")
         for axes in panels[len(maps) :]:
             axes.set_axis_off()
         for axes in panels[max(0, len(maps) - columns) : len(maps)]:

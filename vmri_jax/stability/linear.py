@@ -6,7 +6,7 @@ forces. Either way it is a `System` like any other, so that every scheme applies
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,8 @@ import numpy as np
 from vmri_jax import ConstantMass, Problem, State, System
 from vmri_jax.diagnostics import velocity
 
+QUICK = {"xla_backend_optimization_level": 0}
+"""Programs that run for milliseconds: compiled in half the time, at the same speed on matrices this small."""
 GROWING = 1e-6
 """Growth rates below this part of the fastest rate are round-off of motions that do not grow."""
 
@@ -190,7 +192,7 @@ def small_motions(system: System, state: State) -> SmallMotions:
     )
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK)
 def _expansion(system: System, state: State) -> dict:
     """Derivatives of every term by the positions (n,), slow first, and velocities.
 

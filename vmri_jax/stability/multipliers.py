@@ -7,13 +7,14 @@ meeting, however narrow the instability it leaves.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import Composition, Newton, Scheme, State, System, macro_step
-from vmri_jax.stability.linear import SmallMotions
+from vmri_jax.stability.linear import QUICK, SmallMotions
 
 LANES = 64
 """Step sizes that one compiled call does side by side, where the system is small."""
@@ -80,7 +81,7 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
     return Multipliers(values, vectors.astype(complex), own)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=QUICK)
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest for k lengths of it."""
     n_s, n = rest.q_s.size, rest.q_s.size + rest.q_f.size

@@ -1,0 +1,96 @@
+"""Advice: what is unstable is named, measured, and cured by the step it proposes."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tests.stability.systems import double_pendulum, hanging
+from vmri_jax import State, System, compose, explicit_slow, fully_explicit, fully_implicit
+from vmri_jax.stability import advise, linear_model
+from vmri_jax.systems.fermi_pasta_ulam import soft_springs
+
+
+def kinds(advice, severity="error"):
+    return [finding.kind for finding in advice.findings if finding.severity == severity]
+
+
+def test_impulse_resonance_of_the_chain(fpu):
+    """FPU at omega H = pi."""
+    scheme, state = explicit_slow(30), fpu.state()
+    advice = advise(fpu.system, scheme, state, 0.0628)
+    assert kinds(advice) == ["impulse resonance"] and not advice.ok
+    assert advice.growth == pytest.approx(5.0e-3, rel=0.1)
+    assert "turns by 1 pi" in str(advice) and "tenfold in 460" in str(advice)
+    assert 0.06 < advice.safe_macro_dt < 0.066 and advice.safe_macro_dt != 0.0628
+    again = advise(fpu.system, scheme, state, advice.safe_macro_dt)
+    assert again.ok and again.findings == () and again.safe_macro_dt == again.macro_dt == advice.safe_macro_dt
+    near = advise(fpu.system, scheme, state, 0.0631)
+    assert near.growth == 0 and kinds(near, "warning") == ["impulse resonance"] and not near.ok
+
+
+def test_combination_resonance():
+    """Linear model, kappa 25, omega h = 0.1, num_micro 57, fully implicit."""
+    problem = linear_model()
+    advice = advise(problem.system, fully_implicit(57), problem.state(), 0.114)
+    assert kinds(advice) == ["combination resonance"]
+    assert advice.growth == pytest.approx(8.4e-4, abs=2e-5)
+    assert "frequencies 50.25 and 4.975" in str(advice)
+    assert advice.safe_macro_dt == pytest.approx(0.114, rel=0.01)
+    assert any(a < 0.114 < b for a, b in advice.windows)
+
+
+@pytest.mark.parametrize(("x", "severity"), [(1.6, None), (1.98, "warning"), (2.1, "error")])
+def test_stability_limit_of_the_chain(fpu, x, severity):
+    advice = advise(fpu.system, fully_explicit(1), fpu.state(), x / 50)
+    assert advice.ok == (severity is None)
+    assert (advice.growth > 0) == (severity == "error")
+    if severity:
+        assert kinds(advice, severity) == ["stability limit"]
+        assert "stable below 2" in str(advice)
+        assert 1.7 / 50 < advice.safe_macro_dt < 2.0 / 50
+
+
+def test_stages_of_a_composition(fpu):
+    advice = advise(fpu.system, compose(fully_explicit(1), "yoshida4"), fpu.state(), 1.3 / 50)
+    assert kinds(advice) == ["stability limit"] and "longest stage" in str(advice)
+    assert kinds(advice, "note") == ["stages"]
+    [note] = [finding for finding in advice.findings if finding.kind == "stages"]
+    assert note.number == pytest.approx(1.7024, abs=1e-4)
+    assert advice.safe_macro_dt < 2 / 50 / note.number
+
+
+def all_in_the_slow_potential(q_s, q_f, params):
+    return soft_springs(q_f, q_s, params) + params["omega"] ** 2 / 2 * jnp.sum(q_s**2)
+
+
+def test_swapped_labels(fpu):
+    state = fpu.state()
+    swapped = System(fpu.system.kinetic, all_in_the_slow_potential, params=fpu.system.params)
+    start = State(0.0, state.q_f, state.q_s, state.p_f, state.p_s)
+    advice = advise(swapped, fully_explicit(1), start, 0.005)
+    assert kinds(advice, "warning") == ["labels"] and not advice.ok
+    assert "q_s[0], q_s[1], q_s[2]" in str(advice) and "Swap the labels" in str(advice)
+    assert advice.findings[0].number > 10
+    assert advice.safe_macro_dt == advice.macro_dt  # the step itself is stable
+
+
+def test_a_state_that_is_unstable_by_itself():
+    """Rods standing up: the growth is the motion's, not the scheme's."""
+    system = double_pendulum(stiffness=0.0)
+    advice = advise(system, fully_explicit(1), hanging(system, up=1.0), 0.01)
+    assert advice.ok and advice.growth == 0 and kinds(advice, "note") == ["motion"]
+    assert advice.findings[0].number > 3
+
+
+def test_table_and_bad_input(fpu):
+    advice = advise(fpu.system, fully_explicit(1), fpu.state(), 2.1 / 50)
+    console = Console(width=300, record=True, file=None, quiet=False)
+    with console.capture() as captured:
+        console.print(advice)
+    assert "stability limit" in captured.get() and advice.verdict in captured.get()
+    with pytest.raises(TypeError, match="scheme is int"):
+        advise(fpu.system, 3, fpu.state(), 0.1)  # pyright: ignore[reportArgumentType]
+    for macro_dt in (0.0, np.nan, [0.1]):
+        with pytest.raises(ValueError, match="macro_dt is"):
+            advise(fpu.system, fully_explicit(1), fpu.state(), macro_dt)  # pyright: ignore[reportArgumentType]

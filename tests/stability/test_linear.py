@@ -1,0 +1,110 @@
+"""Small motions: at an equilibrium they are the derivative of the step of the system itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests import user_systems
+from tests.stability.systems import double_pendulum, hanging
+from vmri_jax import ConstantMass, State, System, fully_explicit, fully_implicit, initial_state, macro_step
+from vmri_jax.stability import linear_model, multipliers, small_motions
+
+
+def step_matrix(system, scheme, state, macro_dt, motions):
+    """Derivative of the system's own step, in the coordinates of the small motions."""
+    n_s, n = state.q_s.size, state.q_s.size + state.q_f.size
+    z = jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
+
+    def step(coordinates):
+        start = State(state.t, *jnp.split(z + motions.embed @ coordinates, (n_s, n, n + n_s)))
+        end = macro_step(system, scheme, start, macro_dt)[0]
+        return motions.read @ jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
+
+    return np.asarray(jax.jit(jax.jacfwd(step))(jnp.zeros(motions.embed.shape[1])))
+
+
+def damping(t, q_s, q_f, v_s, v_f, params):
+    return -3.0 * v_s, -0.02 * v_f + 0.1 * q_f
+
+
+def swinging_with_damping():
+    problem = user_systems.double_pendulum()  # in angles, at rest below: a kinetic function with coupled masses
+    zero = jnp.zeros(1)
+    system = problem.system.replace(force=damping)
+    return system, initial_state(system, zero, zero, zero, zero)
+
+
+def hanging_under_tension():
+    system = double_pendulum()
+    return system, hanging(system)
+
+
+@pytest.mark.parametrize("case", [hanging_under_tension, swinging_with_damping])
+def test_the_step_of_the_expansion_is_the_derivative_of_the_step(case):
+    system, state = case()
+    motions = small_motions(system, state)
+    values = multipliers(motions, fully_implicit(2), [0.05]).values[0]
+    expected = np.linalg.eigvals(step_matrix(system, fully_implicit(2), state, 0.05, motions))
+    assert np.abs(np.sort_complex(values) - np.sort_complex(expected)).max() < 1e-12  # 3e-14
+    assert np.abs(np.sort_complex(np.exp(0.05 * motions.rates)) - np.sort_complex(values)).max() < 0.1
+
+
+def test_constraint_forces_stiffen_a_pendulum():
+    """Point mass on a rod, hanging: ``omega^2 = g / l`` comes from the tension alone; standing, it grows at that rate."""
+
+    def rod(q_s, q_f, params):
+        return (q_f @ q_f - 4.0)[None] / 2
+
+    def gravity(q_s, q_f, params):
+        return 3 * 9.81 * q_f[1]
+
+    system = System(ConstantMass([], [3.0, 3.0]), gravity, constraint=rod)
+    none = jnp.zeros(0)
+    for side in (-1.0, 1.0):
+        motions = small_motions(system, initial_state(system, none, [0.0, 2.0 * side], none, [0.0, 0.0]))
+        assert motions.stiffness == pytest.approx(-side * 9.81 / 2)
+        assert motions.slow == pytest.approx(-side * 9.81 / 2)
+        assert motions.growing == pytest.approx([np.sqrt(9.81 / 2)] if side > 0 else [])
+    spinning = small_motions(system, initial_state(system, none, [0.0, -2.0], none, [4.0, 0.0]))
+    assert spinning.stiffness == pytest.approx(9.81 / 2 + 4.0**2 / 2**2)  # and the centripetal force
+
+
+def test_frequencies_of_the_linear_model():
+    problem = linear_model(omega=50.0, kappa=25.0)
+    motions = small_motions(problem.system, problem.state())
+    exact = np.sqrt(np.linalg.eigvalsh([[25.0, -25.0], [-25.0, 2525.0]]))[::-1]
+    assert motions.modes[0] == pytest.approx(exact)
+    assert np.sort(np.abs(motions.rates))[::-2] == pytest.approx(exact)
+    assert motions.fast_frequencies == pytest.approx([50.0, 0.0])
+    assert motions.slow_frequencies == pytest.approx([np.sqrt(50.0), 0.0])
+    assert motions.omega == pytest.approx(50.0)
+
+
+def test_multipliers_of_the_impulse_method():
+    """Kicks and drifts written as matrices."""
+    problem, h, n = linear_model(), 0.01, 4
+    motions = small_motions(problem.system, problem.state())
+    slow, fast = np.array([[25.0, -25.0], [-25.0, 25.0]]), np.diag([0.0, 2500.0])
+    zero, one = np.zeros((2, 2)), np.eye(2)
+
+    def kick(stiffness, t):
+        return np.block([[one, zero], [-t * stiffness, one]])
+
+    verlet = kick(fast, h / 2) @ np.block([[one, h * one], [zero, one]]) @ kick(fast, h / 2)
+    step = kick(slow, n * h / 2) @ np.linalg.matrix_power(verlet, n) @ kick(slow, n * h / 2)
+    found = multipliers(motions, fully_explicit(n), [n * h])
+    expected = np.linalg.eigvals(step)
+    assert np.sort_complex(found.values[0]) == pytest.approx(np.sort_complex(expected), abs=1e-13)
+    assert found.radius[0] == pytest.approx(np.abs(expected).max(), abs=1e-13)
+
+
+def corner(q_s, q_f, params):
+    return jnp.linalg.norm(q_s)
+
+
+def test_no_second_derivative():
+    one = jnp.zeros(1)
+    system = System(ConstantMass([1.0], [1.0]), corner)
+    with pytest.raises(ValueError, match="expansion of .*slow.* is not finite"):
+        small_motions(system, State(0.0, one, one, one, one))

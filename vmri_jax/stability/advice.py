@@ -1,0 +1,290 @@
+"""Advice before a long run: is a step stable at this state, what is wrong where it is not, and which step is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vmri_jax import Composition, Scheme, State, System
+from vmri_jax.checks import require_x64
+from vmri_jax.composition import stage_scheme
+from vmri_jax.stability.linear import SmallMotions, small_motions
+from vmri_jax.stability.map import TOLERANCE, measure
+from vmri_jax.stability.multipliers import multipliers
+from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
+
+SCAN = (0.5, 1.25)
+"""Macro steps that are looked at, in units of the one in question; further ones if none of them is safe."""
+TURN = 0.15
+"""Spacing of these in turns of the fastest vibration, in radians."""
+POINTS = (48, 384)
+"""The fewest and the most of them."""
+RESOLUTION = 1e-5
+"""Ends of windows are found to this part of the scan."""
+NEAR = 0.05
+"""Windows at most this part of the step away are near: frequencies move along a trajectory,"""
+WIDTHS = 3.0
+"""but no further than so many times their width, which grows with the coupling as their distance does."""
+FASTER = 2.0
+"""Slow variables that vibrate so many times faster than the fast ones are wrongly labelled."""
+SCANS = 5
+"""Scans downwards, each over smaller steps, until there is a safe one."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to know before a run.
+
+    severity: "error" where the step is unstable, "warning" where it may be or where something is set up badly, "note".
+    kind: "impulse resonance", "combination resonance", "stability limit", "labels", "stages" or "motion".
+    sentence: what it is, for people.
+    number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, longest
+        stage, growth rate.
+    """
+
+    severity: str
+    kind: str
+    sentence: str
+    number: float
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What `advise` found.
+
+    macro_dt: the step in question.
+    growth: measured growth of disturbances per macro step, 0 where stable.
+    findings: the worst first.
+    windows: unstable intervals of macro_dt in the range `scanned`.
+    safe_macro_dt: the nearest step without an error or a window near it, macro_dt itself if that is one; NaN if none
+        was found.
+    fast_frequencies, slow_frequencies: (d,) of the fast and the slow potential at the state, the largest first.
+    """
+
+    macro_dt: float
+    growth: float
+    findings: tuple[Finding, ...]
+    windows: tuple[tuple[float, float], ...]
+    scanned: tuple[float, float]
+    safe_macro_dt: float
+    fast_frequencies: np.ndarray
+    slow_frequencies: np.ndarray
+
+    @property
+    def ok(self) -> bool:
+        """Whether there are no errors and no warnings."""
+        return all(finding.severity == "note" for finding in self.findings)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        if self.safe_macro_dt == self.macro_dt:
+            return f"macro_dt = {self.macro_dt:.6g} is stable at this state."
+        state = "unstable" if self.growth else "close to an instability"
+        if np.isnan(self.safe_macro_dt):
+            return f"macro_dt = {self.macro_dt:.6g} is {state}, and no safe step was found; take another scheme."
+        return f"macro_dt = {self.macro_dt:.6g} is {state}; the nearest safe step is {self.safe_macro_dt:.6g}."
+
+    def table(self):
+        """Findings as a `rich.table.Table`."""
+        from rich.table import Table
+
+        table = Table("", "", "finding", box=None, pad_edge=False, header_style="bold", caption=self.verdict)
+        for finding in self.findings:
+            table.add_row(finding.severity, finding.kind, finding.sentence)
+        return table
+
+    def __rich__(self):
+        return self.table()
+
+    def __str__(self) -> str:
+        lines = [f"{f.severity}: {f.kind}: {f.sentence}" for f in self.findings]
+        return "\n".join([*lines, self.verdict])
+
+
+def advise(
+    system: System, scheme: Scheme | Composition, state: State, macro_dt: float, *, tolerance: float = TOLERANCE
+) -> Advice:
+    """Judge a macro step before a long run, from the multipliers of the step of small motions about the state.
+
+    Everything called unstable was measured: the derivative of the step of the frozen problem (see `small_motions`) has
+    a multiplier outside the unit circle, at macro_dt or in a window of steps near it. Formulas only name the cause:
+
+    * stability limit: ``omega h`` of the fast potential, ``omega H`` of the slow one, beyond what its rule bears (2 for
+      kicks at the ends), for the longest stage of a composition;
+    * impulse resonance: slow potential on the macro grid, two vibrations (or one twice) that turn together by a
+      multiple of 2 pi per macro step, as the micro steps turn them (midpoint rule: 2 atan(omega h / 2) each);
+    * combination resonance: the same with V on the micro grid, through the slow path that is one polynomial per macro step;
+    * labels: the fastest vibration is one of the slow variables;
+    * stages, motion (notes): a composition with steps backwards; a state that is unstable by itself.
+
+    One compilation and some hundred eigenvalue problems. Far from the state frequencies differ: ask again there.
+
+    Args:
+        system, scheme, state, macro_dt: of the run.
+        tolerance: growth per macro step above which a step is unstable.
+
+    Raises:
+        ValueError: a macro step that is not positive; second derivatives that are not finite at the state.
+        TypeError: not a scheme.
+    """
+    require_x64()
+    if not isinstance(scheme, Scheme | Composition):
+        raise TypeError(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
+    if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
+        raise ValueError(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
+    macro_dt, motions = float(macro_dt), small_motions(system, state)
+    lower, upper = SCAN[0] * macro_dt, SCAN[1] * macro_dt
+    windows = _scan(motions, scheme, lower, upper, macro_dt, tolerance)
+    radius = float(multipliers(motions, scheme, [macro_dt]).radius[0])
+    growth = radius - 1 if radius > 1 + tolerance else 0.0
+
+    findings = []
+    if growth:
+        kind, cause = _cause(motions, scheme, macro_dt)
+        tenfold = np.log(10) / np.log1p(growth)
+        grows = f"Disturbances grow by {growth:.2g} per macro step, tenfold in {max(1, round(tenfold))}."
+        findings.append(Finding("error", kind, f"{cause} {grows}", growth))
+    else:
+        for a, b in windows:
+            distance = max(a - macro_dt, macro_dt - b) / macro_dt
+            if distance * macro_dt <= _margin(a, b, macro_dt):
+                kind, cause = _cause(motions, scheme, (a + b) / 2)
+                where = f"Steps from {a:.6g} to {b:.6g} are unstable, {100 * distance:.1f} % from this one."
+                findings.append(Finding("warning", kind, f"{where} There: {cause}", distance))
+    near = bool(findings)
+    findings += _labels(motions) + _stages(scheme) + _motion(motions)
+
+    safe, scans = macro_dt, 0
+    while near and scans < SCANS:
+        safe = _nearest_safe(macro_dt, windows, lower, upper)
+        if not np.isnan(safe):
+            break
+        upper, lower = lower, lower / 3
+        windows, scans = _scan(motions, scheme, lower, upper, upper, tolerance) + windows, scans + 1
+    return Advice(
+        macro_dt,
+        growth,
+        tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))),
+        tuple(windows),
+        (lower, SCAN[1] * macro_dt),
+        safe,
+        motions.fast_frequencies,
+        motions.slow_frequencies,
+    )
+
+
+def _scan(motions: SmallMotions, scheme, lower: float, upper: float, through: float, tolerance: float) -> list:
+    """Unstable windows of macro steps between lower and upper."""
+    turn = motions.modes[0].max(initial=0.0) * (upper - lower)
+    grid = np.linspace(lower, upper, int(np.clip(turn / TURN, *POINTS)))
+    return measure(motions, scheme, np.union1d(grid, [through]), tolerance, RESOLUTION)[1]
+
+
+def _margin(a: float, b: float, macro_dt: float) -> float:
+    """How far from a window steps are near it."""
+    return min(NEAR * macro_dt, WIDTHS * (b - a))
+
+
+def _nearest_safe(macro_dt: float, windows, lower: float, upper: float) -> float:
+    """The step nearest to macro_dt that is not near a window; NaN if there is none in the range."""
+    unsafe = [(a - 1.01 * _margin(a, b, macro_dt), b + 1.01 * _margin(a, b, macro_dt)) for a, b in windows]
+    ends = [end for window in unsafe for end in window if lower <= end <= upper]
+    free = [end for end in ends if not any(a < end < b for a, b in unsafe)]
+    return min(free, key=lambda end: abs(end - macro_dt), default=np.nan)
+
+
+def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
+    """Kind and description of an instability at this step."""
+    stage = stage_scheme(scheme)
+    parts = np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)
+    longest, h = np.abs(parts).max() * macro_dt, macro_dt / stage.num_micro
+    of = " of the longest stage" if isinstance(scheme, Composition) else ""
+    for name, frequency, step, limit in (
+        ("fast", motions.fast_frequencies[0], longest / stage.num_micro, fast_limit(stage)),
+        ("slow", motions.slow_frequencies[0], longest, slow_limit(stage)),
+    ):
+        if frequency * step >= limit * (1 - 1e-6):
+            grid = "micro" if name == "fast" else "macro"
+            return "stability limit", (
+                f"The {name} potential's frequency {frequency:.4g} times the {grid} step{of} is {frequency * step:.4g}; its "
+                f"quadrature rule is stable below {limit:.4g}."
+            )
+    found = multipliers(motions, scheme, [macro_dt])
+    worst = np.argmax(np.where(found.own[0], 0.0, np.abs(found.values[0])))
+    eta, pi = np.split(found.vectors[0][:, worst], 2)
+    frequencies, modes = motions.modes
+    energy = np.abs(modes.T @ eta) ** 2 * frequencies**2 + np.abs(modes.T @ pi) ** 2
+    first, second = np.argsort(-energy)[:2] if len(energy) > 1 else (0, 0)
+    alone = abs(found.values[0, worst].imag) < 1e-6
+    second = first if alone else second
+
+    def turned(i) -> float:
+        if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
+            return frequencies[i] * macro_dt
+        turn = stage.num_micro * sum(phase(stage, frequencies[i] * c * h) for c in parts)
+        return turn if np.isfinite(turn) else frequencies[i] * macro_dt
+
+    kind = "impulse resonance" if stage.slow.grid == "macro" else "combination resonance"
+    a, b = turned(first), turned(second)
+    if alone:
+        return kind, (
+            f"The vibration of frequency {frequencies[first]:.4g} turns by {a / np.pi:.4g} pi in a macro step, close to a "
+            "multiple of pi, and the slow potential feeds it."
+        )
+    return kind, (
+        f"The vibrations of frequencies {frequencies[first]:.4g} and {frequencies[second]:.4g} turn by {a / np.pi:.4g} pi and "
+        f"{b / np.pi:.4g} pi in a macro step, together close to a multiple of 2 pi, and the slow potential couples them."
+    )
+
+
+def _labels(motions: SmallMotions) -> list[Finding]:
+    """Whether slow variables carry faster vibrations than fast ones."""
+    frequencies, modes = motions.modes
+    n_s, n_f, d = motions.rest.q_s.size, motions.rest.q_f.size, len(frequencies)
+    shares = (motions.shapes @ modes) * (motions.embed[n_s + n_f :, d:] @ modes)  # of each coordinate in each mode
+    slow = shares[:n_s].sum(axis=0) > 0.5
+    fastest, others = frequencies[slow].max(initial=0.0), frequencies[~slow].max(initial=0.0)
+    if not n_f or fastest <= FASTER * others or fastest == 0:
+        return []
+    carried = shares[:n_s, frequencies > fastest / FASTER].sum(axis=1)
+    names = ", ".join(f"q_s[{i}]" for i in np.flatnonzero(carried > 0.1))
+    return [
+        Finding(
+            "warning",
+            "labels",
+            f"The fastest vibration, of frequency {fastest:.4g}, is one of the slow variables {names}; those of the fast "
+            f"variables reach {others:.4g}. Swap the labels: make these variables fast and put their energy into "
+            "fast_potential, and the soft ones slow.",
+            float(fastest / others) if others else np.inf,
+        )
+    ]
+
+
+def _stages(scheme: Scheme | Composition) -> list[Finding]:
+    if not isinstance(scheme, Composition) or (np.asarray(scheme.coefficients) > 0).all():
+        return []
+    parts = np.asarray(scheme.coefficients)
+    longest = float(np.abs(parts).max())
+    return [
+        Finding(
+            "note",
+            "stages",
+            f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
+            f"backwards: stability limits of the scheme hold for the longest, so for {longest:.3g} macro_dt.",
+            longest,
+        )
+    ]
+
+
+def _motion(motions: SmallMotions) -> list[Finding]:
+    if not motions.growing.size:
+        return []
+    rate = float(motions.growing.real.max())
+    return [
+        Finding(
+            "note",
+            "motion",
+            f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of what is measured.",
+            rate,
+        )
+    ]
