@@ -21,7 +21,7 @@ from vmri_jax import (
     micro,
     quadrature,
 )
-from vmri_jax.step import split
+from vmri_jax.split import split
 
 
 def step(problem, scheme, macro_dt):

@@ -7,7 +7,7 @@ from vmri_jax.discrete_lagrangian import discrete_lagrangian, discrete_legendre
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import macro, micro
 from vmri_jax.results import Method, Result, SimulationError
-from vmri_jax.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin
+from vmri_jax.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, mollified_impulse
 from vmri_jax.simulate import simulate
 from vmri_jax.state import State, initial_state
 from vmri_jax.step import StepInfo, macro_step
@@ -41,6 +41,7 @@ __all__ = [
     "macro",
     "macro_step",
     "micro",
+    "mollified_impulse",
     "quadrature",
     "runtime",
     "simulate",

@@ -13,8 +13,8 @@ from vmri_jax.lanes import over_lanes
 from vmri_jax.newton import Newton
 from vmri_jax.scheme import Scheme
 from vmri_jax.simulate import check_run, run, run_memory
+from vmri_jax.split import split
 from vmri_jax.state import State, check_constraints
-from vmri_jax.step import split
 from vmri_jax.system import System
 from vmri_jax.trajectory import Trajectory
 

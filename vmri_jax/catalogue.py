@@ -57,6 +57,12 @@ SCHEMES = {
     "explicit-slow": NamedScheme(
         vm.explicit_slow, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at micro midpoints"
     ),
+    "mollified-impulse": NamedScheme(
+        vm.mollified_impulse,
+        ("alpha",),
+        "2 at alpha = 1/2, else 1",
+        "explicit-slow with V at averaged fast positions: no impulse resonance",
+    ),
     "fully-explicit": NamedScheme(
         vm.fully_explicit, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at the micro nodes"
     ),

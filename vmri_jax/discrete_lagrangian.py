@@ -23,7 +23,8 @@ class Term:
     """An integrand on its nodes: ``path -> H sum_i w_i integrand(path at theta_i)``.
 
     `integrand` takes the arguments it names, e.g. ``("q_s", "q_f")``. Weights at the ends of the macro interval
-    are held apart for terms without velocities (None where there is no such node): those are kicks.
+    are held apart for terms without velocities (None where there is no such node): those are kicks, from averaged
+    positions where `mollified`.
     """
 
     integrand: Callable
@@ -32,6 +33,7 @@ class Term:
     start: Any = None
     end: Any = None
     sign: float = 1.0
+    mollified: bool = False
 
     def __call__(self, path: Path):
         return self.at_nodes_inside(path) + self.at_ends(path)
@@ -157,7 +159,8 @@ def _on_position_nodes(function, arguments, placed, scheme, system) -> Sum:
     if function is None:
         return Sum(())
     start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
-    return Sum((Term(lambda *q: function(*q, system.params), arguments, inside, start, end),))
+    at_node = Term(lambda *q: function(*q, system.params), arguments, inside, start, end, mollified=placed.mollified)
+    return Sum((at_node,))
 
 
 def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
@@ -171,6 +174,10 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
     Its slot derivatives are ``jax.grad(L_d, argnums=(0, 1))``; the discrete Legendre transforms are the first and
     last of them, see `discrete_legendre`.
     """
+    if scheme.slow.mollified:
+        raise ValueError(
+            "discrete_lagrangian: a mollified potential depends on more than the control points of a step."
+        )
     terms = lagrangian(system, scheme)
 
     def L_d(slow, fast, macro_dt):

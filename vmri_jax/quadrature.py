@@ -185,10 +185,14 @@ simpson = (left + 4 * midpoint + right) / 6
 
 
 class PlacedRule(eqx.Module):
-    """A rule and the grid it lives on: once per macro interval, or once per micro interval."""
+    """A rule and the grid it lives on: once per macro interval, or once per micro interval.
+
+    mollified: whether its term is taken at averaged fast positions, see `mollified`.
+    """
 
     rule: Rule
     grid: Literal["macro", "micro"] = eqx.field(static=True)
+    mollified: bool = eqx.field(static=True, default=False)
 
     def composite(self, num_micro: int) -> Rule:
         """The rule on the macro interval [0, 1] that this placement amounts to."""
@@ -208,3 +212,16 @@ def macro(rule: Rule) -> PlacedRule:
 def micro(rule: Rule) -> PlacedRule:
     """Place a rule on every micro interval: ``rule.repeat(num_micro)`` of the macro interval."""
     return PlacedRule(rule, "micro")
+
+
+def mollified(placed: PlacedRule) -> PlacedRule:
+    """The same nodes, with the slow potential at averaged fast positions: ``V(q_s, a(q_s, q_f))``.
+
+    The average is that of the fast motion from rest over the macro step (`vmri_jax.step.averaging`). Kicks by V then
+    act through ``a'(q)^T grad V``, which filters out the vibrations that they would excite where a macro step is a
+    multiple of half their period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
+    differential equations* (1998), the mollified impulse method with LongAverage.
+    """
+    if not isinstance(placed, PlacedRule) or placed.grid != "macro" or not placed.only_ends:
+        raise ValueError(f"mollified: got {placed!r}; give kicks at the macro nodes, e.g. macro(trapezoidal).")
+    return PlacedRule(placed.rule, placed.grid, mollified=True)

@@ -2,6 +2,9 @@
 
 from enum import IntEnum
 
+CONSTRAINT_TOLERANCE = 1e-6
+"""Largest constraint value, in the constraint's own unit, that counts as kept; more where the Newton tolerance is loose."""
+
 
 class Result(IntEnum):
     """Status of a macro step. `CONVERGED` and `CONVERGED_AT_ROUNDOFF` are successes."""
@@ -11,6 +14,9 @@ class Result(IntEnum):
     STAGNATED = 2
     DIVERGED = 3
     NON_FINITE = 4
+    SINGULAR = 5
+    RANK_DEFICIENT = 6
+    CONSTRAINT_VIOLATED = 7
 
     @property
     def success(self) -> bool:
@@ -27,20 +33,40 @@ _MESSAGES = {
         "the step converged to the round-off floor of its own numbers, which lies above the Newton tolerance."
     ),
     Result.STAGNATED: (
-        "Newton's iteration used up its iterations while still improving slowly. Likely causes: the step is too large for "
-        "the fast forces, or the constraints are nearly dependent. Try a smaller macro_dt or a larger num_micro, or raise "
-        "Newton(max_iterations=...)."
+        "Newton's iteration used up its iterations while still improving slowly, and so did shorter parts of the step. Likely "
+        "causes: the step is too large for the fast forces, or the constraints are nearly dependent. Try a smaller macro_dt "
+        "or a larger num_micro, or raise Newton(max_iterations=...)."
     ),
     Result.DIVERGED: (
-        "Newton's iteration moved away from a solution. Likely causes: the step is too large for the curvature of the "
-        "potentials or constraints, or the state is far from them. Try a smaller macro_dt."
+        "Newton's iteration moved away from a solution, and following the solution of shorter steps ended before the whole "
+        "step: there may be none. Likely causes: the step is too large for the curvature of the potentials or constraints, "
+        "or the run is unstable and its energy has grown. Try a smaller macro_dt, and look at the energy before the failure."
     ),
     Result.NON_FINITE: (
         "a NaN or infinity appeared. Likely causes: an explicit scheme beyond its stability limit (omega h < 2), a function "
-        "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number), or dependent constraints "
-        "that make the Newton matrix singular. Try a smaller macro_dt, or look at the state just before the failure."
+        "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number). Try a smaller macro_dt, or look at the "
+        "state just before the failure."
+    ),
+    Result.SINGULAR: (
+        "the Newton matrix is singular although the functions are finite. Likely causes: a kinetic energy that does not see "
+        "every velocity (a mass that is or becomes zero), or a potential whose curvature cancels the mass at this step. Look "
+        "at the mass matrix at the last state, or change macro_dt."
+    ),
+    Result.RANK_DEFICIENT: (
+        "the constraints have become dependent: the rank of their Jacobian in the fast variables (of slow_constraint: in the "
+        "slow ones) is less than their number. Likely causes: redundant rows that contradict each other, a singular "
+        "configuration (links in line, a closed loop folded flat), or a constraint whose fast variables no longer enter. "
+        "Remove rows, make the variables they need fast, or start elsewhere."
+    ),
+    Result.CONSTRAINT_VIOLATED: (
+        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or rows of "
+        "very different size (scale them to order one)."
     ),
 }
+
+
+RUNNING = -1
+"""Status of an iteration that goes on."""
 
 
 class Method(IntEnum):

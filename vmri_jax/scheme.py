@@ -6,6 +6,7 @@ A scheme is data. The reference schemes and the Galerkin family are points in on
 |---|---|---|---|---|
 | `fully_implicit(num_micro)` | micro(midpoint) | micro(midpoint) | no | 2 |
 | `explicit_slow(num_micro, alpha)` | macro(affine(alpha)) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
+| `mollified_impulse(num_micro, alpha)` | mollified(macro(affine(alpha))) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
 | `fully_explicit(num_micro, alpha)` | macro(affine(alpha)) | micro(affine(alpha)) | yes | 2 at alpha = 1/2, else 1 |
 | `galerkin(num_micro, degree, rule)` | micro(rule) | micro(rule) | no | min(2 degree, rule order) |
 """
@@ -27,6 +28,7 @@ from vmri_jax.quadrature import (
     macro,
     micro,
     midpoint,
+    mollified,
 )
 
 
@@ -74,6 +76,12 @@ class Scheme(eqx.Module):
                 "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
             )
         _check_kinetic(self.kinetic.rule, self.degree)
+        filtered = [name for name in ("kinetic", "fast", "force", "constraint") if getattr(self, name).mollified]
+        if filtered or (self.slow.mollified and self.fast.grid != "micro"):
+            raise ValueError(
+                f"Scheme: {filtered or 'slow'} is mollified; only kicks of the slow potential can be, along fast motion on the "
+                "micro grid: slow=mollified(macro(...)) with fast=micro(...)."
+            )
         for name, grid in (("constraint", "micro"), ("slow_constraint", "macro")):
             placed = getattr(self, name)
             nodes, needed = np.array(placed.rule.nodes), control_nodes(self.degree)
@@ -106,6 +114,7 @@ class Scheme(eqx.Module):
         kicked = self.degree == 1 and self.slow.only_ends and self.slow.grid == "macro"
         free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
         slow, fast = (_evaluations(placed, self.num_micro) for placed in (self.slow, self.fast))
+        fast *= 1 + self.slow.mollified  # along the motion that is averaged
         return Description(self.order, self.is_symmetric, 1, self.num_micro, self.degree, slow, fast, free, 1)
 
 
@@ -201,6 +210,15 @@ def explicit_slow(num_micro: int, alpha=0.5) -> Scheme:
     Newton iteration. Unstable near the impulse resonances omega H = k pi.
     """
     return Scheme(num_micro, kinetic=micro(midpoint), slow=macro(affine(alpha)), fast=micro(midpoint))
+
+
+def mollified_impulse(num_micro: int, alpha=0.5) -> Scheme:
+    """`explicit_slow` with V at averaged fast positions, ``V(q_s, a(q_s, q_f))``: stable at the impulse resonances.
+
+    Order 2 and symmetric at alpha = 1/2, else order 1. Evaluations per macro step: V once; W num_micro per Newton
+    iteration as before, and as many again for the average, with their derivative. See `vmri_jax.quadrature.mollified`.
+    """
+    return Scheme(num_micro, kinetic=micro(midpoint), slow=mollified(macro(affine(alpha))), fast=micro(midpoint))
 
 
 def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:

@@ -10,6 +10,7 @@ import numpy as np
 from vmri_jax import algebra
 from vmri_jax.checks import check_arrays, check_system, require_x64
 from vmri_jax.quadrature import is_concrete
+from vmri_jax.results import CONSTRAINT_TOLERANCE
 from vmri_jax.system import ConstantMass, System
 
 
@@ -47,7 +48,7 @@ def project_momentum(system: System, q_s, q_f, p_s, p_f, guess=None):
         if g.size:
             push = jax.linearize(system.constraints, q_s, q_f)[1]
             matrix = jax.vmap(lambda unit: push(*velocity(*pull(unit))))(jnp.eye(g.size))  # G M^-1 G^T
-            mu = algebra.solve(matrix, push(*velocity(p_s, p_f))[:, None])[:, 0]
+            mu = algebra.solve(algebra.regularized(matrix), push(*velocity(p_s, p_f))[:, None])[:, 0]
             pull_s, pull_f = pull(mu)
             p_s, p_f = p_s - pull_s, p_f - pull_f
         return p_s, p_f, *velocity(p_s, p_f)
@@ -69,7 +70,7 @@ def _velocity(system: System, q_s, q_f, jacobian, p, guess, max_iterations: int 
     def direction(at, v):
         system, q_s, q_f, jacobian, p = at
         hessian, gradient = (d(lambda v: kinetic(system, q_s, q_f, v))(v) for d in (jax.hessian, jax.grad))
-        matrix = jnp.block([[hessian, jacobian.T], [jacobian, jnp.zeros((jacobian.shape[0],) * 2)]])
+        matrix = algebra.saddle(hessian, jacobian.T, jacobian)
         return jnp.linalg.solve(matrix, jnp.concatenate([p - gradient, -jacobian @ v]))[: v.size]
 
     def search(carry):
@@ -170,7 +171,12 @@ def _constraint_values(system, q_s, q_f):
 
 
 def check_constraints(
-    system: System, q_s, q_f, what: str, tolerance: float = 1e-6, advice: str = "start from initial_state(...)."
+    system: System,
+    q_s,
+    q_f,
+    what: str,
+    tolerance: float = CONSTRAINT_TOLERANCE,
+    advice: str = "start from initial_state(...).",
 ) -> None:
     """Refuse positions off the constraints, and constraints that cannot be kept where they are held."""
     if system.constraint is system.slow_constraint is None:
@@ -189,12 +195,6 @@ def check_constraints(
         raise ValueError(
             f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
         )
-    if n_gs and np.isfinite(alone).all() and _rank(alone) < n_gs:
-        raise ValueError(
-            f"System: the {n_gs} rows of slow_constraint have rank {_rank(alone)} at these positions; remove redundant rows."
-        )
-    if not n_g:
-        return
     fix = (
         "A constraint held on the micro grid must be satisfiable by the fast variables: the slow ones have one value "
         "per macro step, so that a slow-only constraint held at every micro node is over-determined (rank deficit "
@@ -202,8 +202,8 @@ def check_constraints(
     )
     if n_g > n_f:
         raise ValueError(f"System: constraint returns {n_g} values for {n_f} fast variables. {fix} Remove rows.")
-    if not (np.isfinite(slow).all() and np.isfinite(fast).all()):
-        raise ValueError("System: the Jacobian of constraint is not finite at these positions (a norm at zero?).")
+    if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
+        raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
     slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= 1e-12 * size)
     if slow_only.size:
@@ -211,12 +211,35 @@ def check_constraints(
             f"System: row(s) {slow_only.tolist()} of constraint do not depend on the fast variables q_f. {fix} "
             "Pass them as slow_constraint(q_s, params), which is held at the macro nodes."
         )
-    rank = _rank(fast)
-    if rank < n_g:
-        raise ValueError(
-            f"System: the {n_g} constraint rows have rank {rank} in the fast variables at the initial positions. {fix} "
-            "Remove redundant rows, or make the variables they need fast."
-        )
+    for name, jacobian in (("slow_constraint", alone), ("constraint", fast)):
+        rows = dependent_rows(jacobian)
+        if not rows:
+            continue
+        # At a singular configuration (a linkage folded flat) rows are dependent at that place alone: runs pass it.
+        near = _constraint_values(system, *_nearby(q_s, q_f))
+        jacobian = np.asarray(near[3] if name == "slow_constraint" else near[2])
+        if rows := dependent_rows(jacobian):
+            of = "slow variables." if name == "slow_constraint" else f"fast variables. {fix}"
+            raise ValueError(
+                f"System: rows {rows} of {name} depend on each other: {len(jacobian)} rows have rank {_rank(jacobian)} in the "
+                f"{of} Remove redundant ones of these rows, or make the variables they need fast."
+            )
+
+
+def dependent_rows(jacobian) -> list[int]:
+    """Numbers of the rows that take part in a linear dependence; rows count as of length one."""
+    size = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    rows = jacobian / np.where(size > 0, size, 1)
+    u, s, _ = np.linalg.svd(rows)
+    null = u[:, np.count_nonzero(s > 1e-8) :]
+    return np.flatnonzero(np.linalg.norm(null, axis=1) > 1e-6).tolist()
+
+
+def _nearby(q_s, q_f):
+    """A generic configuration about a hundredth of the size of these positions away, always the same."""
+    random = np.random.default_rng(0)
+    size = 1e-2 * max(1e-3, *(float(np.abs(q).max(initial=0.0)) for q in (q_s, q_f)))
+    return tuple(q + size * random.normal(size=q.shape) for q in (q_s, q_f))
 
 
 def _rank(jacobian) -> int:

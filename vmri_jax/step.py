@@ -2,7 +2,8 @@
 
 The route is chosen statically, by `split` and `is_explicit`:
 
-* *kicks*: potentials at the ends of the interval only shift momenta, before and after everything else;
+* *kicks*: potentials at the ends of the interval only shift momenta, before and after everything else; a mollified one
+  does so from averaged positions;
 * *split*: if, kicks aside, the slow equations do not see the fast unknowns, the slow variables make one step over the
   macro interval and the fast ones num_micro steps over the micro intervals, each a problem of the same kind;
 * *explicit*: an interval on which nothing but constant-mass kinetic energy is left is a straight drift, no Newton;
@@ -18,15 +19,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.composition import Composition
-from vmri_jax.discrete_lagrangian import Term, lagrangian
+from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
 from vmri_jax.newton import Newton, Warm, interval_matrix, is_constant, solve
 from vmri_jax.path import control_nodes
-from vmri_jax.quadrature import is_concrete, micro, midpoint
+from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
+from vmri_jax.split import fast_alone, is_explicit, split
 from vmri_jax.state import State, project_momentum
-from vmri_jax.structure import depends_on
 from vmri_jax.system import ConstantMass, System
 
 
@@ -64,82 +65,6 @@ class Memory(NamedTuple):
     matrix: Any = None
     warm: Any = None
     parts: Any = None
-
-
-class Split(NamedTuple):
-    """A system taken apart: kicks that stay outside, a slow system for one step, a fast one for num_micro steps.
-
-    Each part is a system of fast variables alone on a single micro interval.
-    """
-
-    kicks: System
-    slow: System
-    slow_scheme: Scheme
-    fast: System
-    fast_scheme: Scheme
-
-
-def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
-    """The parts of a macro step whose slow equations, kicks aside, do not see the fast unknowns, else None."""
-    n_s, n_f = q_s.shape[0], q_f.shape[0]
-    params = system.params
-    if scheme.degree > 1 or system.force is not None or not isinstance(system.kinetic, ConstantMass):
-        return None
-    if scheme.num_micro == 1 and not n_s:
-        return None  # a part already
-    slow_potential, fast_potential, constraint = system.slow_potential, system.fast_potential, system.constraint
-    kicked = {}
-    if slow_potential is not None and scheme.slow.grid == "macro" and scheme.slow.only_ends:
-        kicked["slow_potential"], slow_potential = slow_potential, None
-    if fast_potential is not None and scheme.fast.grid == "macro" and scheme.fast.only_ends:
-        kicked["fast_potential"], fast_potential = fast_potential, None
-
-    coupled_slow = slow_potential is not None and (
-        scheme.slow.grid == "micro" or depends_on(lambda q: slow_potential(q_s, q, params), q_f)[0]
-    )
-    coupled_fast = fast_potential is not None and scheme.fast.grid == "macro"
-    coupled_constraint = constraint is not None and depends_on(lambda q: constraint(q, q_f, params), q_s)[0]
-    if coupled_slow or coupled_fast or coupled_constraint:
-        return None
-
-    def potential_of_slow(q, params):
-        return slow_potential(q, jnp.zeros(n_f), params)  # pyright: ignore[reportOptionalCall]
-
-    def constraint_of_slow(_, q, params):
-        return system.replace(params=params).g_slow(q)
-
-    def constraint_of_fast(_, q, params):
-        return system.replace(params=params).g(jnp.zeros(n_s), q)
-
-    none, drift = jnp.zeros(0), micro(midpoint)
-    return Split(
-        kicks=System(system.kinetic, **kicked, params=params),
-        slow=System(
-            ConstantMass(none, system.kinetic.slow),
-            fast_potential=None if slow_potential is None else potential_of_slow,
-            constraint=None if system.slow_constraint is None else constraint_of_slow,
-            params=params,
-        ),
-        slow_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.slow),
-        fast=System(
-            ConstantMass(none, system.kinetic.fast),
-            fast_potential=fast_potential,
-            constraint=None if constraint is None else constraint_of_fast,
-            params=params,
-        ),
-        fast_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast),
-    )
-
-
-def is_explicit(system: System, scheme: Scheme) -> bool:
-    """Whether a single micro interval is a straight drift between kicks."""
-    terms = lagrangian(system, scheme).terms
-    return (
-        scheme.num_micro == scheme.degree == 1
-        and isinstance(system.kinetic, ConstantMass)
-        and system.constraint is system.slow_constraint is system.force is None
-        and not any(term.inside.groups for term in terms if isinstance(term, Term))
-    )
 
 
 def macro_step(
@@ -189,7 +114,8 @@ def start_memory(
             start_memory(parts.slow, parts.slow_scheme, slow, macro_dt, newton),
             start_memory(parts.fast, parts.fast_scheme, fast, macro_dt / scheme.num_micro, newton),
         )
-    kicks = _kick_gradients(own, scheme, state.q_s, state.q_f)
+    average = averaging(system, scheme, macro_dt, newton)
+    kicks = _kick_gradients(own, scheme, state.q_s, state.q_f, average)
     matrix = warm = None
     if parts is None and not is_explicit(system, scheme) and newton.marches(system, scheme):
         equations = _equations(system, scheme, state, macro_dt)
@@ -246,6 +172,9 @@ def _advance_stages(system, scheme, state, macro_dt, newton, memory: Stages):
     def stage(carry, at):
         (state, last), (c, own) = carry, at
         memory = _at_same_point(own, last)
+        if scheme.scheme.slow.mollified:  # the average depends on the length of the stage
+            average = averaging(system, scheme.scheme, c * macro_dt, newton)
+            memory = memory._replace(kicks=_kick_gradients(system, scheme.scheme, state.q_s, state.q_f, average))
         state, info, memory = advance(system, scheme.scheme, state, c * macro_dt, newton, memory)
         return (state, memory), (memory, info)
 
@@ -269,7 +198,7 @@ def _interval(system, scheme, state, macro_dt, newton, memory):
     own = system if parts is None else parts.kicks
     state = _kick(own, scheme, state, macro_dt, memory.kicks, ("start",))
     state, info, memory = _move(system, scheme, state, macro_dt, newton, memory)
-    kicks = _kick_gradients(own, scheme, state.q_s, state.q_f)
+    kicks = _kick_gradients(own, scheme, state.q_s, state.q_f, averaging(system, scheme, macro_dt, newton))
     state = _kick(own, scheme, state, macro_dt, kicks, ("end",))
     return state, info, memory._replace(kicks=kicks)
 
@@ -284,8 +213,40 @@ def _move(system, scheme, state, macro_dt, newton, memory):
     return _move_coupled(system, scheme, state, macro_dt, newton, memory)
 
 
-def _kick_gradients(system, scheme, q_s, q_f):
-    return tuple(term.gradient(q_s, q_f) for term in lagrangian(system, scheme).kicks)
+def _kick_gradients(system, scheme, q_s, q_f, average=None):
+    """``(d/dq_s, d/dq_f)`` of every kicked term, of mollified ones at averaged fast positions."""
+
+    def gradient(term):
+        if not term.mollified:
+            return term.gradient(q_s, q_f)
+        at_average, pull = jax.vjp(lambda q_s, q_f: (q_s, average(q_s, q_f)), q_s, q_f)
+        return pull(term.gradient(*at_average))
+
+    return tuple(gradient(term) for term in lagrangian(system, scheme).kicks)
+
+
+def averaging(system: System, scheme: Scheme, macro_dt, newton: Newton):
+    """The filter of a mollified slow potential, ``(q_s, q_f) -> a(q_s, q_f)``, or None.
+
+    ``a = (x_0 / 2 + x_1 + ... + x_{num_micro - 1} + x_num_micro / 2) / num_micro`` over the micro nodes of the fast motion
+    from rest at q_f, slow variables at rest: the trapezoidal rule on the micro grid. A fast vibration whose phase advances by
+    k pi over the macro step, as the scheme resolves it, has the average zero, so that V cannot excite it.
+    """
+    if not scheme.slow.mollified:
+        return None
+    if not isinstance(system.kinetic, ConstantMass):
+        raise ValueError("Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass.")
+
+    def average(q_s, q_f):
+        fast, fast_scheme = fast_alone(system, scheme, q_s)
+        micro_dt, none = macro_dt / scheme.num_micro, jnp.zeros(0)
+        start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
+        memory = start_memory(fast, fast_scheme, start, micro_dt, newton)
+        _, _, (result, *_), q, _ = _march_fast(fast, fast_scheme, scheme.num_micro, start, micro_dt, newton, memory)
+        a = (q_f / 2 + jnp.sum(q[:-1], axis=0) + q[-1] / 2) / scheme.num_micro
+        return jnp.where(result <= Result.CONVERGED_AT_ROUNDOFF, a, jnp.nan)
+
+    return average
 
 
 def _kick(system, scheme, state, macro_dt, gradients, ends: tuple[str, ...]) -> State:
@@ -321,7 +282,7 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
     slow, slow_info, slow_memory = _interval(parts.slow, parts.slow_scheme, slow, macro_dt, newton, slow_memory)
 
     fast, fast_memory, status, q_f, multiplier = _march_fast(
-        parts, num_micro, fast, macro_dt / num_micro, newton, fast_memory
+        parts.fast, parts.fast_scheme, num_micro, fast, macro_dt / num_micro, newton, fast_memory
     )
     status = (jnp.maximum(a, b) for a, b in zip(_status(slow_info), status, strict=True))
     info = StepInfo(*status, q_f, multiplier, slow_info.multiplier[0])  # pyright: ignore[reportCallIssue]
@@ -329,9 +290,8 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
     return end, info, memory._replace(parts=(slow_memory, fast_memory))
 
 
-def _march_fast(parts, num_micro, fast, micro_dt, newton, memory):
+def _march_fast(system, scheme, num_micro, fast, micro_dt, newton, memory):
     """num_micro steps of the fast variables; kicks of two steps at the node they share are merged into one."""
-    system, scheme = parts.fast, parts.fast_scheme
 
     def micro_step(fast, memory, ends):
         fast, info, memory = _move(system, scheme, fast, micro_dt, newton, memory)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from vmri_jax.algebra import saddle
 from vmri_jax.equations import Unknowns
 from vmri_jax.linearization import Blocks
 
@@ -43,8 +44,7 @@ def factor(blocks: Blocks, like: Unknowns, coupled: bool = True) -> Factors:
     top_right = -jnp.einsum("mjga,ji->mjaig", blocks.g_f[:, :-1], nodes).reshape(n, r * n_f, r * n_g)
     bottom_left = jnp.einsum("mjga,ji->mjgia", blocks.g_f[:, 1:], nodes).reshape(n, r * n_g, r * n_f)
     top_left = blocks.ff[:, :-1, :, 1:].reshape(n, r * n_f, r * n_f)
-    zero = jnp.zeros((n, r * n_g, r * n_g))
-    chain = jnp.linalg.inv(jnp.block([[top_left, top_right], [bottom_left, zero]]))
+    chain = jnp.linalg.inv(saddle(top_left, top_right, bottom_left))
 
     if coupled:
         slots = blocks.fs.reshape(n, r + 1, n_f, border)
@@ -57,7 +57,7 @@ def factor(blocks: Blocks, like: Unknowns, coupled: bool = True) -> Factors:
     force = -jnp.einsum("iga,ij->iajg", blocks.g_slow[:-1], nodes).reshape(border, r * n_gs) / n
     jacobian = jnp.einsum("iga,ij->igja", blocks.g_slow[1:], nodes).reshape(r * n_gs, border)
     slow = (slow_rows + blocks.ss[:-1].reshape(r, n_s, border)).reshape(border, border)
-    matrix = jnp.block([[slow, force], [jacobian, jnp.zeros((r * n_gs, r * n_gs))]])
+    matrix = saddle(slow, force, jacobian)
     return Factors(blocks, chain, response, jax.scipy.linalg.lu_factor(matrix) if matrix.size else None)
 
 

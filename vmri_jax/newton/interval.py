@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import inverse, matvec, solve
+from vmri_jax.algebra import inverse, matvec, regularized, solve
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.equations import StepEquations
 from vmri_jax.linearization import linearize
@@ -151,7 +151,7 @@ def solve_saddle(solve_k, jacobian, push, rows, g):
         return dx, g
     columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
     response = jax.vmap(solve_k)(columns.reshape(r * n_g, r, -1))
-    schur = jax.vmap(push)(response).reshape(r * n_g, r * n_g)
+    schur = regularized(jax.vmap(push)(response).reshape(r * n_g, r * n_g))
     if rows is not None:
         g = g + push(dx)
     dmu = -solve(schur.T, g.reshape(r * n_g, 1))

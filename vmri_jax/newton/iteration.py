@@ -1,6 +1,5 @@
 """Newton's iteration for the equations of a macro step: its flavours, its convergence test, its derivative."""
 
-from functools import partial
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -10,15 +9,9 @@ import numpy as np
 
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
-from vmri_jax.newton import arrowhead, dense, march
+from vmri_jax.newton import arrowhead, full, march
 from vmri_jax.newton.interval import can_be_cut, is_linear
-from vmri_jax.newton.march import RUNNING
-from vmri_jax.results import Method, Result
-
-SAFETY = 100.0
-"""Margin on the quadratic convergence that is expected of Newton's iteration."""
-ROUNDOFF_FLOOR = 100.0
-"""Updates below this many units of round-off of the positions that no longer shrink are at the floor."""
+from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result
 
 Choice = Literal["auto", "march", "frozen", "decoupled", "arrowhead", "dense"]
 
@@ -42,7 +35,7 @@ class Newton(eqx.Module):
         method: as above.
         tolerance: accepted error of the increments of the step, relative to their size. Errors of the positions at
             the level of round-off are always accepted.
-        max_iterations: after so many iterations the step fails.
+        max_iterations: after so many iterations the step fails; with "march", so many passes.
         fixed_iterations: do exactly so many iterations and check the result afterwards, without a loop that depends
             on the data; a step that has not converged then has failed, whatever the method.
 
@@ -52,7 +45,7 @@ class Newton(eqx.Module):
 
     method: Choice = eqx.field(static=True, default="auto")
     tolerance: float = 1e-12
-    max_iterations: int = 50
+    max_iterations: int = 100
     fixed_iterations: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -107,17 +100,23 @@ def solve(
 
     The solution is differentiable in both modes, twice, with respect to everything in `equations`.
     """
+    marches = newton.marches(equations.system, equations.scheme)
+    if marches and is_linear(equations.system, equations.scheme, equations.q_s, equations.q_f):
+        done, warm = march.solve(equations, matrix, warm, newton, linear=True)  # one pass: differentiable as it is
+        end = done.end.q_f, *_momenta_after(equations, done)
+        status = np.zeros(()), done.result, done.passes, np.asarray(int(Method.LINEAR))
+        return Solution(done.x, *end, *status), warm
+
     fixed, guess, matrix, warm = jax.lax.stop_gradient((equations, guess, matrix, warm))
-    if newton.marches(equations.system, equations.scheme):
-        linear = is_linear(equations.system, equations.scheme, equations.q_s, equations.q_f)
-        done, warm = march.solve(fixed, matrix, warm, newton, linear)
+    if marches:
+        done, warm = march.solve(fixed, matrix, warm, newton, linear=False)
         p_s, p_f = _momenta_after(fixed, done)
-        residual = np.zeros(()) if linear else relative_residual(fixed, *done.residual)
-        method = np.asarray(int(Method.LINEAR if linear else Method.MARCH))
-        found = Solution(done.x, done.end.q_f, p_s, p_f, residual, done.result, done.passes, method)
-        if newton.falls_back and not linear:
+        residual, method = relative_residual(fixed, *done.residual), np.asarray(int(Method.MARCH))
+        result = _kept(done.result, done.residual[1], newton)
+        found = Solution(done.x, done.end.q_f, p_s, p_f, residual, result, done.passes, method)
+        if newton.falls_back:
             found = jax.lax.cond(
-                done.result <= Result.CONVERGED_AT_ROUNDOFF,
+                result <= Result.CONVERGED_AT_ROUNDOFF,
                 lambda: found,
                 lambda: _over_all_unknowns(fixed, guess, newton, "arrowhead"),
             )
@@ -140,68 +139,24 @@ def _end(equations: StepEquations, x: Unknowns):
 
 
 def _over_all_unknowns(equations: StepEquations, guess: Unknowns, newton: Newton, method: str) -> Solution:
-    x, result, iterations = _iterate(equations, guess, newton, method)
+    x, result, iterations = full.solve(equations, guess, newton, method)
     residual, (p_s, p_f) = equations.evaluate(x)
     rows = jnp.maximum(_largest(residual.slow), _largest(residual.fast))
     g = jnp.maximum(_largest(residual.multiplier), _largest(residual.slow_multiplier))
     q_f = equations.q_f + x.fast[:, -1].sum(0)
     code = jnp.asarray(int(Method[method.upper()]))
+    result = _kept(result, g, newton)
+    if not (equations.system.constraint is equations.system.slow_constraint is None):
+        failed = result > Result.CONVERGED_AT_ROUNDOFF
+        dependent = jax.lax.cond(failed, lambda: full.has_dependent_constraints(equations), lambda: jnp.asarray(False))
+        result = jnp.where(dependent, Result.RANK_DEFICIENT, result)
     return Solution(x, q_f, p_s, p_f, relative_residual(equations, rows, g), result, iterations, code)
 
 
-def _iterate(equations: StepEquations, guess: Unknowns, newton: Newton, method: str):
-    """Newton's iteration with the matrix at the present point, or at the guess; (x, `Result`, iterations).
-
-    Converged when the predicted size of all further updates is below ``tolerance`` times the increments, or round-off
-    of the positions. With the contraction ``theta = |d_k| / |d_(k-1)|`` the next update is expected to be
-    ``|d_k| theta min(1, SAFETY theta)``: quadratic convergence with a margin, linear convergence at worst. A matrix
-    that is not renewed converges linearly; there the last update itself has to be that small.
-    """
-    renewed = method in ("arrowhead", "dense")
-    solver = dense if method == "dense" else arrowhead
-    factor = partial(arrowhead.factor, coupled=False) if method == "decoupled" else solver.factor
-    factors = None if renewed else factor(linearize(equations, guess), guess)
-    eps = jnp.finfo(jnp.result_type(float)).eps
-    positions = jnp.maximum(_largest(equations.q_s), _largest(equations.q_f))
-
-    def size(d: Unknowns, x: Unknowns):
-        """Largest update over what is accepted, slow and fast each by its own measure.
-
-        Variables that only see round-off of the others (a centre of mass at rest) have no size of their own.
-        """
-        others = eps * jnp.maximum(_largest(x.slow), _largest(x.fast)) + jnp.finfo(eps.dtype).tiny
-        return jnp.maximum(
-            _largest(d.slow) / (newton.tolerance * _largest(x.slow) + eps * _largest(equations.q_s) + others),
-            _largest(d.fast) / (newton.tolerance * _largest(x.fast) + eps * _largest(equations.q_f) + others),
-        )
-
-    def iterate(carry):
-        x, previous, k, _ = carry
-        now = factor(linearize(equations, x), x) if renewed else factors
-        d = solver.solve(now, equations.residual(x))  # pyright: ignore[reportArgumentType]
-        x = jax.tree.map(jnp.add, x, d)
-        update = size(d, x)
-        contraction, error = update / jnp.maximum(previous, jnp.finfo(eps.dtype).tiny), update
-        if renewed:  # quadratic convergence: the next update is known to be much smaller
-            shrink = contraction * jnp.minimum(1.0, SAFETY * contraction)
-            predicted = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
-            error = jnp.where(k == 0, update, predicted)
-        largest = jnp.maximum(_largest(d.slow), _largest(d.fast))
-        at_floor = (contraction > 0.5) & (largest <= ROUNDOFF_FLOOR * eps * positions)
-        last = jnp.where(update > previous, Result.DIVERGED, Result.STAGNATED)
-        running = jnp.where(k + 1 >= newton.max_iterations, last, RUNNING)
-        result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, running)
-        result = jnp.where(error <= 1, Result.CONVERGED, result)
-        result = jnp.where(jnp.isfinite(update), result, Result.NON_FINITE)
-        return x, update, k + 1, result
-
-    start = (guess, jnp.inf, 0, jnp.asarray(RUNNING))
-    if newton.fixed_iterations is None:
-        x, _, iterations, result = jax.lax.while_loop(lambda carry: carry[3] == RUNNING, iterate, start)
-    else:
-        x, _, iterations, result = jax.lax.fori_loop(0, newton.fixed_iterations, lambda _, at: iterate(at), start)
-        result = jnp.where(result == RUNNING, Result.STAGNATED, result)
-    return x, result, iterations
+def _kept(result, g, newton: Newton):
+    """The status, unless the increments converged and the constraints are violated: by contradicting rows."""
+    violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, 100 * newton.tolerance)
+    return jnp.where((result <= Result.CONVERGED_AT_ROUNDOFF) & violated, Result.CONSTRAINT_VIOLATED, result)
 
 
 def _largest(a):

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import inverse, matmul, matvec
+from vmri_jax.algebra import inverse, matmul, matvec, regularized
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.newton.interval import (
@@ -31,7 +31,7 @@ from vmri_jax.newton.interval import (
 )
 from vmri_jax.newton.secant import SIZE, Pairs
 from vmri_jax.path import control_nodes
-from vmri_jax.results import Result
+from vmri_jax.results import RUNNING, Result
 
 ROUNDOFF = 4.0
 """Changes of the positions below so many units of round-off are accepted."""
@@ -130,7 +130,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
         if first:
             units = jnp.eye(r * n_g).reshape(r * n_g, r, n_g)
             columns = jax.vmap(lambda unit: push(matrix.solve(pull(unit)[1])))(units)
-            schur = inverse(columns.reshape(r * n_g, r * n_g)).T
+            schur = inverse(regularized(columns.reshape(r * n_g, r * n_g))).T
         dmu = -matvec(schur, change_of_g.reshape(-1)).reshape(r, n_g)
         more_s, more_f = pull(dmu)
         dx += matrix.solve(more_f)
@@ -281,10 +281,6 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     slow = jnp.concatenate([done.x.slow[None], warm.slow[:-1]])
     slow_multiplier = jnp.stack([done.x.slow_multiplier, warm.slow_multiplier[0]])
     return done, Warm(slow, slow_multiplier, done.end.multiplier, done.pairs)
-
-
-RUNNING = -1
-"""Status of an iteration that goes on."""
 
 
 def _inverse_mass(mass):

@@ -1,0 +1,108 @@
+"""The parts of a macro step: what can be taken apart, decided statically from the rules and the system."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from vmri_jax.discrete_lagrangian import Term, lagrangian
+from vmri_jax.quadrature import PlacedRule, micro, midpoint
+from vmri_jax.scheme import Scheme
+from vmri_jax.structure import depends_on
+from vmri_jax.system import ConstantMass, System
+
+
+class Split(NamedTuple):
+    """A system taken apart: kicks that stay outside, a slow system for one step, a fast one for num_micro steps.
+
+    Each part is a system of fast variables alone on a single micro interval.
+    """
+
+    kicks: System
+    slow: System
+    slow_scheme: Scheme
+    fast: System
+    fast_scheme: Scheme
+
+
+def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
+    """The parts of a macro step whose slow equations, kicks aside, do not see the fast unknowns, else None."""
+    n_s, n_f = q_s.shape[0], q_f.shape[0]
+    params = system.params
+    if scheme.degree > 1 or system.force is not None or not isinstance(system.kinetic, ConstantMass):
+        return None
+    if scheme.num_micro == 1 and not n_s:
+        return None  # a part already
+    slow_potential, fast_potential, constraint = system.slow_potential, system.fast_potential, system.constraint
+    kicked = {}
+    if slow_potential is not None and scheme.slow.grid == "macro" and scheme.slow.only_ends:
+        kicked["slow_potential"], slow_potential = slow_potential, None
+    if fast_potential is not None and scheme.fast.grid == "macro" and scheme.fast.only_ends:
+        kicked["fast_potential"], fast_potential = fast_potential, None
+
+    coupled_slow = slow_potential is not None and (
+        scheme.slow.grid == "micro" or depends_on(lambda q: slow_potential(q_s, q, params), q_f)[0]
+    )
+    coupled_fast = fast_potential is not None and scheme.fast.grid == "macro"
+    coupled_constraint = constraint is not None and depends_on(lambda q: constraint(q, q_f, params), q_s)[0]
+    if coupled_slow or coupled_fast or coupled_constraint:
+        return None
+
+    def potential_of_slow(q, params):
+        return slow_potential(q, jnp.zeros(n_f), params)  # pyright: ignore[reportOptionalCall]
+
+    def constraint_of_slow(_, q, params):
+        return system.replace(params=params).g_slow(q)
+
+    def constraint_of_fast(_, q, params):
+        return system.replace(params=params).g(jnp.zeros(n_s), q)
+
+    none, drift = jnp.zeros(0), micro(midpoint)
+    return Split(
+        kicks=System(system.kinetic, **kicked, params=params),
+        slow=System(
+            ConstantMass(none, system.kinetic.slow),
+            fast_potential=None if slow_potential is None else potential_of_slow,
+            constraint=None if system.slow_constraint is None else constraint_of_slow,
+            params=params,
+        ),
+        slow_scheme=Scheme(1, kinetic=drift, slow=drift, fast=PlacedRule(scheme.slow.rule, scheme.slow.grid)),
+        fast=System(
+            ConstantMass(none, system.kinetic.fast),
+            fast_potential=fast_potential,
+            constraint=None if constraint is None else constraint_of_fast,
+            params=params,
+        ),
+        fast_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast),
+    )
+
+
+def fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
+    """The fast variables under W and g with the slow ones at rest in q_s, and the scheme of one micro interval of them."""
+    assert isinstance(system.kinetic, ConstantMass)
+    fast_potential, constraint = system.fast_potential, system.constraint
+
+    def potential(q, at):
+        return fast_potential(q, at[0])  # pyright: ignore[reportOptionalCall]
+
+    def constraint_at_rest(_, q, at):
+        return constraint(at[1], q, at[0])  # pyright: ignore[reportOptionalCall]
+
+    alone = System(
+        ConstantMass(jnp.zeros(0), system.kinetic.fast),
+        fast_potential=None if fast_potential is None else potential,
+        constraint=None if constraint is None else constraint_at_rest,
+        params=(system.params, q_s),
+    )
+    rule = micro(scheme.kinetic.rule)
+    return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)
+
+
+def is_explicit(system: System, scheme: Scheme) -> bool:
+    """Whether a single micro interval is a straight drift between kicks."""
+    terms = lagrangian(system, scheme).terms
+    return (
+        scheme.num_micro == scheme.degree == 1
+        and isinstance(system.kinetic, ConstantMass)
+        and system.constraint is system.slow_constraint is system.force is None
+        and not any(term.inside.groups for term in terms if isinstance(term, Term))
+    )
