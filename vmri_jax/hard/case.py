@@ -19,8 +19,8 @@ class Outcome:
     """
 
     measured: str
-    passed: bool
-    values: Mapping[str, float] = field(default_factory=dict)
+    passed: bool | np.bool
+    values: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):

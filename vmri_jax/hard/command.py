@@ -31,13 +31,18 @@ def hard(
         ) as bar:
             task = bar.add_task("hard cases")
             report = run_cases(
-                case, full, lambda what, done, total: bar.update(task, description=what, completed=done, total=total), cases
+                case,
+                full,
+                lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
+                cases,
             )
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
     console.print(report.table())
     missed = [str(row.case.number) for row in report.rows if not row.outcome.passed]
-    console.print(f"{len(report.rows) - len(missed)} of {len(report.rows)} criteria met{'; missed: ' * bool(missed)}{', '.join(missed)}")
+    console.print(
+        f"{len(report.rows) - len(missed)} of {len(report.rows)} criteria met{'; missed: ' * bool(missed)}{', '.join(missed)}"
+    )
     if out is not None:
         for path in report.write(out):
             console.print(f"wrote {path}")

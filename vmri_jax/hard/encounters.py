@@ -55,9 +55,15 @@ def norm_at_zero(full: bool) -> Outcome:
         gradient, trajectory = reached(problem.system.params["stiffness"], state)
         largest = float(jnp.max(jnp.abs(gradient)) * problem.system.params["stiffness"])
         values[f"gradient_{distance:g}"] = largest if trajectory.success else np.nan
-        said.append(f"{largest:.2g} ({distance:g} apart)" if trajectory.success else f"{status(trajectory)} ({distance:g})")
+        said.append(
+            f"{largest:.2g} ({distance:g} apart)" if trajectory.success else f"{status(trajectory)} ({distance:g})"
+        )
     zero = values.pop("gradient_0")
-    return Outcome(f"derivative of the positions by log k, largest entry: {', '.join(said)}", np.isfinite(list(values.values())).all() and np.isnan(zero), values)
+    return Outcome(
+        f"derivative of the positions by log k, largest entry: {', '.join(said)}",
+        np.isfinite(list(values.values())).all() and np.isnan(zero),
+        values,
+    )
 
 
 def close_encounter(full: bool) -> Outcome:
@@ -70,9 +76,7 @@ def close_encounter(full: bool) -> Outcome:
     for name, (scheme, per_orbit) in settings.items():
         trajectory = long_run(problem, scheme, 2 * np.pi / per_orbit, orbits * per_orbit)
         values[name] = energy(trajectory, 1, abs(float(trajectory.energy[0]))).band
-        seconds = min(
-            interleaved({"": lambda s=scheme, n=per_orbit: run(problem, s, 2 * np.pi / n, 5 * n).q_f}, 3)[""]
-        )
+        seconds = min(interleaved({"": lambda s=scheme, n=per_orbit: run(problem, s, 2 * np.pi / n, 5 * n).q_f}, 3)[""])
         said.append(f"{name} {values[name]:.1e} at {per_orbit} steps, {seconds / 5 * 1e6:.0f} us an orbit")
     return Outcome(f"relative energy error: {'; '.join(said)}", values["impulse, kahan-li8"] < 1e-5, values)
 

@@ -34,7 +34,9 @@ def _refusal(call) -> str:
     return ""
 
 
-def bad_lane(problem: vm.Problem, scheme, macro_dt, num_steps: int, newton: vm.Newton, lanes: int = 256, compared: int = 4) -> Outcome:
+def bad_lane(
+    problem: vm.Problem, scheme, macro_dt, num_steps: int, newton: vm.Newton, lanes: int = 256, compared: int = 4
+) -> Outcome:
     """A batch of starts beside each other in velocity, one of them absurd, against single runs of some lanes."""
     bad = lanes // 3
     faster = 1 + 0.1 * np.linspace(-1, 1, lanes)

@@ -91,8 +91,8 @@ def tiny_steps(full: bool) -> Outcome:
 def many_micro_steps(full: bool) -> Outcome:
     problem, macro_dt, micro = vm.systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
 
-    def end(num_micro, steps, method="auto"):  # one saved node: one program for each num_micro
-        newton, scheme = vm.Newton(method=method), vm.fully_implicit(num_micro)
+    def end(num_micro, steps, newton=None):  # one saved node: one program for each num_micro
+        scheme = vm.fully_implicit(num_micro)
         return nodes(run(problem, scheme, macro_dt, steps, save_every=steps, newton=newton))[-1]
 
     steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
@@ -105,7 +105,7 @@ def many_micro_steps(full: bool) -> Outcome:
             end(n, steps[n])
             best[n] = min(best[n], (time.process_time() - start) / steps[n])
     slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
-    apart = difference(end(micro[0], 3), end(micro[0], 3, "dense"))
+    apart = difference(end(micro[0], 3), end(micro[0], 3, vm.Newton(method="dense")))
     return Outcome(
         f"time over num_micro {micro[0]} to {micro[-1]}: slope {slope:.2f}; from the dense solve at 200: {apart:.0e}",
         abs(slope - 1) <= 0.15 and apart < 1e-11,

@@ -77,7 +77,8 @@ def loose_tolerance(full: bool) -> Outcome:
         details |= {f"{key} {name}": value for key, value in _energy_picture(trajectory).items()}
     loose, middle, default = changes.values()
     return Outcome(
-        "drift of the energy per 1e5 steps: " + ", ".join(f"{c.drift:.0e} ({name}: {c.share:.0%} of the band)" for name, c in changes.items()),
+        "drift of the energy per 1e5 steps: "
+        + ", ".join(f"{c.drift:.0e} ({name}: {c.share:.0%} of the band)" for name, c in changes.items()),
         loose.drifts and abs(middle.drift) < abs(loose.drift) / 3 and not default.drifts,
         {f"drift_{name[:5].strip(',')}": change.drift for name, change in changes.items()},
         details,

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +17,10 @@ SAVED = 10_000
 """About as many nodes of a long run are kept."""
 
 
-def run(problem: vm.Problem, scheme, macro_dt, num_steps: int, **options) -> vm.Trajectory:
+def run(problem: vm.Problem, scheme, macro_dt, num_steps: int, **options: Any) -> vm.Trajectory:
     """`vmri_jax.simulate` from the problem's start; a failure is in the trajectory and not raised."""
-    options = {"throw": False} | options
-    return vm.simulate(problem.system, scheme, problem.state(), macro_dt=macro_dt, num_steps=num_steps, **options)
+    state = problem.state()
+    return vm.simulate(problem.system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
 
 
 def long_run(problem: vm.Problem, scheme, macro_dt, num_steps: int, **options) -> vm.Trajectory:

@@ -22,6 +22,7 @@ from vmri_jax.hard.measures import (
     status,
 )
 from vmri_jax.hard.scales import apart_from, midpoint_integrator, rattle
+from vmri_jax.stability import advise
 
 NUM_MICRO = 5
 PHASE = 0.2
@@ -127,12 +128,15 @@ class OwnSystem:
         words = ", ".join(f"{name} {value:.0e}" for name, value in values.items())
         return Outcome(f"from the known method after {steps} steps: {words}", max(values.values()) < 1e-10, values)
 
+    def advice(self, full: bool) -> Outcome:
+        advice = advise(self.problem.system, self.scheme, self.problem.state(), self.macro_dt)
+        return Outcome(str(advice).replace("\n", "; "), advice.ok, {"safe_macro_dt": advice.safe_macro_dt})
+
     def single_precision(self, full: bool) -> Outcome:
         return single_precision(self.problem, self.macro_dt)
 
     def bad_lane(self, full: bool) -> Outcome:
-        newton = vm.Newton() if full else vm.Newton(method="march" if vm.Newton().marches(self.problem.system, self.scheme) else "auto")
-        return bad_lane(self.problem, self.scheme, self.macro_dt, 20, newton, lanes=64 if full else 16)
+        return bad_lane(self.problem, self.scheme, self.macro_dt, 20, vm.Newton(), lanes=64 if full else 16)
 
 
 def own_system(problem: vm.Problem) -> OwnSystem:
@@ -163,9 +167,16 @@ def cases_for(problem: vm.Problem) -> tuple[Case, ...]:
     step = f"fully_implicit, num_micro {NUM_MICRO}, H = {own.macro_dt:.3g}"
     one = f"num_micro 1, omega = {own.omega:.3g}"
     offered = (
+        (True, "advice", step, "no error, no warning", own.advice),
         (constrained, "rank of the constraints", step, "rows independent at the start and on the way", own.rank),
         (constrained, "constraints for long", step, "position constraint below 1e-10", own.constraints),
-        (free, "energy for long", step, "no line explains more than half of the band, or the band is below 1e-9", own.energy),
+        (
+            free,
+            "energy for long",
+            step,
+            "no line explains more than half of the band, or the band is below 1e-9",
+            own.energy,
+        ),
         (True, "loose Newton tolerance", f"{step}, 1e-4 to 1e-12", "error shrinks with the tolerance", own.tolerance),
         (True, "tiny steps", f"{step} and smaller", "scaled condition flat", own.tiny_steps),
         (free, "reversibility", step, "back at the start to 1e-6", own.reversal),

@@ -12,9 +12,7 @@ Details = Mapping[str, np.ndarray]
 
 def pictures(details: Mapping[str, Details], theme: plots.Theme = plots.LIGHT) -> dict[str, Figure]:
     """Figures by name of the cases, given by title, whose details are there."""
-    return {
-        name: draw(details[title], theme) for title, (name, draw) in PICTURES.items() if details.get(title)
-    }
+    return {name: draw(details[title], theme) for title, (name, draw) in PICTURES.items() if details.get(title)}
 
 
 def _energy(details: Details, theme: plots.Theme) -> Figure:
@@ -29,7 +27,9 @@ def _energy(details: Details, theme: plots.Theme) -> Figure:
             count = len(t) // size
             e = e[: count * size].reshape(count, size)
             label = f"tolerance{name}" if name else None
-            axes.fill_between(t[: count * size : size], e.min(axis=1), e.max(axis=1), color=color, alpha=0.8, lw=0.6, label=label)
+            axes.fill_between(
+                t[: count * size : size], e.min(axis=1), e.max(axis=1), color=color, alpha=0.8, lw=0.6, label=label
+            )
         axes.set(xlabel="time", ylabel=r"energy error $E - E_0$", xlim=(0, details[f"t{runs[0]}"][-1]))
         if len(runs) > 1:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))

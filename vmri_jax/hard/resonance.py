@@ -18,7 +18,7 @@ def impulse_resonance(full: bool) -> Outcome:
     omega_H = np.linspace(0.05, 4 * np.pi, 250)
     found = stability_map(model, {n: vm.explicit_slow(n) for n in expected}, omega_H)
     first = {n: found.first_unstable(n) / np.pi for n in expected}
-    macro_dt = np.mean(found.windows(5)[0]) / 50.0
+    macro_dt = sum(found.windows(5)[0]) / 2 / 50.0
     warned = not advise(model.system, vm.explicit_slow(5), model.state(), macro_dt).ok
     words = ", ".join(f"{value:.3f} ({n})" for n, value in first.items())
     return Outcome(
@@ -71,7 +71,9 @@ def nonlinear_resonance(full: bool) -> Outcome:
         flagged = not trajectory.success or not advise(problem.system, scheme, problem.state(), phase / 50.0).ok
         drift = abs(change.drift) / 1e5
         values |= {f"drift {name}": drift, f"band {name}": change.band}
-        said.append(f"omega H = {name}: {drift:.0e} per step in a band of {change.band:.1e}{', flagged' if flagged else ''}")
+        said.append(
+            f"omega H = {name}: {drift:.0e} per step in a band of {change.band:.1e}{', flagged' if flagged else ''}"
+        )
         fine &= drift < 1e-6 or flagged
     return Outcome(f"relative energy drift at {'; at '.join(said)}", fine, values)
 
@@ -96,7 +98,9 @@ RESONANCES = (
         1,
         "impulse resonance",
         "linear model, kappa = 25, omega = 50, explicit_slow, omega H to 4 pi",
-        "first unstable omega H / pi within 0.005 of " + ", ".join(f"{v} ({n})" for n, v in FIRST_UNSTABLE.items()) + "; advice",
+        "first unstable omega H / pi within 0.005 of "
+        + ", ".join(f"{v} ({n})" for n, v in FIRST_UNSTABLE.items())
+        + "; advice",
         impulse_resonance,
     ),
     Case(

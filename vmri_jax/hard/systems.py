@@ -81,7 +81,7 @@ def four_bar(angle: float = 1.0, speed: float = 1.0, kappa: float = 0.0, redunda
     )
     tip = crank * np.array([np.cos(angle), np.sin(angle)])
     velocity = speed * crank * np.array([-np.sin(angle), np.cos(angle)])
-    q_f, v_f = np.concatenate([tip, tip + [base, 0.0]]), np.tile(velocity, 2)
+    q_f, v_f = np.concatenate([tip, [tip[0] + base, tip[1]]]), np.tile(velocity, 2)
     return Problem(system, jnp.array([-1.0]), jnp.asarray(q_f), jnp.array([0.0]), jnp.asarray(v_f))
 
 
