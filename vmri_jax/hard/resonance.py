@@ -63,7 +63,7 @@ def combination_resonance(full: bool) -> Outcome:
 
 
 def nonlinear_resonance(full: bool) -> Outcome:
-    problem, scheme, steps = cubic_chain(), vm.explicit_slow(10), 100_000 if full else 20_000
+    problem, scheme, steps = cubic_chain(), vm.explicit_slow(10), 100_000
     values, said, fine = {}, [], True
     for name, phase in {"2 pi / 3": 2 * np.pi / 3, "pi / 2": np.pi / 2}.items():
         trajectory = long_run(problem, scheme, phase / 50.0, steps)

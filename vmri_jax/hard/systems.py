@@ -97,7 +97,7 @@ def rigid_links(q_s, q_f, params):
 
 
 def link_chain(num_links: int = 20, bend: float = 0.0) -> Problem:
-    """Chain of rigid links in the plane (fast), from a heavy trolley (slow); started at rest to the side.
+    """Chain of rigid links in the plane (fast), from a rolling trolley (slow); started to the side.
 
     Args:
         num_links: points of mass 0.1 on links of length 0.1.
@@ -111,7 +111,7 @@ def link_chain(num_links: int = 20, bend: float = 0.0) -> Problem:
     masses = ConstantMass([10.0], np.full(2 * num_links, mass))
     system = System(masses, chain_weight, constraint=rigid_links, params=params)
     q_f = jnp.asarray(np.cumsum(steps, axis=0).reshape(-1))
-    return Problem(system, jnp.zeros(1), q_f, jnp.zeros(1), jnp.zeros(2 * num_links))
+    return Problem(system, jnp.zeros(1), q_f, jnp.array([0.1]), jnp.zeros(2 * num_links))
 
 
 def hung_weight(q_s, q_f, params):
