@@ -12,7 +12,9 @@ def singular_configuration(full: bool) -> Outcome:
     scheme, steps = vm.fully_implicit(5), 2_000 if full else 200
     micro = 2 * np.arcsin(0.01 / 2)  # what the crank turns in a micro step of 0.01 without forces
     met = {
-        "turning": run(four_bar(angle=-40 * micro), scheme, 0.05, steps),  # a micro node at the singularity, to round-off
+        "turning": run(
+            four_bar(angle=-40 * micro), scheme, 0.05, steps
+        ),  # a micro node at the singularity, to round-off
         "sprung": run(four_bar(angle=_meets_zero(scheme), kappa=20.0), scheme, 0.05, steps),
         "chain": run(link_chain(20, bend=0.0), scheme, 0.005, steps),
     }

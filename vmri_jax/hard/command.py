@@ -30,12 +30,11 @@ def hard(
             TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True
         ) as bar:
             task = bar.add_task("hard cases")
-            report = run_cases(
-                case,
-                full,
-                lambda what, done, total: bar.update(task, description=what, completed=done, total=total),
-                cases,
-            )
+
+            def tell(what: str, done: int, total: int) -> None:
+                bar.update(task, description=what, completed=done, total=total)
+
+            report = run_cases(case, full, tell, cases)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from error
     console.print(report.table())

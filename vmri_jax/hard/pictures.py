@@ -69,7 +69,7 @@ def _singular(details: Details, theme: plots.Theme) -> Figure:
     return figure
 
 
-def _contact_free(details: Details, theme: plots.Theme) -> Figure:
+def _oscillatory_energies(details: Details, theme: plots.Theme) -> Figure:
     """Oscillatory energies of the three stiff springs, large steps over resolved ones."""
     with plots.style(theme):
         figure = plots.NotebookFigure(figsize=(7.2, 3.2))
@@ -88,6 +88,6 @@ PICTURES: dict[str, tuple[str, Callable[[Details, plots.Theme], Figure]]] = {
     "constraints for long": ("energy_triple_pendulum", _energy),
     "energy for long": ("energy_long_run", _energy),
     "loose Newton tolerance": ("energy_tolerance", _energy),
-    "three scales": ("three_scales", _contact_free),
+    "three scales": ("three_scales", _oscillatory_energies),
 }
 """By title of the case: name of the picture, and how it is drawn."""

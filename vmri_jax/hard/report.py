@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rich.markup import escape
 from rich.table import Table
 
 from vmri_jax import plots
@@ -46,7 +47,7 @@ class Report:
         for row in self.rows:
             color = "green" if row.outcome.passed else "red"
             cells = (str(row.case.number), row.case.title, row.case.criterion, row.outcome.measured)
-            table.add_row(*map(_literal, cells), f"[{color}]{row.verdict}[/{color}]", f"{row.seconds:.1f}")
+            table.add_row(*map(escape, cells), f"[{color}]{row.verdict}[/{color}]", f"{row.seconds:.1f}")
         return table
 
     def markdown(self) -> str:
@@ -137,7 +138,3 @@ def run_cases(
         rows.append(Row(case, outcome, time.perf_counter() - start))
     progress("done", len(chosen), len(chosen))
     return Report(tuple(rows), full)
-
-
-def _literal(text: str) -> str:
-    return text.replace("[", "\\[")
