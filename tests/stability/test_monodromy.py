@@ -13,7 +13,7 @@ MARCH = Newton(method="march")
 
 def test_powers_of_a_linear_step():
     problem, scheme = linear_model(), fully_explicit(5)
-    [(start, stop)] = stability_map(problem, scheme, np.linspace(2.9, 3.2, 7)).windows()
+    [(start, stop, _)] = stability_map(problem, scheme, np.linspace(2.9, 3.2, 7)).windows()
     macro_dt = (start + stop) / 2 / 50  # in the first impulse resonance
     once = monodromy(problem.system, scheme, problem.state(), macro_dt, 1)
     often = monodromy(problem.system, scheme, problem.state(), macro_dt, 40)
