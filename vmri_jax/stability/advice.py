@@ -223,9 +223,9 @@ def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float)
 
     def turned(i) -> float:
         if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
-            return frequencies[i] * macro_dt
-        turn = stage.num_micro * sum(phase(stage, frequencies[i] * c * h) for c in parts)
-        return turn if np.isfinite(turn) else frequencies[i] * macro_dt
+            return float(frequencies[i] * macro_dt)
+        turn = stage.num_micro * sum(phase(stage, float(frequencies[i] * c * h)) for c in parts)
+        return turn if np.isfinite(turn) else float(frequencies[i] * macro_dt)
 
     kind = "impulse resonance" if stage.slow.grid == "macro" else "combination resonance"
     a, b = turned(first), turned(second)
@@ -282,7 +282,7 @@ def _stages(scheme: Scheme | Composition) -> list[Finding]:
 def _motion(motions: SmallMotions) -> list[Finding]:
     if not motions.growing.size:
         return []
-    rate = float(motions.growing.real.max())
+    rate = float(np.real(motions.growing).max())
     return [
         Finding(
             "note",

@@ -83,7 +83,7 @@ class SmallMotions:
     @property
     def growing(self) -> np.ndarray:
         """The rates of motions that grow by themselves, whatever the scheme."""
-        return self.rates[self.rates.real > GROWING * np.abs(self.rates).max(initial=0.0)]
+        return self.rates[np.real(self.rates) > GROWING * np.abs(self.rates).max(initial=0.0)]
 
     @property
     def slow_frequencies(self) -> np.ndarray:
