@@ -112,6 +112,8 @@ def test_bad_input():
             stability_map(model, scheme, grid)
     with pytest.raises(ValueError, match="got 2 scheme"):
         stability_map(model, {1: scheme, 2: scheme}, GRID, kappa=[1.0])
+    with pytest.raises(ValueError, match="kappa is empty"):
+        stability_map(model, scheme, GRID, kappa=[])
     free = System(ConstantMass([1.0], [1.0]))
     zero = np.zeros(1)
     with pytest.raises(ValueError, match="params None"):

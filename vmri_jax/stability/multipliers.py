@@ -73,7 +73,7 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
         for part in padded
     ]
     matrices = np.concatenate(pieces)[: len(macro_dt)]
-    failed = ~np.isfinite(matrices).all(axis=(1, 2))
+    failed = ~np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     values, vectors = np.linalg.eig(np.where(failed[:, None, None], np.eye(size), matrices))
     values = np.where(failed[:, None], np.nan, values.astype(complex))
     own = np.zeros(values.shape, dtype=bool)
