@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tests.stability.systems import double_pendulum, hanging
 from vmri_jax import State, System, compose, explicit_slow, fully_explicit, fully_implicit
 from vmri_jax.stability import advise, linear_model
 from vmri_jax.systems.fermi_pasta_ulam import soft_springs
@@ -19,14 +18,21 @@ def test_impulse_resonance_of_the_chain(fpu):
     """FPU at omega H = pi."""
     scheme, state = explicit_slow(30), fpu.state()
     advice = advise(fpu.system, scheme, state, 0.0628)
-    assert kinds(advice) == ["impulse resonance"] and not advice.ok
+    assert kinds(advice) == ["impulse resonance"]
+    assert not advice.ok
     assert advice.growth == pytest.approx(5.0e-3, rel=0.1)
-    assert "turns by 1 pi" in str(advice) and "tenfold in 460" in str(advice)
-    assert 0.06 < advice.safe_macro_dt < 0.066 and advice.safe_macro_dt != 0.0628
+    assert "turns by 1 pi" in str(advice)
+    assert "tenfold in 460" in str(advice)
+    assert 0.06 < advice.safe_macro_dt < 0.066
+    assert advice.safe_macro_dt != 0.0628
     again = advise(fpu.system, scheme, state, advice.safe_macro_dt)
-    assert again.ok and again.findings == () and again.safe_macro_dt == again.macro_dt == advice.safe_macro_dt
+    assert again.ok
+    assert again.findings == ()
+    assert again.safe_macro_dt == again.macro_dt == advice.safe_macro_dt
     near = advise(fpu.system, scheme, state, 0.0631)
-    assert near.growth == 0 and kinds(near, "warning") == ["impulse resonance"] and not near.ok
+    assert near.growth == 0
+    assert kinds(near, "warning") == ["impulse resonance"]
+    assert not near.ok
 
 
 def test_combination_resonance():
@@ -37,7 +43,7 @@ def test_combination_resonance():
     assert advice.growth == pytest.approx(8.4e-4, abs=2e-5)
     assert "frequencies 50.25 and 4.975" in str(advice)
     assert advice.safe_macro_dt == pytest.approx(0.114, rel=0.01)
-    assert any(a < 0.114 < b for a, b in advice.windows)
+    assert any(a < 0.114 < b for a, b, _ in advice.windows)
 
 
 @pytest.mark.parametrize(("x", "severity"), [(1.6, None), (1.98, "warning"), (2.1, "error")])
@@ -52,12 +58,13 @@ def test_stability_limit_of_the_chain(fpu, x, severity):
 
 
 def test_stages_of_a_composition(fpu):
-    advice = advise(fpu.system, compose(fully_explicit(1), "yoshida4"), fpu.state(), 1.3 / 50)
-    assert kinds(advice) == ["stability limit"] and "longest stage" in str(advice)
+    advice = advise(fpu.system, compose(fully_explicit(1), "yoshida4"), fpu.state(), 1.6 / 50)
+    assert kinds(advice) == ["stability limit"]
+    assert "longest stage" in str(advice)
     assert kinds(advice, "note") == ["stages"]
     [note] = [finding for finding in advice.findings if finding.kind == "stages"]
     assert note.number == pytest.approx(1.7024, abs=1e-4)
-    assert advice.safe_macro_dt < 2 / 50 / note.number
+    assert 1.3 / 50 < advice.safe_macro_dt < 1.573 / 50
 
 
 def all_in_the_slow_potential(q_s, q_f, params):
@@ -69,18 +76,22 @@ def test_swapped_labels(fpu):
     swapped = System(fpu.system.kinetic, all_in_the_slow_potential, params=fpu.system.params)
     start = State(0.0, state.q_f, state.q_s, state.p_f, state.p_s)
     advice = advise(swapped, fully_explicit(1), start, 0.005)
-    assert kinds(advice, "warning") == ["labels"] and not advice.ok
-    assert "q_s[0], q_s[1], q_s[2]" in str(advice) and "Swap the labels" in str(advice)
+    assert kinds(advice, "warning") == ["labels"]
+    assert not advice.ok
+    assert "q_s[0], q_s[1], q_s[2]" in str(advice)
+    assert "Swap the labels" in str(advice)
     assert advice.findings[0].number > 10
     assert advice.safe_macro_dt == advice.macro_dt  # the step itself is stable
 
 
 def test_a_state_that_is_unstable_by_itself():
-    """Rods standing up: the growth is the motion's, not the scheme's."""
-    system = double_pendulum(stiffness=0.0)
-    advice = advise(system, fully_explicit(1), hanging(system, up=1.0), 0.01)
-    assert advice.ok and advice.growth == 0 and kinds(advice, "note") == ["motion"]
-    assert advice.findings[0].number > 3
+    """Coupling of the wrong sign: the growth is the motion's, not the scheme's."""
+    problem = linear_model(kappa=-25.0)
+    advice = advise(problem.system, fully_explicit(1), problem.state(), 0.01)
+    assert advice.ok
+    assert advice.growth == 0
+    assert kinds(advice, "note") == ["motion"]
+    assert advice.findings[0].number == pytest.approx(np.sqrt(-np.linalg.eigvalsh([[-25, 25], [25, 2475]])[0]))
 
 
 def test_table_and_bad_input(fpu):
@@ -88,7 +99,8 @@ def test_table_and_bad_input(fpu):
     console = Console(width=300, record=True, file=None, quiet=False)
     with console.capture() as captured:
         console.print(advice)
-    assert "stability limit" in captured.get() and advice.verdict in captured.get()
+    assert "stability limit" in captured.get()
+    assert advice.verdict in captured.get()
     with pytest.raises(TypeError, match="scheme is int"):
         advise(fpu.system, 3, fpu.state(), 0.1)  # pyright: ignore[reportArgumentType]
     for macro_dt in (0.0, np.nan, [0.1]):

@@ -7,8 +7,19 @@ import pytest
 
 from tests import user_systems
 from tests.stability.systems import double_pendulum, hanging
-from vmri_jax import ConstantMass, State, System, fully_explicit, fully_implicit, initial_state, macro_step
+from vmri_jax import (
+    ConstantMass,
+    Newton,
+    State,
+    System,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    initial_state,
+    macro_step,
+)
 from vmri_jax.stability import linear_model, multipliers, small_motions
+from vmri_jax.stability.linear import QUICK
 
 
 def step_matrix(system, scheme, state, macro_dt, motions):
@@ -18,14 +29,14 @@ def step_matrix(system, scheme, state, macro_dt, motions):
 
     def step(coordinates):
         start = State(state.t, *jnp.split(z + motions.embed @ coordinates, (n_s, n, n + n_s)))
-        end = macro_step(system, scheme, start, macro_dt)[0]
+        end = macro_step(system, scheme, start, macro_dt, Newton(method="arrowhead"))[0]
         return motions.read @ jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
 
-    return np.asarray(jax.jit(jax.jacfwd(step))(jnp.zeros(motions.embed.shape[1])))
+    return np.asarray(jax.jit(jax.jacfwd(step), compiler_options=QUICK)(jnp.zeros(motions.embed.shape[1])))
 
 
 def damping(t, q_s, q_f, v_s, v_f, params):
-    return -3.0 * v_s, -0.02 * v_f + 0.1 * q_f
+    return -3.0 * v_s, -2e-5 * v_f + 0.01 * q_f
 
 
 def swinging_with_damping():
@@ -40,12 +51,14 @@ def hanging_under_tension():
     return system, hanging(system)
 
 
-@pytest.mark.parametrize("case", [hanging_under_tension, swinging_with_damping])
-def test_the_step_of_the_expansion_is_the_derivative_of_the_step(case):
+@pytest.mark.parametrize(
+    ("case", "scheme"), [(hanging_under_tension, explicit_slow(2)), (swinging_with_damping, fully_implicit(2))]
+)
+def test_the_step_of_the_expansion_is_the_derivative_of_the_step(case, scheme):
     system, state = case()
     motions = small_motions(system, state)
-    values = multipliers(motions, fully_implicit(2), [0.05]).values[0]
-    expected = np.linalg.eigvals(step_matrix(system, fully_implicit(2), state, 0.05, motions))
+    values = multipliers(motions, scheme, [0.05]).values[0]
+    expected = np.linalg.eigvals(step_matrix(system, scheme, state, 0.05, motions))
     assert np.abs(np.sort_complex(values) - np.sort_complex(expected)).max() < 1e-12  # 3e-14
     assert np.abs(np.sort_complex(np.exp(0.05 * motions.rates)) - np.sort_complex(values)).max() < 0.1
 
@@ -106,5 +119,17 @@ def corner(q_s, q_f, params):
 def test_no_second_derivative():
     one = jnp.zeros(1)
     system = System(ConstantMass([1.0], [1.0]), corner)
-    with pytest.raises(ValueError, match="expansion of .*slow.* is not finite"):
+    with pytest.raises(ValueError, match=r"expansion of .*slow.* is not finite"):
         small_motions(system, State(0.0, one, one, one, one))
+
+
+def fixed(q_s, params):
+    return q_s - 1.0
+
+
+def test_nothing_moves():
+    one, none = jnp.ones(1), jnp.zeros(0)
+    with pytest.raises(ValueError, match="the 1 constraints leave none of the 1 coordinates free"):
+        small_motions(System(ConstantMass([1.0], []), slow_constraint=fixed), State(0.0, one, none, 0 * one, none))
+    with pytest.raises(TypeError, match="got Problem and State"):
+        small_motions(linear_model(), linear_model().state())  # pyright: ignore[reportArgumentType]

@@ -26,15 +26,18 @@ def test_first_impulse_resonances():
     found = stability_map(linear_model(), {n: explicit_slow(n) for n in expected}, GRID)
     first = {n: found.first_unstable(n) / np.pi for n in expected}
     assert first == pytest.approx(expected, abs=0.005)  # 1.2476, 1.0878, 1.0227, 0.9978, 0.9918
-    assert found.omega == 50.0 and found.macro_dt[-1] == pytest.approx(4 * np.pi / 50)
+    assert found.omega == 50.0
+    assert found.macro_dt[-1] == pytest.approx(4 * np.pi / 50)
 
 
 def test_combination_resonance_of_the_fully_implicit_scheme():
     """Growth of 8.4e-4 per step at omega h = 0.1, num_micro 57; a run grows as the map says."""
     found = stability_map(linear_model(), fully_implicit(57), [CASE_3 - 0.02, CASE_3, CASE_3 + 0.02])
     growth = found.growth[0]
-    assert growth[1] == pytest.approx(8.4e-4, abs=2e-5) and growth[0] == growth[2] == 0
-    [(start, stop)] = found.windows()
+    assert growth[1] == pytest.approx(8.4e-4, abs=2e-5)
+    assert growth[0] == growth[2] == 0
+    [(start, stop, peak)] = found.windows()
+    assert peak == pytest.approx(8.44e-4, rel=0.02)
     assert start < CASE_3 < stop < start + 0.01
 
     problem = linear_model()
@@ -49,37 +52,53 @@ def test_windows_narrower_than_the_grid():
     """Galerkin of degree 2 near omega H = 2 pi: a window of 2e-4 between two stable grid points."""
     found = stability_map(linear_model(), galerkin(5, 2), np.linspace(6.1, 6.4, 4))
     assert found.growth.max() == 0.0
-    [(start, stop)] = found.windows()
-    assert 5e-5 < stop - start < 5e-4 and start == pytest.approx(1.9964 * np.pi, abs=1e-3)
-    inside = stability_map(linear_model(), galerkin(5, 2), [(start + stop) / 2, 6.4])
-    assert inside.growth[0, 0] == pytest.approx(9.4e-5, rel=0.1)
+    [(start, stop, growth)] = found.windows()
+    assert 5e-5 < stop - start < 5e-4
+    assert start == pytest.approx(1.9964 * np.pi, abs=1e-3)
+    assert growth == pytest.approx(9.4e-5, rel=0.1)
+
+
+def triple_jump_radius(x):
+    """Spectral radius of Yoshida's triple jump of Verlet steps for one oscillator."""
+    outer, product = 1 / (2 - 2 ** (1 / 3)), np.eye(2)
+    for h in x * np.array([outer, 1 - 2 * outer, outer]):
+        kick = np.array([[1.0, 0.0], [-h / 2, 1.0]])
+        product = kick @ np.array([[1.0, h], [0.0, 1.0]]) @ kick @ product
+    return np.abs(np.linalg.eigvals(product)).max()
 
 
 def test_rows_over_kappa_compositions_and_the_explicit_limit(tmp_path):
     limit = 3 * 2.0  # omega h = 2 at 3 micro steps; kappa adds its part
-    over_kappa = stability_map(linear_model(), fully_explicit(3), np.linspace(0.95, 1.05, 11) * limit, kappa=[0.0, 25.0])
-    assert over_kappa.rows == (0.0, 25.0) and over_kappa.axis == "kappa"
+    over_kappa = stability_map(
+        linear_model(), fully_explicit(3), np.linspace(0.95, 1.05, 11) * limit, kappa=[0.0, 25.0]
+    )
+    assert over_kappa.rows == (0.0, 25.0)
+    assert over_kappa.axis == "kappa"
     assert over_kappa.first_unstable(0.0) == pytest.approx(limit, abs=1e-5)
     assert over_kappa.first_unstable(25.0) < limit
-    stage = stability_map(linear_model(kappa=0.0), compose(fully_explicit(3), "yoshida4"), [3.4, 3.5, 3.6])
-    assert stage.first_unstable() == pytest.approx(limit / 1.7024143839193153, abs=1e-5)  # its longest stage
+    triple = stability_map(linear_model(kappa=0.0), compose(fully_explicit(1), "yoshida4"), [1.5, 1.6])
+    assert triple.first_unstable() == pytest.approx(1.573, abs=1e-3)  # its longest stage is beyond 2 from 1.175 on
+    assert triple.radius[0] == pytest.approx([triple_jump_radius(1.5), triple_jump_radius(1.6)], rel=1e-12)
 
     over_kappa.to_json(tmp_path / "map.json")
     again = StabilityMap.from_json(tmp_path / "map.json")
-    assert again.edges == over_kappa.edges and again.rows == over_kappa.rows
+    assert again.found == over_kappa.found
+    assert again.rows == over_kappa.rows
     assert np.array_equal(again.radius, over_kappa.radius)
     over_kappa.to_csv(tmp_path / "map.csv")
     lines = (tmp_path / "map.csv").read_text().splitlines()
-    assert lines[0] == "kappa,omega_H,macro_dt,radius" and len(lines) == 1 + 2 * 11
-    figure = plot_stability({"kappa": over_kappa, "composition": stage}, "two maps")
+    assert lines[0] == "kappa,omega_H,macro_dt,radius"
+    assert len(lines) == 1 + 2 * 11
+    figure = plot_stability({"kappa": over_kappa, "composition": triple}, "two maps")
     figure.savefig(tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 10_000
 
 
 def test_a_step_that_fails_is_unstable():
-    """An infinite step of the implicit scheme: no derivative, hence no stability."""
+    """A step so large that its numbers overflow."""
     found = stability_map(linear_model(), fully_explicit(3), [1.0, 1e200])
-    assert found.radius[0, 0] == pytest.approx(1.0, abs=1e-9) and found.radius[0, 1] == np.inf
+    assert found.radius[0, 0] == pytest.approx(1.0, abs=1e-9)
+    assert found.radius[0, 1] == np.inf
 
 
 def test_bad_input():
@@ -89,10 +108,12 @@ def test_bad_input():
     with pytest.raises(TypeError, match="give a Scheme or Composition"):
         stability_map(model, {"a": 3}, GRID)  # pyright: ignore[reportArgumentType]
     for grid in ([1.0], [0.0, 1.0], [2.0, 1.0], [1.0, np.nan]):
-        with pytest.raises(ValueError, match="omega_H has shape .* give two or more positive values"):
+        with pytest.raises(ValueError, match=r"omega_H has shape .* give two or more positive values"):
             stability_map(model, scheme, grid)
     with pytest.raises(ValueError, match="got 2 scheme"):
         stability_map(model, {1: scheme, 2: scheme}, GRID, kappa=[1.0])
+    with pytest.raises(ValueError, match="kappa is empty"):
+        stability_map(model, scheme, GRID, kappa=[])
     free = System(ConstantMass([1.0], [1.0]))
     zero = np.zeros(1)
     with pytest.raises(ValueError, match="params None"):

@@ -23,7 +23,7 @@ def test_phases_have_the_order_of_the_scheme(degree, rule):
 
 def test_a_phase_beyond_half_a_turn():
     """Gauss collocation of degree 3 is accurate, and stable, far beyond pi."""
-    assert phase(galerkin(1, 3), 4.0) == pytest.approx(4.0, abs=0.05)
+    assert phase(galerkin(1, 3), 4.0) == pytest.approx(4.0, abs=0.1)
 
 
 def test_limits():
@@ -35,4 +35,5 @@ def test_limits():
     # a linear path over the macro interval with V at n midpoints: x^2 < 12 / (1 - 1 / n^2)
     assert slow_limit(fully_implicit(4)) == pytest.approx(np.sqrt(12 / (1 - 1 / 16)), abs=1e-7)
     on_macro = Scheme(3, kinetic=micro(midpoint), slow=micro(midpoint), fast=macro(trapezoidal))
-    assert fast_limit(on_macro) == np.inf and np.isnan(phase(on_macro, 1.0))
+    assert fast_limit(on_macro) == np.inf
+    assert np.isnan(phase(on_macro, 1.0))

@@ -8,7 +8,7 @@ from vmri_jax import Composition, Scheme, State, System
 from vmri_jax.checks import require_x64
 from vmri_jax.composition import stage_scheme
 from vmri_jax.stability.linear import SmallMotions, small_motions
-from vmri_jax.stability.map import TOLERANCE, measure
+from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
 
@@ -26,6 +26,8 @@ WIDTHS = 3.0
 """but no further than so many times their width, which grows with the coupling as their distance does."""
 FASTER = 2.0
 """Slow variables that vibrate so many times faster than the fast ones are wrongly labelled."""
+BEYOND = 0.01
+"""Causes are looked for in steps longer by so much: V and W together reach a limit before each alone."""
 SCANS = 5
 """Scans downwards, each over smaller steps, until there is a safe one."""
 
@@ -63,7 +65,7 @@ class Advice:
     macro_dt: float
     growth: float
     findings: tuple[Finding, ...]
-    windows: tuple[tuple[float, float], ...]
+    windows: tuple[Window, ...]
     scanned: tuple[float, float]
     safe_macro_dt: float
     fast_frequencies: np.ndarray
@@ -109,8 +111,8 @@ def advise(
     Everything called unstable was measured: the derivative of the step of the frozen problem (see `small_motions`) has
     a multiplier outside the unit circle, at macro_dt or in a window of steps near it. Formulas only name the cause:
 
-    * stability limit: ``omega h`` of the fast potential, ``omega H`` of the slow one, beyond what its rule bears (2 for
-      kicks at the ends), for the longest stage of a composition;
+    * stability limit: the step is unstable for the fast or the slow potential alone; ``omega h`` or ``omega H`` is beyond
+      what its rule bears (2 for kicks at the ends);
     * impulse resonance: slow potential on the macro grid, two vibrations (or one twice) that turn together by a
       multiple of 2 pi per macro step, as the micro steps turn them (midpoint rule: 2 atan(omega h / 2) each);
     * combination resonance: the same with V on the micro grid, through the slow path that is one polynomial per macro step;
@@ -145,7 +147,7 @@ def advise(
         grows = f"Disturbances grow by {growth:.2g} per macro step, tenfold in {max(1, round(tenfold))}."
         findings.append(Finding("error", kind, f"{cause} {grows}", growth))
     else:
-        for a, b in windows:
+        for a, b, _ in windows:
             distance = max(a - macro_dt, macro_dt - b) / macro_dt
             if distance * macro_dt <= _margin(a, b, macro_dt):
                 kind, cause = _cause(motions, scheme, (a + b) / 2)
@@ -173,7 +175,7 @@ def advise(
     )
 
 
-def _scan(motions: SmallMotions, scheme, lower: float, upper: float, through: float, tolerance: float) -> list:
+def _scan(motions: SmallMotions, scheme, lower: float, upper: float, through: float, tolerance: float) -> list[Window]:
     """Unstable windows of macro steps between lower and upper."""
     turn = motions.modes[0].max(initial=0.0) * (upper - lower)
     grid = np.linspace(lower, upper, int(np.clip(turn / TURN, *POINTS)))
@@ -187,7 +189,7 @@ def _margin(a: float, b: float, macro_dt: float) -> float:
 
 def _nearest_safe(macro_dt: float, windows, lower: float, upper: float) -> float:
     """The step nearest to macro_dt that is not near a window; NaN if there is none in the range."""
-    unsafe = [(a - 1.01 * _margin(a, b, macro_dt), b + 1.01 * _margin(a, b, macro_dt)) for a, b in windows]
+    unsafe = [(a - 1.01 * _margin(a, b, macro_dt), b + 1.01 * _margin(a, b, macro_dt)) for a, b, _ in windows]
     ends = [end for window in unsafe for end in window if lower <= end <= upper]
     free = [end for end in ends if not any(a < end < b for a, b in unsafe)]
     return min(free, key=lambda end: abs(end - macro_dt), default=np.nan)
@@ -197,17 +199,18 @@ def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float)
     """Kind and description of an instability at this step."""
     stage = stage_scheme(scheme)
     parts = np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)
-    longest, h = np.abs(parts).max() * macro_dt, macro_dt / stage.num_micro
+    h, longest = macro_dt / stage.num_micro, np.abs(parts).max()
     of = " of the longest stage" if isinstance(scheme, Composition) else ""
-    for name, frequency, step, limit in (
-        ("fast", motions.fast_frequencies[0], longest / stage.num_micro, fast_limit(stage)),
-        ("slow", motions.slow_frequencies[0], longest, slow_limit(stage)),
+    for name, frequencies, grid, step, limit in (
+        ("fast", motions.fast_frequencies, "micro", longest * h, fast_limit(stage)),
+        ("slow", motions.slow_frequencies, "macro", longest * macro_dt, slow_limit(stage)),
     ):
-        if frequency * step >= limit * (1 - 1e-6):
-            grid = "micro" if name == "fast" else "macro"
+        alone = multipliers(motions.only(name), scheme, [macro_dt * (1 + BEYOND)])
+        if alone.radius[0] > 1 + TOLERANCE:
+            bears = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
             return "stability limit", (
-                f"The {name} potential's frequency {frequency:.4g} times the {grid} step{of} is {frequency * step:.4g}; its "
-                f"quadrature rule is stable below {limit:.4g}."
+                f"The step is unstable for the {name} potential alone: its frequency {frequencies[0]:.4g} times the {grid} "
+                f"step{of} is {frequencies[0] * step:.4g}{bears}."
             )
     found = multipliers(motions, scheme, [macro_dt])
     worst = np.argmax(np.where(found.own[0], 0.0, np.abs(found.values[0])))
@@ -220,9 +223,9 @@ def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float)
 
     def turned(i) -> float:
         if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
-            return frequencies[i] * macro_dt
-        turn = stage.num_micro * sum(phase(stage, frequencies[i] * c * h) for c in parts)
-        return turn if np.isfinite(turn) else frequencies[i] * macro_dt
+            return float(frequencies[i] * macro_dt)
+        turn = stage.num_micro * sum(phase(stage, float(frequencies[i] * c * h)) for c in parts)
+        return turn if np.isfinite(turn) else float(frequencies[i] * macro_dt)
 
     kind = "impulse resonance" if stage.slow.grid == "macro" else "combination resonance"
     a, b = turned(first), turned(second)
@@ -270,7 +273,7 @@ def _stages(scheme: Scheme | Composition) -> list[Finding]:
             "note",
             "stages",
             f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
-            f"backwards: stability limits of the scheme hold for the longest, so for {longest:.3g} macro_dt.",
+            f"backwards: it meets the stability limits of its scheme at steps about {longest:.3g} times shorter.",
             longest,
         )
     ]
@@ -279,7 +282,7 @@ def _stages(scheme: Scheme | Composition) -> list[Finding]:
 def _motion(motions: SmallMotions) -> list[Finding]:
     if not motions.growing.size:
         return []
-    rate = float(motions.growing.real.max())
+    rate = float(np.real(motions.growing).max())
     return [
         Finding(
             "note",

@@ -5,7 +5,7 @@ expansion there; elsewhere the expansion stands for the *frozen* problem: the co
 forces. Either way it is a `System` like any other, so that every scheme applies to it unchanged.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import jax
@@ -83,7 +83,7 @@ class SmallMotions:
     @property
     def growing(self) -> np.ndarray:
         """The rates of motions that grow by themselves, whatever the scheme."""
-        return self.rates[self.rates.real > GROWING * np.abs(self.rates).max(initial=0.0)]
+        return self.rates[np.real(self.rates) > GROWING * np.abs(self.rates).max(initial=0.0)]
 
     @property
     def slow_frequencies(self) -> np.ndarray:
@@ -107,6 +107,14 @@ class SmallMotions:
         fast = self.fast_frequencies.max(initial=0.0)
         return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
 
+    def only(self, name: str) -> "SmallMotions":
+        """The same without the slow or without the fast potential; `name` says which one stays, "slow" or "fast"."""
+        other = "slow" if name == "fast" else "fast"
+        removed = getattr(self, other)
+        none = jax.tree.map(np.zeros_like, self.system.params[other])
+        system = self.system.replace(params=self.system.params | {other: none})
+        return replace(self, system=system, stiffness=self.stiffness - removed, **{other: np.zeros_like(removed)})
+
 
 def _frequencies(stiffness) -> np.ndarray:
     return np.sqrt(np.maximum(np.linalg.eigvalsh((stiffness + stiffness.T) / 2)[::-1], 0.0))
@@ -126,8 +134,14 @@ def small_motions(system: System, state: State) -> SmallMotions:
         state: where; its velocity enters through lambda and through the derivatives of the force.
 
     Raises:
-        ValueError: derivatives that are not finite there.
+        TypeError: not a System and a State.
+        ValueError: derivatives that are not finite there, constraints that leave no motion.
     """
+    if not isinstance(system, System) or not isinstance(state, State):
+        raise TypeError(
+            f"small_motions: got {type(system).__name__} and {type(state).__name__}; give a System and a State, e.g. "
+            "problem.system and problem.state()."
+        )
     e = {name: np.asarray(value) for name, value in _expansion(system, state).items()}
     broken = [name for name, value in e.items() if not np.isfinite(value).all()]
     if broken:
@@ -168,6 +182,10 @@ def small_motions(system: System, state: State) -> SmallMotions:
     if len(G):
         _, sizes, rows = np.linalg.svd(G)
         tangents = rows[np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :].T
+    if not tangents.shape[1]:
+        raise ValueError(
+            f"small_motions: the {len(G)} constraints leave none of the {n} coordinates free; nothing moves."
+        )
     shapes = np.linalg.solve(np.linalg.cholesky(tangents.T @ mass @ tangents), tangents.T).T
     bent = np.tensordot(multiplier, curvature, 1)
     bent_by_slow = np.tensordot(own, curvature, 1)

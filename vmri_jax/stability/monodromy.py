@@ -11,6 +11,7 @@ from vmri_jax import Composition, Newton, Result, Scheme, State, System, macro_s
 from vmri_jax.checks import require_x64
 from vmri_jax.diagnostics import velocity
 from vmri_jax.quadrature import is_concrete
+from vmri_jax.stability.linear import QUICK
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def monodromy(
     )
 
 
-@partial(jax.jit, static_argnames="num_steps")
+@partial(jax.jit, static_argnames="num_steps", compiler_options=QUICK)
 def _product(system, scheme, state, macro_dt, newton, num_steps: int):
     """End (2 n,), product of the derivatives, tangent bases at both ends, status of every step."""
     splits = _splits(state)

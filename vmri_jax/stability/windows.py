@@ -37,7 +37,9 @@ def find_windows(
             at = [at_a, *(next(inner_labels) for _ in points), at_b]
             divided += [piece for piece in zip(nodes, nodes[1:], at, at[1:], strict=False) if piece[2] != piece[3]]
         brackets = [piece for piece in divided if piece[1] - piece[0] > resolution]
-        found += [a if at_b is None else b for a, b, at_a, at_b in divided if b - a <= resolution and None in (at_a, at_b)]
+        found += [
+            a if at_b is None else b for a, b, at_a, at_b in divided if b - a <= resolution and None in (at_a, at_b)
+        ]
     if labels[-1] is None:
         found.append(x[-1])
     found = [float(edge) for edge in sorted(found)]
