@@ -43,7 +43,7 @@ def test_combination_resonance():
     assert advice.growth == pytest.approx(8.4e-4, abs=2e-5)
     assert "frequencies 50.25 and 4.975" in str(advice)
     assert advice.safe_macro_dt == pytest.approx(0.114, rel=0.01)
-    assert any(a < 0.114 < b for a, b in advice.windows)
+    assert any(a < 0.114 < b for a, b, _ in advice.windows)
 
 
 @pytest.mark.parametrize(("x", "severity"), [(1.6, None), (1.98, "warning"), (2.1, "error")])

@@ -121,3 +121,15 @@ def test_no_second_derivative():
     system = System(ConstantMass([1.0], [1.0]), corner)
     with pytest.raises(ValueError, match=r"expansion of .*slow.* is not finite"):
         small_motions(system, State(0.0, one, one, one, one))
+
+
+def fixed(q_s, params):
+    return q_s - 1.0
+
+
+def test_nothing_moves():
+    one, none = jnp.ones(1), jnp.zeros(0)
+    with pytest.raises(ValueError, match="the 1 constraints leave none of the 1 coordinates free"):
+        small_motions(System(ConstantMass([1.0], []), slow_constraint=fixed), State(0.0, one, none, 0 * one, none))
+    with pytest.raises(TypeError, match="got Problem and State"):
+        small_motions(linear_model(), linear_model().state())  # pyright: ignore[reportArgumentType]

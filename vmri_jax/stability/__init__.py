@@ -3,7 +3,7 @@
 from vmri_jax.stability.advice import Advice, Finding, advise
 from vmri_jax.stability.figures import plot_stability
 from vmri_jax.stability.linear import SmallMotions, linear_model, small_motions
-from vmri_jax.stability.map import StabilityMap, stability_map
+from vmri_jax.stability.map import StabilityMap, Window, stability_map
 from vmri_jax.stability.monodromy import Monodromy, monodromy
 from vmri_jax.stability.multipliers import Multipliers, multipliers
 
@@ -14,6 +14,7 @@ __all__ = [
     "Multipliers",
     "SmallMotions",
     "StabilityMap",
+    "Window",
     "advise",
     "linear_model",
     "monodromy",

@@ -8,7 +8,7 @@ from vmri_jax import Composition, Scheme, State, System
 from vmri_jax.checks import require_x64
 from vmri_jax.composition import stage_scheme
 from vmri_jax.stability.linear import SmallMotions, small_motions
-from vmri_jax.stability.map import TOLERANCE, measure
+from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
 
@@ -65,7 +65,7 @@ class Advice:
     macro_dt: float
     growth: float
     findings: tuple[Finding, ...]
-    windows: tuple[tuple[float, float], ...]
+    windows: tuple[Window, ...]
     scanned: tuple[float, float]
     safe_macro_dt: float
     fast_frequencies: np.ndarray
@@ -147,7 +147,7 @@ def advise(
         grows = f"Disturbances grow by {growth:.2g} per macro step, tenfold in {max(1, round(tenfold))}."
         findings.append(Finding("error", kind, f"{cause} {grows}", growth))
     else:
-        for a, b in windows:
+        for a, b, _ in windows:
             distance = max(a - macro_dt, macro_dt - b) / macro_dt
             if distance * macro_dt <= _margin(a, b, macro_dt):
                 kind, cause = _cause(motions, scheme, (a + b) / 2)
@@ -175,7 +175,7 @@ def advise(
     )
 
 
-def _scan(motions: SmallMotions, scheme, lower: float, upper: float, through: float, tolerance: float) -> list:
+def _scan(motions: SmallMotions, scheme, lower: float, upper: float, through: float, tolerance: float) -> list[Window]:
     """Unstable windows of macro steps between lower and upper."""
     turn = motions.modes[0].max(initial=0.0) * (upper - lower)
     grid = np.linspace(lower, upper, int(np.clip(turn / TURN, *POINTS)))
@@ -189,7 +189,7 @@ def _margin(a: float, b: float, macro_dt: float) -> float:
 
 def _nearest_safe(macro_dt: float, windows, lower: float, upper: float) -> float:
     """The step nearest to macro_dt that is not near a window; NaN if there is none in the range."""
-    unsafe = [(a - 1.01 * _margin(a, b, macro_dt), b + 1.01 * _margin(a, b, macro_dt)) for a, b in windows]
+    unsafe = [(a - 1.01 * _margin(a, b, macro_dt), b + 1.01 * _margin(a, b, macro_dt)) for a, b, _ in windows]
     ends = [end for window in unsafe for end in window if lower <= end <= upper]
     free = [end for end in ends if not any(a < end < b for a, b in unsafe)]
     return min(free, key=lambda end: abs(end - macro_dt), default=np.nan)
@@ -223,9 +223,9 @@ def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float)
 
     def turned(i) -> float:
         if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
-            return frequencies[i] * macro_dt
-        turn = stage.num_micro * sum(phase(stage, frequencies[i] * c * h) for c in parts)
-        return turn if np.isfinite(turn) else frequencies[i] * macro_dt
+            return float(frequencies[i] * macro_dt)
+        turn = stage.num_micro * sum(phase(stage, float(frequencies[i] * c * h)) for c in parts)
+        return turn if np.isfinite(turn) else float(frequencies[i] * macro_dt)
 
     kind = "impulse resonance" if stage.slow.grid == "macro" else "combination resonance"
     a, b = turned(first), turned(second)
@@ -282,7 +282,7 @@ def _stages(scheme: Scheme | Composition) -> list[Finding]:
 def _motion(motions: SmallMotions) -> list[Finding]:
     if not motions.growing.size:
         return []
-    rate = float(motions.growing.real.max())
+    rate = float(np.real(motions.growing).max())
     return [
         Finding(
             "note",

@@ -83,7 +83,7 @@ class SmallMotions:
     @property
     def growing(self) -> np.ndarray:
         """The rates of motions that grow by themselves, whatever the scheme."""
-        return self.rates[self.rates.real > GROWING * np.abs(self.rates).max(initial=0.0)]
+        return self.rates[np.real(self.rates) > GROWING * np.abs(self.rates).max(initial=0.0)]
 
     @property
     def slow_frequencies(self) -> np.ndarray:
@@ -134,8 +134,14 @@ def small_motions(system: System, state: State) -> SmallMotions:
         state: where; its velocity enters through lambda and through the derivatives of the force.
 
     Raises:
-        ValueError: derivatives that are not finite there.
+        TypeError: not a System and a State.
+        ValueError: derivatives that are not finite there, constraints that leave no motion.
     """
+    if not isinstance(system, System) or not isinstance(state, State):
+        raise TypeError(
+            f"small_motions: got {type(system).__name__} and {type(state).__name__}; give a System and a State, e.g. "
+            "problem.system and problem.state()."
+        )
     e = {name: np.asarray(value) for name, value in _expansion(system, state).items()}
     broken = [name for name, value in e.items() if not np.isfinite(value).all()]
     if broken:
@@ -176,6 +182,10 @@ def small_motions(system: System, state: State) -> SmallMotions:
     if len(G):
         _, sizes, rows = np.linalg.svd(G)
         tangents = rows[np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :].T
+    if not tangents.shape[1]:
+        raise ValueError(
+            f"small_motions: the {len(G)} constraints leave none of the {n} coordinates free; nothing moves."
+        )
     shapes = np.linalg.solve(np.linalg.cholesky(tangents.T @ mass @ tangents), tangents.T).T
     bent = np.tensordot(multiplier, curvature, 1)
     bent_by_slow = np.tensordot(own, curvature, 1)

@@ -5,6 +5,7 @@ import json
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,12 +18,21 @@ from vmri_jax.stability.windows import find_windows
 TOLERANCE = 1e-6
 """Growth per step that counts as instability.
 
-Two equal multipliers (free motion, the end of a window) split under round-off by the square root of it: up to 2e-8 was
-seen on our systems, up to 1e-7 in compositions of many stages. Growth by less than 1e-6 takes a million macro steps to
-be a factor of e.
+Two equal multipliers (free motion, the end of a window) split under round-off by the square root of it: 2e-8 on the triple
+pendulum, 1e-8 on the atomic model. Growth by less than 1e-6 takes a million macro steps to be a factor of e.
 """
+INSIDE = np.linspace(0.0, 1.0, 9)
+"""Where the growth in a window is measured."""
 EDGE = 1e-7
 """Ends of windows are refined to this part of the range of omega H; narrower windows are left out."""
+
+
+class Window(NamedTuple):
+    """An interval of unstable steps and the largest growth per step seen in it."""
+
+    start: float
+    stop: float
+    growth: float
 
 
 @dataclass(frozen=True)
@@ -35,7 +45,7 @@ class StabilityMap:
     omega_H: (n,) grid, macro step times omega.
     radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions that grow by
         themselves; infinite where the step failed.
-    edges: per row, the intervals of omega_H in which radius > 1 + tolerance; they may be far narrower than the grid.
+    found: per row, the windows of omega_H in which radius > 1 + tolerance; they may be far narrower than the grid.
     tolerance: growth per step that counts.
     """
 
@@ -44,7 +54,7 @@ class StabilityMap:
     omega: float
     omega_H: np.ndarray
     radius: np.ndarray
-    edges: tuple[tuple[tuple[float, float], ...], ...]
+    found: tuple[tuple[Window, ...], ...]
     tolerance: float
 
     @property
@@ -57,17 +67,17 @@ class StabilityMap:
         """(m, n) growth per macro step, ``radius - 1``, zero where stable."""
         return np.where(self.radius > 1 + self.tolerance, self.radius - 1, 0.0)
 
-    def windows(self, row=None) -> list[tuple[float, float]]:
+    def windows(self, row=None) -> list[Window]:
         """Intervals of omega H that are unstable, for one row (the first by default)."""
         if row is None:
-            return list(self.edges[0])
+            return list(self.found[0])
         if row not in self.rows:
             raise ValueError(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
-        return list(self.edges[self.rows.index(row)])
+        return list(self.found[self.rows.index(row)])
 
     def first_unstable(self, row=None) -> float:
         """Smallest unstable omega H of one row (the first by default); infinite where there is none on the grid."""
-        return next((start for start, _ in self.windows(row)), np.inf)
+        return next((window.start for window in self.windows(row)), np.inf)
 
     def to_json(self, path: str | Path) -> None:
         """Write everything to a JSON file; `from_json` reads it."""
@@ -78,9 +88,9 @@ class StabilityMap:
     def from_json(cls, path: str | Path) -> "StabilityMap":
         """A map written by `to_json`."""
         content = json.loads(Path(path).read_text())
-        edges = tuple(tuple((start, stop) for start, stop in row) for row in content.pop("edges"))
+        found = tuple(tuple(Window(*window) for window in row) for row in content.pop("found"))
         arrays = {name: np.array(content.pop(name)) for name in ("omega_H", "radius")}
-        return cls(**content | arrays | {"rows": tuple(content["rows"]), "edges": edges})
+        return cls(**content | arrays | {"rows": tuple(content["rows"]), "found": found})
 
     def to_csv(self, path: str | Path) -> None:
         """Write one line per row and grid point: label, omega_H, macro_dt, radius."""
@@ -143,6 +153,8 @@ def stability_map(
         rows = {label: (motions, s) for label, s in schemes.items()}
     else:
         [only] = schemes.values() if len(schemes) == 1 else [None]
+        if not len(kappa):
+            raise ValueError("stability_map: kappa is empty; give at least one value.")
         if only is None or not isinstance(system.params, Mapping) or "kappa" not in system.params:
             raise ValueError(
                 "stability_map: kappa goes with a single scheme and a system whose params are a dict with an entry 'kappa'; "
@@ -159,7 +171,7 @@ def stability_map(
         omega=omega,
         omega_H=grid,
         radius=np.array([radius for radius, _ in measured]),
-        edges=tuple(tuple((omega * a, omega * b) for a, b in windows) for _, windows in measured),
+        found=tuple(tuple(Window(omega * a, omega * b, g) for a, b, g in windows) for _, windows in measured),
         tolerance=tolerance,
     )
 
@@ -170,15 +182,19 @@ def measure(
     macro_dt,
     tolerance: float = TOLERANCE,
     resolution: float = EDGE,
-) -> tuple[np.ndarray, list[tuple[float, float]]]:
-    """Spectral radius (n,) at each of n increasing macro steps, and the unstable intervals between first and last."""
+) -> tuple[np.ndarray, list[Window]]:
+    """Spectral radius (n,) at each of n increasing macro steps, and the unstable windows between first and last."""
 
     def label(macro_dt):
         return multipliers(motions, scheme, macro_dt).words(tolerance)
 
     found = multipliers(motions, scheme, macro_dt)
-    windows = find_windows(label, macro_dt, found.words(tolerance), resolution * (macro_dt[-1] - macro_dt[0]))
-    return found.radius, windows
+    edges = find_windows(label, macro_dt, found.words(tolerance), resolution * (macro_dt[-1] - macro_dt[0]))
+    if not edges:
+        return found.radius, []
+    inside = np.array([a + (b - a) * INSIDE for a, b in edges])
+    peaks = multipliers(motions, scheme, inside.reshape(-1)).radius.reshape(inside.shape).max(axis=1) - 1
+    return found.radius, [Window(*ends, float(peak)) for ends, peak in zip(edges, peaks, strict=True)]
 
 
 def _system_and_state(model) -> tuple[System, State]:

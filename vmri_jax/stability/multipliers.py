@@ -18,6 +18,8 @@ from vmri_jax.stability.linear import QUICK, SmallMotions
 
 LANES = 64
 """Step sizes that one compiled call does side by side, where the system is small."""
+CONSTRAINED_ITERATIONS = 3
+"""Newton's iterations of a step at rest: kicks towards the constraints make it start elsewhere."""
 AT_ONE = 1e-5
 """Multipliers closer to 1 belong to free motions, which have no signature."""
 
@@ -49,10 +51,10 @@ class Multipliers:
             if radius > 1 + tolerance:
                 words.append(None)
                 continue
-            signs = np.imag(np.sum(np.conj(x[:d]) * x[d:], axis=0)) > 0
+            signs = np.sign(np.imag(np.sum(np.conj(x[:d]) * x[d:], axis=0)))
             angles = np.angle(values)
             upper = np.flatnonzero((angles > AT_ONE) & (np.abs(np.abs(values) - 1) <= tolerance))
-            words.append(signs[upper[np.argsort(angles[upper])]].tobytes())
+            words.append(np.take(signs, upper[np.argsort(angles[upper])]).tobytes())
         return words
 
 
@@ -60,7 +62,7 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
     """Multipliers of one macro step of the given lengths (k,).
 
     The derivative of the step is exact, ``jax.jacfwd(macro_step)`` of the expansion at rest on the tangent space of the
-    constraint manifold; Newton's one iteration solves its linear equations.
+    constraint manifold.
     """
     macro_dt = np.asarray(macro_dt, dtype=float)
     size = motions.read.shape[0]
@@ -71,7 +73,7 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
         for part in padded
     ]
     matrices = np.concatenate(pieces)[: len(macro_dt)]
-    failed = ~np.isfinite(matrices).all(axis=(1, 2))
+    failed = ~np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     values, vectors = np.linalg.eig(np.where(failed[:, None, None], np.eye(size), matrices))
     values = np.where(failed[:, None], np.nan, values.astype(complex))
     own = np.zeros(values.shape, dtype=bool)
@@ -85,7 +87,8 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest for k lengths of it."""
     n_s, n = rest.q_s.size, rest.q_s.size + rest.q_f.size
-    newton = Newton(method="arrowhead", fixed_iterations=1)
+    free = system.constraint is system.slow_constraint is None
+    newton = Newton(method="arrowhead", fixed_iterations=1 if free else CONSTRAINED_ITERATIONS)
 
     def step(coordinates, macro_dt):
         state = State(rest.t, *jnp.split(embed @ coordinates, (n_s, n, n + n_s)))

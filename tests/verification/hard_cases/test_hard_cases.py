@@ -1,0 +1,31 @@
+"""Quick forms of the 28 hard cases: every criterion is met, and what a prototype measured is measured again."""
+
+import pytest
+
+from vmri_jax.hard import catalogue
+
+CASES = catalogue()
+
+# (case, value): what an independent prototype measured; the quick forms come within 20 %
+MEASURED = {
+    (1, "first_unstable_2"): 1.248,
+    (1, "first_unstable_5"): 1.025,
+    (3, "growth"): 8.4e-4,
+    (6, "iterations"): 6,
+    (7, "iterations"): 4,
+    (13, "iterations_1e+06"): 3,
+    (17, "band"): 4.4e-4,
+}
+
+
+def test_there_are_28_in_order():
+    assert [case.number for case in CASES] == list(range(1, 29))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.number}-{case.title.replace(' ', '-')}")
+def test_criterion_is_met(case):
+    outcome = case.run(False)
+    assert outcome.passed, outcome.measured
+    for (number, name), value in MEASURED.items():
+        if number == case.number:
+            assert outcome.values[name] == pytest.approx(value, rel=0.2)

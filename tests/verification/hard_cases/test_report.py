@@ -1,0 +1,86 @@
+"""Reports of hard cases: a case that raises is a failed row, tables and files say the same, and the command ends plainly."""
+
+import json
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from vmri_jax.hard import Case, Outcome, run_cases
+from vmri_jax.hard.command import hard
+
+RAISES = "bad | luck"
+
+
+def steady(full: bool) -> Outcome:
+    return Outcome("band 0.5", True, {"band": 0.5, "full": full})
+
+
+def broken(full: bool) -> Outcome:
+    raise RuntimeError(RAISES)
+
+
+CASES = (Case(1, "steady", "a set-up", "a criterion", steady), Case(2, "broken", "another", "no exception", broken))
+
+
+def test_a_case_that_raises_is_a_failed_row_with_the_reason():
+    told = []
+    report = run_cases(cases=CASES, full=True, progress=lambda *a: told.append(a))
+    assert [row.outcome.passed for row in report.rows] == [True, False]
+    assert report.rows[1].outcome.measured == f"raised RuntimeError: {RAISES}"
+    assert report.rows[0].outcome.values == {"band": 0.5, "full": 1.0}
+    assert not report.passed
+    assert told == [("1 steady", 0, 2), ("2 broken", 1, 2), ("done", 2, 2)]
+
+
+def test_numbers_choose_cases_and_unknown_ones_are_refused():
+    report = run_cases([1], cases=CASES)
+    assert [row.case.number for row in report.rows] == [1]
+    assert report.passed
+    with pytest.raises(ValueError, match=r"there is no case 3, 7; they go from 1 to 2"):
+        run_cases([1, 7, 3], cases=CASES)
+
+
+def test_files_say_what_the_table_says(tmp_path):
+    report = run_cases(cases=CASES)
+    names = [path.name for path in report.write(tmp_path / "new")]
+    assert names == ["cases.md", "cases.csv", "cases.json"]
+    lines = (tmp_path / "new" / "cases.md").read_text().splitlines()
+    assert len(lines) == 4
+    assert lines[3] == "| 2 | broken | another | no exception | raised RuntimeError: bad \\| luck | fail |"
+    rows = json.loads((tmp_path / "new" / "cases.json").read_text())["rows"]
+    assert [row["passed"] for row in rows] == [True, False]
+    assert "1,steady,pass,band,0.5" in (tmp_path / "new" / "cases.csv").read_text()
+    assert report.table().row_count == 2
+
+
+def test_pictures_are_drawn_from_details():
+    t = np.linspace(0, 1, 1001)
+
+    def run(full: bool) -> Outcome:
+        return Outcome("", True, {}, {"t": t, "energy error": np.sin(50 * t)})
+
+    report = run_cases(cases=[Case(1, "energy for long", "", "", run), CASES[0]])
+    [(name, figure)] = report.pictures().items()
+    assert name == "energy_long_run"
+    low, high = figure.axes[0].get_ylim()
+    assert low < -0.9
+    assert high > 0.9
+
+
+def test_the_command_refuses_an_unknown_case():
+    app = typer.Typer()
+    app.command()(hard)
+    result = CliRunner().invoke(app, ["--case", "99"])
+    assert result.exit_code == 2
+    assert "there is no case 99" in result.output
+
+
+def test_the_command_runs_a_case_and_writes_files(tmp_path):
+    app = typer.Typer()
+    app.command()(hard)
+    result = CliRunner().invoke(app, ["--case", "27", "--out", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    assert "1 of 1 criteria met" in result.output
+    assert (tmp_path / "out" / "cases.md").read_text().count("\n") == 3

@@ -1,0 +1,89 @@
+"""Cases 11 and 12: linkages through singular configurations, a chain that hardly stretches."""
+
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.hard.case import Case, Outcome
+from vmri_jax.hard.measures import constraints, energy, run, status
+from vmri_jax.hard.systems import four_bar, link_chain, stiff_chain
+
+
+def singular_configuration(full: bool) -> Outcome:
+    scheme, steps = vm.fully_implicit(5), 2_000 if full else 200
+    micro = 2 * np.arcsin(0.01 / 2)  # what the crank turns in a micro step of 0.01 without forces
+    met = {
+        "turning": run(
+            four_bar(angle=-40 * micro), scheme, 0.05, steps
+        ),  # a micro node at the singularity, to round-off
+        "sprung": run(four_bar(angle=_meets_zero(scheme), kappa=20.0), scheme, 0.05, steps),
+        "chain": run(link_chain(20, bend=0.0), scheme, 0.005, steps),
+    }
+    generic = {
+        "turning": run(four_bar(angle=-1.0), scheme, 0.05, steps),
+        "sprung": run(four_bar(angle=-1.0, kappa=20.0), scheme, 0.05, steps),
+        "chain": run(link_chain(20, bend=0.25), scheme, 0.005, steps),
+    }
+    band = {name: (energy(met[name], 1).band, energy(generic[name], 1).band) for name in met}
+    worst = max(constraints(trajectory)[0] for trajectory in met.values())
+    fine = all(trajectory.success for trajectory in met.values())
+    bounded = all(here < max(10 * there, 1e-10) for here, there in band.values())
+    sizes = ", ".join(f"{name} {here:.1e} ({there:.1e})" for name, (here, there) in band.items())
+    failed = "; ".join(f"{name}: {status(trajectory)}" for name, trajectory in met.items() if not trajectory.success)
+    flat = np.asarray(met["turning"].q_f)
+    return Outcome(
+        f"{failed + '; ' if failed else ''}constraint {worst:.0e}; energy error, in brackets generic: {sizes}",
+        fine and worst < 1e-10 and bounded,
+        {"constraint": worst, **{f"energy_{name}": here for name, (here, _) in band.items()}},
+        {"t": met["turning"].t, "height": flat[:, 1], "chain": np.asarray(met["chain"].q_f)[:: max(1, steps // 10)]},
+    )
+
+
+def _meets_zero(scheme, macro_steps: int = 8) -> float:
+    """Start angle from which the sprung four-bar linkage is collinear after so many macro steps, by secants."""
+
+    def height(angle):
+        return float(run(four_bar(angle=angle, kappa=20.0), scheme, 0.05, macro_steps).q_f[-1, 1])
+
+    a, b = -0.25, -0.2
+    f, g = height(a), height(b)
+    while abs(g) > 1e-13 and g != f:  # ends where it cannot get closer, or where the run fails
+        a, b, f = b, b - g * (b - a) / (g - f), g
+        g = height(b)
+    return b
+
+
+def stiff_springs_in_a_chain(full: bool) -> Outcome:
+    problem, steps = stiff_chain(), 10_000 if full else 50
+    trajectory = run(problem, vm.fully_implicit(20), 0.02, steps, save_every=steps // 50)
+    points = np.asarray(trajectory.q_f).reshape(len(trajectory.t), -1, 2)
+    points = np.concatenate([np.zeros_like(points[:, :1]), points], axis=1)
+    strain = np.abs(np.linalg.norm(np.diff(points, axis=1), axis=2) / 0.2 - 1).max(axis=1)
+    params = problem.system.params
+    weight = params["gravity"] * (params["load"] + 50 * params["mass"])
+    at_rest = float(weight / params["stiffness"] / params["length"])
+    change = energy(trajectory, steps, float(abs(trajectory.energy[0])))
+    return Outcome(
+        f"{steps} steps, omega h = 2: {status(trajectory)}, strain at most {strain.max() / at_rest:.2f} x that at rest; relative "
+        f"energy error {change.band:.1e}",
+        trajectory.success and strain.max() < 3 * at_rest and change.band < 1e-3,
+        {"strain": strain.max(), "strain_at_rest": at_rest, "band": change.band},
+        {"t": trajectory.t, "strain": strain},
+    )
+
+
+CHAINS = (
+    Case(
+        11,
+        "singular configuration",
+        "four-bar linkage through its collinear position, straight 20-link chain",
+        "no NaN, constraint below 1e-10, energy error at most 10 x that of a generic start, or round-off",
+        singular_configuration,
+    ),
+    Case(
+        12,
+        "near-inextensible chain",
+        "50 masses, k = 1e6, fully_implicit, num_micro 20, H = 0.02, 1e4 steps",
+        "strain at most 3 x that of the load at rest, relative energy error below 1e-3",
+        stiff_springs_in_a_chain,
+    ),
+)

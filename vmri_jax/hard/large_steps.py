@@ -1,0 +1,161 @@
+"""Cases 5 to 7 and 13 to 15: explicit limit, large and tiny steps, mass ratios, very many micro steps."""
+
+import time
+
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.hard.case import Case, Outcome
+from vmri_jax.hard.measures import constraints, difference, energy, iterations, nodes, run, scaled_condition, status
+
+EXACT = vm.Newton(method="arrowhead")
+"""Newton's iteration with the exact matrix, whose iterations are counted."""
+
+
+def explicit_limit(full: bool) -> Outcome:
+    problem, num_micro, steps = vm.systems.fermi_pasta_ulam(), 2, 20_000 if full else 5_000
+    scheme = vm.fully_explicit(num_micro)  # with more micro steps omega h = 1.9 meets an impulse resonance
+    below, at, beyond = (run(problem, scheme, num_micro * wh / 50.0, steps, save_every=20) for wh in (1.9, 2.0, 2.1))
+    e = np.abs(np.asarray(below.energy - below.energy[0]))
+    first, second = e[: len(e) // 2].max(), e[len(e) // 2 :].max()
+    clean = beyond.result == vm.Result.NON_FINITE and not np.isfinite(beyond.energy[-1])
+    return Outcome(
+        f"1.9: energy error up to {first:.1f} in the first half, {second:.1f} in the second; 2.0: {status(at)}; 2.1: "
+        f"{status(beyond)}, NaN from there",
+        below.success and second < 2 * first and clean,
+        {"first_half": first, "second_half": second, "failed_at_2.0": at.failed_at, "failed_at_2.1": beyond.failed_at},
+    )
+
+
+def large_macro_step(full: bool) -> Outcome:
+    problem, scheme = vm.systems.fermi_pasta_ulam(), vm.fully_implicit(100)
+    one, two = (run(problem, scheme, h, 100 if full else 20, newton=EXACT) for h in (1.0, 2.0))
+    band = energy(two, 1, float(two.energy[0])).band
+    return Outcome(
+        f"H = 1: {iterations(one)} iterations, {status(one)}; H = 2: {status(two)}",
+        one.success and iterations(one) <= 8 and (not two.success or band < 2),
+        {"iterations": iterations(one), "failed_at_2": int(two.failed_at)},
+    )
+
+
+PENDULUM = vm.fully_implicit(5)
+
+
+def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int) -> vm.Trajectory:
+    """With 20 saved nodes, so that one program does all of them."""
+    return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, newton=EXACT)
+
+
+def large_constrained_step(full: bool) -> Outcome:
+    problem = vm.systems.triple_spherical_pendulum()
+    usual, large = (_pendulum_run(problem, h, 400 if full else 40) for h in (0.05, 0.2))
+    kept = float(np.nanmax(np.asarray(large.constraint_residual)[:, 0]))
+    return Outcome(
+        f"H = 0.05: {iterations(usual)} iterations, {status(usual)}; H = 0.2: {status(large)}, constraint {kept:.1e}",
+        usual.success and iterations(usual) <= 4 and kept < 1e-10,
+        {"iterations": iterations(usual), "failed_at_0.2": int(large.failed_at), "constraint_0.2": kept},
+    )
+
+
+def mass_ratios(full: bool) -> Outcome:
+    values = {}
+    for ratio in (1e4, 1e6, 1e8):
+        problem = vm.systems.triple_spherical_pendulum(masses=(ratio, 1.0, 1.0))
+        trajectory = _pendulum_run(problem, 0.01, 1000 if full else 100)
+        values[f"iterations_{ratio:.0e}"] = iterations(trajectory) if trajectory.success else np.inf
+        values[f"condition_{ratio:.0e}"] = scaled_condition(problem.system, PENDULUM, problem.state(), 0.01)
+    worst = max(v for name, v in values.items() if name.startswith("iterations"))
+    condition = max(v for name, v in values.items() if name.startswith("condition"))
+    return Outcome(
+        f"at most {worst:.0f} iterations ({values['iterations_1e+06']:.0f} at 1e6), scaled condition {condition:.0f}",
+        worst <= 5 and condition < 100,
+        values,
+    )
+
+
+def tiny_steps(full: bool) -> Outcome:
+    problem = vm.systems.triple_spherical_pendulum()
+    state, steps = problem.state(), 10.0 ** -np.arange(1.0, 7.0)
+    conditions = np.array([scaled_condition(problem.system, PENDULUM, state, h) for h in steps])
+    floor = _pendulum_run(problem, 1e-6, 10_000 if full else 1_000)
+    error = energy(floor, 1, float(floor.energy[0])).band
+    flat = conditions[1:].max() / conditions[1:].min()  # H = 0.1 is no small step
+    return Outcome(
+        f"scaled condition {conditions.min():.0f} to {conditions.max():.0f} for H = 0.1 to 1e-6; at H = 1e-6 {status(floor)}, "
+        f"constraint {constraints(floor)[0]:.0e}, relative energy error {error:.0e} (round-off)",
+        flat < 1.1 and conditions.max() < 100 and floor.success and constraints(floor)[0] < 1e-13,
+        {f"condition_{h:.0e}": c for h, c in zip(steps, conditions, strict=True)} | {"energy_floor": error},
+    )
+
+
+def many_micro_steps(full: bool) -> Outcome:
+    problem, macro_dt, micro = vm.systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
+
+    def end(num_micro, steps, newton=None):  # one saved node: one program for each num_micro
+        scheme = vm.fully_implicit(num_micro)
+        return nodes(run(problem, scheme, macro_dt, steps, save_every=steps, newton=newton))[-1]
+
+    steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
+    for n in micro:
+        end(n, steps[n])  # compiles
+    best = dict.fromkeys(micro, np.inf)
+    for _ in range(40 if full else 20):
+        for n in micro:  # in turns; the time of the processor, which others on the machine do not stretch
+            start = time.process_time()
+            end(n, steps[n])
+            best[n] = min(best[n], (time.process_time() - start) / steps[n])
+    slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
+    apart = difference(end(micro[0], 3), end(micro[0], 3, vm.Newton(method="dense")))
+    return Outcome(
+        f"time over num_micro {micro[0]} to {micro[-1]}: slope {slope:.2f}; from the dense solve at 200: {apart:.0e}",
+        abs(slope - 1) <= 0.15 and apart < 1e-11,
+        {"slope": slope, "from_dense": apart, **{f"seconds_{n}": s for n, s in best.items()}},
+    )
+
+
+EXPLICIT_LIMIT = Case(
+    5,
+    "explicit limit",
+    "FPU chain, fully_explicit, omega h = 1.9, 2.0, 2.1",
+    "stable, marginal, and a clean error",
+    explicit_limit,
+)
+LARGE_STEPS = (
+    Case(
+        6,
+        "large macro step",
+        "FPU chain, fully_implicit, num_micro 100, H = 1 and H = 2",
+        "at most 8 Newton iterations; H = 2 fails plainly or stays bounded",
+        large_macro_step,
+    ),
+    Case(
+        7,
+        "large constrained step",
+        "triple pendulum, H = 0.05 and H = 0.2",
+        "at most 4 Newton iterations; H = 0.2 goes on or fails plainly, constraints kept",
+        large_constrained_step,
+    ),
+)
+SCALES_OF_STEPS = (
+    Case(
+        13,
+        "mass ratios 1e4 to 1e8",
+        "triple pendulum, H = 0.01",
+        "at most 5 Newton iterations, scaled condition below 100",
+        mass_ratios,
+    ),
+    Case(
+        14,
+        "tiny steps",
+        "triple pendulum, H from 0.1 to 1e-6",
+        "scaled condition flat, round-off floor stated",
+        tiny_steps,
+    ),
+    Case(
+        15,
+        "very many micro steps",
+        "FPU chain, H = 0.1, num_micro 200 to 5000",
+        "time linear (slope 1 within 0.15), equal to the dense solve to 1e-11",
+        many_micro_steps,
+    ),
+)

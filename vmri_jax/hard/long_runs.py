@@ -1,0 +1,145 @@
+"""Cases 16 to 18 and 20: constraints and energy over long runs, a loose tolerance, chaos."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.hard.case import Case, Outcome
+from vmri_jax.hard.measures import (
+    constraints,
+    difference,
+    energy,
+    energy_scale,
+    long_run,
+    nodes,
+    run,
+    smooth_shift,
+    status,
+)
+
+CHAIN_DT = 0.03
+
+
+def hanging_pendulum() -> vm.Problem:
+    """The triple pendulum hanging at rest but for small velocities: quasi-periodic motion."""
+    problem = vm.systems.triple_spherical_pendulum()
+    params = {name: np.asarray(value) for name, value in problem.system.params.items()}
+    l_1, l_2, l_3 = params["lengths"] + [0.0, 0.0, params["gravity"] * params["masses"][2] / params["stiffness"]]
+    q_f = jnp.array([0.0, 0.0, -l_1 - l_2, 0.0, 0.0, -l_1 - l_2 - l_3])
+    v_s, v_f = jnp.array([0.5, 0.3, 0.0]), jnp.array([0.5, 0.3, 0.0, 0.7, 0.4, 0.1])
+    return vm.Problem(problem.system, jnp.array([0.0, 0.0, -l_1]), q_f, v_s, v_f)
+
+
+def constraints_for_long(full: bool) -> Outcome:
+    steps = 1_000_000 if full else 20_000
+    wild, calm = vm.systems.triple_spherical_pendulum(), hanging_pendulum()
+    trajectory, regular = (long_run(problem, vm.fully_implicit(5), 0.01, steps) for problem in (wild, calm))
+    position, velocity = (max(a) for a in zip(constraints(trajectory), constraints(regular), strict=True))
+    change = energy(trajectory, steps, energy_scale(wild, trajectory))
+    shift = smooth_shift(regular, steps, energy_scale(calm, regular))
+    return Outcome(
+        f"{steps:.0e} steps: |g| {position:.1e}, |G v| {velocity:.1e}; relative energy per 1e5 steps: hanging {shift:.0e}, "
+        f"chaotic {change.drift:.0e} in a band of {change.band:.1e}",
+        position < 1e-12 and abs(shift) < 1e-6 and not change.drifts,
+        {
+            "constraint": position,
+            "velocity_constraint": velocity,
+            "shift_per_1e5": shift,
+            "band": change.band,
+            "drift_per_1e5": change.drift,
+        },
+        _energy_picture(trajectory),
+    )
+
+
+def energy_for_long(full: bool) -> Outcome:
+    steps = 1_000_000 if full else 100_000
+    trajectory = long_run(vm.systems.fermi_pasta_ulam(), vm.fully_implicit(10), CHAIN_DT, steps)
+    e = np.abs(np.asarray(trajectory.energy) - trajectory.energy[0])
+    whole, tenth = e.max(), e[: len(e) // 10 + 1].max()
+    change = energy(trajectory, steps)
+    return Outcome(
+        f"band {tenth:.2g} at {steps / 10:.0e} steps, {whole:.2g} at {steps:.0e} ({whole / tenth:.2f} times); drift "
+        f"{change.drift:.0e} per 1e5 steps ({change.share:.0%} of the band over the run)",
+        whole <= 2 * tenth,
+        {"band": whole, "band_at_tenth": tenth, "ratio": whole / tenth, "drift_per_1e5": change.drift},
+        _energy_picture(trajectory),
+    )
+
+
+def loose_tolerance(full: bool) -> Outcome:
+    steps, problem = 1_000_000 if full else 100_000, vm.systems.fermi_pasta_ulam()
+    changes, details = {}, {}
+    for name, tolerance in {"1e-4": 1e-4, "1e-8": 1e-8, "1e-12, the default": vm.Newton().tolerance}.items():
+        newton = vm.Newton(tolerance=tolerance)
+        trajectory = long_run(problem, vm.fully_implicit(10), CHAIN_DT, steps, newton=newton)
+        changes[name] = energy(trajectory, steps)
+        details |= {f"{key} {name}": value for key, value in _energy_picture(trajectory).items()}
+    loose, middle, default = changes.values()
+    return Outcome(
+        "drift of the energy per 1e5 steps: "
+        + ", ".join(f"{c.drift:.0e} ({name}: {c.share:.0%} of the band)" for name, c in changes.items()),
+        loose.drifts and abs(middle.drift) < abs(loose.drift) / 3 and not default.drifts,
+        {f"drift_{name[:5].strip(',')}": change.drift for name, change in changes.items()},
+        details,
+    )
+
+
+def chaotic_pendulum(full: bool) -> Outcome:
+    problem = vm.systems.triple_spherical_pendulum()
+    lengths = np.asarray(problem.system.params["lengths"])
+    tilt = np.array([np.sin(1e-3), 0.0, np.cos(1e-3)])
+    q = np.cumsum(lengths)[:, None] * tilt
+    problem = vm.Problem(problem.system, jnp.asarray(q[0]), jnp.asarray(q[1:].reshape(-1)), jnp.zeros(3), jnp.zeros(6))
+    scheme, t_end = vm.fully_implicit(5), 100.0 if full else 10.0
+    macro_dt = 0.005
+    trajectory = run(problem, scheme, macro_dt, round(t_end / macro_dt), save_every=10)
+    scale = 2 * abs(float(trajectory.energy[0]))  # from upright to hanging
+    position, change = constraints(trajectory)[0], energy(trajectory, 1, scale)
+    steps, ends = 0.02 / 2.0 ** np.arange(5 if full else 4), []
+    for h in steps:
+        ends.append(nodes(run(problem, scheme, h, round(1 / h), save_every=round(1 / h)))[-1])
+    order = vm.diagnostics.observed_order(steps[:-2], [difference(a, ends[-1]) for a in ends[:-2]])
+    return Outcome(
+        f"t = {t_end:g}: {status(trajectory)}, |g| {position:.1e}, energy error {change.band:.1e} of the fall; order {order:.2f} "
+        "on t <= 1",
+        position < 1e-12 and change.band < 1e-2 and abs(order - 2) < 0.2,
+        {"constraint": position, "band": change.band, "order": order},
+    )
+
+
+def _energy_picture(trajectory: vm.Trajectory) -> dict:
+    e = np.asarray(trajectory.energy)
+    return {"t": trajectory.t, "energy error": e - e[0]}
+
+
+LONG_RUNS = (
+    Case(
+        16,
+        "constraints for long",
+        "triple pendulum, fully_implicit, num_micro 5, H = 0.01, 1e6 steps",
+        "position constraint below 1e-12, relative energy shift below 1e-6 per 1e5 steps; no drift seen in chaotic motion",
+        constraints_for_long,
+    ),
+    Case(
+        17,
+        "energy for long",
+        "FPU chain, fully_implicit, num_micro 10, H = 0.03, 1e6 steps",
+        "energy band of the whole run at most twice that of its first tenth",
+        energy_for_long,
+    ),
+    Case(
+        18,
+        "loose Newton tolerance",
+        "case 17 with tolerance 1e-4, 1e-8, 1e-12",
+        "drift shrinks with the tolerance, the default shows none",
+        loose_tolerance,
+    ),
+)
+CHAOS = Case(
+    20,
+    "chaotic pendulum",
+    "triple pendulum, upright but for 1e-3, t = 100",
+    "constraints below 1e-12, energy error below 1 % of the fall; order 2 on t <= 1",
+    chaotic_pendulum,
+)

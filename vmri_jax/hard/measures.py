@@ -1,0 +1,149 @@
+"""What the cases measure: energy band and drift, constraints, iterations, conditioning, reversal."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+import vmri_jax as vm
+from vmri_jax.equations import StepEquations
+from vmri_jax.linearization import apply, linearize
+
+SAVED = 10_000
+"""About as many nodes of a long run are kept."""
+
+
+def run(problem: vm.Problem, scheme, macro_dt, num_steps: int, **options: Any) -> vm.Trajectory:
+    """`vmri_jax.simulate` from the problem's start; a failure is in the trajectory and not raised."""
+    state = problem.state()
+    return vm.simulate(problem.system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
+
+
+def long_run(problem: vm.Problem, scheme, macro_dt, num_steps: int, **options) -> vm.Trajectory:
+    """`run` that saves about `SAVED` nodes."""
+    return run(problem, scheme, macro_dt, num_steps, save_every=max(1, num_steps // SAVED), **options)
+
+
+def status(trajectory: vm.Trajectory) -> str:
+    """The status of a run in words."""
+    name = vm.Result(int(trajectory.result)).name
+    return name if trajectory.success else f"{name} at step {int(trajectory.failed_at)}"
+
+
+def iterations(trajectory: vm.Trajectory) -> int:
+    """The most iterations of a step."""
+    return int(np.max(np.asarray(trajectory.info.iterations)))
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energy of a run against its start.
+
+    band: largest deviation from the start.
+    jump: largest change from one saved node to the next.
+    drift: slope of a straight line, per 1e5 steps.
+    share: change along that line over the whole run, as a share of the band.
+    """
+
+    band: float
+    jump: float
+    drift: float
+    share: float
+
+    @property
+    def drifts(self) -> bool:
+        """Whether a line explains more than half of the band: chaotic motion alone moves the mean by a tenth or two."""
+        return not self.share <= 0.5
+
+
+def energy(trajectory: vm.Trajectory, num_steps: int, scale: float = 1.0) -> Energy:
+    """Band, largest jump and drift of the energy over a run of `num_steps` steps, in units of `scale`.
+
+    All are infinite where the run failed.
+    """
+    e = (np.asarray(trajectory.energy) - float(trajectory.energy[0])) / scale
+    if not np.isfinite(e).all():
+        return Energy(np.inf, np.inf, np.inf, np.inf)
+    band = float(np.abs(e).max())
+    change = float(np.polyfit(np.linspace(0.0, 1.0, len(e)), e, 1)[0])
+    share = abs(change) / band if band else 0.0
+    return Energy(band, float(np.abs(np.diff(e)).max()), change / num_steps * 1e5, share)
+
+
+def smooth_shift(trajectory: vm.Trajectory, num_steps: int, scale: float = 1.0) -> float:
+    """Change of the mean energy per 1e5 steps, between the halves of a run, for motion that is quasi-periodic.
+
+    The means are weighted by ``exp(-1 / (x (1 - x)))``, x from 0 to 1: they converge faster than any power of the length
+    (Das, Saiki, Sander and Yorke 2017), so that the shift is not hidden by oscillations.
+    """
+    e = np.asarray(trajectory.energy) / scale
+    half = len(e) // 2
+    x = (np.arange(half) + 0.5) / half
+    weights = np.exp(-1 / (x * (1 - x)))
+    return float(weights @ (e[-half:] - e[:half]) / weights.sum() / (num_steps - num_steps / 2) * 1e5)
+
+
+def energy_scale(problem: vm.Problem, trajectory: vm.Trajectory) -> float:
+    """Size of the energies of a run: the larger of ``|E_0|`` and the largest kinetic energy, at least 1e-300."""
+    still = problem.system.replace(slow_potential=None, fast_potential=None)
+    kinetic = jax.vmap(partial(vm.diagnostics.energy, still))
+    phase = (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)
+    return max(float(np.nanmax(kinetic(*phase))), float(abs(trajectory.energy[0])), 1e-300)
+
+
+def constraints(trajectory: vm.Trajectory) -> tuple[float, float]:
+    """Largest ``|g|`` and ``|G v|`` of a run; infinite where it failed."""
+    position, velocity = np.nan_to_num(np.asarray(trajectory.constraint_residual), nan=np.inf).max(axis=0)
+    return float(position), float(velocity)
+
+
+def nodes(trajectory: vm.Trajectory) -> np.ndarray:
+    """(k, n) positions at the saved nodes, slow first."""
+    return np.concatenate([trajectory.q_s, trajectory.q_f], axis=1)
+
+
+def difference(a, b) -> float:
+    """Largest absolute difference of two arrays; infinite if one is not finite."""
+    return float(np.max(np.nan_to_num(np.abs(np.asarray(a) - np.asarray(b)), nan=np.inf), initial=0.0))
+
+
+def reversal(problem: vm.Problem, scheme, macro_dt, num_steps: int) -> float:
+    """Distance from the start after `num_steps` there and, with momenta turned around, as many back."""
+    there = run(problem, scheme, macro_dt, num_steps, save_every=num_steps)
+    if not there.success:
+        return np.inf
+    end = there.final_state
+    turned = vm.State(0.0, end.q_s, end.q_f, -end.p_s, -end.p_f)
+    back = vm.simulate(
+        problem.system, scheme, turned, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps, throw=False
+    )
+    return difference(nodes(back)[-1], nodes(there)[0])
+
+
+@jax.jit
+def _newton_matrix(system, scheme, state, macro_dt):
+    equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
+    v_s, v_f = vm.diagnostics.velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    x = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
+    blocks, (flat, unravel) = linearize(equations, x), ravel_pytree(x)
+    return jax.vmap(lambda e: ravel_pytree(apply(blocks, unravel(e)))[0])(jnp.eye(flat.size)).T
+
+
+def scaled_condition(system: vm.System, scheme: vm.Scheme, state: vm.State, macro_dt, sweeps: int = 10) -> float:
+    """Condition number of the Newton matrix of a macro step, rows and columns scaled to length one.
+
+    The matrix is that of the first iteration from straight motion; it is dense here, so take few micro steps. Scaling is
+    by square roots of the lengths, again and again (Ruiz 2001).
+    """
+    a = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
+    for _ in range(sweeps):
+        rows, columns = np.linalg.norm(a, axis=1), np.linalg.norm(a, axis=0)
+        if not (np.isfinite(a).all() and rows.all() and columns.all()):
+            return np.inf
+        a = a / np.sqrt(rows[:, None] * columns)
+    return float(np.linalg.cond(a))

@@ -1,0 +1,201 @@
+"""The hard cases that make sense for any system, with steps chosen from its frequencies."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.hard.case import Case, Outcome
+from vmri_jax.hard.guards import bad_lane, single_precision
+from vmri_jax.hard.measures import (
+    constraints,
+    difference,
+    energy,
+    energy_scale,
+    long_run,
+    nodes,
+    reversal,
+    run,
+    scaled_condition,
+    status,
+)
+from vmri_jax.hard.scales import apart_from, midpoint_integrator, rattle
+from vmri_jax.stability import advise
+
+NUM_MICRO = 5
+PHASE = 0.2
+"""omega h of the fastest vibration: resolved, and omega H = 1 well below the first resonance."""
+
+
+@dataclass(frozen=True)
+class OwnSystem:
+    """A problem with a scheme and a step that resolve its fastest vibration; every method is a case."""
+
+    problem: vm.Problem
+    scheme: vm.Scheme
+    macro_dt: float
+    omega: float
+
+    def rank(self, full: bool) -> Outcome:
+        state, system = self.problem.state(), self.problem.system
+        trajectory = run(self.problem, self.scheme, self.macro_dt, 10_000 if full else 1_000, save_every=10)
+        jacobians = jax.jit(jax.vmap(jax.jacrev(system.constraints, argnums=(0, 1))))(trajectory.q_s, trajectory.q_f)
+        rows = np.concatenate([np.asarray(a) for a in jacobians], axis=2)
+        rows = rows[np.isfinite(rows).all(axis=(1, 2))]
+        rows = rows / np.linalg.norm(rows, axis=2, keepdims=True)
+        smallest = np.linalg.svd(rows, compute_uv=False)[:, -1]
+        return Outcome(
+            f"{sum(system.num_constraints(state.q_s, state.q_f))} rows; smallest singular value of the scaled rows "
+            f"{smallest[0]:.1e} at the start, {smallest.min():.1e} on the way; {status(trajectory)}",
+            trajectory.success and smallest.min() > 1e-8,
+            {"at_start": smallest[0], "least": smallest.min()},
+        )
+
+    def constraints(self, full: bool) -> Outcome:
+        steps = 1_000_000 if full else 10_000
+        trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)
+        position, velocity = constraints(trajectory)
+        return Outcome(
+            f"{steps:.0e} steps: {status(trajectory)}, |g| {position:.1e}, |G v| {velocity:.1e}",
+            trajectory.success and position < 1e-10,
+            {"constraint": position, "velocity_constraint": velocity},
+        )
+
+    def energy(self, full: bool) -> Outcome:
+        steps = 1_000_000 if full else 10_000
+        trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)
+        change = energy(trajectory, steps, energy_scale(self.problem, trajectory))
+        e = np.asarray(trajectory.energy)
+        return Outcome(
+            f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per 1e5 steps "
+            f"({change.share:.0%} of the band over the run)",
+            trajectory.success and not (change.drifts and change.band > 1e-9),
+            {"band": change.band, "drift_per_1e5": change.drift},
+            {"t": trajectory.t, "energy error": e - e[0]},
+        )
+
+    def tolerance(self, full: bool) -> Outcome:
+        steps, ends = 1_000 if full else 100, {}
+        for tolerance in (1e-4, 1e-8, 1e-12):
+            newton = vm.Newton(tolerance=tolerance)
+            trajectory = run(self.problem, self.scheme, self.macro_dt, steps, save_every=steps, newton=newton)
+            ends[tolerance] = nodes(trajectory)[-1]
+        size = np.abs(ends[1e-12]).max()
+        loose, middle = (difference(ends[t], ends[1e-12]) / size for t in (1e-4, 1e-8))
+        return Outcome(
+            f"after {steps} steps from the run at 1e-12: {loose:.0e} at 1e-4, {middle:.0e} at 1e-8",
+            np.isfinite(loose) and middle <= max(loose, 1e-10) and middle < 1e-3,
+            {"apart_1e-4": loose, "apart_1e-8": middle},
+        )
+
+    def tiny_steps(self, full: bool) -> Outcome:
+        state, steps = self.problem.state(), self.macro_dt * 10.0 ** -np.arange(0, 6 if full else 5, 2)
+        conditions = [scaled_condition(self.problem.system, self.scheme, state, h) for h in steps]
+        words = ", ".join(f"{c:.3g} at H = {h:.0e}" for c, h in zip(conditions, steps, strict=True))
+        return Outcome(
+            f"scaled condition {words}",
+            np.isfinite(conditions).all() and conditions[-1] < 1.5 * conditions[1],
+            {f"condition_{h:.0e}": c for h, c in zip(steps, conditions, strict=True)},
+        )
+
+    def reversal(self, full: bool) -> Outcome:
+        steps = 1_000 if full else 100
+        size = max(float(jnp.max(jnp.abs(q), initial=0.0)) for q in (self.problem.q_s, self.problem.q_f))
+        apart = reversal(self.problem, self.scheme, self.macro_dt, steps) / max(size, 1e-300)
+        return Outcome(f"{steps} steps there and back: {apart:.0e} from the start", apart < 1e-6, {"apart": apart})
+
+    def explicit_limit(self, full: bool) -> Outcome:
+        steps = 10_000 if full else 1_000
+        below, beyond = (
+            run(self.problem, vm.fully_explicit(1), wh / self.omega, steps, save_every=10) for wh in (1.0, 2.5)
+        )
+        bounded = energy(below, steps, energy_scale(self.problem, below)).band
+        finite = all(bool(jnp.isfinite(r.energy).all()) == bool(r.success) for r in (below, beyond))
+        return Outcome(
+            f"omega h = 1: {status(below)}, relative energy error {bounded:.1e}; 2.5: {status(beyond)}",
+            below.success and finite,
+            {"band_below": bounded, "failed_at_beyond": beyond.failed_at},
+        )
+
+    def reductions(self, full: bool) -> Outcome:
+        h, steps, values = 0.1 / self.omega, 100 if full else 20, {}
+        free = self.problem.system.constraint is self.problem.system.slow_constraint is None
+        if free:
+            values["midpoint"] = apart_from(midpoint_integrator, self.problem, vm.fully_implicit(1), h, steps)
+        values["Verlet" if free else "RATTLE"] = apart_from(rattle, self.problem, vm.fully_explicit(1), h, steps)
+        words = ", ".join(f"{name} {value:.0e}" for name, value in values.items())
+        return Outcome(f"from the known method after {steps} steps: {words}", max(values.values()) < 1e-10, values)
+
+    def advice(self, full: bool) -> Outcome:
+        advice = advise(self.problem.system, self.scheme, self.problem.state(), self.macro_dt)
+        return Outcome(str(advice).replace("\n", "; "), advice.ok, {"safe_macro_dt": advice.safe_macro_dt})
+
+    def single_precision(self, full: bool) -> Outcome:
+        return single_precision(self.problem, self.macro_dt)
+
+    def bad_lane(self, full: bool) -> Outcome:
+        return bad_lane(self.problem, self.scheme, self.macro_dt, 20, vm.Newton(), lanes=64 if full else 16)
+
+
+def own_system(problem: vm.Problem) -> OwnSystem:
+    """A problem with five micro steps of ``omega h = 0.2`` for its fastest frequency at the start.
+
+    Where nothing vibrates, omega is the rate at which positions would change by their own size.
+
+    Raises:
+        ValueError: the problem is refused by `initial_state`.
+    """
+    state = problem.state()
+    omega = float(vm.diagnostics.frequencies(problem.system, state)[0])
+    if not omega > 0:
+        ahead = run(problem, vm.fully_implicit(1), 1e-3, 1)  # what forces do to velocities that may be zero
+        position, moved = nodes(ahead)
+        momentum = [np.concatenate([p, q]) for p, q in zip(ahead.p_s, ahead.p_f, strict=True)]
+        push = np.abs(momentum[1] - momentum[0]).max() / 1e-3 / max(np.abs(momentum).max(), 1e-300)
+        omega = max(np.abs(moved - position).max() / 1e-3 / max(np.abs(position).max(), 1e-300), min(push, 1e3), 1e-3)
+    return OwnSystem(problem, vm.fully_implicit(NUM_MICRO), NUM_MICRO * PHASE / omega, omega)
+
+
+def cases_for(problem: vm.Problem) -> tuple[Case, ...]:
+    """The hard cases that a system can be put to: those without sense for it, e.g. constraints it lacks, are left out."""
+    own, system = own_system(problem), problem.system
+    constrained = not (system.constraint is system.slow_constraint is None)
+    diagonal = isinstance(system.kinetic, vm.ConstantMass) and system.kinetic.slow.ndim == system.kinetic.fast.ndim == 1
+    free = system.force is None
+    step = f"fully_implicit, num_micro {NUM_MICRO}, H = {own.macro_dt:.3g}"
+    one = f"num_micro 1, omega = {own.omega:.3g}"
+    offered = (
+        (True, "advice", step, "no error, no warning", own.advice),
+        (constrained, "rank of the constraints", step, "rows independent at the start and on the way", own.rank),
+        (constrained, "constraints for long", step, "position constraint below 1e-10", own.constraints),
+        (
+            free,
+            "energy for long",
+            step,
+            "no line explains more than half of the band, or the band is below 1e-9",
+            own.energy,
+        ),
+        (True, "loose Newton tolerance", f"{step}, 1e-4 to 1e-12", "error shrinks with the tolerance", own.tolerance),
+        (True, "tiny steps", f"{step} and smaller", "scaled condition flat", own.tiny_steps),
+        (free, "reversibility", step, "back at the start to 1e-6", own.reversal),
+        (
+            diagonal and free and not constrained,
+            "explicit limit",
+            f"fully_explicit, {one}",
+            "runs at omega h = 1, and at 2.5 no NaN without a failure",
+            own.explicit_limit,
+        ),
+        (diagonal and free, "reductions", one, "known methods to 1e-10", own.reductions),
+        (True, "float32", "64-bit mode off, and float32 data", "refused with the one-line fix", own.single_precision),
+        (
+            True,
+            "one bad lane in a batch",
+            step,
+            "the bad lane reports its failure, the others equal their single runs to 1e-12",
+            own.bad_lane,
+        ),
+    )
+    wanted = [row[1:] for row in offered if row[0]]
+    return tuple(Case(k, *row) for k, row in enumerate(wanted, start=1))

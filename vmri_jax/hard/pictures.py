@@ -1,0 +1,93 @@
+"""Pictures of the cases where one helps: energy over long runs, growth over omega H, linkages at their singularity."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from vmri_jax import plots
+
+Details = Mapping[str, np.ndarray]
+
+
+def pictures(details: Mapping[str, Details], theme: plots.Theme = plots.LIGHT) -> dict[str, Figure]:
+    """Figures by name of the cases, given by title, whose details are there."""
+    return {name: draw(details[title], theme) for title, (name, draw) in PICTURES.items() if details.get(title)}
+
+
+def _energy(details: Details, theme: plots.Theme) -> Figure:
+    """Energy error against time, one curve per run; every curve as the band that it fills."""
+    runs = [name.removeprefix("t") for name in details if name == "t" or name.startswith("t ")]
+    with plots.style(theme):
+        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+        axes = figure.subplots()
+        for name, color in zip(runs, theme.curves, strict=False):
+            t, e = details[f"t{name}"], details[f"energy error{name}"]
+            size = max(1, len(t) // 400)
+            count = len(t) // size
+            e = e[: count * size].reshape(count, size)
+            label = f"tolerance{name}" if name else None
+            axes.fill_between(
+                t[: count * size : size], e.min(axis=1), e.max(axis=1), color=color, alpha=0.8, lw=0.6, label=label
+            )
+        axes.set(xlabel="time", ylabel=r"energy error $E - E_0$", xlim=(0, details[f"t{runs[0]}"][-1]))
+        if len(runs) > 1:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _growth(details: Details, theme: plots.Theme) -> Figure:
+    """Growth per macro step of the linear model over omega H / pi, one curve per num_micro."""
+    omega_H = details["omega_H"] / np.pi
+    with plots.style(theme):
+        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+        axes = figure.subplots()
+        for (name, growth), color in zip(details.items(), theme.curves, strict=False):
+            if name != "omega_H":
+                axes.plot(omega_H, np.where(growth > 0, growth, np.nan), color=color, label=name)
+        for k in range(1, round(omega_H[-1]) + 1):
+            axes.axvline(k, color=theme.ink, linewidth=0.5, linestyle=":", zorder=0)
+        axes.set(xlabel=r"$\omega H / \pi$", ylabel="growth per macro step", yscale="log", xlim=(0, omega_H[-1]))
+        axes.legend(title="num_micro", loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _singular(details: Details, theme: plots.Theme) -> Figure:
+    """Height of the crank through the collinear position, and the falling chain, started straight."""
+    with plots.style(theme):
+        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+        left, right = figure.subplots(1, 2)
+        left.plot(details["t"], details["height"], color=theme.curves[0])
+        left.axhline(0.0, color=theme.ink, linewidth=0.5, linestyle=":")
+        left.set(xlabel="time", ylabel="height of the crank", title="four-bar linkage, collinear at 0")
+        shapes = details["chain"].reshape(len(details["chain"]), -1, 2)
+        for k, points in enumerate(shapes):
+            last = k == len(shapes) - 1
+            color = theme.curves[1] if last else theme.curves[0]
+            right.plot(*points.T, color=color, linewidth=1.3 if last else 0.7, alpha=1.0 if last else 0.6)
+        right.set(xlabel="x", ylabel="y", title="chain, started straight", aspect="equal")
+    return figure
+
+
+def _oscillatory_energies(details: Details, theme: plots.Theme) -> Figure:
+    """Oscillatory energies of the three stiff springs, large steps over resolved ones."""
+    with plots.style(theme):
+        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+        axes = figure.subplots()
+        for i, color in zip(range(2), theme.curves, strict=False):
+            axes.plot(details["t"], details["fine"][:, i], color=color, linewidth=0.7, alpha=0.5)
+            axes.plot(details["t"], details["coarse"][:, i], color=color, linewidth=1.0, label=f"$I_{i + 1}$")
+        axes.set(xlabel="time", ylabel="oscillatory energy", xlim=(0, details["t"][-1]))
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+PICTURES: dict[str, tuple[str, Callable[[Details, plots.Theme], Figure]]] = {
+    "impulse resonance": ("impulse_resonance", _growth),
+    "singular configuration": ("singular_configuration", _singular),
+    "constraints for long": ("energy_triple_pendulum", _energy),
+    "energy for long": ("energy_long_run", _energy),
+    "loose Newton tolerance": ("energy_tolerance", _energy),
+    "three scales": ("three_scales", _oscillatory_energies),
+}
+"""By title of the case: name of the picture, and how it is drawn."""
