@@ -19,20 +19,21 @@ class Place(NamedTuple):
     size: int
 
 
-def layout(bodies: Sequence[Body], paces: Mapping[str, str]) -> dict[str, Place]:
+def layout(bodies: Mapping[str, Body], paces: Mapping[str, str]) -> dict[str, Place]:
     """The place of every body: slow ones in order in q_s, fast ones in order in q_f."""
     ends: dict[Part, int] = {"s": 0, "f": 0}
     places = {}
-    for body in bodies:
-        part: Part = "f" if paces[body.name] == "fast" else "s"
-        places[body.name] = Place(part, ends[part], body.size)
+    for name, body in bodies.items():
+        part: Part = "f" if paces[name] == "fast" else "s"
+        places[name] = Place(part, ends[part], body.size)
         ends[part] += body.size
     return places
 
 
-def join(bodies: Sequence[Body], places: Mapping[str, Place], part: Part, what: str):
+def join(bodies: Mapping[str, Body], places: Mapping[str, Place], part: Part, what: str):
     """One vector of all slow or of all fast bodies: their "position", "velocity" or "mass"."""
-    pieces = [jnp.broadcast_to(getattr(body, what), (body.size,)) for body in bodies if places[body.name].part == part]
+    members = [body for name, body in bodies.items() if places[name].part == part]
+    pieces = [jnp.broadcast_to(getattr(body, what), (body.size,)) for body in members]
     return jnp.concatenate(pieces) if pieces else jnp.zeros(0)
 
 
@@ -70,13 +71,13 @@ class Rows:
     def take(self, q_s, q_f):
         """The rows of these vectors, positions or velocities."""
         pieces = [self._take(run, q_s if run.part == "s" else q_f) for run in self.runs]
-        rows = pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
-        return rows[0] if self.single else rows
+        flat = pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
+        return flat if self.single else flat.reshape(-1, self.size)
 
     def _take(self, run: Run, q):
         stop = run.start + self.size * (1 if run.same else run.count)
-        rows = (q if run.start == 0 and stop == q.shape[0] else q[run.start : stop]).reshape(-1, self.size)
-        return jnp.broadcast_to(rows, (run.count, self.size)) if run.same else rows
+        piece = q if run.start == 0 and stop == q.shape[0] else q[run.start : stop]
+        return jnp.tile(piece, run.count) if run.same else piece
 
     def put(self, rows, n_s: int, n_f: int):
         """The transpose of `take`: vectors (n_s,), (n_f,) with these rows added at their places, None where there are none."""

@@ -1,27 +1,23 @@
 """Scenes: bodies and the effects between them, turned into an ordinary `System`."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+from vmri_jax.composition import Composition
 from vmri_jax.scene import drawing as drawings
+from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect, unknown
 from vmri_jax.scene.layout import Place, join, layout
+from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints
-from vmri_jax.scene.sorting import Placed, Sorting, sort
-from vmri_jax.scene.terms import (
-    MASS,
-    FastPotential,
-    KineticEnergy,
-    MacroConstraint,
-    MicroConstraint,
-    SlowPotential,
-    TotalForce,
-)
+from vmri_jax.scene.sorting import Sorting, sort
+from vmri_jax.scene.terms import MASS
+from vmri_jax.scheme import Scheme
 from vmri_jax.state import State
-from vmri_jax.system import ConstantMass, Problem, System
+from vmri_jax.system import Problem, System
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +89,7 @@ class Scene:
     @cached_property
     def places(self) -> dict[str, Place]:
         """Where each body's coordinates are in q_s and q_f."""
-        return layout(self.bodies, {name: pace.value for name, pace in self.sorting.paces.items()})
+        return layout(self.by_name, {name: pace.value for name, pace in self.sorting.paces.items()})
 
     @property
     def params(self) -> dict[str, Any]:
@@ -102,11 +98,13 @@ class Scene:
 
     def system(self) -> System:
         """The system: ``T - V - W`` with constraints and forces, each None where no effect calls for it."""
-        return build(self, self.sorting.placed)
+        return build(self.by_name, self.places, self.sorting.placed)
 
     def problem(self) -> Problem:
         """The system with positions and velocities at the start."""
-        start = [join(self.bodies, self.places, part, what) for what in ("position", "velocity") for part in ("s", "f")]
+        start = [
+            join(self.by_name, self.places, part, what) for what in ("position", "velocity") for part in ("s", "f")
+        ]
         return Problem(self.system(), *start)
 
     def state(self) -> State:
@@ -148,6 +146,15 @@ class Scene:
         changed = list(items.values())
         return Scene(changed[: len(self.bodies)], changed[len(self.bodies) :])
 
+    def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
+        """What every body and effect adds to a macro step of a scheme: where it lives, unknowns, evaluations, and its cost.
+
+        Args:
+            macro_dt: step that is measured; by default micro steps of a tenth of the fastest vibration's radian.
+            measure: compile the scene without each effect in turn and time it; without, the ledger costs nothing.
+        """
+        return ledger(self, scheme, macro_dt, measure)
+
     def drawing(self) -> dict[str, list]:
         """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.scene.drawing`."""
         return drawings.drawing(self.by_name, self.effects, self.places)
@@ -157,33 +164,3 @@ class Scene:
         for name in names:
             if name not in known:
                 raise ValueError(f"Scene.{what}: {unknown('effect', name, known)}")
-
-
-def build(scene: Scene, placed: Iterable[Placed]) -> System:
-    """The system of a scene's bodies with some of its effects at their places."""
-    bodies, places, placed = scene.by_name, scene.places, tuple(placed)
-    potentials = {}
-    terms: dict[str, list] = {}
-    for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):  # forces may build on potentials
-        made = part.effect.terms(part.elements, bodies, places, potentials)
-        if part.effect.kind == "potential":
-            potentials[part.effect.name] = (*potentials.get(part.effect.name, ()), *made)
-        terms.setdefault(part.home, []).extend(made)
-
-    def made_of(home: str, function):
-        return function(tuple(terms[home])) if terms.get(home) else None
-
-    params = {part.effect.name: part.effect.parameters(bodies) for part in placed}
-    slow, fast = (join(scene.bodies, places, part, "mass") for part in ("s", "f"))
-    kinetic = made_of("kinetic", KineticEnergy)
-    if kinetic is not None:
-        params[MASS] = {"slow": slow, "fast": fast}
-    return System(
-        ConstantMass(slow, fast) if kinetic is None else kinetic,
-        slow_potential=made_of("slow_potential", SlowPotential),
-        fast_potential=made_of("fast_potential", FastPotential),
-        constraint=made_of("constraint", MicroConstraint),
-        slow_constraint=made_of("slow_constraint", MacroConstraint),
-        force=made_of("force", TotalForce),
-        params=params,
-    )

@@ -13,7 +13,8 @@ def weight(q, params):
     """``V = -sum_i m_i g . q_i``, for a number g downwards along the last axis."""
     (q,), g = q, params["acceleration"]
     if jnp.ndim(g) == 0:
-        return g * jnp.sum(params["mass"] * q[..., -1])
+        last = q.shape[-1] - 1
+        return g * jnp.sum(params["mass"] * q.reshape(-1)[last :: last + 1])
     return -jnp.sum(params["mass"] * jnp.sum(g * q, axis=-1))
 
 

@@ -57,10 +57,10 @@ class RigidLink(Effect):
         self.require_positive(length=length)
         start = distances(elements, bodies)
         if is_concrete((length, start)):
-            for (a, b), l, d in zip(elements, *np.broadcast_arrays(*map(np.atleast_1d, (length, start))), strict=True):
-                self.require(
-                    abs(l - d) <= START * l, f"the link {a}-{b}", f"{l:g} long", f"{a} and {b} start {d:.12g} apart"
-                )
+            found = zip(elements, *np.broadcast_arrays(*map(np.atleast_1d, (length, start))), strict=True)
+            for (a, b), given, apart in found:
+                right = abs(given - apart) <= START * given
+                self.require(right, f"the link {a}-{b}", f"{given:g} long", f"{a} and {b} start {apart:.12g} apart")
 
     def drawing(self, bodies):
         return {"links": [list(element) for element in self.elements(bodies)]}
