@@ -1,3 +1,5 @@
+# pyright: reportOptionalCall=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false, reportOptionalOperand=false
 """Scenes: sorting, composition, structure that is compared by value, parameters, drawing, the ledger."""
 
 import dataclasses
@@ -104,10 +106,10 @@ def test_same_structure_is_compiled_once():
         scene.without("gravity").replace("springs", stiffness=3000.0),
     ):
         step(other.system(), other.state())
-    assert len(traces) == 2  # with and without gravity
+    assert len(traces) == 2  # with gravity and without
     params = jax.tree.map(lambda leaf: leaf, scene.params)
     for stiffness in (1.0, 2e4):  # even where the scene would sort differently
-        params["springs"]["stiffness"] = jnp.asarray(stiffness)
+        params["springs"]["stiffness"] = jnp.asarray(stiffness, dtype=float)
         step(scene.system().replace(params=params), scene.state())
     assert len(traces) == 2
     assert hash(scene.system().slow_potential) == hash(triple_spherical_pendulum().system().slow_potential)
@@ -122,7 +124,7 @@ def test_gradient_by_a_parameter():
 
     slope = jax.jit(jax.grad(height))(5000.0)
     value = jax.jit(height)
-    assert slope == pytest.approx((value(5010.0) - value(4990.0)) / 20, rel=1e-5)  # measured 2e-9
+    assert slope == pytest.approx(float(value(5010.0) - value(4990.0)) / 20, rel=1e-5)  # measured 2e-9
 
 
 def counting(counts, name):
@@ -173,7 +175,11 @@ def test_own_effects_are_a_function_and_one_line():
 
 
 def test_bodies_of_different_dimension_share_an_effect_on_single_ones():
-    bodies = [Body("a", 2.0, [0.0, 5.0], [1.0, 2.0]), Body("b", 3.0, [7.0], [3.0]), Body("c", 1.0, [1.0, 1.0], [1.0, 1.0])]
+    bodies = [
+        Body("a", 2.0, [0.0, 5.0], [1.0, 2.0]),
+        Body("b", 3.0, [7.0], [3.0]),
+        Body("c", 1.0, [1.0, 1.0], [1.0, 1.0]),
+    ]
     scene = Scene(bodies, [Gravity(10.0), LinearDamping([0.1, 0.2, 0.3])])
     q, v = (jnp.concatenate([getattr(body, what) for body in bodies]) for what in ("position", "velocity"))
     none = jnp.zeros(0)
@@ -221,7 +227,11 @@ def test_rayleigh_damping_is_the_matrix():
 
 def test_drawing_is_plain_data():
     scene = Scene(
-        [Body("a", 1.0, [0.0, 1.0], pace="fast"), Body("b", 1.0, [1.0, 1.0], pace="slow"), Body("block", 1.0, np.ones(4))],
+        [
+            Body("a", 1.0, [0.0, 1.0], pace="fast"),
+            Body("b", 1.0, [1.0, 1.0], pace="slow"),
+            Body("block", 1.0, np.ones(4)),
+        ],
         [
             RigidLink(("a", "b")),
             SpringAnchor("b", [0.0, 0.0], 3.0, 1.0),

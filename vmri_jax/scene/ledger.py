@@ -59,7 +59,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Program:
-    """A compiled scene: instructions of the optimised program by name, temporary bytes, microseconds per macro step."""
+    """A compiled scene: instructions of the optimised program, temporary bytes, microseconds per macro step."""
 
     operations: int
     temporary_bytes: int
@@ -120,10 +120,7 @@ def ledger(scene: "Scene", scheme: Scheme | Composition, macro_dt: float | None,
         rows.append(
             Row(name, "body", grid, f"{pace.value}: {pace.reason}", intervals[grid] * scene.by_name[name].size, 0, 0)
         )
-    shares: dict[str, tuple] = {}
-    programs: tuple = ()
-    if measure:
-        *programs, shares = _measure(scene, scheme, macro_dt)
+    whole, bare, shares = _measure(scene, scheme, macro_dt) if measure else (None, None, {})
     for part in scene.sorting.placed:
         placed = (
             one.slow
@@ -133,7 +130,7 @@ def ledger(scene: "Scene", scheme: Scheme | Composition, macro_dt: float | None,
             else getattr(one, part.home)
         )
         alone = build(scene.by_name, scene.places, [part])
-        values = sum(alone.num_constraints(*_starts(scene, alone)[:2]))
+        values = sum(alone.num_constraints(*_starts(scene)[:2]))
         count = stages * evaluations(placed, one.num_micro)
         rows.append(
             Row(
@@ -147,16 +144,18 @@ def ledger(scene: "Scene", scheme: Scheme | Composition, macro_dt: float | None,
                 *shares.get(part.effect.name, (None, None)),
             )
         )
-    return Ledger(tuple(rows), *programs)
+    return Ledger(tuple(rows), whole, bare)
 
 
 def evaluations(placed, num_micro: int) -> int:
     """Nodes of a rule in a macro step, one at the border of two steps counted once."""
     nodes = placed.composite(num_micro).nodes
-    return len(nodes) - (np.isclose(nodes[0], 0.0) and np.isclose(nodes[-1], 1.0))
+    shared = np.isclose(nodes[0], 0.0) and np.isclose(nodes[-1], 1.0)
+    return len(nodes) - int(shared)
 
 
-def _starts(scene, system: System) -> tuple:
+def _starts(scene) -> tuple:
+    """(q_s, q_f, v_s, v_f) of the scene."""
     problem = scene.problem()
     return problem.q_s, problem.q_f, problem.v_s, problem.v_f
 
@@ -165,25 +164,29 @@ def _measure(scene, scheme, macro_dt) -> tuple[Program, Program, dict]:
     """The scene's program, that of its bodies alone, and shares of operations and time by effect."""
     from vmri_jax.study.timing import interleaved
 
-    names = [effect.name for effect in scene.effects]
-    systems = {"": scene.system(), None: build(scene.by_name, scene.places, ())}
-    for name in names:
-        kept = [part for part in scene.sorting.placed if part.effect.name != name]
-        systems[name] = build(scene.by_name, scene.places, kept)
-    states = {name: initial_state(system, *_starts(scene, system)) for name, system in systems.items()}
+    placed, whole, bare = scene.sorting.placed, "whole", "bare"
+    names = {effect.name: f"without {effect.name}" for effect in scene.effects}
+    kept = {key: [part for part in placed if part.effect.name != name] for name, key in names.items()}
+    kept |= {whole: list(placed), bare: []}
+    systems = {key: build(scene.by_name, scene.places, parts) for key, parts in kept.items()}
+    states = {key: initial_state(system, *_starts(scene)) for key, system in systems.items()}
     if macro_dt is None:
-        fastest = float(frequencies(systems[""], states[""])[0])
+        fastest = float(frequencies(systems[whole], states[whole])[0])
         macro_dt = scheme.num_micro * 0.1 / fastest if fastest > 0 else 0.01
-    compiled = {name: compile_run(system, scheme, states[name], macro_dt) for name, system in systems.items()}
-    arguments = {name: (system, scheme, states[name], macro_dt) for name, system in systems.items()}
-    runs = {name: partial(program, *arguments[name]) for name, program in compiled.items()}
-    seconds = {name: float(np.median(times)) for name, times in interleaved(runs, 5).items()}
-    sizes = {name: sum(operations(program).values()) for name, program in compiled.items()}
-    shares = {name: (1 - sizes[name] / sizes[""], 1 - seconds[name] / seconds[""]) for name in names}
-    whole, bare = (
-        Program(sizes[name], temporary_bytes(compiled[name]), 1e6 * seconds[name] / STEPS) for name in ("", None)
-    )
-    return whole, bare, shares
+    arguments = {key: (system, scheme, states[key], macro_dt) for key, system in systems.items()}
+    compiled = {key: compile_run(*some) for key, some in arguments.items()}
+    times = interleaved({key: partial(compiled[key], *some) for key, some in arguments.items()}, 5)
+
+    def program(key: str) -> Program:
+        us = 1e6 * float(np.median(times[key])) / STEPS
+        return Program(sum(operations(compiled[key]).values()), temporary_bytes(compiled[key]), us)
+
+    of = {key: program(key) for key in systems}
+    shares = {
+        name: (1 - of[key].operations / of[whole].operations, 1 - of[key].microseconds / of[whole].microseconds)
+        for name, key in names.items()
+    }
+    return of[whole], of[bare], shares
 
 
 def compile_run(system: System, scheme: Scheme | Composition, state, macro_dt):

@@ -70,10 +70,10 @@ class TangentDamping:
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates."""
 
-        def gradient(q_s, q_f):
-            return jax.grad(lambda q: total([term.value(*q, params) for term in self.terms]))((q_s, q_f))
+        def energy(q):
+            return total([term.value(*q, params) for term in self.terms])
 
-        rates = jax.jvp(gradient, (q_s, q_f), (v_s, v_f))[1]
+        rates = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
         return tuple(-params[self.name]["stiffness"] * rate for rate in rates)
 
 
@@ -150,7 +150,7 @@ class KineticEnergy:
     def __call__(self, q_s, q_f, v_s, v_f, params):
         mass = params[MASS]
         constant = (jnp.sum(mass["slow"] * v_s**2) + jnp.sum(mass["fast"] * v_f**2)) / 2
-        return constant + total([term.kinetic(q_s, q_f, v_s, v_f, params) for term in self.terms])
+        return total([constant, *(term.kinetic(q_s, q_f, v_s, v_f, params) for term in self.terms)])
 
 
 @dataclass(frozen=True)
