@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
+from vmri_jax.quadrature import is_concrete
 from vmri_jax.scene.effect import Effect, all_pairs, each
 from vmri_jax.scene.effects.geometry import mass_of, require_apart
 
@@ -47,7 +49,7 @@ class Gravity(Effect):
 
     def check(self, bodies):
         super().check(bodies)
-        shape = jnp.shape(self.acceleration)
+        shape = np.shape(self.acceleration)
         for (name,) in self.elements(bodies):
             if shape not in ((), (bodies[name].size,)):
                 raise ValueError(
@@ -95,5 +97,5 @@ class NBodyGravity(Effect):
 
     def check(self, bodies):
         super().check(bodies)
-        if not jnp.any(jnp.asarray(self.softening)):
+        if not (is_concrete(self.softening) and np.all(np.asarray(self.softening) > 0)):
             require_apart(self, bodies)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.scene.effect import Effect, each
 from vmri_jax.scene.effects.geometry import check_points
@@ -52,7 +53,7 @@ class MagneticField(Effect):
     def check(self, bodies):
         super().check(bodies)
         check_points(self, bodies, (2, 3))
-        shape = jnp.shape(self.field)
+        shape = np.shape(self.field)
         for (name,) in self.elements(bodies):
             needed = () if bodies[name].size == 2 else (3,)
             if shape != needed:
