@@ -56,9 +56,10 @@ def project_momentum(system: System, q_s, q_f, p_s, p_f, guess=None):
     jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(0, 1))(q_s, q_f), axis=1)  # (n_g + n_gs, n)
     p = jnp.concatenate([p_s, p_f])
     v = _velocity(system, q_s, q_f, jacobian, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
+    v_s, v_f = v[:n_s], v[n_s:]
     if jacobian.shape[0]:
-        p = jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
-    return p[:n_s], p[n_s:], v[:n_s], v[n_s:]
+        p_s, p_f = legendre(system, q_s, q_f, v_s, v_f)
+    return p_s, p_f, v_s, v_f
 
 
 def _velocity(system: System, q_s, q_f, jacobian, p, guess, max_iterations: int = 50):

@@ -1,0 +1,168 @@
+"""Scenes that are wrong say what is wrong, with which names, before anything is computed."""
+
+import numpy as np
+import pytest
+
+from vmri_jax import Problem
+from vmri_jax.scene import (
+    Anchor,
+    Angle,
+    Body,
+    Coulomb,
+    Gravity,
+    HarmonicDrive,
+    LinearDamping,
+    MagneticField,
+    PlaneContact,
+    Potential,
+    RigidLink,
+    Scene,
+    Spring,
+    SpringAnchor,
+    Torsion,
+)
+
+A, B, C = Body("bob", 1.0, [0.0, 0.0]), Body("tip", 1.0, [1.0, 0.0]), Body("load", 1.0, [1.0, 1.0])
+SPACE = [Body(name, 1.0, q) for name, q in zip("wxyz", np.eye(4)[:, :3] + 1, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("a", 0.0, [1.0]), r"Body a: mass is 0.0; every mass must be positive"),
+        (("a", [1.0, -2.0], [1.0, 1.0]), r"Body a: mass is \[ 1. -2.\]"),
+        (("a", [1.0, 2.0], [1.0]), r"Body a: mass has shape \(2,\); give one number, or one for each of 1 coordinates"),
+        (("a", 1.0, [np.nan]), "Body a: position is .*not finite"),
+        (("a", 1.0, [[1.0]]), r"Body a: position has shape \(1, 1\); give a vector"),
+        (("a", 1.0, [1.0], [1.0, 2.0]), r"Body a: velocity has shape \(2,\), position has \(1,\)"),
+        (("a", 1.0, [1.0], None, "quick"), "Body a: pace is 'quick'; it must be 'slow', 'fast' or 'auto'"),
+        (("", 1.0, [1.0]), "Body: name is ''"),
+    ],
+)
+def test_body(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Body(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "effects", "message"),
+    [
+        ([], [], "there are no bodies"),
+        ([A, A], [], "the name 'bob' occurs twice"),
+        ([A, B], [Gravity(), Gravity()], "the name 'gravity' occurs twice.*name="),
+        ([A, B], [Gravity(name="bob")], "the name 'bob' occurs twice"),
+        ([A], [Gravity(name="mass")], "an effect is called 'mass'"),
+        ([A, B], [Spring(("bob", "tipp"), 1.0)], "springs: there is no body 'tipp'. Did you mean tip\\?"),
+        ([A, B], [Spring(("bob", "bob"), 1.0)], "springs: bob occurs twice"),
+        ([A, B, C], [Spring(("bob", "tip", "load"), 1.0)], "springs: between is .*give 2 names of bodies"),
+        ([A, B], [Spring(("bob", "tip"), -1.0)], "springs: stiffness is -1.0; it must be positive"),
+        ([A, B], [Spring(("bob", "tip"), 1.0, 0.0)], "springs: length is 0.0; it must be positive"),
+        (
+            [A, B],
+            [Spring(("bob", "tip"), [1.0, 2.0])],
+            r"springs: stiffness has shape \(2,\); give one number, or one for each of the 1",
+        ),
+        ([A, B], [Gravity([0.0, 0.0, 1.0])], r"gravity: acceleration has shape \(3,\), bob has dimension 2"),
+        (
+            [A, Body("x", 1.0, [0.0, 0.0])],
+            [RigidLink(("bob", "x"))],
+            "links: the distance of bob and x is 0.0; they must not start at the same point",
+        ),
+        ([A, B], [RigidLink(("bob", "tip"), -1.0)], "links: length is -1.0; it must be positive"),
+        ([A, B], [RigidLink(("bob", "tip"), 2.0)], "links: the link bob-tip is 2 long; bob and tip start 1 apart"),
+        ([A, SPACE[0]], [RigidLink(("bob", "w"))], r"links: bodies of different dimension \(bob 2, w 3\)"),
+        (
+            [A, SPACE[0]],
+            [SpringAnchor(["bob", "w"], [0.0, 0.0], 1.0)],
+            r"spring_anchors: bodies of different dimension \(bob 2, w 3\)",
+        ),
+        (
+            [A],
+            [Anchor("bob", [0.0, 0.0])],
+            "anchors: the distance of a body from its point is 0.0; bodies must not start there",
+        ),
+        ([A], [Anchor("bob", [0.0, 0.0, 1.0])], r"anchors: point has shape \(3,\); its bodies have dimension 2"),
+        ([B], [Anchor("tip", [0.0, 0.0], 3.0)], "anchors: length is 3.0; the bodies start 1.0 from their points"),
+        (
+            [Body("block", 1.0, np.ones(5)), Body("b", 1.0, np.zeros(5))],
+            [Spring(("block", "b"), 1.0)],
+            "springs: block has 5 coordinates",
+        ),
+        ([A], [LinearDamping(0.0)], "damping: coefficient is 0.0; it must be positive"),
+        ([A], [HarmonicDrive("bob", [1.0], 1.0)], r"harmonic_drive: amplitude has shape \(1,\)"),
+        (
+            [A],
+            [PlaneContact(point=[0, 0], normal=[0, 0], stiffness=1.0, smoothing=1.0)],
+            "plane_contact: normal is .*must not be zero",
+        ),
+        ([A, B], [Coulomb({"bob": 1.0}, 1.0, [("bob", "tip")])], "coulomb: tip has no charge"),
+        ([A], [MagneticField([0.0, 0.0, 1.0], 1.0)], r"magnetic_field: field has shape \(3,\) and bob has dimension 2"),
+        ([A, B, Body("c", 1.0, [2.0, 0.0])], [Angle(("bob", "tip", "c"), 1.0)], "angles: angle is .*take Bending"),
+        (SPACE, [Torsion(("w", "x", "y", "z"), 1.0, 0.0, 1.5)], "torsion: multiplicity is 1.5; it must be an integer"),
+    ],
+)
+def test_scene(bodies, effects, message):
+    with pytest.raises(ValueError, match=message):
+        Scene(bodies, effects)
+
+
+def test_wrong_kinds():
+    with pytest.raises(TypeError, match=r"Scene: bodies is .*give a list"):
+        Scene(A)
+    with pytest.raises(TypeError, match=r"'gravity' is among effects; it must be Effect"):
+        Scene([A], ["gravity"])
+    with pytest.raises(TypeError, match=r"Potential: function is 3"):
+        Potential(3, "bob")
+    with pytest.raises(ValueError, match=r"springs: rate is 'stiff'"):
+        Spring(("bob", "tip"), 1.0, rate="stiff")
+    with pytest.raises(TypeError, match=r"Scene.explain: scheme is 'galerkin'"):
+        Scene([A]).explain("galerkin", measure=False)
+
+
+SQUARE = [Body(name, 1.0, q, pace="slow") for name, q in zip("abcd", [[0, 0], [1, 0], [1, 1], [0, 1]], strict=True)]
+SIDES = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("a", "c"), ("b", "d")]
+
+
+def test_redundant_links_are_named():
+    Scene(SQUARE, [RigidLink(SIDES[:5])])
+    with pytest.raises(
+        ValueError, match=r"over-constrained at the start: links a-b, .*links b-d are 6 constraints of rank 5"
+    ):
+        Scene(SQUARE, [RigidLink(SIDES)])
+    with pytest.raises(ValueError, match=r"links a-b, again a-b are 2 constraints of rank 1; leave one of them out"):
+        Scene(SQUARE, [RigidLink(SIDES[:2]), RigidLink(("a", "b"), name="again")])
+
+
+def test_links_that_the_fast_bodies_cannot_keep_are_named():
+    bodies = [*SQUARE[:3], Body("d", 1.0, [0.0, 1.0], pace="fast")]
+    Scene(bodies, [RigidLink([("a", "d"), ("c", "d")])])
+    with pytest.raises(
+        ValueError, match=r"links a-d, links c-d, links b-d are 3 constraints of rank 2; .*only d can move"
+    ):
+        Scene(bodies, [RigidLink([("a", "d"), ("c", "d"), ("b", "d")])])
+
+
+def test_unknown_names_come_with_the_near_miss():
+    scene = Scene([A, B], [Spring(("bob", "tip"), 1.0), Gravity()])
+    with pytest.raises(
+        ValueError,
+        match=r"Scene.without: there is no effect 'gravty'. Did you mean gravity\? There are springs, gravity.",
+    ):
+        scene.without("gravty")
+    with pytest.raises(ValueError, match=r"Scene.only: there is no effect 'spring'. Did you mean springs"):
+        scene.only("spring")
+    with pytest.raises(ValueError, match=r"Scene.replace: there is no body or effect 'bop'. Did you mean bob"):
+        scene.replace("bop", mass=1.0)
+    with pytest.raises(
+        ValueError, match=r"Scene.replace: springs: there is no argument 'stifness'. Did you mean stiffness"
+    ):
+        scene.replace("springs", stifness=1.0)
+    assert isinstance(scene.problem(), Problem)
+
+
+def test_energy_that_is_not_smooth_at_the_start():
+    def root(q, params):
+        return (q[0][0] ** 2) ** 0.25
+
+    with pytest.raises(ValueError, match=r"root: its energy between bob has no finite derivatives at the start"):
+        Scene([A], [Potential(root, "bob")])

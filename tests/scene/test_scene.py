@@ -1,0 +1,289 @@
+# pyright: reportOptionalCall=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false, reportOptionalOperand=false
+"""Scenes: sorting, composition, structure that is compared by value, parameters, drawing, the ledger."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.scene.reference_scenes import simple_atomic_model, triple_spherical_pendulum
+from vmri_jax import ConstantMass, compose, fully_explicit, fully_implicit, galerkin, initial_state
+from vmri_jax.scene import (
+    Body,
+    Constraint,
+    Coulomb,
+    Dashpot,
+    Force,
+    Gravity,
+    LinearDamping,
+    MagneticField,
+    PlaneContact,
+    Potential,
+    RayleighDamping,
+    RigidLink,
+    Scene,
+    Spring,
+    SpringAnchor,
+)
+from vmri_jax.step import macro_step
+
+TSP = triple_spherical_pendulum()
+
+
+def homes(scene) -> dict:
+    """Where each effect lives."""
+    found: dict = {}
+    for part in scene.sorting.placed:
+        found.setdefault(part.effect.name, []).append((part.home, part.elements))
+    return found
+
+
+def paces(scene) -> dict:
+    return {name: pace.value for name, pace in scene.sorting.paces.items()}
+
+
+def test_pace_is_found_from_stiffness():
+    assert paces(TSP) == {"bob": "slow", "hook": "fast", "load": "fast"}
+    assert "springs, 100 rad/s" in TSP.sorting.paces["hook"].reason  # sqrt(k (1 / m_1 + 1 / m_2))
+    assert homes(TSP) == {
+        "gravity": [("slow_potential", (0, 1, 2))],
+        "anchors": [("slow_constraint", (0,))],
+        "links": [("constraint", (0,))],
+        "springs": [("fast_potential", (0,))],
+    }
+
+
+def test_one_rate_is_enough_without_a_gap():
+    scene = TSP.replace("springs", stiffness=1.0)
+    assert set(paces(scene).values()) == {"slow"}
+    assert "no gap" in scene.sorting.paces["load"].reason
+    assert homes(scene)["links"] == [("slow_constraint", (0,))]
+    run = compiled(scene.system(), fully_implicit(2), scene.state(), 0.01)
+    assert int(run[1].result) <= 1
+
+
+def test_one_effect_is_split_by_stiffness_and_pace():
+    bodies = [Body(name, 1.0, [float(i)], pace="slow" if name == "a" else "fast") for i, name in enumerate("abcd")]
+    springs = Spring([("a", "b"), ("c", "b"), ("b", "c"), ("c", "d")], [1e4, 1.0, 1e4, 1e4])
+    scene = Scene(bodies, [springs])
+    assert homes(scene)["springs"] == [("slow_potential", (0, 1)), ("fast_potential", (2, 3))]
+    system, params = scene.system(), scene.params
+    q_s, q_f = jnp.array([0.1]), jnp.array([1.3, 2.5, 2.9])
+    assert system.slow_potential(q_s, q_f, params) == pytest.approx((1e4 * 0.2**2 + 0.2**2) / 2)
+    assert system.fast_potential(q_f, params) == pytest.approx((1e4 * 0.2**2 + 1e4 * 0.6**2) / 2)
+
+
+def test_declared_rate_wins():
+    scene = TSP.replace("springs", rate="slow")
+    assert paces(scene)["load"] == "slow"
+    fast = [dataclasses.replace(body, pace="fast") for body in TSP.bodies]
+    assert homes(Scene(fast, TSP.effects).replace("gravity", rate="fast"))["gravity"] == [("fast_potential", (0, 1, 2))]
+    with pytest.raises(ValueError, match="gravity: its rate is 'fast' but it touches bob, which is slow"):
+        Scene([dataclasses.replace(TSP.bodies[0], pace="slow"), *TSP.bodies[1:]], [Gravity(rate="fast")])
+
+
+compiled = jax.jit(macro_step)
+
+
+SPRINGS = Scene(
+    [Body("trolley", 50.0, [0.0, 5.0]), Body("hook", 1.0, [0.0, 2.0], [1.0, 0.0]), Body("load", 1.0, [0.5, 1.0])],
+    [Gravity(), Spring(("trolley", "hook"), 20.0, name="rope"), Spring(("hook", "load"), 5e3, 1.1)],
+)
+
+
+def test_same_structure_is_compiled_once():
+    traces = []
+
+    @jax.jit
+    def step(system, state):
+        traces.append(None)
+        return macro_step(system, fully_explicit(2), state, 0.001)[0]
+
+    for scene in (
+        SPRINGS,
+        Scene(SPRINGS.bodies, [dataclasses.replace(effect) for effect in SPRINGS.effects]),
+        SPRINGS.replace("springs", stiffness=4000.0),
+        SPRINGS.replace("trolley", mass=100.0),
+        SPRINGS.without("gravity"),
+        SPRINGS.without("gravity").replace("rope", stiffness=30.0),
+    ):
+        step(scene.system(), scene.state())
+    assert len(traces) == 2  # with gravity and without
+    for stiffness in (1.0, 2e6):  # even where the scene would sort differently
+        params = SPRINGS.params | {"springs": SPRINGS.params["springs"] | {"stiffness": jnp.asarray(stiffness, float)}}
+        step(SPRINGS.system().replace(params=params), SPRINGS.state())
+    assert len(traces) == 2
+
+
+def test_gradient_by_a_parameter():
+    system, state = SPRINGS.system(), SPRINGS.state()
+
+    def height(stiffness):
+        params = system.params | {"springs": system.params["springs"] | {"stiffness": stiffness}}
+        return macro_step(system.replace(params=params), fully_explicit(2), state, 0.02)[0].p_f[3]
+
+    slope = jax.jit(jax.grad(height))(5000.0)
+    value = jax.jit(height)
+    assert slope == pytest.approx(float(value(5010.0) - value(4990.0)) / 20, rel=1e-5)
+
+
+def counting(counts, name):
+    def energy(q, params):
+        counts[name] += 1
+        return params["k"] * jnp.sum(q[0] ** 2)
+
+    return energy
+
+
+def test_what_is_left_out_is_never_evaluated():
+    counts = dict.fromkeys("abcd", 0)
+    effects = [Potential(counting(counts, name), "body", {"k": 1.0}, name=name) for name in counts]
+    scene = Scene([Body("body", 1.0, [1.0, 0.0], pace="slow")], effects)
+    without = scene.without("c")
+    compiled(without.system(), fully_implicit(2), without.state(), 0.1)
+    assert counts["c"] == 0
+    assert min(counts[name] for name in "abd") > 0
+    assert [effect.name for effect in scene.only("d", "a").effects] == ["a", "d"]
+
+
+def test_what_no_effect_calls_for_does_not_exist():
+    system = Scene([Body("body", 1.0, [1.0, 0.0])]).system()
+    assert isinstance(system.kinetic, ConstantMass)
+    for name in ("slow_potential", "fast_potential", "constraint", "slow_constraint", "force"):
+        assert getattr(system, name) is None
+    assert Scene([Body("body", 1.0, [1.0, 0.0])], [RayleighDamping(stiffness=0.1)]).system().force is None
+
+
+def swing(q, params):
+    return jnp.sum(q[0] ** 2) - params["length"] ** 2
+
+
+def push(t, q, v, params):
+    return -params["c"] * v[0], jnp.zeros_like(v[1])
+
+
+def test_own_effects_are_a_function_and_one_line():
+    bodies = [Body("a", 1.0, [1.0, 0.0], pace="slow"), Body("block", [1.0, 2.0, 3.0, 4.0], np.ones(4), pace="fast")]
+    scene = Scene(bodies, [Constraint(swing, "a", {"length": 1.0}), Force(push, ("a", "block"), {"c": 0.5})])
+    system = scene.system()
+    q_s, q_f, v = jnp.array([1.0, 1.0]), jnp.ones(4), jnp.array([1.0, 2.0])
+    assert system.g_slow(q_s).tolist() == [1.0]
+    forces = system.forces(0.0, q_s, q_f, v, q_f)
+    assert forces[0].tolist() == [-0.5, -1.0]
+    assert forces[1].tolist() == [0.0] * 4
+    assert np.array_equal(system.kinetic.fast, [1, 2, 3, 4])
+
+
+def test_bodies_of_different_dimension_share_an_effect_on_single_ones():
+    bodies = [
+        Body("a", 2.0, [0.0, 5.0], [1.0, 2.0]),
+        Body("b", 3.0, [7.0], [3.0]),
+        Body("c", 1.0, [1.0, 1.0], [1.0, 1.0]),
+    ]
+    scene = Scene(bodies, [Gravity(10.0), LinearDamping([0.1, 0.2, 0.3])])
+    q, v = (jnp.concatenate([getattr(body, what) for body in bodies]) for what in ("position", "velocity"))
+    none = jnp.zeros(0)
+    assert scene.system().slow_potential(q, none, scene.params) == pytest.approx(10 * (2 * 5 + 3 * 7 + 1 * 1))
+    force = scene.system().forces(0.0, q, none, v, none)[0]
+    assert np.allclose(force, [-0.1, -0.2, -0.6, -0.3, -0.3])
+
+
+def test_all_pairs_and_dashpots_are_the_formulas():
+    points = np.random.default_rng(0).normal(size=(2, 4, 2))
+    charges = dict(zip("abcd", [1.0, -2.0, 3.0, 0.5], strict=True))
+    bodies = [Body(name, 1.0, q, v) for name, q, v in zip("abcd", *points, strict=True)]
+    scene = Scene(bodies, [Coulomb(charges, 2.0), Dashpot([("a", "b"), ("d", "b")], [0.3, 0.7])])
+    q, v = (jnp.asarray(p.reshape(-1)) for p in points)
+    expected = sum(
+        2 * charges[a] * charges[b] / np.linalg.norm(points[0, i] - points[0, j])
+        for i, a in enumerate("abcd")
+        for j, b in enumerate("abcd")
+        if i < j
+    )
+    none, params = jnp.zeros(0), scene.params
+    assert scene.system().slow_potential(q, none, params) == pytest.approx(expected)
+    force = np.zeros((4, 2))
+    for a, b, c in ((0, 1, 0.3), (3, 1, 0.7)):
+        n = (points[0, b] - points[0, a]) / np.linalg.norm(points[0, b] - points[0, a])
+        pull = -c * ((points[1, b] - points[1, a]) @ n) * n
+        force[b] += pull
+        force[a] -= pull
+    assert np.allclose(scene.system().forces(0.0, q, none, v, none)[0], force.reshape(-1))
+
+
+def test_rayleigh_damping_is_the_matrix():
+    """alpha M v + beta K v with K the Hessian of the named potentials."""
+    bodies = [Body("a", 2.0, [0.0, 1.0], [1.0, 0.5]), Body("b", 1.0, [1.0, 3.0], [0.0, -1.0])]
+    springs, well = Spring(("a", "b"), 7.0, 1.5), SpringAnchor("a", [0.0, 0.0], 3.0)
+    scene = Scene(bodies, [springs, well, RayleighDamping(0.1, 0.02, of="springs")])
+    q, v, none = jnp.array([0.0, 1.0, 1.0, 3.0]), jnp.array([1.0, 0.5, 0.0, -1.0]), jnp.zeros(0)
+    only = scene.only("springs").system()
+    matrix = jax.hessian(lambda q: only.slow_potential(q, none, only.params))(q)
+    expected = -0.1 * np.array([2, 2, 1, 1]) * v - 0.02 * matrix @ v
+    assert np.allclose(scene.system().forces(0.0, q, none, v, none)[0], expected)
+    with pytest.raises(ValueError, match="rayleigh_damping: there is no potential 'springs'"):
+        scene.without("springs")
+
+
+def test_drawing_is_plain_data():
+    scene = Scene(
+        [
+            Body("a", 1.0, [0.0, 1.0], pace="fast"),
+            Body("b", 1.0, [1.0, 1.0], pace="slow"),
+            Body("block", 1.0, np.ones(4)),
+        ],
+        [
+            RigidLink(("a", "b")),
+            SpringAnchor("b", [0.0, 0.0], 3.0, 1.0),
+            PlaneContact(point=[0, 0], normal=[0, 2], stiffness=1e4, smoothing=0.01, radius=0.1, bodies="a"),
+        ],
+    )
+    drawing = scene.drawing()
+    assert json.loads(json.dumps(drawing)) == drawing
+    axes = {body["name"]: body["coordinates"] for body in drawing["bodies"]}
+    assert axes["a"] == [["f", 0], ["f", 1]]
+    assert axes["b"] == [["s", 0], ["s", 1]]
+    assert axes["block[3]"] == [["s", 5]]
+    assert drawing["bodies"][0]["radius"] == 0.1
+    assert drawing["links"] == [["a", "b"]]
+    assert drawing["anchors"] == [{"body": "b", "point": [0.0, 0.0], "kind": "spring"}]
+    assert drawing["planes"] == [{"point": [0.0, 0.0], "normal": [0.0, 1.0]}]
+
+
+def test_ledger_counts_unknowns_by_the_formula():
+    sam = simple_atomic_model()
+    ledger = sam.explain(fully_implicit(20), measure=False)
+    assert ledger.unknowns == 307  # the number that the reference study reports
+    rows = {row.name: row for row in ledger.rows}
+    assert (rows["gravity"].grid, rows["gravity"].evaluations) == ("micro", 20)
+    assert (rows["links"].multipliers, rows["anchors"].multipliers) == (60, 1)
+    rows = {row.name: row for row in sam.explain(fully_explicit(20), measure=False).rows}
+    assert (rows["gravity"].grid, rows["gravity"].evaluations) == ("macro", 1)
+    assert rows["stiff"].evaluations == 20
+    assert sam.explain(galerkin(5, 2), measure=False).unknowns == 2 * 6 + 2 * 1 + 5 * 2 * (12 + 3)
+    assert sam.explain(compose(fully_explicit(4), "yoshida4"), measure=False).unknowns == 3 * (6 + 1 + 4 * 15)
+
+
+def test_ledger_measures():
+    scene = Scene([Body("a", 1.0, [1.0])], [SpringAnchor("a", 0.0, 4.0), LinearDamping(0.1)])
+    ledger = scene.explain(fully_implicit(1))
+    assert ledger.scene.operations > ledger.bare.operations
+    assert ledger.scene.microseconds > ledger.bare.microseconds
+    shares = {row.name: row.operations for row in ledger.rows if row.kind != "body"}
+    assert 0 < shares["damping"] < 1
+    assert ledger.as_dict()["rows"][1]["name"] == "spring_anchors"
+    assert ledger.table().row_count == 5
+    assert json.dumps(ledger.as_dict())
+
+
+def test_kinetic_energy_is_a_function_only_with_a_magnetic_field():
+    charge = [Body("a", 2.0, [1.0, 0.0], [0.0, 1.0])]
+    scene = Scene(charge, [MagneticField(3.0, 0.5)])
+    assert not isinstance(scene.system().kinetic, ConstantMass)
+    assert isinstance(scene.without("magnetic_field").system().kinetic, ConstantMass)
+    state = initial_state(scene.system(), *(getattr(scene.problem(), name) for name in ("q_s", "q_f", "v_s", "v_f")))
+    assert np.allclose(state.p_s, [0.0, 2.0 + 0.5 * 3.0 / 2])  # m v + Q A

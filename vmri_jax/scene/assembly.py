@@ -1,0 +1,46 @@
+"""The `System` of bodies and effects whose places are known."""
+
+from collections.abc import Mapping, Sequence
+
+from vmri_jax.scene.body import Body
+from vmri_jax.scene.layout import Place, join
+from vmri_jax.scene.sorting import Placed
+from vmri_jax.scene.terms import (
+    MASS,
+    FastPotential,
+    KineticEnergy,
+    MacroConstraint,
+    MicroConstraint,
+    SlowPotential,
+    TotalForce,
+)
+from vmri_jax.system import ConstantMass, System
+
+
+def build(bodies: Mapping[str, Body], places: Mapping[str, Place], placed: Sequence[Placed]) -> System:
+    """The system of these bodies with these effects; functions, constraints and forces that nothing calls for are None."""
+    potentials = {}
+    terms: dict[str, list] = {}
+    for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):  # forces may build on potentials
+        made = part.effect.terms(part.elements, bodies, places, potentials)
+        if part.effect.kind == "potential":
+            potentials[part.effect.name] = (*potentials.get(part.effect.name, ()), *made)
+        terms.setdefault(part.home, []).extend(made)
+
+    def made_of(home: str, function):
+        return function(tuple(terms[home])) if terms.get(home) else None
+
+    params = {part.effect.name: part.effect.parameters(bodies) for part in placed}
+    slow, fast = (join(bodies, places, part, "mass") for part in ("s", "f"))
+    kinetic = made_of("kinetic", KineticEnergy)
+    if kinetic is not None:
+        params[MASS] = {"slow": slow, "fast": fast}
+    return System(
+        ConstantMass(slow, fast) if kinetic is None else kinetic,
+        slow_potential=made_of("slow_potential", SlowPotential),
+        fast_potential=made_of("fast_potential", FastPotential),
+        constraint=made_of("constraint", MicroConstraint),
+        slow_constraint=made_of("slow_constraint", MacroConstraint),
+        force=made_of("force", TotalForce),
+        params=params,
+    )

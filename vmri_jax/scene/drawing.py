@@ -1,0 +1,48 @@
+"""What a scene looks like, as plain data that is stored with a run.
+
+    {
+        "bodies":  [{"name": "bob", "coordinates": [["s", 0], ["s", 1], ["s", 2]], "radius": 0.1}, ...],
+        "links":   [["bob", "tip"], ...],
+        "springs": [["tip", "load"], ...],
+        "anchors": [{"body": "bob", "point": [0.0, 0.0, 0.0], "kind": "link"}, ...],
+        "planes":  [{"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}, ...],
+        "spheres": [{"center": [0.0, 0.0, 0.0], "radius": 1.0}, ...],
+    }
+
+`coordinates` says for each axis (one to three of them) which entry of q_s ("s") or q_f ("f") it is; `radius` is only
+there where the body has one. A block of more than three general coordinates is drawn as that many bodies ``name[i]`` on
+a line. `kind` is "link" or "spring". Everything is lists, strings and numbers.
+"""
+
+from collections.abc import Iterable, Mapping
+
+from vmri_jax.scene.body import Body
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.layout import Place
+
+KINDS = ("links", "springs", "anchors", "planes", "spheres")
+LARGEST_POINT = 3
+"""Coordinates of a point; blocks have more."""
+
+
+def drawing(bodies: Mapping[str, Body], effects: Iterable[Effect], places: Mapping[str, Place]) -> dict[str, list]:
+    """The description of these bodies at these places with these effects."""
+    seen: dict[str, list] = {"bodies": [entry for name in bodies for entry in _entries(name, places[name])]}
+    seen |= {kind: [] for kind in KINDS}
+    radii = {}
+    for effect in effects:
+        parts = effect.drawing(bodies)
+        for kind in KINDS:
+            seen[kind] += parts.get(kind, [])
+        radii |= dict(parts.get("radii", []))
+    for entry in seen["bodies"]:
+        if entry["name"] in radii:
+            entry["radius"] = radii[entry["name"]]
+    return seen
+
+
+def _entries(name: str, place: Place) -> list[dict]:
+    axes = [[place.part, place.start + i] for i in range(place.size)]
+    if place.size <= LARGEST_POINT:
+        return [{"name": name, "coordinates": axes}]
+    return [{"name": f"{name}[{i}]", "coordinates": [axis]} for i, axis in enumerate(axes)]

@@ -1,0 +1,166 @@
+"""Scenes: bodies and the effects between them, turned into an ordinary `System`."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from vmri_jax.composition import Composition
+from vmri_jax.scene import drawing as drawings
+from vmri_jax.scene.assembly import build
+from vmri_jax.scene.body import Body
+from vmri_jax.scene.effect import Effect, unknown
+from vmri_jax.scene.layout import Place, join, layout
+from vmri_jax.scene.ledger import Ledger, ledger
+from vmri_jax.scene.redundancy import check_constraints
+from vmri_jax.scene.sorting import Sorting, sort
+from vmri_jax.scene.terms import MASS
+from vmri_jax.scheme import Scheme
+from vmri_jax.state import State
+from vmri_jax.system import Problem, System
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Bodies and the effects between them.
+
+        scene = Scene(
+            [Body("bob", 100.0, [10, 0, 0]), Body("hook", 1.0, [10, 2, 0]), Body("load", 1.0, [10, 2, 3])],
+            [Gravity(), Anchor("bob", [0, 0, 0]), RigidLink(("bob", "hook")), Spring(("hook", "load"), 5000.0)],
+        )
+        run = simulate(scene.system(), fully_implicit(10), scene.state(), macro_dt=0.01, num_steps=1000)
+
+    What the scene does not call for does not exist in its system: no function, no unknown, no evaluation. Scenes of the
+    same structure (names, who touches whom, who is slow and fast) give systems that share compiled programs, whatever their
+    numbers; these are in the system's params by the name of the effect, ``params["springs"]["stiffness"]``.
+
+    Args:
+        bodies: `Body` instances; slow ones become q_s and fast ones q_f, in this order.
+        effects: of `vmri_jax.scene.effects`, or one's own: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
+            summed and constraints joined in this order.
+
+    Raises:
+        TypeError: something else among them.
+        ValueError: no bodies, names that occur twice, what is wrong with an effect (see there), redundant constraints.
+    """
+
+    bodies: Any
+    effects: Any = ()
+
+    def __post_init__(self):
+        for name, kind in (("bodies", Body), ("effects", Effect)):
+            items = getattr(self, name)
+            if isinstance(items, kind) or not isinstance(items, Iterable):
+                raise TypeError(f"Scene: {name} is {items!r}; give a list.")
+            object.__setattr__(self, name, tuple(items))
+            for item in getattr(self, name):
+                if not isinstance(item, kind):
+                    raise TypeError(f"Scene: {item!r} is among {name}; it must be {kind.__name__}.")
+        if not self.bodies:
+            raise ValueError("Scene: there are no bodies; give at least one.")
+        names = [item.name for item in (*self.bodies, *self.effects)]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(
+                    f"Scene: the name {name!r} occurs twice; give each body and effect its own, e.g. name=..."
+                )
+        if MASS in [effect.name for effect in self.effects]:
+            raise ValueError(
+                f"Scene: an effect is called {MASS!r}, where the params keep the masses; give it another name."
+            )
+        potentials = [effect.name for effect in self.effects if effect.kind == "potential"]
+        for effect in self.effects:
+            effect.check(self.by_name)
+            for name in effect.refers_to:
+                if name not in potentials:
+                    raise ValueError(f"{effect.name}: {unknown('potential', name, potentials)}")
+        check_constraints(self.by_name, self.places, self.sorting.placed)
+
+    @cached_property
+    def by_name(self) -> dict[str, Body]:
+        """Bodies by name."""
+        return {body.name: body for body in self.bodies}
+
+    @cached_property
+    def sorting(self) -> Sorting:
+        """Who is slow and who is fast, where every effect lives, and why."""
+        return sort(self.by_name, self.effects)
+
+    @cached_property
+    def places(self) -> dict[str, Place]:
+        """Where each body's coordinates are in q_s and q_f."""
+        return layout(self.by_name, {name: pace.value for name, pace in self.sorting.paces.items()})
+
+    @property
+    def params(self) -> dict[str, Any]:
+        """Parameters by the name of the effect."""
+        return {effect.name: effect.parameters(self.by_name) for effect in self.effects}
+
+    def system(self) -> System:
+        """The system: ``T - V - W`` with constraints and forces, each None where no effect calls for it."""
+        return build(self.by_name, self.places, self.sorting.placed)
+
+    def problem(self) -> Problem:
+        """The system with positions and velocities at the start."""
+        start = [
+            join(self.by_name, self.places, part, what) for what in ("position", "velocity") for part in ("s", "f")
+        ]
+        return Problem(self.system(), *start)
+
+    def state(self) -> State:
+        """The consistent initial state: velocities are projected onto the constraints."""
+        return self.problem().state()
+
+    def without(self, *names: str) -> "Scene":
+        """The scene without these effects.
+
+        Raises:
+            ValueError: a name that no effect has.
+        """
+        self._check_names("without", names)
+        return Scene(self.bodies, [effect for effect in self.effects if effect.name not in names])
+
+    def only(self, *names: str) -> "Scene":
+        """The scene with these effects and no other.
+
+        Raises:
+            ValueError: a name that no effect has.
+        """
+        self._check_names("only", names)
+        return Scene(self.bodies, [effect for effect in self.effects if effect.name in names])
+
+    def replace(self, name: str, **changes) -> "Scene":
+        """The scene with a body or an effect changed, ``scene.replace("springs", stiffness=2.0)``.
+
+        Raises:
+            ValueError: a name that no body or effect has, or an argument that it does not have.
+        """
+        items = {item.name: item for item in (*self.bodies, *self.effects)}
+        if name not in items:
+            raise ValueError(f"Scene.replace: {unknown('body or effect', name, items)}")
+        fields = items[name].__dataclass_fields__
+        for key in changes:
+            if key not in fields:
+                raise ValueError(f"Scene.replace: {name}: {unknown('argument', key, fields)}")
+        items[name] = replace(items[name], **changes)
+        changed = list(items.values())
+        return Scene(changed[: len(self.bodies)], changed[len(self.bodies) :])
+
+    def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
+        """What every body and effect adds to a macro step of a scheme: where it lives, unknowns, evaluations, and its cost.
+
+        Args:
+            macro_dt: step that is measured; by default micro steps of a tenth of the fastest vibration's radian.
+            measure: compile the scene without each effect in turn and time it; without, the ledger costs nothing.
+        """
+        return ledger(self, scheme, macro_dt, measure)
+
+    def drawing(self) -> dict[str, list]:
+        """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.scene.drawing`."""
+        return drawings.drawing(self.by_name, self.effects, self.places)
+
+    def _check_names(self, what: str, names: Iterable[str]) -> None:
+        known = [effect.name for effect in self.effects]
+        for name in names:
+            if name not in known:
+                raise ValueError(f"Scene.{what}: {unknown('effect', name, known)}")

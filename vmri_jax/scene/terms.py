@@ -1,0 +1,165 @@
+"""Terms: effects at their places in q_s and q_f, and the functions of a `System` as sums of terms.
+
+Everything here is compared by value: scenes of the same structure give equal functions, and nothing is compiled twice.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.scene.layout import Rows
+
+
+@dataclass(frozen=True)
+class Term:
+    """The function of an effect on the elements `select` (None: all of them), whose roles lie at `roles`.
+
+    `split` names the parameters that have an entry for each element.
+    """
+
+    name: str
+    function: Callable
+    roles: tuple[Rows, ...]
+    select: tuple[int, ...] | None = None
+    split: tuple[str, ...] = ()
+
+    def own(self, params):
+        """What the function gets as params."""
+        own = params[self.name]
+        if self.select is None:
+            return own
+        chosen = {name: pick(own[name], self.select) for name in self.split if name in own and jnp.ndim(own[name])}
+        return own | chosen
+
+    def take(self, q_s, q_f):
+        """The coordinates of every role."""
+        return tuple(rows.take(q_s, q_f) for rows in self.roles)
+
+    def value(self, q_s, q_f, params):
+        """Energy or constraint values."""
+        return self.function(self.take(q_s, q_f), self.own(params))
+
+    def kinetic(self, q_s, q_f, v_s, v_f, params):
+        """Velocity-dependent energy."""
+        return self.function(self.take(q_s, q_f), self.take(v_s, v_f), self.own(params))
+
+    def forces(self, t, q_s, q_f, v_s, v_f, params):
+        """Force on all slow and on all fast coordinates, None where there is none."""
+        forces = self.function(t, self.take(q_s, q_f), self.take(v_s, v_f), self.own(params))
+        shapes = [
+            (rows.size,) if rows.single else (sum(run.count for run in rows.runs), rows.size) for rows in self.roles
+        ]
+        put = [
+            rows.put(jnp.broadcast_to(force, shape), q_s.shape[0], q_f.shape[0])
+            for rows, force, shape in zip(self.roles, forces, shapes, strict=True)
+        ]
+        return tuple(total([part for part in parts if part is not None]) for parts in zip(*put, strict=True))
+
+
+@dataclass(frozen=True)
+class TangentDamping:
+    """``F = -beta K v``, K the Hessian of the energy of some terms."""
+
+    name: str
+    terms: tuple[Term, ...]
+
+    def forces(self, t, q_s, q_f, v_s, v_f, params):
+        """Force on all slow and on all fast coordinates."""
+
+        def energy(q):
+            return total([term.value(*q, params) for term in self.terms])
+
+        rates = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
+        return tuple(-params[self.name]["stiffness"] * rate for rate in rates)
+
+
+def pick(values, select: Sequence[int]):
+    """Entries of an array by static slices; a single one without its axis."""
+    if len(select) == 1:
+        return values[select[0]]
+    if list(select) == list(range(select[0], select[0] + len(select))):
+        return values[select[0] : select[0] + len(select)]
+    return jnp.stack([values[i] for i in select])
+
+
+def total(values: Sequence):
+    """Sum of one or more arrays, None of none."""
+    return reduce(add, values) if values else None
+
+
+@dataclass(frozen=True)
+class SlowPotential:
+    """``V(q_s, q_f, params)``, the sum of its terms."""
+
+    terms: tuple[Term, ...]
+
+    def __call__(self, q_s, q_f, params):
+        return total([term.value(q_s, q_f, params) for term in self.terms])
+
+
+@dataclass(frozen=True)
+class FastPotential:
+    """``W(q_f, params)``, the sum of its terms."""
+
+    terms: tuple[Term, ...]
+
+    def __call__(self, q_f, params):
+        return total([term.value(None, q_f, params) for term in self.terms])
+
+
+@dataclass(frozen=True)
+class MicroConstraint:
+    """``g(q_s, q_f, params)``, the values of its terms one after the other."""
+
+    terms: tuple[Term, ...]
+
+    def __call__(self, q_s, q_f, params):
+        return join([term.value(q_s, q_f, params) for term in self.terms])
+
+
+@dataclass(frozen=True)
+class MacroConstraint:
+    """``g_s(q_s, params)``, the values of its terms one after the other."""
+
+    terms: tuple[Term, ...]
+
+    def __call__(self, q_s, params):
+        return join([term.value(q_s, None, params) for term in self.terms])
+
+
+def join(values: Sequence):
+    """One vector of arrays of any shape."""
+    vectors = [jnp.reshape(value, (-1,)) for value in values]
+    return vectors[0] if len(vectors) == 1 else jnp.concatenate(vectors)
+
+
+MASS = "mass"
+"""Where the masses are in params if the kinetic energy is a function."""
+
+
+@dataclass(frozen=True)
+class KineticEnergy:
+    """``T = sum m v^2 / 2`` and the velocity-dependent terms."""
+
+    terms: tuple[Term, ...]
+
+    def __call__(self, q_s, q_f, v_s, v_f, params):
+        mass = params[MASS]
+        constant = (jnp.sum(mass["slow"] * v_s**2) + jnp.sum(mass["fast"] * v_f**2)) / 2
+        return total([constant, *(term.kinetic(q_s, q_f, v_s, v_f, params) for term in self.terms)])
+
+
+@dataclass(frozen=True)
+class TotalForce:
+    """``F(t, q_s, q_f, v_s, v_f, params)``, the sum of its terms."""
+
+    terms: tuple[Term | TangentDamping, ...]
+
+    def __call__(self, t, q_s, q_f, v_s, v_f, params):
+        forces = [term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms]
+        slow, fast = (total([part for part in parts if part is not None]) for parts in zip(*forces, strict=True))
+        return jnp.zeros_like(q_s) if slow is None else slow, jnp.zeros_like(q_f) if fast is None else fast
