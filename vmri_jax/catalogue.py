@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import vmri_jax as vm
+from vmri_jax.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -73,13 +74,30 @@ SCHEMES = {
 
 
 def find_problem(name: str) -> vm.Problem:
-    """A built-in problem by name, or ``my_file.py:my_problem``, a `Problem` or a function without arguments making one.
+    """A built-in problem by name, or ``my_file.py:my_problem``: a `Problem`, a `Scene`, or a function that makes one.
 
     Raises:
         ValueError: an unknown name; a file that does not exist, fails to run, or has no such name; no Problem there.
     """
     if name in SYSTEMS:
         return SYSTEMS[name].factory()
+    found = _in_file(name)
+    try:
+        return found.problem() if isinstance(found, Scene) else found
+    except Exception as error:
+        raise ValueError(f"{name} is a scene that makes no system: {type(error).__name__}: {error}") from error
+
+
+def find_scene(name: str) -> Scene:
+    """The scene ``my_file.py:my_scene``; errors as in `find_problem`."""
+    found = None if name in SYSTEMS else _in_file(name)
+    if not isinstance(found, Scene):
+        raise ValueError(f"{name} is no scene; give my_file.py:my_scene, a vmri_jax.scene.Scene in that file.")
+    return found
+
+
+def _in_file(name: str) -> vm.Problem | Scene:
+    """What ``my_file.py:name`` names."""
     file_name, colon, attribute = name.partition(":")
     if not colon and not file_name.endswith(".py"):
         raise ValueError(f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem.")
@@ -141,23 +159,23 @@ def _run_file(path: Path):
     return module
 
 
-def _problem_in(module, path: Path, attribute: str) -> vm.Problem:
+def _problem_in(module, path: Path, attribute: str) -> vm.Problem | Scene:
     found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
     if attribute not in found:
-        problems = [name for name, value in found.items() if isinstance(value, vm.Problem)]
+        problems = [name for name, value in found.items() if isinstance(value, vm.Problem | Scene)]
         near = difflib.get_close_matches(attribute, found, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         listed = f" Problems in it: {', '.join(problems)}." if problems else ""
         raise ValueError(f"{path} has no name {attribute!r}.{hint}{listed}")
     problem = found[attribute]
-    if callable(problem) and not isinstance(problem, vm.Problem):
+    if callable(problem) and not isinstance(problem, vm.Problem | Scene):
         try:
             problem = problem()
         except Exception as error:
             raise ValueError(f"{attribute}() in {path} failed: {type(error).__name__}: {error}") from error
-    if not isinstance(problem, vm.Problem):
+    if not isinstance(problem, vm.Problem | Scene):
         raise ValueError(
-            f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem, or a function without "
-            "arguments that returns one."
+            f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem or a "
+            "vmri_jax.scene.Scene, or a function without arguments that returns one."
         )
     return problem

@@ -158,7 +158,10 @@ class System(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A system with initial positions and velocities."""
+    """A system with initial positions and velocities.
+
+    drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
+    """
 
     system: System
     q_s: Any
@@ -166,6 +169,7 @@ class Problem:
     v_s: Any
     v_f: Any
     t: Any = 0.0
+    drawing: dict | None = None
 
     def state(self, project: bool = False):
         """The consistent initial `State` (see `initial_state`)."""

@@ -90,7 +90,7 @@ def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
     if drawing is not None:
         description = _read(drawing)
     if not description and problem is not None:
-        description = getattr(problem, "drawing", None) or built_in(system or "", np.size(problem.q_s))
+        description = problem.drawing or built_in(system or "", np.size(problem.q_s))
     found = Drawing.from_dict(description or bars(trajectory))
     return motion(trajectory, found, None if problem is None else problem.system)
 

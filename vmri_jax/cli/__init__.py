@@ -10,7 +10,8 @@ import typer
 
 from vmri_jax import runtime
 from vmri_jax.animation.command import animate
-from vmri_jax.cli import lists, run, stability, study
+from vmri_jax.cli import lists, run, scenes, stability, study
+from vmri_jax.hard.command import hard
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -18,8 +19,9 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for part in (lists, run, stability, study):
+for part in (lists, run, stability, study, scenes):
     app.add_typer(part.app)
+app.command()(hard)
 app.command()(animate)
 
 

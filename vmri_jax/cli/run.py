@@ -74,14 +74,14 @@ def simulate(
             "progress": True,
         }
         if streamed:
-            arguments |= {"out": out, "resume": resume, "overwrite": overwrite}
+            arguments |= {"out": out, "resume": resume, "overwrite": overwrite, "drawing": problem.drawing}
         compiling = _compile_clock()
         start = time.perf_counter()
         trajectory, stopped = _run(vm.stream if streamed else vm.simulate, problem, chosen, arguments)
         seconds = time.perf_counter() - start
         saved = [str(out)] if out is not None else []
         if out is not None and isinstance(trajectory, vm.Trajectory):
-            trajectory.save(out)
+            trajectory.save(out, problem.drawing)
         if plot is not None:
             nodes = trajectory if isinstance(trajectory, vm.Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
             plots.save(plots.plot_trajectory(nodes, f"{system}, {scheme}, {num_micro} micro steps"), plot)

@@ -105,7 +105,7 @@ class Scene:
         start = [
             join(self.by_name, self.places, part, what) for what in ("position", "velocity") for part in ("s", "f")
         ]
-        return Problem(self.system(), *start)
+        return Problem(self.system(), *start, drawing=self.drawing())
 
     def state(self) -> State:
         """The consistent initial state: velocities are projected onto the constraints."""

@@ -49,6 +49,7 @@ def stream(
     overwrite: bool = False,
     throw: bool = True,
     progress: bool = False,
+    drawing: dict | None = None,
 ) -> StoredTrajectory:
     """`simulate` that writes the trajectory to disk chunk by chunk: a long run survives a kill, and goes on with `resume`.
 
@@ -67,6 +68,7 @@ def stream(
         overwrite: replace a store that is in `out`.
         throw: raise `SimulationError` if a step fails; else return the store. What was computed is on disk either way.
         progress: show a progress bar.
+        drawing: what the system looks like, plain data kept with the run (see `Trajectory.save`).
 
     Returns:
         The `StoredTrajectory`. After a failure it ends with the chunk of the failure, NaN from the failing step on.
@@ -93,6 +95,7 @@ def stream(
         "identity": identity(simulation, start),
         "made_with": environment(),
     }
+    attributes |= {} if drawing is None else {"drawing": drawing}
     with interrupts_noted() as interrupted:
         if overwrite or not path.exists():
             with _explained(path, 0):

@@ -1,0 +1,36 @@
+"""`vmri explain`: what a scene adds to a macro step, body by body and effect by effect."""
+
+from typing import Annotated
+
+import typer
+
+from vmri_jax.catalogue import find_scene, find_scheme
+from vmri_jax.cli import options
+from vmri_jax.cli.common import BadInput, console
+
+app = typer.Typer()
+
+
+@app.command(epilog="Example:\n\nvmri explain my_file.py:my_scene --scheme explicit-slow --num-micro 20")
+def explain(
+    scene: Annotated[str, typer.Argument(help="my_file.py:my_scene.")],
+    scheme: options.Scheme = "fully-implicit",
+    num_micro: options.NumMicro = 10,
+    alpha: options.Alpha = None,
+    degree: options.Degree = None,
+    rule: options.Rule = None,
+    compose: options.Compose = None,
+    macro_dt: Annotated[
+        float | None, typer.Option(help="Macro step that is timed. [dim]from the fastest vibration[/dim]")
+    ] = None,
+    measure: Annotated[bool, typer.Option(help="Compile the scene without each effect in turn and time it.")] = True,
+) -> None:
+    """Where every body and effect of a scene lives, and what it adds: unknowns, evaluations, operations, time."""
+    try:
+        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
+        found = find_scene(scene)
+        with console.status("compiling the scene without each effect in turn" if measure else "looking"):
+            ledger = found.explain(chosen, macro_dt=macro_dt, measure=measure)
+    except (ValueError, TypeError) as error:
+        raise BadInput(str(error)) from error
+    console.print(ledger.table())
