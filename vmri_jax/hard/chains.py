@@ -34,7 +34,7 @@ def singular_configuration(full: bool) -> Outcome:
         f"{failed + '; ' if failed else ''}constraint {worst:.0e}; energy error, in brackets generic: {sizes}",
         fine and worst < 1e-10 and bounded,
         {"constraint": worst, **{f"energy_{name}": here for name, (here, _) in band.items()}},
-        {"t": met["turning"].t, "height": flat[:, 1], "chain": np.asarray(met["chain"].q_f)[:: max(1, steps // 10)]},
+        {"t": met["turning"].t[:201], "height": flat[:201, 1], "chain": np.asarray(met["chain"].q_f)[:201:20]},
     )
 
 
