@@ -26,7 +26,7 @@ def _energy(details: Details, theme: plots.Theme) -> Figure:
             size = max(1, len(t) // 400)
             count = len(t) // size
             e = e[: count * size].reshape(count, size)
-            label = f"tolerance{name}" if name else None
+            label = f"tolerance {name.strip()}" if name else None
             axes.fill_between(
                 t[: count * size : size], e.min(axis=1), e.max(axis=1), color=color, alpha=0.8, lw=0.6, label=label
             )
