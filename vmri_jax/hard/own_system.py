@@ -142,7 +142,7 @@ class OwnSystem:
 def own_system(problem: vm.Problem) -> OwnSystem:
     """A problem with five micro steps of ``omega h = 0.2`` for its fastest frequency at the start.
 
-    Where nothing vibrates, omega is the rate at which positions would change by their own size.
+    Where nothing vibrates, omega is the rate at which velocity or acceleration changes positions by their own size.
 
     Raises:
         ValueError: the problem is refused by `initial_state`.
@@ -150,11 +150,11 @@ def own_system(problem: vm.Problem) -> OwnSystem:
     state = problem.state()
     omega = float(vm.diagnostics.frequencies(problem.system, state)[0])
     if not omega > 0:
-        ahead = run(problem, vm.fully_implicit(1), 1e-3, 1)  # what forces do to velocities that may be zero
-        position, moved = nodes(ahead)
-        momentum = [np.concatenate([p, q]) for p, q in zip(ahead.p_s, ahead.p_f, strict=True)]
-        push = np.abs(momentum[1] - momentum[0]).max() / 1e-3 / max(np.abs(momentum).max(), 1e-300)
-        omega = max(np.abs(moved - position).max() / 1e-3 / max(np.abs(position).max(), 1e-300), min(push, 1e3), 1e-3)
+        dt = 1e-3
+        q = nodes(run(problem, vm.fully_implicit(1), dt, 2))
+        size = max(np.abs(q).max(), 1e-300)
+        velocity, acceleration = (np.abs(np.diff(q, k, axis=0)).max() / dt**k for k in (1, 2))
+        omega = float(max(velocity / size, np.sqrt(acceleration / size), 1e-3))
     return OwnSystem(problem, vm.fully_implicit(NUM_MICRO), NUM_MICRO * PHASE / omega, omega)
 
 
