@@ -53,22 +53,36 @@ def _meets_zero(scheme, macro_steps: int = 8) -> float:
 
 
 def stiff_springs_in_a_chain(full: bool) -> Outcome:
+    """Implicit at a large step, and 1e5 steps of the explicit scheme below the first impulse resonance of its fastest mode."""
     problem, steps = stiff_chain(), 2_000 if full else 50
-    trajectory = run(problem, vm.fully_implicit(20), 0.02, steps, save_every=steps // 50)
-    points = np.asarray(trajectory.q_f).reshape(len(trajectory.t), -1, 2)
-    points = np.concatenate([np.zeros_like(points[:, :1]), points], axis=1)
-    strain = np.abs(np.linalg.norm(np.diff(points, axis=1), axis=2) / 0.2 - 1).max(axis=1)
     params = problem.system.params
     weight = params["gravity"] * (params["load"] + 50 * params["mass"])
     at_rest = float(weight / params["stiffness"] / params["length"])
-    change = energy(trajectory, steps, float(abs(trajectory.energy[0])))
+    implicit = run(problem, vm.fully_implicit(20), 0.02, steps, save_every=steps // 50)
+    explicit = run(problem, vm.fully_explicit(20), 0.001, 100_000, save_every=100)
+    strain = {name: _strain(trajectory) / at_rest for name, trajectory in (("2", implicit), ("0.1", explicit))}
+    half = len(strain["0.1"]) // 2
+    growth = strain["0.1"][half:].max() / strain["0.1"][:half].max()
+    band = max(energy(t, n, float(abs(t.energy[0]))).band for t, n in ((implicit, steps), (explicit, 100_000)))
+    largest = ", ".join(f"{s.max():.2f} (omega h = {name})" for name, s in strain.items())
     return Outcome(
-        f"{steps} steps, omega h = 2: {status(trajectory)}, strain at most {strain.max() / at_rest:.2f} x that at rest; relative "
-        f"energy error {change.band:.1e}",
-        trajectory.success and strain.max() < 3 * at_rest and change.band < 1e-3,
-        {"strain": strain.max(), "strain_at_rest": at_rest, "band": change.band},
-        {"t": trajectory.t, "strain": strain},
+        f"{steps} implicit steps: {status(implicit)}, 1e5 explicit ones: {status(explicit)}; strain over that at rest at most "
+        f"{largest}, in the second half {growth:.2f} x that of the first; relative energy error {band:.1e}",
+        implicit.success
+        and explicit.success
+        and max(map(np.max, strain.values())) < 3
+        and growth < 1.2
+        and band < 1e-3,
+        {"strain_implicit": strain["2"].max(), "strain_explicit": strain["0.1"].max(), "growth": growth, "band": band},
+        {"t": explicit.t, "strain": strain["0.1"] * at_rest},
     )
+
+
+def _strain(trajectory: vm.Trajectory) -> np.ndarray:
+    """Largest strain of the links at every saved node."""
+    points = np.asarray(trajectory.q_f).reshape(len(trajectory.t), -1, 2)
+    points = np.concatenate([np.zeros_like(points[:, :1]), points], axis=1)
+    return np.abs(np.linalg.norm(np.diff(points, axis=1), axis=2) / 0.2 - 1).max(axis=1)
 
 
 CHAINS = (
@@ -82,8 +96,8 @@ CHAINS = (
     Case(
         12,
         "near-inextensible chain",
-        "50 masses, k = 1e6, fully_implicit, num_micro 20, H = 0.02, 2000 steps",
-        "strain at most 3 x that of the load at rest, relative energy error below 1e-3",
+        "50 masses, k = 1e6, num_micro 20: fully_implicit, H = 0.02; fully_explicit, H = 0.001, 1e5 steps",
+        "strain at most 4 x that of the load at rest and no growth in 1e5 steps, relative energy error below 1e-3",
         stiff_springs_in_a_chain,
     ),
 )
