@@ -180,7 +180,7 @@ def _found_in(module, path: Path, attribute: str) -> vm.Problem | Scene:
             raise ValueError(f"{attribute}() in {path} failed: {type(error).__name__}: {error}") from error
     if not isinstance(problem, vm.Problem | Scene):
         raise ValueError(
-            f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem, a vmri_jax.scene.Scene, or a "
-            "function without arguments that returns one."
+            f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem, or a function without "
+            "arguments that returns one; a vmri_jax.scene.Scene will do as well."
         )
     return problem
