@@ -54,15 +54,6 @@ def test_map_of_stable_steps(vmri, tmp_path):
     assert (tmp_path / "map.png").stat().st_size > 10_000
 
 
-def test_ledger_of_a_scene(vmri):
-    code, text = vmri("explain", "my.py:scene", "--num-micro", 4, "--no-measure")
-    assert code == 0
-    assert all(name in text for name in ("hook", "load", "gravity", "micro", "macro"))
-    code, text = vmri("explain", "fpu")
-    assert code == 2
-    assert "fpu is no scene" in text
-
-
 def test_a_scene_is_simulated_and_drawn(vmri, tmp_path):
     code, text = vmri(
         "simulate", "my.py:scene", "--macro-dt", 0.01, "--steps", 20, "--num-micro", 4, "--out", "run.npz"

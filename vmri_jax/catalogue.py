@@ -53,6 +53,9 @@ SYSTEMS = {
     ),
 }
 
+DEFAULT_NAME = "scene"
+"""What a file alone stands for, if it has one."""
+
 SCHEMES = {
     "fully-implicit": NamedScheme(vm.fully_implicit, (), "2", "V and W at the micro midpoints"),
     "explicit-slow": NamedScheme(
@@ -74,14 +77,17 @@ SCHEMES = {
 
 
 def find_problem(name: str) -> vm.Problem:
-    """A built-in problem by name, or ``my_file.py:my_problem``: a `Problem`, a `Scene`, or a function that makes one.
+    """A built-in problem by name, or one of your own, ``my_file.py:my_problem``.
+
+    In the file it is a `Problem`, a `Scene`, or a function without arguments making one; ``my_file.py`` alone stands for
+    its ``scene``.
 
     Raises:
         ValueError: an unknown name; a file that does not exist, fails to run, or has no such name; no Problem there.
     """
     if name in SYSTEMS:
         return SYSTEMS[name].factory()
-    found = _in_file(name)
+    found = _find_own(name)
     try:
         return found.problem() if isinstance(found, Scene) else found
     except Exception as error:
@@ -89,24 +95,32 @@ def find_problem(name: str) -> vm.Problem:
 
 
 def find_scene(name: str) -> Scene:
-    """The scene ``my_file.py:my_scene``; errors as in `find_problem`."""
-    found = None if name in SYSTEMS else _in_file(name)
+    """The scene in your own file, ``my_file.py:my_scene``, or ``my_file.py`` for its ``scene``.
+
+    Raises:
+        ValueError: as of `find_problem`; a system that is no scene.
+    """
+    found = SYSTEMS[name] if name in SYSTEMS else _find_own(name)
     if not isinstance(found, Scene):
-        raise ValueError(f"{name} is no scene; give my_file.py:my_scene, a vmri_jax.scene.Scene in that file.")
+        raise ValueError(
+            f"{name} is a system of functions, not a scene; give a vmri_jax.scene.Scene, my_file.py:my_scene."
+        )
     return found
 
 
-def _in_file(name: str) -> vm.Problem | Scene:
-    """What ``my_file.py:name`` names."""
+def _find_own(name: str) -> vm.Problem | Scene:
     file_name, colon, attribute = name.partition(":")
     if not colon and not file_name.endswith(".py"):
         raise ValueError(f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem.")
     path = Path(file_name)
     if not path.is_file():
         raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
+    module = _run_file(path)
+    if not attribute and hasattr(module, DEFAULT_NAME):
+        attribute = DEFAULT_NAME
     if not attribute:
         raise ValueError(f"{name}: say which problem in that file, e.g. {file_name}:my_problem.")
-    return _problem_in(_run_file(path), path, attribute)
+    return _found_in(module, path, attribute)
 
 
 def find_scheme(name: str, num_micro: int, compose: str | None = None, **options) -> vm.Scheme | vm.Composition:
@@ -159,7 +173,7 @@ def _run_file(path: Path):
     return module
 
 
-def _problem_in(module, path: Path, attribute: str) -> vm.Problem | Scene:
+def _found_in(module, path: Path, attribute: str) -> vm.Problem | Scene:
     found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
     if attribute not in found:
         problems = [name for name, value in found.items() if isinstance(value, vm.Problem | Scene)]
@@ -175,7 +189,7 @@ def _problem_in(module, path: Path, attribute: str) -> vm.Problem | Scene:
             raise ValueError(f"{attribute}() in {path} failed: {type(error).__name__}: {error}") from error
     if not isinstance(problem, vm.Problem | Scene):
         raise ValueError(
-            f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem or a "
-            "vmri_jax.scene.Scene, or a function without arguments that returns one."
+            f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem, or a function without "
+            "arguments that returns one; a vmri_jax.scene.Scene will do as well."
         )
     return problem

@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false
 """Scenes that are wrong say what is wrong, with which names, before anything is computed."""
 
 import numpy as np

@@ -10,7 +10,7 @@ from tests.scene import reference_scenes
 from vmri_jax import ConstantMass, fully_explicit, fully_implicit, simulate, systems
 
 NAMES = ("fermi_pasta_ulam", "triple_spherical_pendulum", "simple_atomic_model")
-CASES = [(NAMES[0], fully_explicit(5)), (NAMES[1], fully_implicit(5)), (NAMES[2], fully_explicit(5))]
+CASES = [(NAMES[0], fully_explicit(5)), (NAMES[1], fully_implicit(5)), (NAMES[2], fully_implicit(5))]
 
 
 @pytest.mark.parametrize(("name", "scheme"), CASES)

@@ -22,7 +22,7 @@ import numpy as np
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.layout import Place, Rows
-from vmri_jax.scene.terms import Term
+from vmri_jax.scene.terms import Term, choose
 
 Kind = Literal["kinetic", "potential", "constraint", "force"]
 Elements = tuple[tuple[str, ...], ...]
@@ -66,6 +66,11 @@ class Effect:
             object.__setattr__(self, "name", self.default_name)
         if self.rate not in ("slow", "fast", "auto"):
             raise ValueError(f"{self.name}: rate is {self.rate!r}; it must be 'slow', 'fast' or 'auto'.")
+
+    def one(self, params: dict[str, Any], i: int, bodies: Mapping[str, Body]) -> dict[str, Any]:
+        """The parameters of element i among those of all."""
+        single = len(self.elements(bodies)) == 1
+        return params if single else choose(params, (i,), self.numbers + self.vectors)
 
     @property
     def refers_to(self) -> tuple[str, ...]:

@@ -12,7 +12,6 @@ from vmri_jax.quadrature import is_concrete
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.layout import Place
 from vmri_jax.scene.sorting import Placed
-from vmri_jax.scene.terms import pick
 
 TOLERANCE = 1e-8
 """Singular values below this, of rows scaled to length one, are zero."""
@@ -54,12 +53,7 @@ def _rows(bodies, places, held: Sequence[Placed]) -> list[tuple[str, np.ndarray]
         effect = part.effect
         elements, params = effect.elements(bodies), effect.parameters(bodies)
         for i in part.elements:
-            own = params
-            if len(elements) > 1:
-                split = effect.numbers + effect.vectors
-                own = params | {
-                    name: pick(params[name], (i,)) for name in split if name in params and jnp.ndim(params[name])
-                }
+            own = effect.one(params, i, bodies)
             jacobian = _jacobian(effect.function, tuple(bodies[name].position for name in elements[i]), own)
             columns = [
                 (n_s if places[name].part == "f" else 0) + places[name].start + k

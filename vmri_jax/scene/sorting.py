@@ -17,14 +17,12 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.terms import pick
 
 SEPARATION = 3.0
 """Smallest ratio of two neighbouring rates that separates slow from fast."""
@@ -118,12 +116,7 @@ def stiffness(effect: Effect, bodies: Mapping[str, Body]) -> Stiffness:
     size = max(float(np.ptp(_positions(bodies), axis=0).max(initial=0.0)), float(np.abs(_positions(bodies)).max()))
     frequency, rate = np.zeros(len(elements)), np.zeros(len(elements))
     for i, element in enumerate(elements):
-        own = params
-        if len(elements) > 1:
-            split = effect.numbers + effect.vectors
-            own = params | {
-                name: pick(params[name], (i,)) for name in split if name in params and jnp.ndim(params[name])
-            }
+        own = effect.one(params, i, bodies)
         force, matrix = _derivatives(effect.function, tuple(bodies[name].position for name in element), own)
         if not (np.isfinite(force).all() and np.isfinite(matrix).all()):
             raise ValueError(

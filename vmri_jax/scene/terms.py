@@ -29,11 +29,7 @@ class Term:
 
     def own(self, params):
         """What the function gets as params."""
-        own = params[self.name]
-        if self.select is None:
-            return own
-        chosen = {name: pick(own[name], self.select) for name in self.split if name in own and jnp.ndim(own[name])}
-        return own | chosen
+        return params[self.name] if self.select is None else choose(params[self.name], self.select, self.split)
 
     def take(self, q_s, q_f):
         """The coordinates of every role."""
@@ -71,10 +67,16 @@ class TangentDamping:
         """Force on all slow and on all fast coordinates."""
 
         def energy(q):
-            return total([term.value(*q, params) for term in self.terms])
+            q_s, q_f = q
+            return total([term.value(q_s, q_f, params) for term in self.terms])
 
         rates = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
         return tuple(-params[self.name]["stiffness"] * rate for rate in rates)
+
+
+def choose(own, select: Sequence[int], split: Sequence[str]):
+    """Parameters of some elements: entries of those in `split` that have one for each element."""
+    return own | {name: pick(own[name], select) for name in split if name in own and jnp.ndim(own[name])}
 
 
 def pick(values, select: Sequence[int]):
