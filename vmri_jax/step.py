@@ -217,7 +217,7 @@ def _kick_gradients(system, scheme, q_s, q_f, average=None):
     """``(d/dq_s, d/dq_f)`` of every kicked term, of mollified ones at averaged fast positions."""
 
     def gradient(term):
-        if not term.mollified:
+        if average is None or not term.mollified:
             return term.gradient(q_s, q_f)
         at_average, pull = jax.vjp(lambda q_s, q_f: (q_s, average(q_s, q_f)), q_s, q_f)
         return pull(term.gradient(*at_average))

@@ -169,7 +169,7 @@ class Problem:
     v_s: Any
     v_f: Any
     t: Any = 0.0
-    drawing: dict | None = None
+    drawing: Any = None
 
     def state(self, project: bool = False):
         """The consistent initial `State` (see `initial_state`)."""

@@ -2,10 +2,10 @@
 
 import csv
 import json
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -109,7 +109,7 @@ class StabilityMap:
 
 def stability_map(
     model: Problem | tuple[System, State],
-    scheme: Scheme | Composition | Mapping[Hashable, Scheme | Composition],
+    scheme: Scheme | Composition | Mapping[Any, Scheme | Composition],
     omega_H: Sequence[float] | np.ndarray,
     *,
     kappa: Sequence[float] | None = None,
