@@ -219,8 +219,10 @@ def _kick_gradients(system, scheme, q_s, q_f, average=None):
     def gradient(term):
         if average is None or not term.mollified:
             return term.gradient(q_s, q_f)
-        at_average, pull = jax.vjp(lambda q_s, q_f: (q_s, average(q_s, q_f)), q_s, q_f)
-        return pull(term.gradient(*at_average))
+        a, pull = jax.vjp(average, q_s, q_f)
+        d_s, d_f = term.gradient(q_s, a)
+        more_s, d_f = pull(d_f)
+        return d_s + more_s, d_f
 
     return tuple(gradient(term) for term in lagrangian(system, scheme).kicks)
 
