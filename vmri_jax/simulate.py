@@ -8,10 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import diagnostics
-from vmri_jax.checks import check_arrays, check_system, require_x64
+from vmri_jax.checks import (
+    check_arrays,
+    check_flags,
+    check_number,
+    check_params,
+    check_system,
+    check_type,
+    require_x64,
+)
 from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.newton import Newton
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import Result, SimulationError
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
@@ -62,8 +70,9 @@ def simulate(
         SimulationError: a step failed.
     """
     macro_dt = jnp.asarray(
-        check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every), dtype=float
+        check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro), dtype=float
     )
+    check_flags(throw=throw, progress=progress)
     start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
     newton, num_saves = newton or Newton(), num_steps // save_every
     memory = run_memory(system, scheme, start, macro_dt, newton)
@@ -184,23 +193,26 @@ def _vectors(state: State) -> dict:
     return {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
 
 
-def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every):
+def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro=False):
     """Refuse bad arguments of `simulate`; returns macro_dt."""
     require_x64()
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(
             f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
         )
-    if not isinstance(state, State):
-        raise TypeError(f"simulate: state is {type(state).__name__}; give a State, e.g. from initial_state(...).")
+    check_type("simulate: system", system, System, "a vmri_jax.System")
+    check_type("simulate: state", state, State, "a State, e.g. from initial_state(...)")
+    check_params(system.params)
     if not isinstance(newton, Newton | None):
         raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(method='dense').")
     if (macro_dt is None) == (micro_dt is None):
         got = "neither" if macro_dt is None else "both"
         raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
-    if is_concrete(dt) and not (np.ndim(dt) == 0 and np.isfinite(dt) and dt > 0):
+    check_flags(save_micro=save_micro)
+    if is_concrete(real_array(f"simulate: {name}", dt, 0)) and not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"simulate: {name} is {dt}; it must be a positive number.")
+    check_number("simulate: the t of state", state.t)
     for name, value in (("num_steps", num_steps), ("save_every", save_every)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"simulate: {name} is {value!r}; it must be an integer of at least 1.")
@@ -212,8 +224,6 @@ def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save
     vectors = _vectors(state)
     if is_concrete(vectors):
         check_arrays(**vectors)
-    if not isinstance(system, System):
-        raise TypeError(f"simulate: system is {type(system).__name__}; it must be a vmri_jax.System.")
     return dt if micro_dt is None else scheme.num_micro * micro_dt
 
 
