@@ -20,7 +20,7 @@ from vmri_jax.checks import (
 from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import is_concrete, real_array
-from vmri_jax.results import Result, SimulationError
+from vmri_jax.results import CONSTRAINT_TOLERANCE, Result, SimulationError
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
 from vmri_jax.step import Memory, Stages, advance, start_memory
@@ -143,18 +143,23 @@ def run(
     energy = jax.vmap(partial(diagnostics.energy, system))(*phase)
 
     # The energy is NaN from a failing step on. A potential may also be NaN where its gradient is not (a logarithm beyond
-    # its pole): such nodes are no result either.
-    broken = jnp.cumsum(~jnp.isfinite(energy)) > 0
-    at_node = first_step + jnp.argmax(broken) * save_every - 1
-    newly = broken.any() & (status[1] < 0)
-    status = (jnp.where(newly, Result.NON_FINITE, status[0]), jnp.where(newly, jnp.maximum(at_node, 0), status[1]))
+    # its pole), and a lane of a batch may start off its constraints: such nodes are no result either.
+    residual = jax.vmap(partial(diagnostics.constraint_residual, system))(*phase)
+    kept = residual[:, 0] <= jnp.maximum(CONSTRAINT_TOLERANCE, 100 * newton.tolerance)
+    broken = jnp.cumsum(~jnp.isfinite(energy) | ~kept) > 0
+    first = jnp.argmax(broken)
+    at_node = first_step + first * save_every - 1
+    newly = broken.any() & ((status[1] < 0) | (at_node < status[1]))
+    cause = jnp.where(jnp.isfinite(energy[first]), Result.CONSTRAINT_VIOLATED, Result.NON_FINITE)
+    status = (jnp.where(newly, cause, status[0]), jnp.where(newly, jnp.maximum(at_node, 0), status[1]))
+    energy = jnp.where(broken, jnp.nan, energy)
     phase = tuple(jnp.where(broken[:, None], jnp.nan, a) for a in phase)
 
     trajectory = Trajectory(
         nodes.t,
         *phase,
         energy=energy,
-        constraint_residual=jax.vmap(partial(diagnostics.constraint_residual, system))(*phase),
+        constraint_residual=jnp.where(broken[:, None], jnp.nan, residual),
         info=RunInfo(*worst),
         result=status[0],
         failed_at=status[1],
