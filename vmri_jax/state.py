@@ -144,7 +144,8 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
     check_type("initial_state: system", system, System, "a vmri_jax.System")
     check_params(system.params)
     check_flags(project=project)
-    t, tolerance = check_number("t", t), check_number("tolerance", tolerance)
+    t = check_number("t", t)
+    check_number("tolerance", tolerance)
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     if project:
         q_s, q_f = _projected_positions(system, q_s, q_f)

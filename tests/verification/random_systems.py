@@ -213,33 +213,33 @@ def draw(random: Random, of: Structure) -> Draw:
 @cache
 def functions(of: Structure) -> dict:
     """The functions of a system of this structure, made once, so that its draws share their programs."""
-    shape = (-1, of.dimension)
+    shape, names = (-1, of.dimension), dataclasses.asdict(of)
 
     def slow_potential(q_s, q_f, params):
         x = q_s.reshape(shape)[:, None] - q_f.reshape(shape)
-        return ENERGIES[of.slow_potential](x.reshape(shape), params["stiffness"][0], params["length"])
+        return ENERGIES[names["slow_potential"]](x.reshape(shape), params["stiffness"][0], params["length"])
 
     def fast_potential(q_f, params):
         x = jnp.diff(q_f.reshape(shape), axis=0, prepend=jnp.zeros((1, of.dimension)))
-        return ENERGIES[of.fast_potential](x, params["stiffness"][1], params["length"])
+        return ENERGIES[names["fast_potential"]](x, params["stiffness"][1], params["length"])
 
     def constraint(q_s, q_f, params):
-        values = CONSTRAINTS[of.constraint](q_s.reshape(shape), q_f.reshape(shape), params["small"])
+        values = CONSTRAINTS[names["constraint"]](q_s.reshape(shape), q_f.reshape(shape), params["small"])
         return values - params.get("g", 0.0)
 
     def slow_constraint(q_s, params):
-        return SLOW_CONSTRAINTS[of.slow_constraint](q_s.reshape(shape)) - params.get("g_slow", 0.0)
+        return SLOW_CONSTRAINTS[names["slow_constraint"]](q_s.reshape(shape)) - params.get("g_slow", 0.0)
 
     def force(t, q_s, q_f, v_s, v_f, params):
-        f = FORCES[of.force]
+        f = FORCES[names["force"]]
         return f(t, q_s, v_s, params["force"]), f(t, q_f, v_f, params["force"])
 
     def kinetic(q_s, q_f, v_s, v_f, params):
         q, v = jnp.concatenate([q_s, q_f]), jnp.concatenate([v_s, v_f])
-        return KINETIC[of.kinetic](q, v, params["masses"], params["small"])
+        return KINETIC[names["kinetic"]](q, v, params["masses"], params["small"])
 
     made = [slow_potential, fast_potential, constraint, slow_constraint, force]
-    return {f.__name__: f for f in made if getattr(of, f.__name__)} | {"kinetic": kinetic}
+    return {f.__name__: f for f in made if names[f.__name__]} | {"kinetic": kinetic}
 
 
 def problem(of: Structure, at: Draw) -> vm.Problem:
