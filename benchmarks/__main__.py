@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks import batch, compilation, cost, floor, kills, orders, peers
+from benchmarks import batch, compilation, cost, floor, fuzz, kills, orders, peers
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -69,6 +69,34 @@ def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 10
     """A streaming run killed at random moments, and resumed to the last bit."""
     prepare(cache=False)
     _measure("kills", kills, False, out, count=count)
+
+
+@app.command("fuzz")
+def fuzz_command(
+    count: Annotated[int, typer.Option(min=1, help="Runs in all; those done before are kept.")] = 2000,
+    seed: Annotated[int, typer.Option(help="Other seeds are other systems.")] = 0,
+    limit: Annotated[
+        float, typer.Option(help="Seconds after which a run, compiling included, counts as a hang.")
+    ] = 600.0,
+    reduce: Annotated[
+        int | None, typer.Option(help="Simplify this run, as long as it goes wrong in the same way.")
+    ] = None,
+    core: Core = None,
+    out: Out = OUT,
+) -> None:
+    """Random systems: how their runs end, and every one that ends wrong."""
+    prepare(core)
+    if reduce is not None:
+        for part in fuzz.reduce(seed, reduce, console.log):
+            console.print(part)
+        return
+    path = out / f"fuzz_{seed}.jsonl"
+    with progress("fuzz", count) as tell:
+        found = fuzz.fuzz(count, seed, path, limit, tell)
+    fuzz.table(found, console)
+    if wrong := fuzz.wrong(found):
+        console.print(f"\nsimplify one with: python -m benchmarks fuzz --seed {seed} --reduce {min(wrong)}")
+        raise typer.Exit(1)
 
 
 @app.command("all")

@@ -3,7 +3,9 @@
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from vmri_jax import (
     micro,
     quadrature,
     simulate,
+    simulate_batch,
     systems,
 )
 
@@ -83,6 +86,53 @@ def test_bad_vectors(fpu, changes, message):
         start(fpu, **changes)
 
 
+@pytest.mark.parametrize("junk", [None, "one", [1.0, "a"], [[1.0], [2.0, 3.0]], {"a": 1}, object(), 1j, 10**400])
+def test_what_is_no_number(fpu, junk):
+    for name in ("q_s", "v_f", "t", "tolerance"):
+        with pytest.raises(TypeError, match=rf"{name} is .*; give (a )?real number"):
+            start(fpu, **{name: junk})
+    with pytest.raises(TypeError, match=r"ConstantMass: fast is .*; give real numbers"):
+        ConstantMass([1.0], junk)
+    with pytest.raises(TypeError, match=r"affine: alpha is .*; give a real number"):
+        explicit_slow(2, junk)
+    with pytest.raises(TypeError, match=r"Rule: weights is .*; give real numbers"):
+        quadrature.Rule((0.5,), junk)
+    if junk is not None:
+        with pytest.raises(TypeError, match=r"simulate: macro_dt is .*; give a real number"):
+            simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=junk, num_steps=1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"), [({"t": np.nan}, "t is nan; it must be finite"), ({"t": [0.0]}, "t has shape")]
+)
+def test_bad_start_times(fpu, changes, message):
+    with pytest.raises(ValueError, match=message):
+        start(fpu, **changes)
+
+
+def test_flags_are_true_or_false(fpu):
+    with pytest.raises(TypeError, match="project is 'no'; it must be True or False"):
+        start(fpu, project="no")
+    for name in ("save_micro", "throw", "progress"):
+        with pytest.raises(TypeError, match=f"{name} is 1; it must be True or False"):
+            simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=1, **{name: 1})
+
+
+def test_parameters_that_are_no_numbers(fpu):
+    system = fpu.system.replace(params={"springs": [1.0, "stiff"]})
+    with pytest.raises(TypeError, match=r"params\['springs'\]\[1\] is 'stiff'; give arrays of numbers"):
+        initial_state(system, fpu.q_s, fpu.q_f, fpu.v_s, fpu.v_f)
+    with pytest.raises(TypeError, match=r"params\['springs'\]\[1\] is 'stiff'; give arrays of numbers"):
+        simulate(system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=1)
+
+
+def test_parameters_of_a_batch(fpu):
+    states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
+    for params in ("stiff", {"other": jnp.ones(2)}, jax.tree.map(lambda a: jnp.stack([a] * 3), fpu.system.params)):
+        with pytest.raises((ValueError, TypeError), match="params"):
+            simulate_batch(fpu.system, fully_implicit(2), states, macro_dt=0.1, num_steps=1, params=params)
+
+
 def vector_potential(q_s, q_f, params):
     return q_s**2
 
@@ -107,9 +157,36 @@ def failing_potential(q_s, q_f, params):
     return params["no such entry"]
 
 
+def whole_potential(q_s, q_f, params):
+    return 0
+
+
+def complex_potential(q_f, params):
+    return jnp.sum(q_f) * 1j
+
+
+def single_constraint(q_s, q_f, params):
+    return q_f.astype(jnp.float32)
+
+
+def branching_potential(q_f, params):
+    return q_f[0] if q_f[0] > 0 else 0.0
+
+
+def numpy_potential(q_f, params):
+    return np.square(float(q_f[0]))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"slow_potential": whole_potential}, "slow_potential returns int64; it must return float64"),
+        ({"fast_potential": complex_potential}, "fast_potential returns complex128; it must return float64"),
+        ({"constraint": single_constraint}, "constraint returns float32; it must return float64"),
+        ({"fast_potential": branching_potential}, "fast_potential could not be evaluated .*Tracer"),
+        ({"fast_potential": numpy_potential}, "fast_potential could not be evaluated .*ConcretizationTypeError"),
+        ({"fast_potential": lambda q_f: 0.0}, "fast_potential could not be evaluated .*positional argument"),
+        ({"slow_potential": lambda q_s, q_f, params: None}, "slow_potential returns NoneType; it must return a scalar"),
         ({"slow_potential": vector_potential}, r"slow_potential returns shape \(3,\); it must return a scalar"),
         ({"fast_potential": vector_fast_potential}, r"fast_potential returns shape \(3,\); it must return a scalar"),
         ({"constraint": scalar_constraint}, r"constraint returns shape \(\); it must return a vector"),
@@ -147,6 +224,18 @@ def test_system_fields_of_the_wrong_type():
         System(3.0)
     with pytest.raises(TypeError, match="slow_potential is 2; it must be a function or None"):
         System(ConstantMass([1.0], [1.0]), slow_potential=2)
+    with pytest.raises(TypeError, match=r"force is Unhashable.*, which has no hash"):
+        System(ConstantMass([1.0], [1.0]), force=Unhashable())
+
+
+@dataclass
+class Unhashable:
+    """A callable that programs cannot be kept for."""
+
+    strength: float = 1.0
+
+    def __call__(self, t, q_s, q_f, v_s, v_f, params):
+        return v_s, v_f
 
 
 @pytest.mark.parametrize("make", [fully_implicit, explicit_slow, lambda n: galerkin(n, 2)])
@@ -224,6 +313,14 @@ def test_nan_in_a_state(fpu):
     bad = State(0.0, state.q_s, state.q_f, state.p_s * jnp.nan, state.p_f)
     with pytest.raises(ValueError, match=r"p_s has entries that are not finite at \[0, 1, 2\]"):
         simulate(fpu.system, fully_implicit(2), bad, macro_dt=0.1, num_steps=1)
+
+
+def test_only_rules_are_placed():
+    for place in (macro, micro):
+        with pytest.raises(TypeError, match="rule is 'midpoint'; give a Rule"):
+            place("midpoint")
+    with pytest.raises(TypeError, match="rule is 3; give a Rule"):
+        galerkin(2, 1, 3)  # pyright: ignore[reportArgumentType]
 
 
 def test_bad_number_of_springs():

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -136,3 +137,13 @@ print("same")
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout.strip() == "same", done.stderr
+
+
+def test_a_lane_off_the_constraints_has_failed(tsp):
+    states = jax.tree.map(lambda a: jnp.stack([a, a]), tsp.state())
+    states = eqx.tree_at(lambda s: s.q_f, states, states.q_f.at[1].multiply(1.01))
+    run = simulate_batch(tsp.system, fully_implicit(2), states, macro_dt=0.01, num_steps=2)
+    assert run.result.tolist() == [Result.CONVERGED, Result.CONSTRAINT_VIOLATED]
+    assert run.failed_at.tolist() == [-1, 0]
+    assert np.isnan(run.q_f[1]).all()
+    assert run.constraint_residual[0].max() < 1e-10

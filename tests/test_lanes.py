@@ -27,6 +27,13 @@ def lane_dependent_loop(x, k):
     return jax.lax.while_loop(lambda c: c[1] < k, lambda c: (c[0] * 1.5, c[1] + 1, c[2]), (x, 0, jnp.ones(2)))
 
 
+def loops_side_by_side(x, k):
+    def count(limit, x):
+        return jax.lax.while_loop(lambda c: c[1] < limit, lambda c: (c[0] * 1.5, c[1] + 1), (jnp.stack([x, x]), 0))
+
+    return jax.vmap(count)(k * jnp.arange(4), x), jax.vmap(count)(jnp.arange(4), x)
+
+
 def shared_loop(x, k):
     return jax.lax.fori_loop(0, 3, lambda i, c: (c[0] + i * c[1], c[1]), (x, jnp.ones(4)))
 
@@ -65,6 +72,7 @@ def called(x, k):
         products,
         library_calls,
         lane_dependent_loop,
+        loops_side_by_side,
         shared_loop,
         scanned,
         branches,

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
+from vmri_jax.checks import check_params, check_type
 from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.lanes import over_lanes
 from vmri_jax.newton import Newton
+from vmri_jax.quadrature import real_array
 from vmri_jax.scheme import Scheme
 from vmri_jax.simulate import check_run, run, run_memory
 from vmri_jax.split import split
@@ -58,6 +60,9 @@ def simulate_batch(
     """
     newton = newton or Newton()
     lanes = _check_states(states)
+    check_type("simulate_batch: system", system, System, "a vmri_jax.System")
+    if params is not None:
+        _check_params(system, params, lanes)
     states, params = jax.tree.map(np.asarray, (states, params))  # cut into pieces without a compiled program for each
     first = jax.tree.map(lambda a: a[0], states)
     check_run(
@@ -68,9 +73,10 @@ def simulate_batch(
         *(_first(dt) for dt in (macro_dt, micro_dt)),
         num_steps=num_steps,
         save_every=save_every,
+        save_micro=save_micro,
     )
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
-    dt = np.asarray(dt, dtype=float)
+    dt = np.asarray(real_array(f"simulate_batch: {name}", dt))
     if dt.shape not in ((), (lanes,)):
         raise ValueError(
             f"simulate_batch: {name} has shape {dt.shape}; give a number, or one for each of the {lanes} lanes."
@@ -108,7 +114,25 @@ def simulate_batch(
 
 def _first(dt):
     """The step size of the first lane."""
-    return None if dt is None else np.ravel(dt)[0]
+    if dt is None or not np.size(real_array("simulate_batch: the step size", dt)):
+        return dt
+    return np.ravel(dt)[0]
+
+
+def _check_params(system: System, params, lanes: int) -> None:
+    """Refuse parameters that are not those of the system with a batch axis."""
+    check_params(params)
+    own, given = jax.tree.structure(system.params), jax.tree.structure(params)
+    if own != given:
+        raise ValueError(
+            f"simulate_batch: params is {given}; give the pytree of system.params, {own}, with a batch axis."
+        )
+    wanted = [(lanes, *np.shape(leaf)) for leaf in jax.tree.leaves(system.params)]
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(params)]
+    if shapes != wanted:
+        raise ValueError(
+            f"simulate_batch: the arrays of params have shapes {shapes}; give one per lane of each parameter, {wanted}."
+        )
 
 
 def _check_states(states) -> int:

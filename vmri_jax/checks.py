@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.system import ConstantMass, System
 
 
@@ -23,9 +23,7 @@ def check_arrays(**arrays):
     for name, value in arrays.items():
         if getattr(value, "dtype", None) in (np.float32, np.float16):
             raise ValueError(f"{name} has dtype {value.dtype}; give float64, e.g. {name}.astype(float).")
-        if np.iscomplexobj(value):
-            raise ValueError(f"{name} is complex; coordinates and momenta are real.")
-        array = jnp.asarray(value, dtype=float)
+        array = jnp.asarray(real_array(name, value))
         if array.ndim != 1:
             raise ValueError(f"{name} has shape {array.shape}; it must be a vector of coordinates, shape (n,).")
         if is_concrete(array) and not np.isfinite(array).all():
@@ -37,6 +35,37 @@ def check_arrays(**arrays):
         if a in out and b in out and out[a].shape != out[b].shape:
             raise ValueError(f"{b} has shape {out[b].shape}, {a} has {out[a].shape}; they must be equal.")
     return tuple(out.values())
+
+
+def check_number(name: str, value):
+    """A finite real number, as an array of shape ()."""
+    array = jnp.asarray(real_array(name, value, 0))
+    if is_concrete(array) and not np.isfinite(array):
+        raise ValueError(f"{name} is {value}; it must be finite.")
+    return array
+
+
+def check_flags(**flags) -> None:
+    """Refuse what is neither True nor False: an array or a word would count as one of them."""
+    for name, value in flags.items():
+        if not isinstance(value, bool | np.bool_):
+            raise TypeError(f"{name} is {value!r}; it must be True or False.")
+
+
+def check_type(name: str, value, kind: type, example: str) -> None:
+    """Refuse objects of another class."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} is {type(value).__name__}; give {example}.")
+
+
+def check_params(params) -> None:
+    """Refuse parameters that are no numbers, naming where they are in the pytree."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if is_concrete(leaf) and getattr(leaf, "dtype", np.asarray(leaf).dtype).kind not in "biufc":
+            raise TypeError(
+                f"System: params{jax.tree_util.keystr(path)} is {leaf!r}; give arrays of numbers, which are handed to every "
+                "function. What is no number belongs into the functions themselves."
+            )
 
 
 def check_system(system: System, q_s, q_f) -> None:
@@ -58,18 +87,22 @@ def check_system(system: System, q_s, q_f) -> None:
             shape = _shape(name, function, *args, system.params)
             if getattr(shape, "shape", None) != ():
                 raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a scalar, shape ().")
+            _check_float64(name, shape)
     for name, args in (("constraint", (q_s, q_f)), ("slow_constraint", (q_s,))):
         function = getattr(system, name)
         if function is not None:
             shape = _shape(name, function, *args, system.params)
             if len(getattr(shape, "shape", ())) != 1:
                 raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a vector, shape (n_g,).")
+            _check_float64(name, shape)
     if system.force is not None:
         shape = _shape("force", system.force, jnp.zeros(()), q_s, q_f, q_s, q_f, system.params)
         if not isinstance(shape, tuple) or [getattr(s, "shape", None) for s in shape] != [(n_s,), (n_f,)]:
             raise ValueError(
                 f"System: force returns {_describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
             )
+        for part in shape:
+            _check_float64("force", part)
 
 
 def _shape(name: str, function, *args):
@@ -80,6 +113,14 @@ def _shape(name: str, function, *args):
             f"System: {name} could not be evaluated on arguments of shapes "
             f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and the params: {type(error).__name__}: {error}"
         ) from error
+
+
+def _check_float64(name: str, value) -> None:
+    if value.dtype != np.float64:
+        raise ValueError(
+            f"System: {name} returns {value.dtype}; it must return float64. Whole numbers become floats as 0.0 instead of 0, "
+            "arrays by .astype(float)."
+        )
 
 
 def _describe(value) -> str:

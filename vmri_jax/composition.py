@@ -18,7 +18,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.scheme import Description, Scheme
 
 
@@ -173,7 +173,8 @@ def compose(scheme: Scheme | Composition, coefficients: str | Sequence[float]) -
                 f"{kind}. Take e.g. fully_explicit(num_micro, alpha=0.5), or give coefficients of your own."
             )
         coefficients = COMPOSITIONS[coefficients].coefficients
-    c = np.asarray(coefficients, dtype=float) if is_concrete(coefficients) else jnp.asarray(coefficients, dtype=float)
+    c = real_array("compose: coefficients", coefficients)
+    c = np.asarray(c) if is_concrete(c) else c
     if c.ndim != 1 or not c.size:
         raise ValueError(f"compose: coefficients have shape {c.shape}; give a sequence of parts of the macro step.")
     if is_concrete(c) and not (np.all(np.isfinite(c)) and np.all(c != 0) and abs(c.sum() - 1) < 1e-10):

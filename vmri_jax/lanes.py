@@ -278,16 +278,20 @@ def _while(size, inputs, *, cond_jaxpr, body_jaxpr, cond_nconsts, body_nconsts):
         carry = _values(arrays, lanes)
         new = _arrays(size, body(carry), lanes)
         goes_on = test(carry)
-        if not goes_on.lanes:
+        if not goes_on.lanes and not np.ndim(goes_on.array):
             return new
-        return [a if a is b else _freeze(goes_on, a, b) for a, b in zip(new, arrays, strict=True)]
+        return [a if a is b else _freeze(goes_on, a, b, on) for a, b, on in zip(new, arrays, lanes, strict=True)]
 
     arrays = lax.while_loop(lambda a: jnp.any(test(_values(a, lanes)).array), step, _arrays(size, start, lanes))
     return _values(arrays, lanes)
 
 
-def _freeze(goes_on: _Value, new, old):
-    return lax.select(jnp.broadcast_to(_aligned(goes_on, new.ndim - 1), new.shape), new, old)
+def _freeze(goes_on: _Value, new, old, lanes: bool = True):
+    """`new` where it goes on; a predicate of several entries, of a loop under `jax.vmap`, belongs to the first axes."""
+    flags = goes_on.array if goes_on.lanes or not lanes else jnp.expand_dims(goes_on.array, -1)
+    cut = flags.ndim - lanes
+    flags = jnp.reshape(flags, flags.shape[:cut] + (1,) * (new.ndim - flags.ndim) + flags.shape[cut:])
+    return lax.select(jnp.broadcast_to(flags, new.shape), new, old)
 
 
 def _scan(size, inputs, *, jaxpr, length, reverse, num_consts, num_carry, unroll, **_):

@@ -28,6 +28,23 @@ def is_concrete(tree) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))  # pyright: ignore
 
 
+def real_array(name: str, value, ndim: int | None = None):
+    """Numbers as users give them as an array of floats, of JAX if they are, else of NumPy; refused is what is not real."""
+    advice = "give a real number" if ndim == 0 else "give real numbers, an array of float64"
+    if is_concrete(value):
+        try:
+            kind = np.asarray(value).dtype.kind
+        except Exception:  # ragged lists, and whatever an object of one's own raises
+            kind = ""
+        if kind not in tuple("biuf"):
+            raise TypeError(f"{name} is {value!r}; {advice}.")
+    given = isinstance(value, jax.Array) or not is_concrete(value)
+    array = jnp.asarray(value, dtype=float) if given else np.asarray(value, dtype=float)
+    if ndim is not None and array.ndim != ndim:
+        raise ValueError(f"{name} has shape {array.shape}; {advice}.")
+    return array
+
+
 class Rule(eqx.Module):
     """Quadrature rule ``sum_i w_i f(theta_i)`` on [0, 1].
 
@@ -44,9 +61,8 @@ class Rule(eqx.Module):
     __array_ufunc__ = None  # so that numpy scalars leave `alpha * rule` to __rmul__
 
     def __init__(self, nodes, weights):
-        self.nodes = tuple(float(node) for node in nodes)
-        traced = isinstance(weights, jax.Array) or not is_concrete(weights)
-        self.weights = jnp.asarray(weights, dtype=float) if traced else np.asarray(weights, dtype=float)
+        self.nodes = tuple(real_array("Rule: nodes", nodes, 1).tolist())
+        self.weights = real_array("Rule: weights", weights)
         if self.weights.shape != (len(self.nodes),):
             raise ValueError(
                 f"Rule: got {len(self.nodes)} nodes and weights of shape {self.weights.shape}; give one weight per node."
@@ -169,6 +185,7 @@ def radau(n: int, end: Literal["left", "right"] = "right") -> Rule:
 
 def affine(alpha) -> Rule:
     """``alpha * left + (1 - alpha) * right``; order 2 for alpha = 1/2, else 1. alpha may be traced."""
+    real_array("affine: alpha", alpha, 0)
     return alpha * left + (1 - alpha) * right
 
 
@@ -206,12 +223,18 @@ class PlacedRule(eqx.Module):
 
 def macro(rule: Rule) -> PlacedRule:
     """Place a rule on the macro interval: its nodes are visited once per macro step."""
-    return PlacedRule(rule, "macro")
+    return _placed(rule, "macro")
 
 
 def micro(rule: Rule) -> PlacedRule:
     """Place a rule on every micro interval: ``rule.repeat(num_micro)`` of the macro interval."""
-    return PlacedRule(rule, "micro")
+    return _placed(rule, "micro")
+
+
+def _placed(rule: Rule, grid: Literal["macro", "micro"]) -> PlacedRule:
+    if not isinstance(rule, Rule):
+        raise TypeError(f"{grid}: rule is {rule!r}; give a Rule, e.g. midpoint or gauss(2).")
+    return PlacedRule(rule, grid)
 
 
 def mollified(placed: PlacedRule) -> PlacedRule:

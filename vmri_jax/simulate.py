@@ -9,12 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import diagnostics
-from vmri_jax.checks import check_arrays, check_system, require_x64
+from vmri_jax.checks import (
+    check_arrays,
+    check_flags,
+    check_number,
+    check_params,
+    check_system,
+    check_type,
+    require_x64,
+)
 from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.interrupts import Interrupted, interrupts_noted
 from vmri_jax.newton import Newton
-from vmri_jax.quadrature import is_concrete
-from vmri_jax.results import Method, Result, SimulationError
+from vmri_jax.quadrature import is_concrete, real_array
+from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result, SimulationError
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
 from vmri_jax.step import Memory, Stages, advance, start_memory
@@ -64,6 +72,7 @@ def simulate(
         SimulationError: a step failed.
         Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
     """
+    check_flags(throw=throw, progress=progress)
     simulation, start = prepare(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
     at, num_saves = simulation.start(start), num_steps // save_every
     if not simulation.is_concrete(start):
@@ -189,18 +198,23 @@ def run(
     energy = jax.vmap(partial(diagnostics.energy, system))(*phase)
 
     # The energy is NaN from a failing step on. A potential may also be NaN where its gradient is not (a logarithm beyond
-    # its pole): such nodes are no result either.
-    broken = jnp.cumsum(~jnp.isfinite(energy)) > 0
-    at_node = first_step + jnp.argmax(broken) * save_every - 1
-    newly = broken.any() & (status[1] < 0)
-    status = (jnp.where(newly, Result.NON_FINITE, status[0]), jnp.where(newly, jnp.maximum(at_node, 0), status[1]))
+    # its pole), and a lane of a batch may start off its constraints: such nodes are no result either.
+    residual = jax.vmap(partial(diagnostics.constraint_residual, system))(*phase)
+    kept = residual[:, 0] <= jnp.maximum(CONSTRAINT_TOLERANCE, 100 * newton.tolerance)
+    broken = jnp.cumsum(~jnp.isfinite(energy) | ~kept) > 0
+    first = jnp.argmax(broken)
+    at_node = first_step + first * save_every - 1
+    newly = broken.any() & ((status[1] < 0) | (at_node < status[1]))
+    cause = jnp.where(jnp.isfinite(energy[first]), Result.CONSTRAINT_VIOLATED, Result.NON_FINITE)
+    status = (jnp.where(newly, cause, status[0]), jnp.where(newly, jnp.maximum(at_node, 0), status[1]))
+    energy = jnp.where(broken, jnp.nan, energy)
     phase = tuple(jnp.where(broken[:, None], jnp.nan, a) for a in phase)
 
     trajectory = Trajectory(
         nodes.t,
         *phase,
         energy=energy,
-        constraint_residual=jax.vmap(partial(diagnostics.constraint_residual, system))(*phase),
+        constraint_residual=jnp.where(broken[:, None], jnp.nan, residual),
         info=RunInfo(*worst),
         result=status[0],
         failed_at=status[1],
@@ -257,23 +271,26 @@ def _vectors(state: State) -> dict:
     return {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
 
 
-def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every):
+def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro=False):
     """Refuse bad arguments of `simulate`; returns macro_dt."""
     require_x64()
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(
             f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
         )
-    if not isinstance(state, State):
-        raise TypeError(f"simulate: state is {type(state).__name__}; give a State, e.g. from initial_state(...).")
+    check_type("simulate: system", system, System, "a vmri_jax.System")
+    check_type("simulate: state", state, State, "a State, e.g. from initial_state(...)")
+    check_params(system.params)
     if not isinstance(newton, Newton | None):
         raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(method='dense').")
     if (macro_dt is None) == (micro_dt is None):
         got = "neither" if macro_dt is None else "both"
         raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
-    if is_concrete(dt) and not (np.ndim(dt) == 0 and np.isfinite(dt) and dt > 0):
+    check_flags(save_micro=save_micro)
+    if is_concrete(real_array(f"simulate: {name}", dt, 0)) and not (np.isfinite(dt) and dt > 0):
         raise ValueError(f"simulate: {name} is {dt}; it must be a positive number.")
+    check_number("simulate: the t of state", state.t)
     for name, value in (("num_steps", num_steps), ("save_every", save_every)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"simulate: {name} is {value!r}; it must be an integer of at least 1.")
@@ -285,8 +302,6 @@ def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save
     vectors = _vectors(state)
     if is_concrete(vectors):
         check_arrays(**vectors)
-    if not isinstance(system, System):
-        raise TypeError(f"simulate: system is {type(system).__name__}; it must be a vmri_jax.System.")
     return dt if micro_dt is None else scheme.num_micro * micro_dt
 
 

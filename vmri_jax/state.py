@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import algebra
-from vmri_jax.checks import check_arrays, check_system, require_x64
+from vmri_jax.checks import (
+    check_arrays,
+    check_flags,
+    check_number,
+    check_params,
+    check_system,
+    check_type,
+    require_x64,
+)
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import CONSTRAINT_TOLERANCE
 from vmri_jax.system import ConstantMass, System
@@ -134,6 +142,11 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
             the size of the violation), constraints that the fast variables cannot satisfy.
     """
     require_x64()
+    check_type("initial_state: system", system, System, "a vmri_jax.System")
+    check_params(system.params)
+    check_flags(project=project)
+    t = check_number("t", t)
+    check_number("tolerance", tolerance)
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     if project:
         q_s, q_f = _projected_positions(system, q_s, q_f)
@@ -150,7 +163,7 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
                 "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
                 "singular at the initial positions, or a function returned NaN there."
             )
-    return State(jnp.asarray(t, dtype=float), q_s, q_f, p_s, p_f)
+    return State(t, q_s, q_f, p_s, p_f)
 
 
 @jax.jit

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.quadrature import is_concrete, real_array
 
 
 class ConstantMass(eqx.Module):
@@ -49,7 +49,7 @@ def _solve(mass, p):
 
 
 def _mass(name: str, mass):
-    mass = jnp.asarray(mass, dtype=float)
+    mass = jnp.asarray(real_array(f"ConstantMass: {name}", mass))
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
         raise ValueError(f"ConstantMass: {name} has shape {mass.shape}; give (n,) masses or an (n, n) mass matrix.")
     if not is_concrete(mass):
@@ -118,6 +118,7 @@ class System(eqx.Module):
         for name, function in functions.items():
             if function is not None and not callable(function):
                 raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
+            _check_hash(name, function)
             setattr(self, name, function)
         if not isinstance(kinetic, ConstantMass | KineticFunction):
             if not callable(kinetic):
@@ -125,6 +126,7 @@ class System(eqx.Module):
                     f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function "
                     "kinetic(q_s, q_f, v_s, v_f, params)."
                 )
+            _check_hash("kinetic", kinetic)
             kinetic = KineticFunction(kinetic)
         self.kinetic = kinetic
         self.params = params
@@ -154,6 +156,16 @@ class System(eqx.Module):
     def num_constraints(self, q_s, q_f) -> tuple[int, int]:
         """``(n_g, n_gs)`` for configurations of these shapes."""
         return jax.eval_shape(self.g, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, q_s).shape[0]
+
+
+def _check_hash(name: str, function) -> None:
+    try:
+        hash(function)
+    except TypeError:
+        raise TypeError(
+            f"System: {name} is {function!r}, which has no hash: programs are compiled once per function. Give a plain "
+            "function, with what varies in params."
+        ) from None
 
 
 @dataclasses.dataclass(frozen=True)
