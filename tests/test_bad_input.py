@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -115,7 +116,8 @@ def test_flags_are_true_or_false(fpu):
         start(fpu, project="no")
     for name in ("save_micro", "throw", "progress"):
         with pytest.raises(TypeError, match=f"{name} is 1; it must be True or False"):
-            simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=1, **{name: 1})
+            flag: Any = {name: 1}
+            simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=1, **flag)
 
 
 def test_parameters_that_are_no_numbers(fpu):
@@ -318,7 +320,7 @@ def test_nan_in_a_state(fpu):
 def test_only_rules_are_placed():
     for place in (macro, micro):
         with pytest.raises(TypeError, match="rule is 'midpoint'; give a Rule"):
-            place("midpoint")
+            place("midpoint")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="rule is 3; give a Rule"):
         galerkin(2, 1, 3)  # pyright: ignore[reportArgumentType]
 
