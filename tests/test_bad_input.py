@@ -115,8 +115,8 @@ def test_flags_are_true_or_false(fpu):
     with pytest.raises(TypeError, match="project is 'no'; it must be True or False"):
         start(fpu, project="no")
     for name in ("save_micro", "throw", "progress"):
+        flag: Any = {name: 1}
         with pytest.raises(TypeError, match=f"{name} is 1; it must be True or False"):
-            flag: Any = {name: 1}
             simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=1, **flag)
 
 

@@ -92,6 +92,19 @@ def test_bad_options_are_refused(arguments, message):
         Newton(**arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"tolerance": "small"}, "tolerance is 'small'; give a real number"),
+        ({"max_iterations": None}, "max_iterations"),
+        ({"fixed_iterations": 2.5}, "fixed_iterations is 2.5; it must be an integer"),
+    ],
+)
+def test_options_that_are_no_numbers_are_refused(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        Newton(**arguments)
+
+
 def test_every_status_has_a_message():
     assert all(len(result.message) > 40 and result.message.endswith(".") for result in Result)
     assert [result.success for result in Result] == [True, True] + [False] * (len(Result) - 2)

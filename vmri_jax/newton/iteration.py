@@ -11,6 +11,7 @@ from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
 from vmri_jax.newton import arrowhead, full, march
 from vmri_jax.newton.interval import can_be_cut, is_linear
+from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result
 
 Choice = Literal["auto", "march", "frozen", "decoupled", "arrowhead", "dense"]
@@ -41,6 +42,7 @@ class Newton(eqx.Module):
 
     Raises:
         ValueError: an unknown method, a tolerance that is not positive, a number of iterations below 1.
+        TypeError: what is no number.
     """
 
     method: Choice = eqx.field(static=True, default="auto")
@@ -51,9 +53,15 @@ class Newton(eqx.Module):
     def __check_init__(self):
         if self.method not in get_args(Choice):
             raise ValueError(f"Newton: method is {self.method!r}; it must be one of {', '.join(get_args(Choice))}.")
-        for name, least in (("tolerance", 0.0), ("max_iterations", 0), ("fixed_iterations", 0)):
+        if not isinstance(self.fixed_iterations, int | None):
+            raise TypeError(f"Newton: fixed_iterations is {self.fixed_iterations!r}; it must be an integer or None.")
+        for name in ("tolerance", "max_iterations", "fixed_iterations"):
             value = getattr(self, name)
-            if isinstance(value, int | float) and not value > least:
+            if (
+                (name != "fixed_iterations" or value is not None)
+                and is_concrete(value)
+                and not real_array(f"Newton: {name}", value, 0) > 0
+            ):
                 raise ValueError(f"Newton: {name} is {value}; it must be positive.")
 
     @property
