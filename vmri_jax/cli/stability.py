@@ -58,13 +58,15 @@ def advise(
 
 @app.command(
     epilog="Examples:\n\nvmri stability --scheme explicit-slow --num-micro 2 --num-micro 5 --num-micro 10 --out map.png\n\n"
-    "vmri stability tsp --scheme fully-explicit"
+    "vmri stability tsp --scheme fully-explicit --scheme mollified-impulse"
 )
 def stability(
     system: Annotated[
         str | None, typer.Argument(help="A system at its start. [dim]one slow and one stiff spring, kappa = 25[/dim]")
     ] = None,
-    scheme: options.Scheme = "explicit-slow",
+    scheme: Annotated[
+        list[str] | None, typer.Option(help="See [bold]vmri schemes[/bold]; may be repeated. [dim]explicit-slow[/dim]")
+    ] = None,
     num_micro: Annotated[
         list[int] | None, typer.Option(help="Micro steps per macro step; may be repeated. [dim]2 5 10 20[/dim]")
     ] = None,
@@ -79,20 +81,21 @@ def stability(
     try:
         check_target_file("--out", out, (".png", ".svg", ".pdf"))
         problem = linear_model() if system is None else find_problem(system)
-        schemes = {
-            n: find_scheme(scheme, n, compose, alpha=alpha, degree=degree, rule=rule)
-            for n in num_micro or (2, 5, 10, 20)
+        numbers, grid = num_micro or [2, 5, 10, 20], np.linspace(0.02, until, max(2, round(50 * until))) * np.pi
+        chosen = {
+            name: {n: find_scheme(name, n, compose, alpha=alpha, degree=degree, rule=rule) for n in numbers}
+            for name in scheme or ["explicit-slow"]
         }
-        grid = np.linspace(0.02, until, max(2, round(50 * until))) * np.pi
         with console.status("multipliers of the steps"):
-            found = stability_map(problem, schemes, grid)
+            maps = {name: stability_map(problem, schemes, grid) for name, schemes in chosen.items()}
     except (ValueError, TypeError) as error:
         raise BadInput(str(error)) from error
-    table = Table("num_micro", "unstable where omega H / pi is in", box=None, pad_edge=False)
-    for n in schemes:
-        windows = [f"{w.start / np.pi:.4g} to {w.stop / np.pi:.4g}" for w in found.windows(n)]
-        table.add_row(str(n), ", ".join(windows) or "nowhere")
+    table = Table("scheme", "num_micro", "unstable where omega H / pi is in", box=None, pad_edge=False)
+    for name, found in maps.items():
+        for n in numbers:
+            windows = [f"{w.start / np.pi:.4g} to {w.stop / np.pi:.4g}" for w in found.windows(n)]
+            table.add_row(name, str(n), ", ".join(windows) or "nowhere")
     console.print(table)
     if out is not None:
-        plots.save(plot_stability({scheme: found}, system or "one slow and one stiff spring"), out)
+        plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
         console.print(f"Figure: [bold]{escape(str(out))}[/bold]", soft_wrap=True)
