@@ -216,7 +216,8 @@ def mollified_impulse(num_micro: int, alpha=0.5) -> Scheme:
     """`explicit_slow` with V at averaged fast positions, ``V(q_s, a(q_s, q_f))``: stable at the impulse resonances.
 
     Order 2 and symmetric at alpha = 1/2, else order 1. Evaluations per macro step: V once; W num_micro per Newton
-    iteration as before, and as many again for the average, with their derivative. See `vmri_jax.quadrature.mollified`.
+    iteration as before, and as many again for the average, with their derivative: cheap where W is quadratic, else an
+    exact solve per micro step. See `vmri_jax.quadrature.mollified`.
     """
     return Scheme(num_micro, kinetic=micro(midpoint), slow=mollified(macro(affine(alpha))), fast=micro(midpoint))
 
