@@ -219,7 +219,7 @@ def test_a_full_disk_is_told(vmri, monkeypatch):
         (["fpu", *RUN, "--save-every", 3], "not a multiple of save_every = 3"),
         (["fpu", *RUN, "--num-micro", 0], "num_micro is 0; it must be at least 1"),
         (["fpu", *RUN, "--degree", 2], "the scheme fully-explicit has no degree"),
-        (["fpu", *RUN[:4], "--alpha", 0.5], "use explicit-slow or fully-explicit"),
+        (["fpu", *RUN[:4], "--alpha", 0.5], "use explicit-slow or mollified-impulse or fully-explicit"),
         (["fpu", *RUN[:4], "--scheme", "galerkin"], "needs the degree"),
         (["fpu", *RUN[:4], "--scheme", "galerkin", "--degree", 2, "--rule", "simpson"], "must be 'gauss', 'lobatto'"),
         (["fpu", *RUN, "--method", "sparse"], "it must be one of auto, march, frozen, decoupled, arrowhead, dense"),

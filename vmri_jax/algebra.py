@@ -13,7 +13,7 @@ UNROLLED = 4
 ELEMENTWISE = 16
 """Largest system that is eliminated by elementwise operations."""
 
-REGULARIZATION = 1e-14
+REGULARIZATION = 2e-15
 """Part of its diagonal that is added to ``G M^-1 G^T``, see `regularized`."""
 
 

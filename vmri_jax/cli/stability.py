@@ -90,7 +90,7 @@ def stability(
         raise BadInput(str(error)) from error
     table = Table("num_micro", "unstable where omega H / pi is in", box=None, pad_edge=False)
     for n in schemes:
-        windows = [f"{start / np.pi:.4g} to {stop / np.pi:.4g}" for start, stop in found.windows(n)]
+        windows = [f"{w.start / np.pi:.4g} to {w.stop / np.pi:.4g}" for w in found.windows(n)]
         table.add_row(str(n), ", ".join(windows) or "nowhere")
     console.print(table)
     if out is not None:

@@ -19,7 +19,7 @@ def penalty_contact(full: bool) -> Outcome:
     steps = int((bounces + 0.5) * period / macro_dt) // 20 * 20
     heights, jumps, lost = [], [], []
     for scheme in (vm.fully_explicit(20), vm.fully_implicit(20)):
-        trajectory = run(problem, scheme, macro_dt, steps, save_every=20)
+        trajectory = run(problem, scheme, macro_dt, steps, save_every=2)  # a contact takes 4.5 steps
         z, e = np.asarray(trajectory.q_f)[:, 0], np.asarray(trajectory.energy) / float(trajectory.energy[0])
         flying = z > 1e-3  # contact sinks in by 4e-4
         flights = np.split(np.arange(len(z)), np.flatnonzero(np.diff(flying.astype(int))) + 1)

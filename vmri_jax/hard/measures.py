@@ -97,7 +97,9 @@ def energy_scale(problem: vm.Problem, trajectory: vm.Trajectory) -> float:
 
 def constraints(trajectory: vm.Trajectory) -> tuple[float, float]:
     """Largest ``|g|`` and ``|G v|`` of a run; infinite where it failed."""
-    position, velocity = np.nan_to_num(np.asarray(trajectory.constraint_residual), nan=np.inf).max(axis=0)
+    if not trajectory.success:
+        return np.inf, np.inf
+    position, velocity = np.asarray(trajectory.constraint_residual).max(axis=0)
     return float(position), float(velocity)
 
 

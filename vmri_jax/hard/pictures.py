@@ -1,4 +1,4 @@
-"""Pictures of the cases where one helps: energy over long runs, growth over omega H, linkages at their singularity."""
+"""Pictures of the cases where one helps: energy over long runs, unstable omega H, linkages at their singularity."""
 
 from collections.abc import Callable, Mapping
 
@@ -26,7 +26,7 @@ def _energy(details: Details, theme: plots.Theme) -> Figure:
             size = max(1, len(t) // 400)
             count = len(t) // size
             e = e[: count * size].reshape(count, size)
-            label = f"tolerance{name}" if name else None
+            label = f"tolerance {name.strip()}" if name else None
             axes.fill_between(
                 t[: count * size : size], e.min(axis=1), e.max(axis=1), color=color, alpha=0.8, lw=0.6, label=label
             )
@@ -36,19 +36,17 @@ def _energy(details: Details, theme: plots.Theme) -> Figure:
     return figure
 
 
-def _growth(details: Details, theme: plots.Theme) -> Figure:
-    """Growth per macro step of the linear model over omega H / pi, one curve per num_micro."""
-    omega_H = details["omega_H"] / np.pi
+def _windows(details: Details, theme: plots.Theme) -> Figure:
+    """Unstable intervals of omega H / pi of the linear model, one line per num_micro; narrow ones at least a hairline."""
     with plots.style(theme):
-        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+        figure = plots.NotebookFigure(figsize=(7.2, 2.6))
         axes = figure.subplots()
-        for (name, growth), color in zip(details.items(), theme.curves, strict=False):
-            if name != "omega_H":
-                axes.plot(omega_H, np.where(growth > 0, growth, np.nan), color=color, label=name)
-        for k in range(1, round(omega_H[-1]) + 1):
-            axes.axvline(k, color=theme.ink, linewidth=0.5, linestyle=":", zorder=0)
-        axes.set(xlabel=r"$\omega H / \pi$", ylabel="growth per macro step", yscale="log", xlim=(0, omega_H[-1]))
-        axes.legend(title="num_micro", loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        for k, ((_, windows), color) in enumerate(zip(details.items(), theme.curves, strict=False)):
+            bars = [(start / np.pi, (stop - start) / np.pi) for start, stop in windows]
+            axes.broken_barh(bars, (k - 0.35, 0.7), facecolor=color, edgecolor=color, linewidth=1.0)
+        axes.set(xlabel=r"$\omega H / \pi$", ylabel="num_micro", xlim=(0, 4), title="unstable steps")
+        axes.set_yticks(range(len(details)), details)
+        axes.grid(axis="y", visible=False)
     return figure
 
 
@@ -83,7 +81,7 @@ def _oscillatory_energies(details: Details, theme: plots.Theme) -> Figure:
 
 
 PICTURES: dict[str, tuple[str, Callable[[Details, plots.Theme], Figure]]] = {
-    "impulse resonance": ("impulse_resonance", _growth),
+    "impulse resonance": ("impulse_resonance", _windows),
     "singular configuration": ("singular_configuration", _singular),
     "constraints for long": ("energy_triple_pendulum", _energy),
     "energy for long": ("energy_long_run", _energy),

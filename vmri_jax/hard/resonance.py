@@ -18,14 +18,15 @@ def impulse_resonance(full: bool) -> Outcome:
     omega_H = np.linspace(0.05, 4 * np.pi, 250)
     found = stability_map(model, {n: vm.explicit_slow(n) for n in expected}, omega_H)
     first = {n: found.first_unstable(n) / np.pi for n in expected}
-    macro_dt = sum(found.windows(5)[0]) / 2 / 50.0
+    first_window = found.windows(5)[0]
+    macro_dt = (first_window.start + first_window.stop) / 2 / found.omega
     warned = not advise(model.system, vm.explicit_slow(5), model.state(), macro_dt).ok
     words = ", ".join(f"{value:.3f} ({n})" for n, value in first.items())
     return Outcome(
         f"first unstable omega H / pi (num_micro): {words}; a step in the window is {'advised against' if warned else 'let pass'}",
         warned and all(abs(first[n] - expected[n]) < 0.005 for n in expected),
         {f"first_unstable_{n}": value for n, value in first.items()} | {"warned": warned},
-        {"omega_H": omega_H} | {str(n): found.growth[found.rows.index(n)] for n in expected},
+        {str(n): np.array([(window.start, window.stop) for window in found.windows(n)]) for n in expected},
     )
 
 

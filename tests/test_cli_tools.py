@@ -1,0 +1,75 @@
+"""Commands that judge a step or show a scene: advise, stability, explain, and scenes in simulate and animate."""
+
+import re
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from vmri_jax import cli
+
+SCENE = """
+from vmri_jax.scene import Anchor, Body, Gravity, Scene, Spring
+
+scene = Scene(
+    [Body("hook", 5.0, [0.0, -1.0], pace="slow"), Body("load", 1.0, [0.5, -1.0], pace="fast")],
+    [Gravity(), Anchor("hook", [0.0, 0.0]), Spring(("hook", "load"), 4e3, 0.5)],
+)
+"""
+
+
+@pytest.fixture
+def vmri(tmp_path, monkeypatch):
+    """Runs ``vmri`` in a folder with a scene: (exit code, everything printed on one line)."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my.py").write_text(SCENE)
+
+    def run(*arguments):
+        result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+        return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
+
+    return run
+
+
+def test_advice_against_a_resonant_step(vmri):
+    code, text = vmri("advise", "fpu", "--scheme", "explicit-slow", "--num-micro", 30, "--macro-dt", 0.0628)
+    assert code == 1
+    assert "impulse resonance" in text
+    assert "nearest safe step" in text
+
+
+def test_advice_needs_one_step(vmri):
+    code, text = vmri("advise", "fpu")
+    assert code == 2
+    assert "exactly one of --macro-dt and --micro-dt" in text
+
+
+def test_map_of_stable_steps(vmri, tmp_path):
+    code, text = vmri("stability", "--num-micro", 2, "--until", 1.5, "--out", "map.png")
+    assert code == 0
+    start, stop = map(float, re.search(r"2 ([\d.]+) to ([\d.]+)", text).groups())  # pyright: ignore[reportOptionalMemberAccess]
+    assert start == pytest.approx(1.248, abs=0.005)
+    assert 1.25 < stop < 1.28  # 4 / pi = 1.273, where two micro steps turn by pi
+    assert (tmp_path / "map.png").stat().st_size > 10_000
+
+
+def test_ledger_of_a_scene(vmri):
+    code, text = vmri("explain", "my.py:scene", "--num-micro", 4, "--no-measure")
+    assert code == 0
+    assert all(name in text for name in ("hook", "load", "gravity", "micro", "macro"))
+    code, text = vmri("explain", "fpu")
+    assert code == 2
+    assert "fpu is no scene" in text
+
+
+def test_a_scene_is_simulated_and_drawn(vmri, tmp_path):
+    code, text = vmri(
+        "simulate", "my.py:scene", "--macro-dt", 0.01, "--steps", 20, "--num-micro", 4, "--out", "run.npz"
+    )
+    assert code == 0, text
+    with np.load(tmp_path / "run.npz") as arrays:
+        assert '"hook"' in str(arrays["drawing"])
+    code, text = vmri("animate", "run.npz")
+    assert code == 0, text
+    assert "hook" in (tmp_path / "run.html").read_text()
