@@ -6,6 +6,8 @@ Teaches: an explicit scheme solves nothing, however long the chain; gravity is e
     vmri animate pendulum_chain.npz
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from vmri_jax.scene import Body, Gravity, Scene, Spring, SpringAnchor
@@ -26,6 +28,6 @@ scene = Scene(
     [
         Gravity(G, rate="slow"),
         SpringAnchor(names[0], [0.0, 0.0], STIFFNESS, LENGTH, name="hook", rate="fast"),
-        Spring(list(zip(names, names[1:])), STIFFNESS, LENGTH, rate="fast"),
+        Spring(list(pairwise(names)), STIFFNESS, LENGTH, rate="fast"),
     ],
 )

@@ -24,7 +24,9 @@ def boom(name, side):
     for part, distance, bent in (("root", 0.6, 0.0), ("middle", 1.3, 0.0), ("tip", 2.0, 0.1)):
         offset = side * distance * radial + bent * along + np.array([0.0, 0.0, bent])
         position = np.array([ORBIT, 0.0, 0.0]) + offset
-        bodies.append(Body(f"{name} {part}", 0.05, position, np.cross([0.0, 0.0, RATE], position), pace="fast"))
+        bodies.append(
+            Body(f"{name} {part}", 0.05, position, np.cross([0.0, 0.0, RATE], position), pace="fast", radius=0.12)
+        )
     return bodies
 
 
@@ -33,8 +35,8 @@ satellite = ["hub", *(body.name for body in (*inner, *outer))]
 
 scene = Scene(
     [
-        Body("planet", PLANET, [0.0, 0.0, 0.0], pace="slow"),
-        Body("hub", 3.0, [ORBIT, 0.0, 0.0], [0.0, ORBIT * RATE, 0.0], pace="slow"),
+        Body("planet", PLANET, [0.0, 0.0, 0.0], pace="slow", radius=3.0),
+        Body("hub", 3.0, [ORBIT, 0.0, 0.0], [0.0, ORBIT * RATE, 0.0], pace="slow", radius=0.3),
         *inner,
         *outer,
     ],

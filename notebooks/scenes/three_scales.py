@@ -23,7 +23,7 @@ def coupling(q, params):
 
 def oscillator(name, place, frequency, elongation, pace):
     """A mass on a spring: kg, N/m."""
-    body = Body(name, 1.0, place + elongation, pace=pace)
+    body = Body(name, 1.0, place + elongation, pace=pace, radius=0.15)
     return body, SpringAnchor(name, place - 1.0, frequency**2, 1.0, name=f"{name} spring")
 
 
