@@ -2,7 +2,7 @@
 
 Teaches: one scene from the orbit to the vibration; momentum maps of the whole stay exact.
 
-    vmri simulate notebooks/scenes/satellite.py:scene --num-micro 10 --macro-dt 0.02 --steps 1000 --out satellite.npz
+    vmri simulate notebooks/scenes/satellite.py:scene --scheme explicit-slow --num-micro 10 --macro-dt 0.02 --steps 1000 --out satellite.npz
     vmri animate satellite.npz
 """
 
