@@ -30,6 +30,7 @@ SPACE = [Body(name, 1.0, q) for name, q in zip("wxyz", np.eye(4)[:, :3] + 1, str
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (("a", 1.0, [1.0], None, "slow", -1.0), r"Body a: radius is -1.0; it must be a positive number"),
         (("a", 0.0, [1.0]), r"Body a: mass is 0.0; every mass must be positive"),
         (("a", [1.0, -2.0], [1.0, 1.0]), r"Body a: mass is \[ 1. -2.\]"),
         (("a", [1.0, 2.0], [1.0]), r"Body a: mass has shape \(2,\); give one number, or one for each of 1 coordinates"),

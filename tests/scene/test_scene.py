@@ -12,6 +12,7 @@ import pytest
 
 from tests.scene.reference_scenes import simple_atomic_model, triple_spherical_pendulum
 from vmri_jax import ConstantMass, compose, fully_explicit, fully_implicit, galerkin, initial_state
+from vmri_jax.animation.drawing import Drawing
 from vmri_jax.scene import (
     Body,
     Constraint,
@@ -233,10 +234,11 @@ def test_drawing_is_plain_data():
     scene = Scene(
         [
             Body("a", 1.0, [0.0, 1.0], pace="fast"),
-            Body("b", 1.0, [1.0, 1.0], pace="slow"),
+            Body("b", 1.0, [1.0, 1.0], pace="slow", radius=0.5),
             Body("block", 1.0, np.ones(4)),
         ],
         [
+            Gravity([1.0, -2.0], ["a", "b"]),
             RigidLink(("a", "b")),
             SpringAnchor("b", [0.0, 0.0], 3.0, 1.0),
             PlaneContact(point=[0, 0], normal=[0, 2], stiffness=1e4, smoothing=0.01, radius=0.1, bodies="a"),
@@ -244,11 +246,14 @@ def test_drawing_is_plain_data():
     )
     drawing = scene.drawing()
     assert json.loads(json.dumps(drawing)) == drawing
+    Drawing.from_dict(drawing)
     axes = {body["name"]: body["coordinates"] for body in drawing["bodies"]}
     assert axes["a"] == [["f", 0], ["f", 1]]
     assert axes["b"] == [["s", 0], ["s", 1]]
-    assert axes["block[3]"] == [["s", 5]]
-    assert drawing["bodies"][0]["radius"] == 0.1
+    assert axes["block[3]"] == [[], ["s", 5]]
+    assert drawing["bodies"][-1]["offset"] == [3.0, 0.0]
+    assert [body.get("radius") for body in drawing["bodies"][:3]] == [0.1, 0.5, None]
+    assert drawing["up"] == [-1.0, 2.0]
     assert drawing["links"] == [["a", "b"]]
     assert drawing["anchors"] == [{"body": "b", "point": [0.0, 0.0], "kind": "spring"}]
     assert drawing["planes"] == [{"point": [0.0, 0.0], "normal": [0.0, 1.0]}]

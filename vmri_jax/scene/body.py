@@ -24,10 +24,12 @@ class Body:
         velocity: (n,) at the start; at rest by default.
         pace: "slow" coordinates take macro steps, "fast" ones micro steps; "auto" lets the scene decide from
             estimates of frequencies.
+        radius: how large it is drawn, in the unit of its position; by default as suits the picture. Of no effect on the
+            motion: contacts have a radius of their own.
 
     Raises:
-        ValueError: an empty name, a mass that is not positive, numbers that are not finite, shapes that do not match,
-            another pace.
+        ValueError: an empty name, a mass or radius that is not positive, numbers that are not finite, shapes that do not
+            match, another pace.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Body:
     position: Any
     velocity: Any = None
     pace: Pace = "auto"
+    radius: float | None = None
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
@@ -61,6 +64,8 @@ class Body:
                 raise ValueError(f"Body {self.name}: {name} is {np.asarray(value)}, which is not finite.")
         if is_concrete(mass) and not np.all(np.asarray(mass) > 0):
             raise ValueError(f"Body {self.name}: mass is {np.asarray(mass)}; every mass must be positive.")
+        if self.radius is not None and not 0 < self.radius < np.inf:
+            raise ValueError(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
         for name, value in (("position", position), ("velocity", velocity), ("mass", mass)):
             object.__setattr__(self, name, value)
 

@@ -7,11 +7,13 @@
         "anchors": [{"body": "bob", "point": [0.0, 0.0, 0.0], "kind": "link"}, ...],
         "planes":  [{"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}, ...],
         "spheres": [{"center": [0.0, 0.0, 0.0], "radius": 1.0}, ...],
+        "up":      [0.0, 0.0, 1.0],
     }
 
 `coordinates` says for each axis (one to three of them) which entry of q_s ("s") or q_f ("f") it is; `radius` is only
-there where the body has one. A block of more than three general coordinates is drawn as that many bodies ``name[i]`` on
-a line. `kind` is "link" or "spring". Everything is lists, strings and numbers.
+there where the body has one, `up` where gravity has a direction. A block of more than three general coordinates is drawn
+as that many bodies ``name[i]`` side by side, at `offset`, each as high as its coordinate. `kind` is "link" or "spring".
+Everything is lists, strings and numbers.
 """
 
 from collections.abc import Iterable, Mapping
@@ -29,12 +31,13 @@ def drawing(bodies: Mapping[str, Body], effects: Iterable[Effect], places: Mappi
     """The description of these bodies at these places with these effects."""
     seen: dict[str, list] = {"bodies": [entry for name in bodies for entry in _entries(name, places[name])]}
     seen |= {kind: [] for kind in KINDS}
-    radii = {}
+    radii = {name: float(body.radius) for name, body in bodies.items() if body.radius is not None}
     for effect in effects:
         parts = effect.drawing(bodies)
         for kind in KINDS:
             seen[kind] += parts.get(kind, [])
         radii |= dict(parts.get("radii", []))
+        seen |= {key: value for key, value in parts.items() if key == "up"}
     for entry in seen["bodies"]:
         if entry["name"] in radii:
             entry["radius"] = radii[entry["name"]]
@@ -45,4 +48,6 @@ def _entries(name: str, place: Place) -> list[dict]:
     axes = [[place.part, place.start + i] for i in range(place.size)]
     if place.size <= LARGEST_POINT:
         return [{"name": name, "coordinates": axes}]
-    return [{"name": f"{name}[{i}]", "coordinates": [axis]} for i, axis in enumerate(axes)]
+    return [
+        {"name": f"{name}[{i}]", "coordinates": [[], axis], "offset": [float(i), 0.0]} for i, axis in enumerate(axes)
+    ]

@@ -47,6 +47,11 @@ class Gravity(Effect):
         elements = self.elements(bodies)
         return {"acceleration": jnp.asarray(self.acceleration, dtype=float), "mass": mass_of(self, elements, 0, bodies)}
 
+    def drawing(self, bodies):
+        if np.ndim(self.acceleration) == 0 or not is_concrete(self.acceleration) or not np.any(self.acceleration):
+            return {}
+        return {"up": (-np.asarray(self.acceleration, dtype=float)).tolist()}
+
     def check(self, bodies):
         super().check(bodies)
         shape = np.shape(self.acceleration)

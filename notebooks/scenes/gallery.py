@@ -1,0 +1,184 @@
+"""Run the scenes of this folder by the commands in their docstrings; write README.md with what they kept and a picture each.
+
+python notebooks/scenes/gallery.py
+"""
+
+import ast
+import os
+import resource
+import shlex
+import subprocess
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+import vmri_jax as vm
+from vmri_jax.catalogue import find_scene
+from vmri_jax.diagnostics import energy_parts, velocity
+from vmri_jax.scene import Scene
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+FRAMES = 3
+WIDTH = 1200
+"""Of a picture, in points."""
+SYMMETRIC = 1e-9
+"""Rates of Lagrangian and constraints below this are zero."""
+
+HEAD = f"""# Scenes
+
+Each file is a scene as a user writes one. `vmri simulate` runs it, `vmri animate` shows it, `vmri explain` says where
+every effect lives and what it costs. Table and pictures: `python notebooks/scenes/{Path(__file__).name}`.
+
+- *seconds*: of one core, from the start of Python to the end, compilation included.
+- *energy*: largest change, of the largest kinetic energy; with forces, of energy less their work at the saved nodes.
+- *constraints*: largest residual of positions.
+- *momentum maps*: how many linear and angular momenta belong to symmetries of the scene, and their largest change, of the
+  sum of the sizes of all terms.
+
+| scene | slow, fast, constraints | scheme | H, micro steps, steps | seconds | energy | constraints | momentum maps |
+|---|---|---|---|---|---|---|---|
+"""
+
+
+def scenes() -> list[Path]:
+    """Files of this folder with a scene."""
+    return [path for path in sorted(HERE.glob("*.py")) if path != Path(__file__)]
+
+
+def docstring(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Paragraphs of a scene's docstring, and the words after ``vmri`` of its commands."""
+    *paragraphs, commands = (ast.get_docstring(ast.parse(path.read_text())) or "").split("\n\n")
+    return paragraphs, [shlex.split(line)[1:] for line in commands.splitlines()]
+
+
+def option(words: list[str], name: str, default: str = "") -> str:
+    """The value of an option on a command line."""
+    return words[words.index(name) + 1] if name in words else default
+
+
+def momentum_maps(system: vm.System, run: vm.Trajectory, size: int) -> list[np.ndarray]:
+    """Linear and angular momenta (k,) of points in R^size along a run, of those motions that are symmetries, scaled.
+
+    A translation or rotation ``xi = A x + b`` is one if Lagrangian and constraints do not change along it, at some states
+    of the run. The scale is the largest sum of the sizes of all terms of ``p . xi``.
+    """
+
+    def functions(q, v):
+        lagrangian = system.kinetic(*q, *v, system.params)
+        for potential, where in ((system.slow_potential, q), (system.fast_potential, q[1:])):
+            lagrangian -= 0.0 if potential is None else potential(*where, system.params)
+        return jnp.append(system.constraints(*q), lagrangian)
+
+    def moved(matrix, shift, x):
+        return tuple((part.reshape(-1, size) @ matrix.T + shift).reshape(-1) for part in x)
+
+    @jax.jit
+    def rate(matrix, shift, q, p):
+        v = velocity(system, *q, *p)
+        return jax.jvp(functions, (q, v), (moved(matrix, shift, q), moved(matrix, 0.0, v)))[1]
+
+    zero, eye = np.zeros((size, size)), np.eye(size)
+    motions = [(zero, b) for b in eye]
+    motions += [(np.outer(eye[i], eye[j]) - np.outer(eye[j], eye[i]), zero[0]) for i in range(size) for j in range(i)]
+    found = []
+    for motion in motions:
+        states = [((run.q_s[k], run.q_f[k]), (run.p_s[k], run.p_f[k])) for k in (0, len(run.t) // 2, -1)]
+        if max(float(jnp.abs(rate(*motion, q, p)).max()) for q, p in states) < SYMMETRIC:
+            q, p = (np.concatenate([a, b], axis=1) for a, b in ((run.q_s, run.q_f), (run.p_s, run.p_f)))
+            terms = p * np.stack([moved(*motion, (x,))[0] for x in q])
+            found.append(terms.sum(axis=1) / np.abs(terms).sum(axis=1).max())
+    return found
+
+
+class Kept(NamedTuple):
+    """Largest errors along a run: of the energy, of the constraints' positions, of so many momentum maps."""
+
+    energy: float
+    constraints: float
+    maps: int
+    momentum: float
+
+
+def kept(scene: Scene, run: vm.Trajectory) -> Kept:
+    """What a run of a scene kept, see the head of the table."""
+    system = scene.system()
+    states = (run.q_s, run.q_f, run.p_s, run.p_f)
+    v = jax.vmap(partial(velocity, system))(*states)
+    kinetic = jax.vmap(partial(energy_parts, system))(*states)["kinetic"]
+    forces = jax.vmap(system.forces)(run.t, *states[:2], *v)
+    power = sum(jnp.sum(force * rate, axis=1) for force, rate in zip(forces, v, strict=True))
+    work = np.append(0.0, np.cumsum(np.diff(run.t) * (power[1:] + power[:-1]) / 2))
+    balance = np.asarray(run.energy) - run.energy[0] - work
+    sizes = {body.size for body in scene.bodies}
+    maps = momentum_maps(system, run, sizes.pop()) if len(sizes) == 1 and system.force is None else []
+    momentum = max((float(np.abs(values - values[0]).max()) for values in maps), default=0.0)
+    energy = float(np.abs(balance).max() / kinetic.max())
+    return Kept(energy, float(run.constraint_residual[:, 0].max()), len(maps), momentum)
+
+
+def vmri(*words: str, cache: Path) -> None:
+    """Run a command; programs that others compiled are not used."""
+    environment = os.environ | {"XDG_CACHE_HOME": str(cache)}
+    subprocess.run([sys.executable, "-m", "vmri_jax.cli", *words], cwd=ROOT, check=True, env=environment)
+
+
+def entry(path: Path, folder: Path) -> tuple[str, str]:
+    """The row of a scene and its part with the picture; runs it."""
+    (title, teaches), (simulate, _) = docstring(path)
+    out = str(folder / option(simulate, "--out"))
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    vmri(*simulate[:-1], out, cache=folder)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    vmri("animate", out, "--out", str(path.with_suffix(".png")), "--frames", str(FRAMES), cache=folder)
+    shrink(path.with_suffix(".png"))
+    scene, run = find_scene(f"{path}:scene"), vm.Trajectory.load(out)
+    found = kept(scene, run)
+    sizes = [run.q_s.shape[1], run.q_f.shape[1], sum(scene.system().num_constraints(run.q_s[0], run.q_f[0]))]
+    cells = [
+        f"[{path.stem}](#{path.stem})",
+        ", ".join(map(str, sizes)),
+        option(simulate, "--scheme", "fully-implicit"),
+        ", ".join(option(simulate, name) for name in ("--macro-dt", "--num-micro", "--steps")),
+        f"{after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime:.0f}",
+        f"{found.energy:.0e}",
+        f"{found.constraints:.0e}" if sizes[2] else "",
+        f"{found.maps}: {found.momentum:.0e}" if found.maps else "",
+    ]
+    part = f"""## {path.stem}
+
+{title}
+{teaches}
+
+```sh
+{shlex.join(["vmri", *simulate])}
+```
+
+![{path.stem}]({path.stem}.png)
+"""
+    return "| " + " | ".join(cells) + " |", part
+
+
+def shrink(path: Path) -> None:
+    """A picture of few colours as a small file."""
+    picture = Image.open(path).convert("RGB")
+    picture.thumbnail((WIDTH, WIDTH))
+    picture.quantize(128).save(path, optimize=True)
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    with tempfile.TemporaryDirectory() as folder:
+        rows, parts = zip(*(entry(path, Path(folder)) for path in scenes()), strict=True)
+    (HERE / "README.md").write_text(HEAD + "\n".join(rows) + "\n\n" + "\n".join(parts), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
