@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.composition import Composition
-from vmri_jax.newton import Newton
+from vmri_jax.equations import StepEquations
+from vmri_jax.linearization import linearize
+from vmri_jax.newton import Newton, dense
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, project_momentum
 from vmri_jax.step import macro_step
@@ -127,6 +129,30 @@ def symplectic_defect(
     return jnp.max(jnp.abs(tangents @ (M.T @ J @ M - J) @ tangents.T))
 
 
+def step_condition(system: System, scheme: Scheme, state: State, macro_dt, sweeps: int = 10) -> float:
+    """Condition number of the Newton matrix of a macro step, rows and columns scaled to length one.
+
+    The matrix is that of the first iteration from straight motion; it is dense here, so take few micro steps. Scaling is
+    by square roots of the lengths, again and again (Ruiz 2001).
+    """
+    a = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
+    for _ in range(sweeps):
+        rows, columns = np.linalg.norm(a, axis=1), np.linalg.norm(a, axis=0)
+        if not (np.isfinite(a).all() and rows.all() and columns.all()):
+            return np.inf
+        a = a / np.sqrt(rows[:, None] * columns)
+    return float(np.linalg.cond(a))
+
+
+@jax.jit
+def _newton_matrix(system, scheme, state, macro_dt):
+    equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
+    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    x = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
+    return dense.assemble(linearize(equations, x), x)
+
+
 class OrderFit(NamedTuple):
     """An observed order, half the width of its 95 % confidence interval (NaN for two points), and the points fitted."""
 
@@ -155,7 +181,7 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
     h, e = np.asarray(macro_dt, dtype=float), np.asarray(errors, dtype=float)
     good = np.isfinite(e) & (e > 0)
     if good.sum() < 2:
-        raise ValueError(f"observed_order: {good.sum()} usable errors of {np.size(errors)}; at least 2 are needed.")
+        raise ValueError(f"fit_order: {good.sum()} usable errors of {np.size(errors)}; at least 2 are needed.")
     order = np.argsort(-h[good])
     h, e = h[good][order], e[good][order]
     slopes = np.diff(np.log(e)) / np.diff(np.log(h))

@@ -5,13 +5,9 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 import vmri_jax as vm
-from vmri_jax.equations import StepEquations
-from vmri_jax.linearization import apply, linearize
 
 SAVED = 10_000
 """About as many nodes of a long run are kept."""
@@ -124,28 +120,3 @@ def reversal(problem: vm.Problem, scheme, macro_dt, num_steps: int) -> float:
         problem.system, scheme, turned, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps, throw=False
     )
     return difference(nodes(back)[-1], nodes(there)[0])
-
-
-@jax.jit
-def _newton_matrix(system, scheme, state, macro_dt):
-    equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
-    v_s, v_f = vm.diagnostics.velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
-    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    x = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
-    blocks, (flat, unravel) = linearize(equations, x), ravel_pytree(x)
-    return jax.vmap(lambda e: ravel_pytree(apply(blocks, unravel(e)))[0])(jnp.eye(flat.size)).T
-
-
-def scaled_condition(system: vm.System, scheme: vm.Scheme, state: vm.State, macro_dt, sweeps: int = 10) -> float:
-    """Condition number of the Newton matrix of a macro step, rows and columns scaled to length one.
-
-    The matrix is that of the first iteration from straight motion; it is dense here, so take few micro steps. Scaling is
-    by square roots of the lengths, again and again (Ruiz 2001).
-    """
-    a = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
-    for _ in range(sweeps):
-        rows, columns = np.linalg.norm(a, axis=1), np.linalg.norm(a, axis=0)
-        if not (np.isfinite(a).all() and rows.all() and columns.all()):
-            return np.inf
-        a = a / np.sqrt(rows[:, None] * columns)
-    return float(np.linalg.cond(a))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from vmri_jax.diagnostics import step_condition
 from vmri_jax.hard.case import Case, Outcome
 from vmri_jax.hard.guards import bad_lane, single_precision
 from vmri_jax.hard.measures import (
@@ -18,7 +19,6 @@ from vmri_jax.hard.measures import (
     nodes,
     reversal,
     run,
-    scaled_condition,
     status,
 )
 from vmri_jax.hard.scales import apart_from, midpoint_integrator, rattle
@@ -92,7 +92,7 @@ class OwnSystem:
 
     def tiny_steps(self, full: bool) -> Outcome:
         state, steps = self.problem.state(), self.macro_dt * 10.0 ** -np.arange(0, 6 if full else 5, 2)
-        conditions = [scaled_condition(self.problem.system, self.scheme, state, h) for h in steps]
+        conditions = [step_condition(self.problem.system, self.scheme, state, h) for h in steps]
         words = ", ".join(f"{c:.3g} at H = {h:.0e}" for c, h in zip(conditions, steps, strict=True))
         return Outcome(
             f"scaled condition {words}",

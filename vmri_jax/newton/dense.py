@@ -11,11 +11,15 @@ from vmri_jax.equations import Unknowns
 from vmri_jax.linearization import Blocks, apply
 
 
-def factor(blocks: Blocks, like: Unknowns):
-    """LU factors of the assembled matrix; `like` gives the shapes of the unknowns."""
+def assemble(blocks: Blocks, like: Unknowns):
+    """The matrix over all unknowns in a row; `like` gives their shapes."""
     flat, unravel = ravel_pytree(like)
-    columns = jax.vmap(lambda e: ravel_pytree(apply(blocks, unravel(e)))[0])(jnp.eye(flat.size))
-    return jax.scipy.linalg.lu_factor(columns.T)
+    return jax.vmap(lambda e: ravel_pytree(apply(blocks, unravel(e)))[0])(jnp.eye(flat.size)).T
+
+
+def factor(blocks: Blocks, like: Unknowns):
+    """LU factors of the assembled matrix."""
+    return jax.scipy.linalg.lu_factor(assemble(blocks, like))
 
 
 def solve(factors, residual: Unknowns) -> Unknowns:
