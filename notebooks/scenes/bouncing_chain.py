@@ -1,4 +1,4 @@
-"""A chain of ten balls falls on the ground and bounces: flight is slow, links and contact are fast.
+"""An elastic chain of ten balls falls on the ground and bounces: flight is slow, links and contact are fast.
 
 Teaches: contact as a smooth penalty belongs to the fast potential, where micro steps resolve it.
 
@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from vmri_jax.scene import Body, Gravity, PlaneContact, Scene, Spring
+from vmri_jax.scene import Bending, Body, Gravity, PlaneContact, Scene, Spring
 
 COUNT, LENGTH, MASS, RADIUS, TILT = 10, 0.3, 0.1, 0.1, 0.35
 
@@ -25,6 +25,7 @@ scene = Scene(
     [
         Gravity(9.81, rate="slow"),
         Spring(list(pairwise(names)), 1000.0),
+        Bending(list(zip(names, names[1:], names[2:], strict=False)), 1.0),
         PlaneContact(
             point=[0.0, 0.0, 0.0],
             normal=[0.0, 0.0, 1.0],

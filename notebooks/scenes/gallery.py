@@ -10,7 +10,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -92,8 +91,8 @@ def momentum_maps(system: vm.System, run: vm.Trajectory, size: int) -> list[np.n
     for motion in motions:
         states = [((run.q_s[k], run.q_f[k]), (run.p_s[k], run.p_f[k])) for k in (0, len(run.t) // 2, -1)]
         if max(float(jnp.abs(rate(*motion, q, p)).max()) for q, p in states) < SYMMETRIC:
-            q, p = (np.concatenate([a, b], axis=1) for a, b in ((run.q_s, run.q_f), (run.p_s, run.p_f)))
-            terms = p * np.stack([moved(*motion, (x,))[0] for x in q])
+            q, p = (np.concatenate(pair, axis=1) for pair in ((run.q_s, run.q_f), (run.p_s, run.p_f)))
+            terms = p * (q.reshape(len(q), -1, size) @ motion[0].T + motion[1]).reshape(q.shape)
             found.append(terms.sum(axis=1) / np.abs(terms).sum(axis=1).max())
     return found
 
@@ -110,11 +109,15 @@ class Kept(NamedTuple):
 def kept(scene: Scene, run: vm.Trajectory) -> Kept:
     """What a run of a scene kept, see the head of the table."""
     system = scene.system()
-    states = (run.q_s, run.q_f, run.p_s, run.p_f)
-    v = jax.vmap(partial(velocity, system))(*states)
-    kinetic = jax.vmap(partial(energy_parts, system))(*states)["kinetic"]
-    forces = jax.vmap(system.forces)(run.t, *states[:2], *v)
-    power = sum(jnp.sum(force * rate, axis=1) for force, rate in zip(forces, v, strict=True))
+
+    @jax.jit
+    @jax.vmap
+    def kinetic_and_power(t, q_s, q_f, p_s, p_f):
+        v_s, v_f = velocity(system, q_s, q_f, p_s, p_f)
+        force_s, force_f = system.forces(t, q_s, q_f, v_s, v_f)
+        return energy_parts(system, q_s, q_f, p_s, p_f)["kinetic"], force_s @ v_s + force_f @ v_f
+
+    kinetic, power = kinetic_and_power(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
     work = np.append(0.0, np.cumsum(np.diff(run.t) * (power[1:] + power[:-1]) / 2))
     balance = np.asarray(run.energy) - run.energy[0] - work
     sizes = {body.size for body in scene.bodies}
@@ -132,7 +135,7 @@ def vmri(*words: str, cache: Path) -> None:
 
 def entry(path: Path, folder: Path) -> tuple[str, str]:
     """The row of a scene and its part with the picture; runs it."""
-    (title, teaches), (simulate, _) = docstring(path)
+    (title, teaches), (simulate, show) = docstring(path)
     out = str(folder / option(simulate, "--out"))
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     vmri(*simulate[:-1], out, cache=folder)
@@ -159,6 +162,7 @@ def entry(path: Path, folder: Path) -> tuple[str, str]:
 
 ```sh
 {shlex.join(["vmri", *simulate])}
+{shlex.join(["vmri", *show])}
 ```
 
 ![{path.stem}]({path.stem}.png)

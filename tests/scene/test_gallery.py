@@ -14,7 +14,8 @@ from vmri_jax.cli import app
 
 FOLDER = Path(__file__).parents[2] / "notebooks" / "scenes"
 SPEC = importlib.util.spec_from_file_location("gallery", FOLDER / "gallery.py")
-assert SPEC is not None and SPEC.loader is not None
+assert SPEC is not None
+assert SPEC.loader is not None
 gallery = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(gallery)
 
@@ -75,7 +76,7 @@ def test_a_short_run_keeps_what_the_table_says(name):
 
 def test_actions_of_resolved_scales_are_kept():
     """Energy over frequency at 50 and 70 rad/s, of 1 and 1.4 rad a micro step; measured 0.5 %."""
-    scene, trajectory = run("three_scales")
+    _, trajectory = run("three_scales")
     rest = np.array([4.0, 6.0])
     e, p = np.asarray(trajectory.q_f)[:, :2] - rest, np.asarray(trajectory.p_f)[:, :2]
     frequency = np.array([50.0, 70.0])
