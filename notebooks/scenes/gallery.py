@@ -133,9 +133,9 @@ def vmri(*words: str, cache: Path) -> None:
     subprocess.run([sys.executable, "-m", "vmri_jax.cli", *words], cwd=ROOT, check=True, env=environment)
 
 
-def entry(path: Path, folder: Path) -> tuple[str, str]:
-    """The row of a scene and its part with the picture; runs it."""
-    (title, teaches), (simulate, show) = docstring(path)
+def row(path: Path, folder: Path) -> str:
+    """The row of a scene, which runs it and draws its picture."""
+    simulate, _ = docstring(path)[1]
     out = str(folder / option(simulate, "--out"))
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     vmri(*simulate[:-1], out, cache=folder)
@@ -155,19 +155,14 @@ def entry(path: Path, folder: Path) -> tuple[str, str]:
         f"{found.constraints:.0e}" if sizes[2] else "",
         f"{found.maps}: {found.momentum:.0e}" if found.maps else "",
     ]
-    part = f"""## {path.stem}
+    return "| " + " | ".join(cells) + " |"
 
-{title}
-{teaches}
 
-```sh
-{shlex.join(["vmri", *simulate])}
-{shlex.join(["vmri", *show])}
-```
-
-![{path.stem}]({path.stem}.png)
-"""
-    return "| " + " | ".join(cells) + " |", part
+def section(path: Path) -> str:
+    """What a scene is about, how to run it, its picture."""
+    (title, teaches), commands = docstring(path)
+    lines = "\n".join(shlex.join(["vmri", *words]) for words in commands)
+    return f"## {path.stem}\n\n{title}\n{teaches}\n\n```sh\n{lines}\n```\n\n![{path.stem}]({path.stem}.png)\n"
 
 
 def shrink(path: Path) -> None:
@@ -180,8 +175,9 @@ def shrink(path: Path) -> None:
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     with tempfile.TemporaryDirectory() as folder:
-        rows, parts = zip(*(entry(path, Path(folder)) for path in scenes()), strict=True)
-    (HERE / "README.md").write_text(HEAD + "\n".join(rows) + "\n\n" + "\n".join(parts), encoding="utf-8")
+        rows = [row(path, Path(folder)) for path in scenes()]
+    sections = [section(path) for path in scenes()]
+    (HERE / "README.md").write_text(HEAD + "\n".join(rows) + "\n\n" + "\n".join(sections), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ heavy = {"A1": [0.1, 1.35, 0.2], "A2": [-0.2, -0.7, 1.15], "A3": [0.3, -0.8, -1.
 scene = Scene(
     [
         *(Body(name, 1.0, place, kick, radius=0.15) for name, place, kick in zip(chain, places, kicks, strict=True)),
-        *(Body(name, 10.0, place, radius=0.25) for name, place in heavy.items()),
+        *(Body(name, 10.0, place, radius=0.3) for name, place in heavy.items()),
     ],
     [
         Spring([("C1", "C2"), ("C2", "C3"), ("C3", "C4"), ("C4", "C5")], 5000.0, BOND, name="bonds"),
