@@ -1,5 +1,7 @@
 """64-bit floats before anything else, and what many tests share."""
 
+import signal
+
 import jax
 import pytest
 from hypothesis import settings
@@ -41,7 +43,23 @@ def sam():
     return systems.simple_atomic_model()
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c():
+    """Ctrl-C interrupts, also where the tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("--full"):
+        for item in items:
+            if item.get_closest_marker("full"):
+                item.add_marker(pytest.mark.skip(reason="takes long; run with --full"))
+
+
 def pytest_addoption(parser):
+    parser.addoption("--full", action="store_true", help="also the tests that take long")
     parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
 
 

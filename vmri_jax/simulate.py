@@ -261,7 +261,7 @@ def prepare(
     system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro
 ) -> tuple[Simulation, State]:
     """The simulation that these arguments of `simulate` ask for, and its start; bad ones are refused."""
-    macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every)
+    macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
     start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
     macro_dt = jnp.asarray(macro_dt, dtype=float)
     return Simulation(system, scheme, newton or Newton(), macro_dt, start.t, save_every, save_micro), start

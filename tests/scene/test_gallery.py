@@ -65,7 +65,10 @@ def test_commands(name):
     assert (command, options["run"]) == ("animate", Path(f"{name}.npz"))
 
 
-@pytest.mark.parametrize("name", NAMES)
+LONG = ("satellite", "valve_train", "ion_trap")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in LONG else ()) for n in NAMES])
 def test_a_short_run_keeps_what_the_table_says(name):
     scene, trajectory = run(name)
     found = gallery.kept(scene, trajectory)

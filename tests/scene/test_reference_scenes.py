@@ -1,4 +1,4 @@
-"""The reference systems as scenes: bit for bit the trajectories of the hand-written ones."""
+"""The reference systems as scenes: the trajectories of the hand-written ones, bit for bit where the programs are the same."""
 
 import dataclasses
 
@@ -14,13 +14,17 @@ CASES = [(NAMES[0], fully_explicit(5)), (NAMES[1], fully_implicit(5)), (NAMES[2]
 
 
 @pytest.mark.parametrize(("name", "scheme"), CASES)
-def test_trajectories_are_equal_bit_for_bit(name, scheme):
+def test_trajectories_are_equal(name, scheme):
     scene, problem = getattr(reference_scenes, name)(), getattr(systems, name)()
     step = {"macro_dt": 0.01, "num_steps": 200}
     run = simulate(scene.system(), scheme, scene.state(), **step)
     expected = simulate(problem.system, scheme, problem.state(), **step)
     for field in ("t", "q_s", "q_f", "p_s", "p_f"):
-        assert np.array_equal(getattr(run, field), getattr(expected, field)), field
+        a, b = getattr(run, field), getattr(expected, field)
+        if name == "simple_atomic_model":  # its rods are one function by hand, three rows of one in the scene
+            assert np.allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max()), field
+        else:
+            assert np.array_equal(a, b), field
     assert np.allclose(run.energy, expected.energy, rtol=1e-13, atol=0)  # of other sums: equal to round-off
 
 

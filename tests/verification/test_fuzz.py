@@ -42,7 +42,10 @@ STRUCTURES = {
 }
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
+LONG = ("a constraint that crosses itself", "a force that is NaN for half of all velocities")
+
+
+@pytest.mark.parametrize("name", [pytest.param(s, marks=pytest.mark.full if s in LONG else ()) for s in STRUCTURES])
 def test_runs_end_as_they_should(name):
     structure, seen = STRUCTURES[name], set()
 
