@@ -8,7 +8,7 @@ reproduce: .venv/installed  ## the quick reference study: figures, tables and ou
 	$(BIN)/vmri reproduce --quick --out out
 
 test: .venv/installed  ## the whole test suite
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 bench: .venv/installed  ## the quick measurements: time, memory, against C; out/benchmarks
 	$(BIN)/python -m benchmarks all

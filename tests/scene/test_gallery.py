@@ -65,7 +65,7 @@ def test_commands(name):
     assert (command, options["run"]) == ("animate", Path(f"{name}.npz"))
 
 
-LONG = ("satellite", "valve_train", "ion_trap")
+LONG = ("satellite", "valve_train", "ion_trap", "molecule")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in LONG else ()) for n in NAMES])
