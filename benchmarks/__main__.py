@@ -1,11 +1,11 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from benchmarks import batch, compilation, cost, floor, kills, orders, peers
+from benchmarks import batch, compilation, cost, floor, kills, orders, peers, scenes
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -19,6 +19,7 @@ Only = Annotated[
     list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
 ]
 Peer = Annotated[list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")]
+Tables = Annotated[list[Literal["absence", "presence", "orders"]] | None, typer.Option(help="Tables; may be repeated.")]
 OUT = Path("out/benchmarks")
 
 
@@ -71,6 +72,14 @@ def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 10
     _measure("kills", kills, False, out, count=count)
 
 
+@app.command("scenes")
+def scenes_command(full: Full = False, core: Core = None, out: Out = OUT, only: Tables = None) -> None:
+    """What an effect costs that a scene does not have, a scene against a system by hand, orders under forces."""
+    prepare(core)
+    for name in only or scenes.PARTS:
+        _measure(f"scenes, {name}", scenes.PARTS[name], full, out, markdown=True)
+
+
 @app.command("all")
 def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
     """All of them, one after the other."""
@@ -79,13 +88,16 @@ def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
         _measure(name, module, full, out)
 
 
-def _measure(title: str, module, full: bool, out: Path, **options) -> None:
+def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, **options) -> None:
     """Measure, print and write."""
     name = "full" if full else "quick"
     size = module.sizes(name, **options)
     with progress(title, module.programs_of(size)) as tell:
         report = module.run(size, name, tell)
     report.show(module.COLUMNS)
+    if markdown:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{report.name}.md").write_text(report.markdown(module.COLUMNS), encoding="utf-8")
     console.print(f"written to {report.write(out)}\n")
 
 
