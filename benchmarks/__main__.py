@@ -1,7 +1,8 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -19,7 +20,7 @@ Only = Annotated[
     list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
 ]
 Peer = Annotated[list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")]
-Tables = Annotated[list[Literal["absence", "presence", "orders"]] | None, typer.Option(help="Tables; may be repeated.")]
+Tables = Annotated[list[StrEnum("Table", list(scenes.PARTS))] | None, typer.Option(help="Tables; may be repeated.")]
 OUT = Path("out/benchmarks")
 
 

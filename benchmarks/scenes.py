@@ -86,7 +86,8 @@ def absence(size: Size, name: str, tell: Tell = silent) -> Report:
             scene = scene_with(watched)
             found = _program(scene.system(), scheme, scene)
             calls_with = len(calls)
-            if i % size.anew == 0:
+            anew = (i + 1) % size.anew == 0
+            if anew:
                 jax.clear_caches()
             calls.clear()
             left = scene.without(effect.name)
@@ -98,7 +99,7 @@ def absence(size: Size, name: str, tell: Tell = silent) -> Report:
                 **_columns("with", found),
                 **_columns("without", without),
                 **_columns("never", never),
-                "compiled": "anew" if i % size.anew == 0 else "",
+                "compiled": "anew" if anew else "",
                 "same": "yes" if without == never else "no",
                 "unknowns": scene.explain(scheme, measure=False).unknowns,
                 "formula": programs.unknowns(scene.problem(), scheme.num_micro),
