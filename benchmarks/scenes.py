@@ -2,8 +2,7 @@
 
 import copy
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -82,17 +81,15 @@ def absence(size: Size, name: str, tell: Tell = silent) -> Report:
     rows = []
     for i, effect in enumerate(EFFECTS):
         tell(effect.name)
-        with counted(effect) as (watched, calls):
-            scene = scene_with(watched)
-            found = _program(scene.system(), scheme, scene)
-            calls_with = len(calls)
-            anew = (i + 1) % size.anew == 0
-            if anew:
-                jax.clear_caches()
-            calls.clear()
-            left = scene.without(effect.name)
-            without = _program(left.system(), scheme, left)
-            calls_without = len(calls)
+        watched, calls = counted(effect)
+        scene = scene_with(watched)
+        found, calls_with = _program(scene.system(), scheme, scene), len(calls)
+        anew = (i + 1) % size.anew == 0
+        if anew:
+            jax.clear_caches()
+        calls.clear()
+        left = scene.without(effect.name)
+        without, calls_without = _program(left.system(), scheme, left), len(calls)
         rows.append(
             {
                 "effect": effect.name,
@@ -146,8 +143,7 @@ def _columns(label: str, program: tuple) -> dict:
     return {f"ops {label}": program[0], f"bytes {label}": program[1]}
 
 
-@contextmanager
-def counted(effect: Effect) -> Iterator[tuple[Effect, list]]:
+def counted(effect: Effect) -> tuple[Effect, list]:
     """The effect with a function that notes each of its calls, and the list in which it does."""
     calls, function = [], effect.function
 
@@ -158,7 +154,7 @@ def counted(effect: Effect) -> Iterator[tuple[Effect, list]]:
     kind = type(effect)
     watched = copy.copy(effect)
     object.__setattr__(watched, "__class__", type(kind.__name__, (kind,), {"function": property(lambda _: noting)}))
-    yield watched, calls
+    return watched, calls
 
 
 # --- presence --------------------------------------------------------------------------------------------------------
