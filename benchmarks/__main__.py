@@ -1,5 +1,6 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,8 @@ Only = Annotated[
     list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
 ]
 Peer = Annotated[list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")]
+Table = StrEnum("Table", ("absence", "presence", "orders"))
+Tables = Annotated[list[Table] | None, typer.Option(help="Tables of scenes; may be repeated.")]
 OUT = Path("out/benchmarks")
 
 
@@ -99,6 +102,16 @@ def fuzz_command(
         raise typer.Exit(1)
 
 
+@app.command("scenes")
+def scenes_command(full: Full = False, core: Core = None, out: Out = OUT, only: Tables = None) -> None:
+    """What an effect costs that a scene does not have, a scene against a system by hand, orders under forces."""
+    prepare(core)
+    from benchmarks import scenes  # only now: bodies are arrays, which start JAX
+
+    for name in only or Table:
+        _measure(f"scenes, {name}", scenes.PARTS[name], full, out, markdown=True)
+
+
 @app.command("all")
 def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
     """All of them, one after the other."""
@@ -107,13 +120,16 @@ def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
         _measure(name, module, full, out)
 
 
-def _measure(title: str, module, full: bool, out: Path, **options) -> None:
+def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, **options) -> None:
     """Measure, print and write."""
     name = "full" if full else "quick"
     size = module.sizes(name, **options)
     with progress(title, module.programs_of(size)) as tell:
         report = module.run(size, name, tell)
     report.show(module.COLUMNS)
+    if markdown:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / f"{report.name}.md").write_text(report.markdown(module.COLUMNS), encoding="utf-8")
     console.print(f"written to {report.write(out)}\n")
 
 

@@ -74,6 +74,17 @@ class Report:
             plots.save(figure, out / f"{name}.png")
         return path
 
+    def markdown(self, columns: Sequence[str]) -> str:
+        """Rows (these columns of them), claims and notes as Markdown."""
+        tables = [[columns, *([_cell(row.get(name)) for name in columns] for row in self.rows)]]
+        if self.claims:
+            claims = [(c.what, str(c.seen), c.target, "yes" if c.holds else "no") for c in self.claims]
+            tables.append([("ratio", "seen (quartiles)", "target", "holds"), *claims])
+        lines = [f"## {self.name}, {self.size}"]
+        for head, *body in tables:
+            lines += ["", *(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body))]
+        return "\n".join([*lines, "", *(f"- {note}" for note in self.notes), ""])
+
     def show(self, columns: Sequence[str]) -> None:
         """Print the rows (these columns of them), the claims and the notes."""
         if self.rows:

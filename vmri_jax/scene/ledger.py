@@ -189,15 +189,17 @@ def _measure(scene, scheme, macro_dt) -> tuple[Program, Program, dict]:
     return of[whole], of[bare], shares
 
 
-def compile_run(system: System, scheme: Scheme | Composition, state, macro_dt):
-    """The compiled program of STEPS macro steps, a function of the same arguments."""
-    return jax.jit(_run).lower(system, scheme, state, macro_dt).compile()
+def compile_run(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS):
+    """The compiled program of so many macro steps, a function of (system, scheme, state, macro_dt)."""
+    return (
+        jax.jit(_run, static_argnames="num_steps").lower(system, scheme, state, macro_dt, num_steps=num_steps).compile()
+    )
 
 
-def _run(system, scheme, state, macro_dt):
+def _run(system, scheme, state, macro_dt, *, num_steps):
     marches = Newton().falls_back and Newton().marches(system, stage_scheme(scheme))
     newton = Newton("march") if marches else None  # `simulate` compiles the fallback only where a step needs it
-    step = {"macro_dt": macro_dt, "num_steps": STEPS, "save_every": STEPS}
+    step = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps}
     return simulate(system, scheme, state, **step, newton=newton, throw=False).final_state
 
 

@@ -56,6 +56,7 @@ def interleaved(
     repeats: int,
     min_seconds: float = MIN_SECONDS,
     tell: Tell = silent,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, list[float]]:
     """Seconds per call of every run, `repeats` samples each, after one call that is not counted.
 
@@ -67,17 +68,18 @@ def interleaved(
         repeats: samples of each.
         min_seconds: a sample is the mean of as many calls as take about so long.
         tell: told the name of each run before its first call.
+        clock: `time.process_time` where other processes share the core.
     """
     calls, seconds = {}, {name: [] for name in runs}
     for name, run in runs.items():
         tell(name)
-        _seconds(run, 1)
-        calls[name] = max(1, round(min_seconds / _seconds(run, 1)))
+        _seconds(run, 1, clock)
+        calls[name] = max(1, round(min_seconds / _seconds(run, 1, clock)))
     names = list(runs)
     for i in range(repeats):
         start = i % max(1, len(names))
         for name in names[start:] + names[:start]:
-            seconds[name].append(_seconds(runs[name], calls[name]))
+            seconds[name].append(_seconds(runs[name], calls[name], clock))
     return seconds
 
 
@@ -97,11 +99,11 @@ def steps_for(run: Callable[[int], object], seconds: float, unit: int = 1, most:
     return max(1, min(round(steps * seconds / taken), most) // unit) * unit
 
 
-def _seconds(run: Callable[[], object], calls: int) -> float:
-    start = time.perf_counter()
+def _seconds(run: Callable[[], object], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
+    start = clock()
     for _ in range(calls):
         jax.block_until_ready(run())
-    return (time.perf_counter() - start) / calls
+    return (clock() - start) / calls
 
 
 def machine() -> dict:
