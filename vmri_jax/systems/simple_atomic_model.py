@@ -8,24 +8,24 @@ from vmri_jax import ConstantMass, Problem, System
 TETRAHEDRON = np.sqrt(np.array([1 / 3, 1 / 12, 2 / 3]))  # for unit edges: radius, inradius of a face; height
 
 
-def distance(a, b):
-    """Euclidean distance of two atoms."""
-    return jnp.linalg.norm(a - b)
+def length_change(a, b, length):
+    """Change of the distance of two atoms, or of each of some pairs (n, 3)."""
+    return jnp.linalg.norm(b - a, axis=-1) - length
 
 
 def slow_forces(q_s, q_f, params):
     """Gravity on all atoms and the soft springs 1-2 and 2-3, ``k/2 (|q_i - q_j| - l)^2``."""
-    q = jnp.concatenate([q_s, q_f]).reshape(6, 3)
     k, length = params["stiffness"], params["length"]
-    springs = k[0] * (distance(q[1], q[0]) - length) ** 2 + k[1] * (distance(q[2], q[1]) - length) ** 2
-    return springs / 2 + params["gravity"] * jnp.sum(params["masses"] * q[:, 2])
+    springs = k[0] / 2 * length_change(q_s[:3], q_s[3:], length) ** 2
+    springs += k[1] / 2 * length_change(q_s[3:], q_f[:3], length) ** 2
+    heights = jnp.concatenate([q_s, q_f])[2::3]
+    return springs + params["gravity"] * jnp.sum(params["masses"] * heights)
 
 
 def stiff_springs(q_f, params):
     """The stiff triangle 3-4-5, ``k/2 sum (|q_i - q_j| - l)^2``."""
-    q_3, q_4, q_5, _ = q_f.reshape(4, 3)
-    edges = jnp.array([distance(q_4, q_3), distance(q_5, q_4), distance(q_3, q_5)])
-    return params["stiffness"][2] / 2 * jnp.sum((edges - params["length"]) ** 2)
+    a, b = q_f[:9].reshape(3, 3), jnp.concatenate([q_f[3:9], q_f[:3]]).reshape(3, 3)
+    return jnp.sum(params["stiffness"][2] / 2 * length_change(a, b, params["length"]) ** 2)
 
 
 def slow_bond(q_s, params):
@@ -35,8 +35,8 @@ def slow_bond(q_s, params):
 
 def bonds(q_s, q_f, params):
     """Rigid bonds 2-4, 2-5 and 3-6, ``(|q_i - q_j|^2 - l^2) / 2``."""
-    q_2, (q_3, q_4, q_5, q_6) = q_s[3:], q_f.reshape(4, 3)
-    bond = jnp.stack([q_4 - q_2, q_5 - q_2, q_6 - q_3])
+    q_2, q_3 = q_s[3:], q_f[:3]
+    bond = q_f[3:].reshape(3, 3) - jnp.concatenate([jnp.tile(q_2, 2), q_3]).reshape(3, 3)
     return (jnp.sum(bond**2, axis=1) - params["length"] ** 2) / 2
 
 
