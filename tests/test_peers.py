@@ -96,7 +96,7 @@ def test_accelerations(name):
         return slow(q[:n_s], q[n_s:], system.params) + fast(q[n_s:], system.params)
 
     def constraints(q):
-        return system.constraints(q[:n_s], q[n_s:])
+        return system.constraints(0.0, q[:n_s], q[n_s:])
 
     def curvature(q, v):
         return jax.jvp(lambda q: jax.jvp(constraints, (q,), (v,))[1], (q,), (v,))[1]

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support import largest_difference
 from tests.user_systems import arms_kinetic, bent_system, double_pendulum
-from vmri_jax import System, fully_implicit, initial_state, simulate
+from vmri_jax import State, System, fully_implicit, initial_state, simulate
 from vmri_jax.diagnostics import constraint_residual, velocity
 from vmri_jax.state import legendre, project_momentum
 
@@ -40,7 +40,7 @@ def test_legendre_transform_of_a_kinetic_function():
     coupling = m_2 * l_1 * l_2 * jnp.cos(q_s - q_f)
     assert largest_difference(state.p_s, (m_1 + m_2) * l_1**2 * v_s + coupling * v_f) < 1e-14
     assert largest_difference(state.p_f, m_2 * l_2**2 * v_f + coupling * v_s) < 1e-14
-    back = project_momentum(problem.system, q_s, q_f, state.p_s, state.p_f)[2:]
+    back = project_momentum(problem.system, state)[2:]
     assert largest_difference(jnp.concatenate(back), jnp.concatenate([v_s, v_f])) < 1e-12
 
 
@@ -50,18 +50,18 @@ def test_momenta_are_projected_onto_the_hidden_constraints(name, request):
     rng = np.random.default_rng(1)
     v_s, v_f = rng.normal(size=problem.q_s.shape), rng.normal(size=problem.q_f.shape)
     state = initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f)
-    assert (
-        float(constraint_residual(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)[1]) < 1e-12
-    )  # measured 1.5e-13
+    assert float(constraint_residual(problem.system, state)[1]) < 1e-12  # measured 1.5e-13
     raw = legendre(problem.system, problem.q_s, problem.q_f, v_s, v_f)
-    residual = constraint_residual(problem.system, problem.q_s, problem.q_f, *raw)
+    residual = constraint_residual(problem.system, State(0.0, problem.q_s, problem.q_f, *raw))
     assert float(residual[1]) > 0.1
     # the correction is along the constraint normals: G^T mu
-    jacobian = np.concatenate(jax.jacrev(problem.system.constraints, argnums=(0, 1))(problem.q_s, problem.q_f), axis=1)
+    jacobian = np.concatenate(
+        jax.jacrev(problem.system.constraints, argnums=(1, 2))(0.0, problem.q_s, problem.q_f), axis=1
+    )
     correction = np.concatenate([raw[0] - state.p_s, raw[1] - state.p_f])
     mu = np.linalg.lstsq(jacobian.T, correction, rcond=None)[0]
     assert np.abs(jacobian.T @ mu - correction).max() < 1e-12
-    again = project_momentum(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)
+    again = project_momentum(problem.system, state)
     assert largest_difference(again[0], state.p_s) < 1e-12
 
 
@@ -74,7 +74,7 @@ def test_inconsistent_positions_are_refused_with_the_violation(tsp):
 def test_projection_repairs_positions(tsp):
     q_f = tsp.q_f.at[1].add(0.1)
     state = initial_state(tsp.system, tsp.q_s, q_f, tsp.v_s, tsp.v_f, project=True)
-    residual = constraint_residual(tsp.system, state.q_s, state.q_f, state.p_s, state.p_f)
+    residual = constraint_residual(tsp.system, state)
     assert float(jnp.max(residual)) < 1e-13
     # nearest in the mass metric: masses 1 and 100 at the ends of the rod share 0.1 as 100 : 1 (about)
     assert float(state.q_f[1] - q_f[1]) == pytest.approx(-0.1 * 100 / 101, rel=0.01)

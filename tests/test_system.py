@@ -43,7 +43,7 @@ def test_replace_changes_one_field_only():
 
 
 def test_constraints_join_coupling_and_slow_ones(sam):
-    values = sam.system.constraints(sam.q_s + 0.1, sam.q_f)
+    values = sam.system.constraints(0.0, sam.q_s + 0.1, sam.q_f)
     assert values.shape == (4,)
     assert np.array_equal(values[:3], sam.system.constraint(sam.q_s + 0.1, sam.q_f, sam.system.params))
     assert np.array_equal(values[3:], sam.system.slow_constraint(sam.q_s + 0.1, sam.system.params))
@@ -51,7 +51,7 @@ def test_constraints_join_coupling_and_slow_ones(sam):
 
 
 def test_a_system_without_constraints_has_none(fpu):
-    assert fpu.system.constraints(fpu.q_s, fpu.q_f).shape == (0,)
+    assert fpu.system.constraints(0.0, fpu.q_s, fpu.q_f).shape == (0,)
     assert fpu.system.num_constraints(fpu.q_s, fpu.q_f) == (0, 0)
 
 

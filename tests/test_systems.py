@@ -36,7 +36,7 @@ def test_pendulum_springs():
 
 def test_pendulum_follows_its_lengths():
     problem = systems.triple_spherical_pendulum(masses=(5.0, 2.0, 1.0), lengths=(4.0, 1.0, 2.0), gravity=1.0)
-    assert np.abs(problem.system.constraints(problem.q_s, problem.q_f)).max() < 1e-14
+    assert np.abs(problem.system.constraints(0.0, problem.q_s, problem.q_f)).max() < 1e-14
     assert problem.system.slow_potential(jnp.ones(3), jnp.ones(6), problem.system.params) == pytest.approx(8.0)
     assert np.array_equal(problem.system.kinetic.fast, [2, 2, 2, 1, 1, 1])
 
@@ -66,4 +66,4 @@ def test_atomic_model_potentials_are_the_formulas():
     assert float(problem.system.fast_potential(q_f, params)) == pytest.approx(W, rel=1e-13)
     rigid = [np.sum(q[0] ** 2), *(np.sum((q[i] - q[j]) ** 2) for i, j in ((3, 1), (4, 1), (5, 2)))]
     expected = (np.array([*rigid[1:], rigid[0]]) - 100) / 2
-    assert np.allclose(problem.system.constraints(q_s, q_f), expected, rtol=1e-13)
+    assert np.allclose(problem.system.constraints(0.0, q_s, q_f), expected, rtol=1e-13)

@@ -13,7 +13,7 @@ from vmri_jax.simulate import simulate
 from vmri_jax.state import State, initial_state
 from vmri_jax.step import StepInfo, macro_step
 from vmri_jax.store import StoredTrajectory, stream
-from vmri_jax.system import ConstantMass, Problem, System
+from vmri_jax.system import ConstantMass, Problem, Rheonomic, System
 from vmri_jax.trajectory import Trajectory
 
 from vmri_jax import systems  # isort: skip  (written with the names above)
@@ -26,6 +26,7 @@ __all__ = [
     "Newton",
     "Problem",
     "Result",
+    "Rheonomic",
     "Scheme",
     "SimulationError",
     "State",

@@ -91,7 +91,7 @@ def simulate_batch(
     if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
         raise ValueError(f"simulate_batch: chunk is {chunk!r}; it must be an integer of at least 1, or None.")
     if params is None:
-        check_constraints(system, first.q_s, first.q_f, "simulate_batch: the first state")
+        check_constraints(system, first, "simulate_batch: the first state")
     macro_dt = dt * (scheme.num_micro if micro_dt is not None else 1)
     size = _chunk(system, stage_scheme(scheme), first) if chunk is None else chunk
     static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}

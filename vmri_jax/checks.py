@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.quadrature import is_concrete, real_array
-from vmri_jax.system import ConstantMass, System
+from vmri_jax.system import ConstantMass, System, with_time
 
 
 def require_x64() -> None:
@@ -89,9 +89,9 @@ def check_system(system: System, q_s, q_f) -> None:
                 raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a scalar, shape ().")
             _check_float64(name, shape)
     for name, args in (("constraint", (q_s, q_f)), ("slow_constraint", (q_s,))):
-        function = getattr(system, name)
+        function, args = with_time(getattr(system, name), jnp.zeros(()), *args, system.params)
         if function is not None:
-            shape = _shape(name, function, *args, system.params)
+            shape = _shape(name, function, *args)
             if len(getattr(shape, "shape", ())) != 1:
                 raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a vector, shape (n_g,).")
             _check_float64(name, shape)

@@ -37,17 +37,32 @@ def oscillatory_energies(omega, q_f, p_f):
     return (p_f**2 + omega**2 * q_f**2) / 2
 
 
-def constraint_residual(system: System, q_s, q_f, p_s, p_f):
-    """Largest ``|g|`` (position level) and largest ``|G v|`` (velocity level), shape (2,)."""
-    both = jax.jvp(system.constraints, (q_s, q_f), velocity(system, q_s, q_f, p_s, p_f))
+def constraint_residual(system: System, state: State):
+    """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,)."""
+    both = all_constraints(system, state)
     # In reductions over many rows XLA's maximum of 0 and NaN may be 0.
     return jnp.stack([jnp.where(jnp.isnan(a).any(), jnp.nan, jnp.max(jnp.abs(a), initial=0.0)) for a in both])
+
+
+def all_constraints(system: System, state: State):
+    """Constraints and hidden constraints, ``(g, G v + dg/dt)``, each (n_g + n_gs,): zero on the constraint manifold."""
+    at = state.t, state.q_s, state.q_f
+    v = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    return system.constraints(*at), system.constraint_rates(*at, *v)
+
+
+def tangents(system: System, t, z, splits):
+    """Orthonormal basis, one row each, of the tangent vectors of the constraint manifold at ``z = (q_s, q_f, p_s, p_f)``."""
+    if not system.is_constrained:
+        return jnp.eye(z.size)
+    normals = jax.jacfwd(lambda z: jnp.concatenate(all_constraints(system, State(t, *jnp.split(z, splits)))))(z)
+    return jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :]
 
 
 def velocity(system: System, q_s, q_f, p_s, p_f):
     """Velocities ``(v_s, v_f)`` of given momenta (inverse Legendre transform, constraints ignored)."""
     free = system.replace(constraint=None, slow_constraint=None)
-    return project_momentum(free, q_s, q_f, p_s, p_f)[2:]
+    return project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))[2:]
 
 
 def momentum_map(generator, q_s, q_f, p_s, p_f):
@@ -93,10 +108,10 @@ def frequencies(system: System, state: State):
         return slow + (0.0 if system.fast_potential is None else system.fast_potential(q_f, params))
 
     mass = jax.hessian(lambda v: system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params))(v)
-    normals = np.asarray(jax.jacfwd(lambda q: system.constraints(q[:n_s], q[n_s:]))(q))
-    tangents = np.linalg.svd(normals)[2][len(normals) :] if normals.size else np.eye(len(q))
-    half = np.linalg.cholesky(tangents @ np.asarray(mass) @ tangents.T)
-    stiffness = tangents @ np.asarray(jax.hessian(potential)(q)) @ tangents.T
+    normals = np.asarray(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q))
+    basis = np.linalg.svd(normals)[2][len(normals) :] if normals.size else np.eye(len(q))
+    half = np.linalg.cholesky(basis @ np.asarray(mass) @ basis.T)
+    stiffness = basis @ np.asarray(jax.hessian(potential)(q)) @ basis.T
     inner = np.linalg.solve(half, np.linalg.solve(half, stiffness).T)
     return np.sqrt(np.maximum(np.linalg.eigvalsh((inner + inner.T) / 2)[::-1], 0.0))
 
@@ -106,7 +121,7 @@ def symplectic_defect(
 ):
     """Largest entry of ``M^T J M - J`` for the derivative M of one macro step, on the constraint manifold.
 
-    With constraints, the form is compared on tangent vectors of ``{g = 0, G v = 0}`` only, in an orthonormal basis.
+    With constraints, the form is compared on tangent vectors of the constraint manifold only, in an orthonormal basis.
     """
     n_s, n_f = state.q_s.size, state.q_f.size
     n = n_s + n_f
@@ -116,17 +131,11 @@ def symplectic_defect(
         s, _ = macro_step(system, scheme, State(state.t, *jnp.split(z, splits)), macro_dt, newton)
         return jnp.concatenate([s.q_s, s.q_f, s.p_s, s.p_f])
 
-    def manifold(z):
-        q_s, q_f, p_s, p_f = jnp.split(z, splits)
-        _, rate = jax.jvp(system.constraints, (q_s, q_f), velocity(system, q_s, q_f, p_s, p_f))
-        return jnp.concatenate([system.constraints(q_s, q_f), rate])
-
     z = jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
     M = jax.jit(jax.jacfwd(step))(z)
     J = jnp.block([[jnp.zeros((n, n)), jnp.eye(n)], [-jnp.eye(n), jnp.zeros((n, n))]])
-    normals = jax.jacfwd(manifold)(z)
-    tangents = jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :] if normals.size else jnp.eye(2 * n)
-    return jnp.max(jnp.abs(tangents @ (M.T @ J @ M - J) @ tangents.T))
+    basis = tangents(system, state.t, z, splits)
+    return jnp.max(jnp.abs(basis @ (M.T @ J @ M - J) @ basis.T))
 
 
 def step_condition(system: System, scheme: Scheme, state: State, macro_dt, sweeps: int = 10) -> float:

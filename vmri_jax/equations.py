@@ -85,8 +85,8 @@ class StepEquations(eqx.Module):
     def constraint_work(self, path: Path, x: Unknowns):
         """``sum mu . g + sum nu . g_s / num_micro`` at all control nodes but the last."""
         q_s, q_f = path.control_points()
-        g = jax.vmap(self.system.g)(q_s[:-1], q_f[:-1])
-        g_slow = jax.vmap(self.system.g_slow)(path.slow_control_points()[:-1])
+        g = jax.vmap(self.system.g)(path.control_times()[:-1], q_s[:-1], q_f[:-1])
+        g_slow = jax.vmap(self.system.g_slow)(path.slow_control_times()[:-1], path.slow_control_points()[:-1])
         return jnp.sum(x.multiplier.reshape(g.shape) * g) + jnp.sum(x.slow_multiplier * g_slow) / self.scheme.num_micro
 
     def slots(self, x: Unknowns):
@@ -105,9 +105,9 @@ class StepEquations(eqx.Module):
         incoming = jnp.concatenate([self.micro_dt * self.p_f[None], fast[:-1, -1]])
         residual = Unknowns(
             slow=slow[:-1].at[0].add(self.micro_dt * self.p_s),
-            slow_multiplier=jax.vmap(self.system.g_slow)(path.slow_control_points()[1:]),
+            slow_multiplier=jax.vmap(self.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:]),
             fast=fast[:, :-1].at[:, 0].add(incoming),
-            multiplier=jax.vmap(self.system.g)(q_s[1:], q_f[1:]).reshape(x.multiplier.shape),
+            multiplier=jax.vmap(self.system.g)(path.control_times()[1:], q_s[1:], q_f[1:]).reshape(x.multiplier.shape),
         )
         return residual, (slow[-1] / self.micro_dt, fast[-1, -1] / self.micro_dt)
 

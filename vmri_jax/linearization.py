@@ -74,21 +74,22 @@ def linearize(equations: StepEquations, x: Unknowns) -> Blocks:
         add(nodes, jacobian, path.macro_dt * equations.micro_dt * nodes.weights)
 
     q_s, q_f = path.control_points()
-    g_s, g_f = (_per_interval(d, n, r) for d in jax.vmap(jax.jacrev(system.g, argnums=(0, 1)))(q_s, q_f))
+    t = path.control_times()
+    g_s, g_f = (_per_interval(d, n, r) for d in jax.vmap(jax.jacrev(system.g, argnums=(1, 2)))(t, q_s, q_f))
     if system.constraint is not None:
         nodes = control_node_groups(n, r)
         mu = x.multiplier.reshape(n * r, x.multiplier.shape[2])
-        curvature = jax.jacfwd(jax.grad(lambda z, mu: -mu @ system.g(z["q_s"], z["q_f"])))
-        hessian = jax.vmap(curvature)({"q_s": q_s[:-1], "q_f": q_f[:-1]}, mu)
+        curvature = jax.jacfwd(jax.grad(lambda z, t, mu: -mu @ system.g(t, z["q_s"], z["q_f"])))
+        hessian = jax.vmap(curvature)({"q_s": q_s[:-1], "q_f": q_f[:-1]}, t[:-1], mu)
         add(nodes, jax.tree.map(lambda d: _group_by_node(d, n, r), hessian), nodes.weights)
 
-    q = path.slow_control_points()
-    g_slow = jax.vmap(jax.jacrev(system.g_slow))(q)
+    t, q = path.slow_control_times(), path.slow_control_points()
+    g_slow = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(t, q)
     if system.slow_constraint is not None and r > 1:
         # the slow control point i moves with increment i alone, and node 0 does not move
-        curvature = jax.jacfwd(jax.grad(lambda q, nu: -nu @ system.g_slow(q) / n))
+        curvature = jax.jacfwd(jax.grad(lambda q, t, nu: -nu @ system.g_slow(t, q) / n))
         i = np.arange(1, r)
-        blocks["ss"] = blocks["ss"].at[i, :, i].add(jax.vmap(curvature)(q[1:-1], x.slow_multiplier[1:]))
+        blocks["ss"] = blocks["ss"].at[i, :, i].add(jax.vmap(curvature)(q[1:-1], t[1:-1], x.slow_multiplier[1:]))
 
     return Blocks(
         blocks["ff"],

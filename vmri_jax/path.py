@@ -88,6 +88,15 @@ class Path(eqx.Module):
         fast = (self.fast_start[:, None] + self.fast).reshape(n * r, -1)
         return slow, jnp.concatenate([self.fast_start[:1], fast])
 
+    def control_times(self):
+        """Times of the num_micro r + 1 micro control nodes."""
+        theta = (np.arange(self.num_micro)[:, None] + control_nodes(self.degree)[None, :-1]).reshape(-1)
+        return self.t + self.macro_dt * np.append(theta / self.num_micro, 1.0)
+
+    def slow_control_times(self):
+        """Times of the r + 1 macro control nodes."""
+        return self.t + self.macro_dt * control_nodes(self.degree)
+
     def slow_control_points(self):
         """Slow positions at the r + 1 macro control nodes."""
         return jnp.concatenate([self.slow_start[None], self.slow_start + self.slow])

@@ -78,7 +78,7 @@ def simulate(
     if not simulation.is_concrete(start):
         return simulation.all(at, num_saves)
 
-    check_constraints(system, start.q_s, start.q_f, "simulate: the state")
+    check_constraints(system, start, "simulate: the state")
     pieces = []
     with interrupts_noted(progress) as interrupted:
         for saves in _sizes(num_saves, progress):
@@ -199,7 +199,7 @@ def run(
 
     # The energy is NaN from a failing step on. A potential may also be NaN where its gradient is not (a logarithm beyond
     # its pole), and a lane of a batch may start off its constraints: such nodes are no result either.
-    residual = jax.vmap(partial(diagnostics.constraint_residual, system))(*phase)
+    residual = jax.vmap(partial(diagnostics.constraint_residual, system))(nodes)
     kept = residual[:, 0] <= jnp.maximum(CONSTRAINT_TOLERANCE, 100 * newton.tolerance)
     broken = jnp.cumsum(~jnp.isfinite(energy) | ~kept) > 0
     first = jnp.argmax(broken)

@@ -8,7 +8,7 @@ from vmri_jax.discrete_lagrangian import Term, lagrangian
 from vmri_jax.quadrature import PlacedRule, micro, midpoint
 from vmri_jax.scheme import Scheme
 from vmri_jax.structure import depends_on
-from vmri_jax.system import ConstantMass, System
+from vmri_jax.system import ConstantMass, Rheonomic, System
 
 
 class Split(NamedTuple):
@@ -32,7 +32,7 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
         return None
     if scheme.num_micro == 1 and not n_s:
         return None  # a part already
-    slow_potential, fast_potential, constraint = system.slow_potential, system.fast_potential, system.constraint
+    slow_potential, fast_potential = system.slow_potential, system.fast_potential
     kicked = {}
     if slow_potential is not None and scheme.slow.grid == "macro" and scheme.slow.only_ends:
         kicked["slow_potential"], slow_potential = slow_potential, None
@@ -43,18 +43,20 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
         scheme.slow.grid == "micro" or depends_on(lambda q: slow_potential(q_s, q, params), q_f)[0]
     )
     coupled_fast = fast_potential is not None and scheme.fast.grid == "macro"
-    coupled_constraint = constraint is not None and depends_on(lambda q: constraint(q, q_f, params), q_s)[0]
+    coupled_constraint = depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
     if coupled_slow or coupled_fast or coupled_constraint:
         return None
 
     def potential_of_slow(q, params):
         return slow_potential(q, jnp.zeros(n_f), params)  # pyright: ignore[reportOptionalCall]
 
-    def constraint_of_slow(_, q, params):
-        return system.replace(params=params).g_slow(q)
+    @Rheonomic
+    def constraint_of_slow(t, _, q, params):
+        return system.replace(params=params).g_slow(t, q)
 
-    def constraint_of_fast(_, q, params):
-        return system.replace(params=params).g(jnp.zeros(n_s), q)
+    @Rheonomic
+    def constraint_of_fast(t, _, q, params):
+        return system.replace(params=params).g(t, jnp.zeros(n_s), q)
 
     none, drift = jnp.zeros(0), micro(midpoint)
     return Split(
@@ -69,7 +71,7 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
         fast=System(
             ConstantMass(none, system.kinetic.fast),
             fast_potential=fast_potential,
-            constraint=None if constraint is None else constraint_of_fast,
+            constraint=None if system.constraint is None else constraint_of_fast,
             params=params,
         ),
         fast_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast),
@@ -79,18 +81,18 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
 def fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     """The fast variables under W and g with the slow ones at rest in q_s, and the scheme of one micro interval of them."""
     assert isinstance(system.kinetic, ConstantMass)
-    fast_potential, constraint = system.fast_potential, system.constraint
+    fast_potential = system.fast_potential
 
     def potential(q, at):
         return fast_potential(q, at[0])  # pyright: ignore[reportOptionalCall]
 
     def constraint_at_rest(_, q, at):
-        return constraint(at[1], q, at[0])  # pyright: ignore[reportOptionalCall]
+        return system.replace(params=at[0]).g(jnp.zeros(()), at[1], q)
 
     alone = System(
         ConstantMass(jnp.zeros(0), system.kinetic.fast),
         fast_potential=None if fast_potential is None else potential,
-        constraint=None if constraint is None else constraint_at_rest,
+        constraint=None if system.constraint is None else constraint_at_rest,
         params=(system.params, q_s),
     )
     rule = micro(scheme.kinetic.rule)
@@ -103,6 +105,7 @@ def is_explicit(system: System, scheme: Scheme) -> bool:
     return (
         scheme.num_micro == scheme.degree == 1
         and isinstance(system.kinetic, ConstantMass)
-        and system.constraint is system.slow_constraint is system.force is None
+        and not system.is_constrained
+        and system.force is None
         and not any(term.inside.groups for term in terms if isinstance(term, Term))
     )

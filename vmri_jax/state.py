@@ -1,5 +1,6 @@
 """States: positions and momenta on the constraint manifold, and how a run gets its first one."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -39,61 +40,73 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     return jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
 
 
-def project_momentum(system: System, q_s, q_f, p_s, p_f, guess=None):
-    """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v = 0``, and their velocities.
+def project_momentum(system: System, state: State, guess=None):
+    """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their velocities.
 
-    v is the velocity of the projected momentum, ``p - G^T mu = dT/dv``: it minimises ``T(v) - p . v`` over ``G v = 0``.
+    v is the velocity of the projected momentum, ``p - G^T mu = dT/dv``: of all v with ``G v + dg/dt = 0`` the one that
+    minimises ``T(v) - p . v``.
     For constant masses that is one linear solve, else Newton's iteration with a line search from `guess` (v_s, v_f), or
     from rest; the kinetic energy must be convex in the velocities.
 
     Returns:
         (p_s, p_f, v_s, v_f)
     """
+    t, q_s, q_f, p_s, p_f = state.t, state.q_s, state.q_f, state.p_s, state.p_f
     n_s = q_s.shape[0]
+    constraints = partial(system.constraints, t)
     if isinstance(system.kinetic, ConstantMass):
         velocity = system.kinetic.velocity
-        g, pull = jax.vjp(system.constraints, q_s, q_f)
+        g, pull = jax.vjp(constraints, q_s, q_f)
         if g.size:
-            push = jax.linearize(system.constraints, q_s, q_f)[1]
+            push = jax.linearize(constraints, q_s, q_f)[1]
             matrix = jax.vmap(lambda unit: push(*velocity(*pull(unit))))(jnp.eye(g.size))  # G M^-1 G^T
-            mu = algebra.solve(algebra.regularized(matrix), push(*velocity(p_s, p_f))[:, None])[:, 0]
+            rates = push(*velocity(p_s, p_f))
+            if system.is_rheonomic:
+                rates = rates + _own_rates(system, t, q_s, q_f)
+            mu = algebra.solve(algebra.regularized(matrix), rates[:, None])[:, 0]
             pull_s, pull_f = pull(mu)
             p_s, p_f = p_s - pull_s, p_f - pull_f
         return p_s, p_f, *velocity(p_s, p_f)
 
-    jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(0, 1))(q_s, q_f), axis=1)  # (n_g + n_gs, n)
+    jacobian = jnp.concatenate(jax.jacrev(constraints, argnums=(0, 1))(q_s, q_f), axis=1)  # (n_g + n_gs, n)
+    own = _own_rates(system, t, q_s, q_f)
     p = jnp.concatenate([p_s, p_f])
-    v = _velocity(system, q_s, q_f, jacobian, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
+    v = _velocity(system, q_s, q_f, jacobian, own, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
     v_s, v_f = v[:n_s], v[n_s:]
     if jacobian.shape[0]:
         p_s, p_f = legendre(system, q_s, q_f, v_s, v_f)
     return p_s, p_f, v_s, v_f
 
 
-def _velocity(system: System, q_s, q_f, jacobian, p, guess, max_iterations: int = 50):
-    """The v that minimises ``T(v) - p . v`` over ``jacobian v = 0``; NaN where Newton's iteration does not converge."""
+def _own_rates(system: System, t, q_s, q_f):
+    """``dg/dt`` of all constraints (n_g + n_gs,) at fixed positions."""
+    return system.constraint_rates(t, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
+
+
+def _velocity(system: System, q_s, q_f, jacobian, own, p, guess, max_iterations: int = 50):
+    """The v that minimises ``T(v) - p . v`` over ``jacobian v + own = 0``; NaN where Newton's iteration does not converge."""
 
     def kinetic(system, q_s, q_f, v):
         return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
 
     def direction(at, v):
-        system, q_s, q_f, jacobian, p = at
+        system, q_s, q_f, jacobian, own, p = at
         hessian, gradient = (d(lambda v: kinetic(system, q_s, q_f, v))(v) for d in (jax.hessian, jax.grad))
         matrix = algebra.saddle(hessian, jacobian.T, jacobian)
-        return jnp.linalg.solve(matrix, jnp.concatenate([p - gradient, -jacobian @ v]))[: v.size]
+        return jnp.linalg.solve(matrix, jnp.concatenate([p - gradient, -(jacobian @ v + own)]))[: v.size]
 
     def search(carry):
         v, k, _ = carry
-        system, q_s, q_f, jacobian, p = fixed
+        system, q_s, q_f, jacobian, own, p = fixed
         d = direction(fixed, v)
         small = _largest(d) <= 1e-9 * _largest(v)  # the two steps at the end do the rest
         merit = jax.vmap(lambda v: kinetic(system, q_s, q_f, v) - p @ v)(v + fractions[:, None] * d)
-        on_constraints = _largest(jacobian @ v) <= 1e-9 * _largest(v)
+        on_constraints = _largest(jacobian @ v + own) <= 1e-9 * _largest(v)
         better = jnp.isfinite(merit) & ((merit < merit[-1]) | ~on_constraints)
         stop = small | ~jnp.any(better)
         return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
 
-    at = (system, q_s, q_f, jacobian, p)
+    at = (system, q_s, q_f, jacobian, own, p)
     fixed, guess = jax.lax.stop_gradient((at, guess))
     fractions = jnp.append(0.5 ** jnp.arange(12.0), 0.0)
     start = (guess, 0, jnp.asarray(False))
@@ -108,13 +121,13 @@ def _largest(a):
     return jnp.max(jnp.abs(a), initial=0.0)
 
 
-def project_positions(system: System, q_s, q_f, iterations: int = 20):
-    """Positions moved onto the constraints along ``M^-1 G^T`` (the nearest point in the mass metric)."""
+def project_positions(system: System, t, q_s, q_f, iterations: int = 20):
+    """Positions moved onto the constraints at a time, along ``M^-1 G^T`` (the nearest point in the mass metric)."""
     n_s = q_s.shape[0]
     q0 = jnp.concatenate([q_s, q_f])
 
     def constraints(q):
-        return system.constraints(q[:n_s], q[n_s:])
+        return system.constraints(t, q[:n_s], q[n_s:])
 
     def momentum(v):
         return jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
@@ -149,53 +162,53 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
     check_number("tolerance", tolerance)
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
     if project:
-        q_s, q_f = _projected_positions(system, q_s, q_f)
-    p_s, p_f = _momenta(system, q_s, q_f, v_s, v_f)
-    if is_concrete((q_s, q_f, p_s, p_f)):
+        q_s, q_f = _projected_positions(system, t, q_s, q_f)
+    state = State(t, q_s, q_f, *_momenta(system, t, q_s, q_f, v_s, v_f))
+    if is_concrete(state):
         advice = (
             "projection did not reach the constraints; start closer to them."
             if project
             else "correct the positions, or pass project=True to move them onto the constraints."
         )
-        check_constraints(system, q_s, q_f, "initial_state: the initial positions", tolerance, advice)
-        if not all(np.isfinite(p).all() for p in (p_s, p_f)):
+        check_constraints(system, state, "initial_state: the initial positions", tolerance, advice)
+        if not all(np.isfinite(p).all() for p in (state.p_s, state.p_f)):
             raise ValueError(
                 "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
                 "singular at the initial positions, or a function returned NaN there."
             )
-    return State(t, q_s, q_f, p_s, p_f)
+    return state
 
 
 @jax.jit
-def _momenta(system, q_s, q_f, v_s, v_f):
+def _momenta(system, t, q_s, q_f, v_s, v_f):
     """Consistent momenta; what the user's functions return is checked while tracing."""
     check_system(system, q_s, q_f)
-    p_s, p_f = legendre(system, q_s, q_f, v_s, v_f)
-    return project_momentum(system, q_s, q_f, p_s, p_f, (v_s, v_f))[:2]
+    state = State(t, q_s, q_f, *legendre(system, q_s, q_f, v_s, v_f))
+    return project_momentum(system, state, (v_s, v_f))[:2]
 
 
 _projected_positions = jax.jit(project_positions)
 
 
 @jax.jit
-def _constraint_values(system, q_s, q_f):
+def _constraint_values(system, t, q_s, q_f):
     """All constraints, and the Jacobians of g by q_s, of g by q_f and of g_slow by q_s."""
-    jacobians = *jax.jacrev(system.g, argnums=(0, 1))(q_s, q_f), jax.jacrev(system.g_slow)(q_s)
-    return system.constraints(q_s, q_f), *jacobians
+    jacobians = *jax.jacrev(system.g, argnums=(1, 2))(t, q_s, q_f), jax.jacrev(system.g_slow, argnums=1)(t, q_s)
+    return system.constraints(t, q_s, q_f), *jacobians
 
 
 def check_constraints(
     system: System,
-    q_s,
-    q_f,
+    state: State,
     what: str,
     tolerance: float = CONSTRAINT_TOLERANCE,
     advice: str = "start from initial_state(...).",
 ) -> None:
     """Refuse positions off the constraints, and constraints that cannot be kept where they are held."""
-    if system.constraint is system.slow_constraint is None:
+    if not system.is_constrained:
         return
-    values, slow, fast, alone = (np.asarray(a) for a in _constraint_values(system, q_s, q_f))
+    t, q_s, q_f = state.t, state.q_s, state.q_f
+    values, slow, fast, alone = (np.asarray(a) for a in _constraint_values(system, t, q_s, q_f))
     if not np.isfinite(values).all():
         raise ValueError(f"{what}: the constraints are {values} there, which is not finite.")
     worst = np.abs(values).max()
@@ -230,7 +243,7 @@ def check_constraints(
         if not rows:
             continue
         # At a singular configuration (a linkage folded flat) rows are dependent at that place alone: runs pass it.
-        near = _constraint_values(system, *_nearby(q_s, q_f))
+        near = _constraint_values(system, t, *_nearby(q_s, q_f))
         jacobian = np.asarray(near[3] if name == "slow_constraint" else near[2])
         if rows := dependent_rows(jacobian):
             of = "slow variables." if name == "slow_constraint" else f"fast variables. {fix}"

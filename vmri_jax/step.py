@@ -72,7 +72,7 @@ def macro_step(
 ) -> tuple[State, StepInfo]:
     """One macro step, ``(state, info) = macro_step(system, scheme, state, macro_dt)``; pure and not compiled.
 
-    The momenta returned are projected onto the hidden constraints, ``G M^-1 p = 0``. `simulate` takes many steps faster:
+    The momenta returned are projected onto the hidden constraints, ``G v + dg/dt = 0``. `simulate` takes many steps faster:
     it reuses gradients and starts Newton from the step before.
 
     Args:
@@ -104,7 +104,7 @@ def start_memory(
         )
         return Stages(jax.tree.map(lambda a: a[0], own), own)  # pyright: ignore[reportArgumentType]
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    velocity = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f)[2:]
+    velocity = project_momentum(system, state)[2:]
     parts = split(system, scheme, state.q_s, state.q_f)
     own = system if parts is None else parts.kicks
     memories = None
@@ -152,7 +152,7 @@ def advance(system: System, scheme: Scheme | Composition, state: State, macro_dt
         return _advance_stages(system, scheme, state, macro_dt, newton, memory)
     memory = _renew_matrix(system, scheme, state, macro_dt, memory)
     state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
-    p_s, p_f, v_s, v_f = project_momentum(system, state.q_s, state.q_f, state.p_s, state.p_f, memory.velocity)
+    p_s, p_f, v_s, v_f = project_momentum(system, state, memory.velocity)
     state = State(state.t, state.q_s, state.q_f, p_s, p_f)
     finite = jnp.all(jnp.isfinite(p_s)) & jnp.all(jnp.isfinite(p_f))  # positions become infinite by momenta that are
     multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, info.multiplier, info.slow_multiplier)
@@ -236,8 +236,10 @@ def averaging(system: System, scheme: Scheme, macro_dt, newton: Newton):
     """
     if not scheme.slow.mollified:
         return None
-    if not isinstance(system.kinetic, ConstantMass):
-        raise ValueError("Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass.")
+    if not isinstance(system.kinetic, ConstantMass) or system.is_rheonomic:
+        raise ValueError(
+            "Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass, without Rheonomic constraints."
+        )
 
     def average(q_s, q_f):
         fast, fast_scheme = fast_alone(system, scheme, q_s)

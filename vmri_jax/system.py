@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -73,6 +74,25 @@ class KineticFunction(eqx.Module):
         return self.function(q_s, q_f, v_s, v_f, params)
 
 
+@dataclasses.dataclass(frozen=True)
+class Rheonomic:
+    """A holonomic constraint that depends on time: a function with the time as its first argument.
+
+        System(..., constraint=Rheonomic(guided))  # guided(t, q_s, q_f, params) -> (n_g,)
+
+    Its hidden constraint is ``G v + dg/dt = 0``. It does work: energy is not kept.
+
+    Raises:
+        TypeError: function is no function.
+    """
+
+    function: Callable
+
+    def __post_init__(self):
+        if not callable(self.function):
+            raise TypeError(f"Rheonomic: function is {self.function!r}; give a function of (t, q_s, q_f, params).")
+
+
 class System(eqx.Module):
     """Mechanical system with Lagrangian ``L = T - V - W``, constraints ``g = 0`` and forces ``F``.
 
@@ -81,7 +101,8 @@ class System(eqx.Module):
         slow_potential: ``V(q_s, q_f, params) -> ()``.
         fast_potential: ``W(q_f, params) -> ()``.
         constraint: ``g(q_s, q_f, params) -> (n_g,)``, holonomic, involving fast variables.
-        slow_constraint: ``g_s(q_s, params) -> (n_gs,)``, holonomic, of slow variables alone.
+        slow_constraint: ``g_s(q_s, params) -> (n_gs,)``, holonomic, of slow variables alone. Constraints that depend on
+            time are given as `Rheonomic` functions.
         force: ``F(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)``, not derived from a potential.
         params: any pytree of arrays, handed to every function; traced, so that sweeps and gradients over it
             never recompile.
@@ -93,8 +114,8 @@ class System(eqx.Module):
     kinetic: ConstantMass | KineticFunction
     slow_potential: Callable | None = eqx.field(static=True, default=None)
     fast_potential: Callable | None = eqx.field(static=True, default=None)
-    constraint: Callable | None = eqx.field(static=True, default=None)
-    slow_constraint: Callable | None = eqx.field(static=True, default=None)
+    constraint: Callable | Rheonomic | None = eqx.field(static=True, default=None)
+    slow_constraint: Callable | Rheonomic | None = eqx.field(static=True, default=None)
     force: Callable | None = eqx.field(static=True, default=None)
     params: Any = None
 
@@ -116,7 +137,8 @@ class System(eqx.Module):
             "force": force,
         }
         for name, function in functions.items():
-            if function is not None and not callable(function):
+            timed = isinstance(function, Rheonomic) and name in ("constraint", "slow_constraint")
+            if function is not None and not callable(function) and not timed:
                 raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
             _check_hash(name, function)
             setattr(self, name, function)
@@ -135,13 +157,23 @@ class System(eqx.Module):
         """The same system with some fields changed, e.g. ``system.replace(params=new)``."""
         return dataclasses.replace(self, **changes)
 
-    def g(self, q_s, q_f):
+    def g(self, t, q_s, q_f):
         """Values of `constraint`, shape (n_g,); n_g = 0 where there is none."""
-        return jnp.zeros(0) if self.constraint is None else self.constraint(q_s, q_f, self.params)
+        return _constrain(self.constraint, t, q_s, q_f, self.params)
 
-    def g_slow(self, q_s):
+    def g_slow(self, t, q_s):
         """Values of `slow_constraint`, shape (n_gs,); n_gs = 0 where there is none."""
-        return jnp.zeros(0) if self.slow_constraint is None else self.slow_constraint(q_s, self.params)
+        return _constrain(self.slow_constraint, t, q_s, self.params)
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether there are constraints."""
+        return not (self.constraint is self.slow_constraint is None)
+
+    @property
+    def is_rheonomic(self) -> bool:
+        """Whether constraints depend on time."""
+        return any(isinstance(function, Rheonomic) for function in (self.constraint, self.slow_constraint))
 
     def forces(self, t, q_s, q_f, v_s, v_f):
         """Values of `force`, ``(F_s, F_f)``; zero where there is none."""
@@ -149,13 +181,32 @@ class System(eqx.Module):
             return jnp.zeros_like(q_s), jnp.zeros_like(q_f)
         return self.force(t, q_s, q_f, v_s, v_f, self.params)
 
-    def constraints(self, q_s, q_f):
+    def constraints(self, t, q_s, q_f):
         """All constraint values at one configuration, ``(g, g_slow)`` joined, shape (n_g + n_gs,)."""
-        return jnp.concatenate([self.g(q_s, q_f), self.g_slow(q_s)])
+        return jnp.concatenate([self.g(t, q_s, q_f), self.g_slow(t, q_s)])
+
+    def constraint_rates(self, t, q_s, q_f, v_s, v_f):
+        """Rates of all constraint values, ``G v + dg/dt``, shape (n_g + n_gs,)."""
+        if self.is_rheonomic:
+            return jax.jvp(self.constraints, (t, q_s, q_f), (jnp.ones_like(t), v_s, v_f))[1]
+        return jax.jvp(partial(self.constraints, t), (q_s, q_f), (v_s, v_f))[1]
 
     def num_constraints(self, q_s, q_f) -> tuple[int, int]:
         """``(n_g, n_gs)`` for configurations of these shapes."""
-        return jax.eval_shape(self.g, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, q_s).shape[0]
+        t = jnp.zeros(())
+        return jax.eval_shape(self.g, t, q_s, q_f).shape[0], jax.eval_shape(self.g_slow, t, q_s).shape[0]
+
+
+def with_time(function, t, *arguments):
+    """A constraint as a plain function and its arguments, the time the first of them if it is `Rheonomic`."""
+    return (function.function, (t, *arguments)) if isinstance(function, Rheonomic) else (function, arguments)
+
+
+def _constrain(function, t, *arguments):
+    if function is None:
+        return jnp.zeros(0)
+    function, arguments = with_time(function, t, *arguments)
+    return function(*arguments)
 
 
 def _check_hash(name: str, function) -> None:

@@ -172,7 +172,7 @@ def test_own_effects_are_a_function_and_one_line():
     scene = Scene(bodies, [Constraint(swing, "a", {"length": 1.0}), Force(push, ("a", "block"), {"c": 0.5})])
     system = scene.system()
     q_s, q_f, v = jnp.array([1.0, 1.0]), jnp.ones(4), jnp.array([1.0, 2.0])
-    assert system.g_slow(q_s).tolist() == [1.0]
+    assert system.g_slow(0.0, q_s).tolist() == [1.0]
     forces = system.forces(0.0, q_s, q_f, v, q_f)
     assert forces[0].tolist() == [-0.5, -1.0]
     assert forces[1].tolist() == [0.0] * 4

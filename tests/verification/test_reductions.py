@@ -91,7 +91,7 @@ def test_one_explicit_micro_step_with_constraints_is_rattle(tsp):
     macro_dt = 0.005
     run = simulate(tsp.system, fully_explicit(1), tsp.state(), macro_dt=macro_dt, num_steps=STEPS)
     force, _ = force_of(tsp)
-    constraints = jax.jit(lambda q: tsp.system.constraints(q[:3], q[3:]))
+    constraints = jax.jit(lambda q: tsp.system.constraints(0.0, q[:3], q[3:]))
     jacobian = jax.jit(jax.jacrev(constraints))
     mass = np.concatenate([tsp.system.kinetic.slow, tsp.system.kinetic.fast])
     q, p = start_of(tsp)

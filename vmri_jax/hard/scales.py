@@ -55,7 +55,7 @@ class Flat:
             return vm.diagnostics.energy(system, q[:n_s], q[n_s:], *zeros)
 
         def rows(q):
-            return system.constraints(q[:n_s], q[n_s:])
+            return system.constraints(state.t, q[:n_s], q[n_s:])
 
         kinetic = system.kinetic
         assert isinstance(kinetic, vm.ConstantMass)

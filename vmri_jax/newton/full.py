@@ -162,8 +162,8 @@ def has_dependent_constraints(equations: StepEquations):
     g on the micro grid must be satisfiable by the fast variables alone, g_s by the slow ones.
     """
     system, q_s, q_f = equations.system, equations.q_s, equations.q_f
-    g_s, g_f = jax.jacrev(system.g, argnums=(0, 1))(q_s, q_f)
-    return _is_dependent(g_f, g_s) | _is_dependent(jax.jacrev(system.g_slow)(q_s))
+    g_s, g_f = jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f)
+    return _is_dependent(g_f, g_s) | _is_dependent(jax.jacrev(system.g_slow, argnums=1)(equations.t, q_s))
 
 
 def _is_dependent(jacobian, others=None):

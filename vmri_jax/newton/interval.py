@@ -102,7 +102,7 @@ def is_constant(system: System, scheme: Scheme, q_s, q_f) -> bool:
 
 def is_linear(system: System, scheme: Scheme, q_s, q_f) -> bool:
     """Whether there are only fast equations, linear ones with matrix K: one pass solves them."""
-    alone = system.constraint is system.slow_constraint is system.force is None and not q_s.shape[0]
+    alone = not system.is_constrained and system.force is None and not q_s.shape[0]
     complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
     return alone and (complete or not _is_per_coordinate(system, scheme, q_f)) and is_constant(system, scheme, q_s, q_f)
 

@@ -154,20 +154,16 @@ def _over_all_unknowns(equations: StepEquations, guess: Unknowns, newton: Newton
     q_f = equations.q_f + x.fast[:, -1].sum(0)
     code = jnp.asarray(int(Method[method.upper()]))
     result = _kept(result, equations, g, newton)
-    if _is_constrained(equations):
+    if equations.system.is_constrained:
         failed = result > Result.CONVERGED_AT_ROUNDOFF
         dependent = jax.lax.cond(failed, lambda: full.has_dependent_constraints(equations), lambda: jnp.asarray(False))
         result = jnp.where(dependent, Result.RANK_DEFICIENT, result)
     return Solution(x, q_f, p_s, p_f, relative_residual(equations, rows, g), result, iterations, code)
 
 
-def _is_constrained(equations: StepEquations) -> bool:
-    return not (equations.system.constraint is equations.system.slow_constraint is None)
-
-
 def _kept(result, equations: StepEquations, g, newton: Newton):
     """The status, unless the increments converged and the constraints are violated: by contradicting rows."""
-    if not _is_constrained(equations):
+    if not equations.system.is_constrained:
         return result
     violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, 100 * newton.tolerance)
     return jnp.where((result <= Result.CONVERGED_AT_ROUNDOFF) & violated, Result.CONSTRAINT_VIOLATED, result)

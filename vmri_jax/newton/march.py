@@ -13,6 +13,7 @@ The residual is exact, so all of this decides only how many passes there are. A 
 each of its nodes; nothing is stored but the path and those small matrices.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -104,7 +105,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
         q_s, steps = equations.q_s + _along(basis[0], x.slow), _along(basis[1:] - basis[0], x.slow)
         none = jnp.zeros_like(q_s), jnp.zeros_like(carry.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, carry.q_f, *none, h)
-        slow_nodes = jnp.concatenate([q_s[None], q_s + steps])
+        slow_nodes, times = jnp.concatenate([q_s[None], q_s + steps]), local.t + h * control_nodes(r)
         if first:
             mu = scale * (2 * carry.multiplier[0] - carry.multiplier[1])
             inc = jnp.zeros((r, carry.q_f.size))
@@ -116,12 +117,12 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
             return jax.grad(local.unconstrained)(path, path)
 
         fast_nodes = jnp.concatenate([carry.q_f[None], carry.q_f + inc[:-1]])
-        pull = _forces(system, slow_nodes[:-1], fast_nodes, stored=not explicit)
+        pull = _forces(system, times[:-1], slow_nodes[:-1], fast_nodes, stored=not explicit)
         pull_s, pull_f = pull(mu)
         if explicit:  # the increment follows from the multipliers
             inc = -matrix.solve(carry.p_f - pull_f)
         d, change = jax.linearize(gradient, inc)
-        g, push = jax.linearize(lambda inc: constraints(slow_nodes[1:], carry.q_f + inc), inc)
+        g, push = jax.linearize(lambda inc: constraints(times[1:], slow_nodes[1:], carry.q_f + inc), inc)
         dx, change_of_g = jnp.zeros_like(inc), g
         if not explicit:
             rows = jnp.concatenate([(d.fast_start - d.fast.sum(1)) + carry.p_f, d.fast[0, :-1]])
@@ -161,14 +162,14 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
     return x._replace(fast=fast, multiplier=mu), end, new if first else schur
 
 
-def _forces(system, slow_nodes, fast_nodes, stored: bool):
+def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
     """``G^T mu`` of multipliers at these nodes, slow and fast part; with stored Jacobians, or as products of derivatives.
 
     Products are cheaper, unless what consumes them is a dense product, into which the compiler would copy them.
     """
     if not stored:
-        return jax.vjp(jax.vmap(system.g), slow_nodes, fast_nodes)[1]
-    g_s, g_f = jax.vmap(jax.jacrev(system.g, argnums=(0, 1)))(slow_nodes, fast_nodes)
+        return jax.vjp(partial(jax.vmap(system.g), times), slow_nodes, fast_nodes)[1]
+    g_s, g_f = jax.vmap(jax.jacrev(system.g, argnums=(1, 2)))(times, slow_nodes, fast_nodes)
     return lambda mu: (jnp.sum(mu[..., None] * g_s, axis=1), jnp.sum(mu[..., None] * g_f, axis=1))
 
 
@@ -210,13 +211,14 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     inverse_slow, inverse_fast = _inverse_mass(mass.slow), _inverse_mass(mass.fast)
     kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
     inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
+    times = equations.t + equations.macro_dt * control_nodes(r)
     accepted_slow, accepted_fast = ROUNDOFF * eps * _largest(equations.q_s), ROUNDOFF * eps * _largest(equations.q_f)
 
     def slow_update(x: Unknowns, end: Pass):
         """Update of the slow unknowns by mass and slow constraint, residuals of their equations, impulse."""
-        g, push = jax.linearize(lambda inc: jax.vmap(system.g_slow)(equations.q_s + inc), x.slow)
+        g, push = jax.linearize(lambda inc: jax.vmap(system.g_slow)(times[1:], equations.q_s + inc), x.slow)
         nodes = jnp.concatenate([equations.q_s[None], equations.q_s + x.slow[:-1]])
-        jacobian = jax.vmap(jax.jacrev(system.g_slow))(nodes)
+        jacobian = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(times[:-1], nodes)
         pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
         rows = (
             jnp.concatenate([(end.start - end.increments.sum(0) + h * equations.p_s)[None], end.increments[:-1]]) - pull

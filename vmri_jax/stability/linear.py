@@ -232,13 +232,16 @@ def _expansion(system: System, state: State) -> dict:
         return system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], params)
 
     def constraints(q):
-        return system.constraints(q[:n_s], q[n_s:])
+        return system.constraints(state.t, q[:n_s], q[n_s:])
+
+    def along(s):  # straight motion through the state
+        return system.constraints(state.t + s, q[:n_s] + s * v[:n_s], q[n_s:] + s * v[n_s:])
 
     def force(q, v):
         return jnp.concatenate(system.forces(state.t, q[:n_s], q[n_s:], v[:n_s], v[n_s:]))
 
     z = jnp.concatenate([q, v])
-    slope, along = jax.jvp(jax.grad(kinetic), (z,), (jnp.concatenate([v, jnp.zeros_like(v)]),))
+    slope, turn = jax.jvp(jax.grad(kinetic), (z,), (jnp.concatenate([v, jnp.zeros_like(v)]),))
     curvature = jax.jacfwd(jax.jacrev(constraints))(q)
     force_q, force_v = jax.jacfwd(force, argnums=(0, 1))(q, v)
     return {
@@ -248,10 +251,10 @@ def _expansion(system: System, state: State) -> dict:
         "fast": jax.hessian(fast)(q),
         "jacobian": jax.jacrev(constraints)(q),
         "curvature": curvature,
-        "centripetal": jnp.einsum("gij,i,j->g", curvature, v, v),
+        "centripetal": jax.jacfwd(jax.jacfwd(along))(0.0),
         "force_q": force_q,
         "force_v": force_v,
-        "impetus": slope[: q.size] - along[q.size :] - jax.grad(lambda q: slow(q) + fast(q))(q) + force(q, v),
+        "impetus": slope[: q.size] - turn[q.size :] - jax.grad(lambda q: slow(q) + fast(q))(q) + force(q, v),
     }
 
 

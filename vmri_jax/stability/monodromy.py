@@ -9,7 +9,7 @@ import numpy as np
 
 from vmri_jax import Composition, Newton, Result, Scheme, State, System, macro_step
 from vmri_jax.checks import require_x64
-from vmri_jax.diagnostics import velocity
+from vmri_jax.diagnostics import tangents
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.stability.linear import QUICK
 
@@ -59,7 +59,7 @@ def monodromy(
 ) -> Monodromy:
     """Product of the step's derivatives along a trajectory, ``M = DPhi(z_(N-1)) ... DPhi(z_0)``.
 
-    With constraints, every factor is taken between the tangent spaces of ``{g = 0, G v = 0}`` at its two ends.
+    With constraints, every factor is taken between the tangent spaces of the constraint manifold at its two ends.
 
     Args:
         system, scheme, macro_dt, newton: as in `macro_step`.
@@ -110,27 +110,13 @@ def _product(system, scheme, state, macro_dt, newton, num_steps: int):
         z, basis, matrix = carry
         t = state.t + k * macro_dt
         derivative, (z, result) = jax.jacfwd(lambda z: step(z, t), has_aux=True)(z)
-        end_basis = _tangents(system, z, splits)
+        end_basis = tangents(system, t + macro_dt, z, splits)
         return (z, end_basis, end_basis @ derivative @ (basis.T @ matrix)), result
 
     z = _vector(state)
-    basis = _tangents(system, z, splits)
+    basis = tangents(system, state.t, z, splits)
     carry, results = jax.lax.scan(along, (z, basis, jnp.eye(basis.shape[0])), jnp.arange(num_steps))
     return carry[0], carry[2], (basis, carry[1]), results
-
-
-def _tangents(system, z, splits):
-    """Orthonormal basis, one row each, of the tangent vectors of ``{g = 0, G v = 0}`` at z."""
-
-    def manifold(z):
-        q_s, q_f, p_s, p_f = jnp.split(z, splits)
-        values, rate = jax.jvp(system.constraints, (q_s, q_f), velocity(system, q_s, q_f, p_s, p_f))
-        return jnp.concatenate([values, rate])
-
-    if system.constraint is system.slow_constraint is None:
-        return jnp.eye(z.size)
-    normals = jax.jacfwd(manifold)(z)
-    return jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :]
 
 
 def _vector(state: State):

@@ -87,8 +87,7 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest for k lengths of it."""
     n_s, n = rest.q_s.size, rest.q_s.size + rest.q_f.size
-    free = system.constraint is system.slow_constraint is None
-    newton = Newton(method="arrowhead", fixed_iterations=1 if free else CONSTRAINED_ITERATIONS)
+    newton = Newton(method="arrowhead", fixed_iterations=CONSTRAINED_ITERATIONS if system.is_constrained else 1)
 
     def step(coordinates, macro_dt):
         state = State(rest.t, *jnp.split(embed @ coordinates, (n_s, n, n + n_s)))

@@ -13,7 +13,7 @@ import numpy as np
 
 from vmri_jax.simulate import Simulation
 from vmri_jax.state import State
-from vmri_jax.system import KineticFunction, System
+from vmri_jax.system import KineticFunction, System, with_time
 
 IN_FULL = 8
 """Arrays of so many numbers are compared in sight, larger ones by a digest."""
@@ -66,14 +66,13 @@ def _words(leaf) -> str:
 def _operations(system: System, start: State) -> dict[str, str]:
     """Digests of what the user's functions do: a changed body under the same name is another run."""
     q_s, q_f, params = start.q_s, start.q_f, system.params
-    arguments = {
-        "slow_potential": (q_s, q_f, params),
-        "fast_potential": (q_f, params),
-        "constraint": (q_s, q_f, params),
-        "slow_constraint": (q_s, params),
-        "force": (start.t, q_s, q_f, q_s, q_f, params),
+    functions = {
+        "slow_potential": (system.slow_potential, (q_s, q_f, params)),
+        "fast_potential": (system.fast_potential, (q_f, params)),
+        "constraint": with_time(system.constraint, start.t, q_s, q_f, params),
+        "slow_constraint": with_time(system.slow_constraint, start.t, q_s, params),
+        "force": (system.force, (start.t, q_s, q_f, q_s, q_f, params)),
     }
-    functions = {name: (getattr(system, name), args) for name, args in arguments.items()}
     if isinstance(system.kinetic, KineticFunction):
         functions["kinetic"] = system.kinetic.function, (q_s, q_f, q_s, q_f, params)
     return {name: _traced(function, args) for name, (function, args) in functions.items() if function is not None}

@@ -85,7 +85,7 @@ def stream(
     if not simulation.is_concrete(start):
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
     check_system(system, start.q_s, start.q_f)
-    check_constraints(system, start.q_s, start.q_f, "stream: the state")
+    check_constraints(system, start, "stream: the state")
     _check_place(path, resume, overwrite)
     attributes = {
         "num_steps": num_steps,

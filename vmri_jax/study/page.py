@@ -195,7 +195,7 @@ def _shares(problem: vm.Problem, setting: Setting | None) -> dict[str, float]:
     if n_constraints:
 
         def rows(q):
-            value, pull = jax.vjp(lambda q: system.constraints(q[:n_s], q[n_s:]), q)
+            value, pull = jax.vjp(lambda q: system.constraints(problem.t, q[:n_s], q[n_s:]), q)
             return sum(value) + jax.vmap(pull)(jnp.eye(n_constraints))[0].sum(0)
 
         evaluations = row.fast_evaluations if row.fast_evaluations else row.slow_evaluations

@@ -1,0 +1,205 @@
+"""Constraints that depend on time: pendulums on pivots that are moved, against their equations in angles."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from vmri_jax import (
+    ConstantMass,
+    Newton,
+    Rheonomic,
+    System,
+    compose,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    galerkin,
+    initial_state,
+    mollified_impulse,
+    simulate,
+    stream,
+)
+from vmri_jax.diagnostics import observed_order, symplectic_defect
+
+LENGTH, G = 0.5, 9.81
+PARAMS = {"amplitude": 0.3, "frequency": 4.0}
+T_END = 1.0
+
+
+def pivot(t, params):
+    return params["amplitude"] * jnp.cos(params["frequency"] * t)
+
+
+def weight(q_s, q_f, params):
+    return G * q_f[1]
+
+
+def spring(q_s, q_f, params):
+    return weight(q_s, q_f, params) + 20.0 * q_s[0] ** 2
+
+
+def guided(t, q_s, params):
+    return q_s - pivot(t, params)
+
+
+def rod(q_s, q_f, params):
+    return (jnp.sum((q_f - jnp.append(q_s, 0.0)) ** 2, keepdims=True) - LENGTH**2) / 2
+
+
+def guided_rod(t, q_s, q_f, params):
+    return rod(jnp.atleast_1d(pivot(t, params)), q_f, params)
+
+
+def shifted_rod(t, q_s, q_f, params):
+    return rod(q_s + pivot(t, params), q_f, params)
+
+
+SYSTEMS = {
+    "cart that is moved": System(ConstantMass([3.0], [1.0, 1.0]), weight, None, rod, Rheonomic(guided), params=PARAMS),
+    "pivot that is moved": System(ConstantMass([3.0], [1.0, 1.0]), spring, None, Rheonomic(guided_rod), params=PARAMS),
+    "pivot on a sprung cart": System(
+        ConstantMass([3.0], [1.0, 1.0]), spring, None, Rheonomic(shifted_rod), params=PARAMS
+    ),
+}
+
+
+def kinetic(q_s, q_f, v_s, v_f, params):
+    return (3.0 * jnp.sum(v_s**2) + jnp.sum(v_f**2)) / 2
+
+
+def start(system):
+    """Hanging at rest in space, but for what the constraints move."""
+    x = PARAMS["amplitude"]
+    q_s = jnp.array([x if system.slow_constraint else 0.0])
+    zero = jnp.zeros(1)
+    return initial_state(system, q_s, jnp.array([x, -LENGTH]), zero, jnp.array([0.4, 0.0]))
+
+
+@cache
+def bob(t: float) -> np.ndarray:
+    """``l phi'' = -g sin phi - x'' cos phi`` of the bob at ``(x + l sin phi, -l cos phi)``."""
+    amplitude, frequency = PARAMS["amplitude"], PARAMS["frequency"]
+
+    def rate(t, y):
+        pull = amplitude * frequency**2 * np.cos(frequency * t)  # -x''
+        return [y[1], (-G * np.sin(y[0]) + pull * np.cos(y[0])) / LENGTH]
+
+    phi = solve_ivp(rate, (0, t), [0.0, 0.4 / LENGTH], method="DOP853", rtol=1e-13, atol=1e-13).y[0, -1]
+    return np.array([amplitude * np.cos(frequency * t) + LENGTH * np.sin(phi), -LENGTH * np.cos(phi)])
+
+
+def run(system, scheme, num_steps, **options):
+    return simulate(system, scheme, start(system), macro_dt=T_END / num_steps, num_steps=num_steps, **options)
+
+
+CASES = [
+    ("cart that is moved", fully_implicit(3), (20, 40)),
+    ("cart that is moved", galerkin(2, 2), (10, 20)),
+    ("pivot that is moved", explicit_slow(3), (20, 40)),
+    ("pivot that is moved", compose(fully_explicit(2), "suzuki4"), (20, 40)),
+]
+
+
+@pytest.mark.parametrize(("name", "scheme", "steps"), CASES)
+def test_order(name, scheme, steps):
+    runs = [run(SYSTEMS[name], scheme, n) for n in steps]
+    errors = [np.abs(trajectory.q_f[-1] - bob(T_END)).max() for trajectory in runs]
+    assert observed_order(1 / np.array(steps), errors) == pytest.approx(scheme.order, abs=0.2), errors
+    assert max(trajectory.constraint_residual.max() for trajectory in runs) < 1e-13  # positions and velocities
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme", "method"),
+    [
+        ("pivot on a sprung cart", galerkin(2, 2), "march"),
+        ("pivot on a sprung cart", galerkin(2, 2), "dense"),
+        ("cart that is moved", fully_implicit(3), "march"),
+        ("cart that is moved", fully_implicit(3), "frozen"),
+    ],
+)
+def test_all_methods_find_the_same(name, scheme, method):
+    expected = run(SYSTEMS[name], scheme, 10, newton=Newton("arrowhead"))
+    found = run(SYSTEMS[name], scheme, 10, newton=Newton(method))
+    assert np.abs(found.q_f - expected.q_f).max() < 1e-12
+    assert np.abs(found.p_s - expected.p_s).max() < 1e-11
+
+
+def test_kinetic_energy_as_a_function_gives_the_same():
+    system = SYSTEMS["pivot on a sprung cart"]
+    expected = run(system, fully_implicit(3), 20)
+    found = run(system.replace(kinetic=kinetic), fully_implicit(3), 20)
+    assert np.abs(found.q_f - expected.q_f).max() < 1e-11
+    assert np.abs(found.p_f - expected.p_f).max() < 1e-10
+
+
+def test_a_step_is_symplectic():
+    system = SYSTEMS["pivot on a sprung cart"]
+    state = run(system, fully_implicit(3), 3).final_state
+    assert float(symplectic_defect(system, fully_implicit(3), state, 0.05)) < 1e-12
+
+
+def test_velocities_follow_the_pivot():
+    """Inconsistent velocities are projected onto ``G v + dg/dt = 0``."""
+    system = SYSTEMS["cart that is moved"]
+    t = 0.2
+    x = float(pivot(t, PARAMS))
+    state = initial_state(system, jnp.array([x]), jnp.array([x, -LENGTH]), jnp.zeros(1), jnp.zeros(2), t)
+    rate = -PARAMS["amplitude"] * PARAMS["frequency"] * np.sin(PARAMS["frequency"] * t)
+    assert float(state.p_s[0]) == pytest.approx(3.0 * rate, rel=1e-14)
+
+
+def test_fast_vibration_of_the_pivot_holds_a_pendulum_upright():
+    """Kapitza's pendulum: upright is stable if ``(a w)^2 > 2 g l``, else it falls."""
+
+    def up_and_down(t, q_s, q_f, params):
+        height = params["amplitude"] * jnp.cos(params["frequency"] * t)
+        return (jnp.sum((q_f - jnp.array([0.0, height])) ** 2, keepdims=True) - LENGTH**2) / 2
+
+    def lowest(frequency):
+        params = {"amplitude": 0.05, "frequency": frequency}
+        none = jnp.zeros(0)
+        system = System(ConstantMass(none, [1.0, 1.0]), weight, None, Rheonomic(up_and_down), params=params)
+        q_f = jnp.array([LENGTH * np.sin(0.1), 0.05 + LENGTH * np.cos(0.1)])
+        state = initial_state(system, none, q_f, none, jnp.zeros(2))
+        return simulate(system, fully_explicit(1), state, macro_dt=2e-3, num_steps=3000).q_f[:, 1].min()
+
+    border = np.sqrt(2 * G * LENGTH) / 0.05
+    assert lowest(2 * border) > 0.9 * LENGTH - 0.05
+    assert lowest(0.5 * border) < 0
+
+
+def test_derivatives_by_parameters():
+    def end(amplitude):
+        system = SYSTEMS["pivot that is moved"].replace(params={"amplitude": amplitude, "frequency": 4.0})
+        state = initial_state(system, jnp.zeros(1), jnp.stack([amplitude, -LENGTH]), jnp.zeros(1), jnp.zeros(2))
+        return simulate(system, fully_implicit(2), state, macro_dt=0.05, num_steps=10).q_f[-1, 0]
+
+    at, h = jnp.asarray(0.3), 1e-5
+    slope = (end(at + h) - end(at - h)) / (2 * h)
+    assert float(jax.grad(end)(at)) == pytest.approx(float(slope), rel=1e-8)
+
+
+def test_stored_run_goes_on(tmp_path):
+    system, path = SYSTEMS["pivot on a sprung cart"], tmp_path / "run.zarr"
+    whole = run(system, fully_implicit(3), 20)
+    step = {"macro_dt": T_END / 20, "out": path}
+    stream(system, fully_implicit(3), start(system), num_steps=10, **step)
+    found = stream(system, fully_implicit(3), start(system), num_steps=20, resume=True, **step).load()
+    assert np.array_equal(found.q_f, whole.q_f)
+
+
+def test_bad_input():
+    with pytest.raises(TypeError, match=r"Rheonomic: function is 3.*t, q_s, q_f, params"):
+        Rheonomic(3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match=r"slow_potential is Rheonomic"):
+        SYSTEMS["cart that is moved"].replace(slow_potential=Rheonomic(guided))
+    system = SYSTEMS["cart that is moved"].replace(slow_constraint=Rheonomic(guided_rod))
+    with pytest.raises(ValueError, match=r"slow_constraint could not be evaluated"):
+        start(system)
+    system = SYSTEMS["pivot that is moved"].replace(fast_potential=lambda q, params: jnp.sum(q**2))
+    with pytest.raises(ValueError, match=r"mollified.*Rheonomic"):
+        run(system, mollified_impulse(3), 5)
