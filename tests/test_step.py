@@ -1,6 +1,5 @@
 """One macro step: the route chosen from rules and system, its end, its multipliers."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -105,8 +104,8 @@ def test_constraints_hold_at_every_micro_node(sam, degree):
     assert info.multiplier.shape == (3, degree, 3)
     assert info.slow_multiplier.shape == (degree, 1)
     # hidden constraints: G M^-1 p = 0
-    _, rate = jax.jvp(sam.system.constraints, (end.q_s, end.q_f), sam.system.kinetic.velocity(end.p_s, end.p_f))
-    assert float(jnp.abs(rate).max()) < 1e-12
+    rates = sam.system.constraint_rates(0.0, end.q_s, end.q_f, *sam.system.kinetic.velocity(end.p_s, end.p_f))
+    assert float(jnp.abs(rates).max()) < 1e-12
 
 
 def test_small_steps_lose_no_digits(fpu):

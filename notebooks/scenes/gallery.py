@@ -74,7 +74,7 @@ def momentum_maps(system: vm.System, run: vm.Trajectory, size: int) -> list[np.n
         lagrangian = system.kinetic(*q, *v, system.params)
         for potential, where in ((system.slow_potential, q), (system.fast_potential, q[1:])):
             lagrangian -= 0.0 if potential is None else potential(*where, system.params)
-        return jnp.append(system.constraints(*q), lagrangian)
+        return jnp.append(system.constraints(0.0, *q), lagrangian)
 
     def moved(matrix, shift, x):
         return tuple((part.reshape(-1, size) @ matrix.T + shift).reshape(-1) for part in x)
