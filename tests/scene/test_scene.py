@@ -4,6 +4,7 @@
 
 import dataclasses
 import json
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -292,3 +293,27 @@ def test_kinetic_energy_is_a_function_only_with_a_magnetic_field():
     assert isinstance(scene.without("magnetic_field").system().kinetic, ConstantMass)
     state = initial_state(scene.system(), *(getattr(scene.problem(), name) for name in ("q_s", "q_f", "v_s", "v_f")))
     assert np.allclose(state.p_s, [0.0, 2.0 + 0.5 * 3.0 / 2])  # m v + Q A
+
+
+def test_arguments_may_be_iterators():
+    bodies = [Body(name, 1.0, [float(i), 0.0]) for i, name in enumerate("abcd")]
+    given = [
+        Spring(pairwise("abcd"), (k for k in (1.0, 2.0, 3.0))),
+        RigidLink([iter("ab")]),
+        LinearDamping(0.1, iter("ab")),
+        Coulomb(dict.fromkeys("abcd", 1.0), between=map(tuple, ["ac", "bd"])),
+        RayleighDamping(stiffness=0.1, of=iter(["springs"])),
+        Force(push, (name for name in "ab"), {"c": 0.5}),
+    ]
+    kept = [
+        Spring([("a", "b"), ("b", "c"), ("c", "d")], [1.0, 2.0, 3.0]),
+        RigidLink([("a", "b")]),
+        LinearDamping(0.1, ["a", "b"]),
+        Coulomb(dict.fromkeys("abcd", 1.0), between=[("a", "c"), ("b", "d")]),
+        RayleighDamping(stiffness=0.1, of=["springs"]),
+        Force(push, ("a", "b"), {"c": 0.5}),
+    ]
+    scene, expected = Scene(bodies, iter(given)), Scene(bodies, kept)
+    assert homes(scene) == homes(expected)
+    assert scene.drawing() == expected.drawing()
+    assert jax.tree.all(jax.tree.map(np.array_equal, scene.replace("springs", rate="slow").params, expected.params))

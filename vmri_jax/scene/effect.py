@@ -10,8 +10,8 @@ An effect of one's own is a function and one line:
 """
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from itertools import combinations
 from typing import Any, ClassVar, Literal
 
@@ -62,6 +62,8 @@ class Effect:
     rate: Literal["slow", "fast", "auto"] = field(default="auto", kw_only=True)
 
     def __post_init__(self):
+        for argument in fields(self):
+            object.__setattr__(self, argument.name, lasting(getattr(self, argument.name)))
         if not self.name:
             object.__setattr__(self, "name", self.default_name)
         if self.rate not in ("slow", "fast", "auto"):
@@ -220,6 +222,13 @@ class Force(_Own):
     """A force of one's own, ``function(t, q, v, params)`` -> a tuple of one force per body, shaped like q."""
 
     kind = "force"
+
+
+def lasting(value):
+    """A value that can be gone through again: an iterator, or a list with iterators in it, as a tuple."""
+    if isinstance(value, Iterator) or (isinstance(value, list | tuple) and any(isinstance(v, Iterator) for v in value)):
+        return tuple(lasting(item) for item in value)
+    return value
 
 
 def groups(between, size: int, what: str) -> Elements:
