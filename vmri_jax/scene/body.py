@@ -9,6 +9,8 @@ import numpy as np
 from vmri_jax.quadrature import is_concrete
 
 Pace = Literal["slow", "fast", "auto"]
+LARGEST_POINT = 3
+"""Coordinates of a point; blocks have more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,3 +75,8 @@ class Body:
     def size(self) -> int:
         """Number of coordinates."""
         return self.position.shape[0]
+
+    @property
+    def is_point(self) -> bool:
+        """Whether it is a point, rather than a block of general coordinates."""
+        return self.size <= LARGEST_POINT

@@ -46,7 +46,8 @@ class Effect:
 
     Args:
         name: of this effect in its scene; by default the name of its class.
-        rate: of a potential, "slow" (V), "fast" (W) or "auto", by stiffness.
+        rate: of a potential, "slow" (V), "fast" (W) or "auto", by stiffness; of a kinetic effect likewise, but it only
+            makes bodies fast: these terms are all on the micro grid.
     """
 
     kind: ClassVar[Kind]
