@@ -112,19 +112,6 @@ def test_kinetic_effects_that_are_not_smooth():
         Scene(IONS.bodies, [Kinetic(norm_of, "neutral", {"f": 1.0})])
 
 
-@pytest.mark.parametrize("what", ["mass", "position", "velocity", "field"])
-def test_traced_numbers_decide_nothing(what):
-    def momentum(x):
-        one, ones = (
-            dict.fromkeys(["mass", "position", "velocity", "field"], n) | {what: x * n} for n in (1.0, np.ones(3))
-        )
-        light = Body("light", one["mass"], ones["position"], ones["velocity"])
-        return Scene([light], [MagneticField(ones["field"], 1.0)]).state().p_s.sum()
-
-    with pytest.raises(ValueError, match="whether light is slow or fast depends on numbers that are traced"):
-        jax.grad(momentum)(1.0)
-
-
 CHAIN = [
     Body(name, 1.0, [float(i), 0.0], pace="slow" if name in "abcde" else "fast") for i, name in enumerate("abcdefgh")
 ]

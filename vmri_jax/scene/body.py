@@ -66,7 +66,7 @@ class Body:
                 raise ValueError(f"Body {self.name}: {name} is {np.asarray(value)}, which is not finite.")
         if is_concrete(mass) and not np.all(np.asarray(mass) > 0):
             raise ValueError(f"Body {self.name}: mass is {np.asarray(mass)}; every mass must be positive.")
-        if self.radius is not None and not 0 < self.radius < np.inf:
+        if self.radius is not None and is_concrete(self.radius) and not 0 < self.radius < np.inf:
             raise ValueError(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
         for name, value in (("position", position), ("velocity", velocity), ("mass", mass)):
             object.__setattr__(self, name, value)
