@@ -21,6 +21,7 @@ from vmri_jax.scene import (
     Dashpot,
     Force,
     Gravity,
+    Kinetic,
     LinearDamping,
     MagneticField,
     PlaneContact,
@@ -168,6 +169,18 @@ def push(t, q, v, params):
     return -params["c"] * v[0], jnp.zeros_like(v[1])
 
 
+def well(q, params):
+    return params["k"] / 2 * sum(jnp.sum(x**2) for x in q)
+
+
+def level(q, params):
+    return q[1][1] - q[0][1]
+
+
+def turn(q, v, params):
+    return params["w"] * jnp.dot(q[0], v[1])
+
+
 def test_own_effects_are_a_function_and_one_line():
     bodies = [Body("a", 1.0, [1.0, 0.0], pace="slow"), Body("block", [1.0, 2.0, 3.0, 4.0], np.ones(4), pace="fast")]
     scene = Scene(bodies, [Constraint(swing, "a", {"length": 1.0}), Force(push, ("a", "block"), {"c": 0.5})])
@@ -258,6 +271,25 @@ def test_drawing_is_plain_data():
     assert drawing["links"] == [["a", "b"]]
     assert drawing["anchors"] == [{"body": "b", "point": [0.0, 0.0], "kind": "spring"}]
     assert drawing["planes"] == [{"point": [0.0, 0.0], "normal": [0.0, 1.0]}]
+
+
+def test_effects_of_ones_own_are_drawn_as_they_say():
+    bodies = [Body(name, 1.0, [float(i), 0.0], pace="fast") for i, name in enumerate("abc")]
+
+    def drawing(**how):
+        effects = [
+            Potential(well, ("a", "c", "b"), {"k": 1.0}, **how),
+            Constraint(level, ("a", "b"), drawn_as="link"),
+            Force(push, ("c", "a"), {"c": 0.5}, drawn_as="spring"),
+            Kinetic(turn, ("c", "b"), {"w": 1.0}, drawn_as="link"),
+        ]
+        return Scene(bodies, effects).drawing()
+
+    seen = drawing(drawn_as="spring")
+    assert seen["springs"] == [["a", "c"], ["c", "b"], ["c", "a"]]
+    assert seen["links"] == [["a", "b"], ["c", "b"]]
+    Drawing.from_dict(seen)
+    assert drawing()["springs"] == [["c", "a"]]
 
 
 def test_ledger_counts_unknowns_by_the_formula():
