@@ -20,11 +20,11 @@ def quadrupole(q, params):
     return params["stiffness"] / 4 * jnp.sum(3 * positions[:, 2] ** 2 - jnp.sum(positions**2, axis=1))
 
 
-ions = [
-    Body("heavy 1", 20.0, [1.2, 0.0, 0.6], [0.0, -0.3, 0.0], pace="slow", radius=0.12),
-    Body("heavy 2", 20.0, [-1.2, 0.0, -0.6], [0.0, 0.3, 0.2], pace="slow", radius=0.12),
-    Body("light 1", 1.0, [0.5, 0.8, 0.4], [4.0, 0.0, 0.5], pace="fast", radius=0.06),
-    Body("light 2", 1.0, [-0.5, -0.8, -0.8], [0.0, 4.0, 0.0], pace="fast", radius=0.06),
+ions = [  # who is slow and who is fast follows from these frequencies
+    Body("heavy 1", 20.0, [1.2, 0.0, 0.6], [0.0, -0.3, 0.0], radius=0.12),
+    Body("heavy 2", 20.0, [-1.2, 0.0, -0.6], [0.0, 0.3, 0.2], radius=0.12),
+    Body("light 1", 1.0, [0.5, 0.8, 0.4], [4.0, 0.0, 0.5], radius=0.06),
+    Body("light 2", 1.0, [-0.5, -0.8, -0.8], [0.0, 4.0, 0.0], radius=0.06),
 ]
 names = [ion.name for ion in ions]
 

@@ -27,6 +27,10 @@ A, B, C = Body("bob", 1.0, [0.0, 0.0]), Body("tip", 1.0, [1.0, 0.0]), Body("load
 SPACE = [Body(name, 1.0, q) for name, q in zip("wxyz", np.eye(4)[:, :3] + 1, strict=True)]
 
 
+def height(q, params):
+    return q[0][1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -100,6 +104,16 @@ def test_body(arguments, message):
         ([A, B], [Coulomb({"bob": 1.0}, 1.0, [("bob", "tip")])], "coulomb: tip has no charge"),
         ([A], [MagneticField([0.0, 0.0, 1.0], 1.0)], r"magnetic_field: field has shape \(3,\) and bob has dimension 2"),
         ([A, B, Body("c", 1.0, [2.0, 0.0])], [Angle(("bob", "tip", "c"), 1.0)], "angles: angle is .*take Bending"),
+        (
+            [A, B],
+            [Potential(height, "bob", drawn_as="spring")],
+            "height: drawn_as is 'spring'; it is drawn between bodies, and bob is alone; leave it out",
+        ),
+        (
+            [A, Body("block", 1.0, np.ones(4))],
+            [Potential(height, ("bob", "block"), drawn_as="link")],
+            "height: drawn_as is 'link'; it is drawn between points, and block has 4 coordinates; leave it out",
+        ),
         (SPACE, [Torsion(("w", "x", "y", "z"), 1.0, 0.0, 1.5)], "torsion: multiplicity is 1.5; it must be an integer"),
     ],
 )
@@ -117,6 +131,13 @@ def test_wrong_kinds():
         Potential(3, "bob")
     with pytest.raises(ValueError, match=r"springs: rate is 'stiff'"):
         Spring(("bob", "tip"), 1.0, rate="stiff")
+    with pytest.raises(ValueError, match=r"height: drawn_as is 'rope'; it must be 'link', 'spring' or None"):
+        Potential(height, ("bob", "tip"), drawn_as="rope")
+    for kind, arguments in ((Anchor, ()), (SpringAnchor, (1.0,))):
+        with pytest.raises(
+            TypeError, match=r"anchors: point is <function height.*; for a point that moves take MovingAnchor"
+        ):
+            kind("bob", height, *arguments)
     with pytest.raises(TypeError, match=r"Scene.explain: scheme is 'galerkin'"):
         Scene([A]).explain("galerkin", measure=False)
 

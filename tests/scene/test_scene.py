@@ -4,6 +4,7 @@
 
 import dataclasses
 import json
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from vmri_jax.scene import (
     Dashpot,
     Force,
     Gravity,
+    Kinetic,
     LinearDamping,
     MagneticField,
     PlaneContact,
@@ -167,6 +169,18 @@ def push(t, q, v, params):
     return -params["c"] * v[0], jnp.zeros_like(v[1])
 
 
+def well(q, params):
+    return params["k"] / 2 * sum(jnp.sum(x**2) for x in q)
+
+
+def level(q, params):
+    return q[1][1] - q[0][1]
+
+
+def turn(q, v, params):
+    return params["w"] * jnp.dot(q[0], v[1])
+
+
 def test_own_effects_are_a_function_and_one_line():
     bodies = [Body("a", 1.0, [1.0, 0.0], pace="slow"), Body("block", [1.0, 2.0, 3.0, 4.0], np.ones(4), pace="fast")]
     scene = Scene(bodies, [Constraint(swing, "a", {"length": 1.0}), Force(push, ("a", "block"), {"c": 0.5})])
@@ -259,6 +273,25 @@ def test_drawing_is_plain_data():
     assert drawing["planes"] == [{"point": [0.0, 0.0], "normal": [0.0, 1.0]}]
 
 
+def test_effects_of_ones_own_are_drawn_as_they_say():
+    bodies = [Body(name, 1.0, [float(i), 0.0], pace="fast") for i, name in enumerate("abc")]
+
+    def drawing(**how):
+        effects = [
+            Potential(well, ("a", "c", "b"), {"k": 1.0}, **how),
+            Constraint(level, ("a", "b"), drawn_as="link"),
+            Force(push, ("c", "a"), {"c": 0.5}, drawn_as="spring"),
+            Kinetic(turn, ("c", "b"), {"w": 1.0}, drawn_as="link"),
+        ]
+        return Scene(bodies, effects).drawing()
+
+    seen = drawing(drawn_as="spring")
+    assert seen["springs"] == [["a", "c"], ["c", "b"], ["c", "a"]]
+    assert seen["links"] == [["a", "b"], ["c", "b"]]
+    Drawing.from_dict(seen)
+    assert drawing()["springs"] == [["c", "a"]]
+
+
 def test_ledger_counts_unknowns_by_the_formula():
     sam = simple_atomic_model()
     ledger = sam.explain(fully_implicit(20), measure=False)
@@ -292,3 +325,27 @@ def test_kinetic_energy_is_a_function_only_with_a_magnetic_field():
     assert isinstance(scene.without("magnetic_field").system().kinetic, ConstantMass)
     state = initial_state(scene.system(), *(getattr(scene.problem(), name) for name in ("q_s", "q_f", "v_s", "v_f")))
     assert np.allclose(state.p_s, [0.0, 2.0 + 0.5 * 3.0 / 2])  # m v + Q A
+
+
+def test_arguments_may_be_iterators():
+    bodies = [Body(name, 1.0, [float(i), 0.0]) for i, name in enumerate("abcd")]
+    given = [
+        Spring(pairwise("abcd"), (k for k in (1.0, 2.0, 3.0))),
+        RigidLink([iter("ab")]),
+        LinearDamping(0.1, iter("ab")),
+        Coulomb(dict.fromkeys("abcd", 1.0), between=map(tuple, ["ac", "bd"])),
+        RayleighDamping(stiffness=0.1, of=iter(["springs"])),
+        Force(push, (name for name in "ab"), {"c": 0.5}),
+    ]
+    kept = [
+        Spring([("a", "b"), ("b", "c"), ("c", "d")], [1.0, 2.0, 3.0]),
+        RigidLink([("a", "b")]),
+        LinearDamping(0.1, ["a", "b"]),
+        Coulomb(dict.fromkeys("abcd", 1.0), between=[("a", "c"), ("b", "d")]),
+        RayleighDamping(stiffness=0.1, of=["springs"]),
+        Force(push, ("a", "b"), {"c": 0.5}),
+    ]
+    scene, expected = Scene(bodies, iter(given)), Scene(bodies, kept)
+    assert homes(scene) == homes(expected)
+    assert scene.drawing() == expected.drawing()
+    assert jax.tree.all(jax.tree.map(np.array_equal, scene.replace("springs", rate="slow").params, expected.params))

@@ -9,6 +9,8 @@ import numpy as np
 from vmri_jax.quadrature import is_concrete
 
 Pace = Literal["slow", "fast", "auto"]
+LARGEST_POINT = 3
+"""Coordinates of a point; blocks have more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ class Body:
                 raise ValueError(f"Body {self.name}: {name} is {np.asarray(value)}, which is not finite.")
         if is_concrete(mass) and not np.all(np.asarray(mass) > 0):
             raise ValueError(f"Body {self.name}: mass is {np.asarray(mass)}; every mass must be positive.")
-        if self.radius is not None and not 0 < self.radius < np.inf:
+        if self.radius is not None and is_concrete(self.radius) and not 0 < self.radius < np.inf:
             raise ValueError(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
         for name, value in (("position", position), ("velocity", velocity), ("mass", mass)):
             object.__setattr__(self, name, value)
@@ -73,3 +75,8 @@ class Body:
     def size(self) -> int:
         """Number of coordinates."""
         return self.position.shape[0]
+
+    @property
+    def is_point(self) -> bool:
+        """Whether it is a point, rather than a block of general coordinates."""
+        return self.size <= LARGEST_POINT

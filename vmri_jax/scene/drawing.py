@@ -23,13 +23,13 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.layout import Place
 
 KINDS = ("links", "springs", "anchors", "planes", "spheres")
-LARGEST_POINT = 3
-"""Coordinates of a point; blocks have more."""
 
 
 def drawing(bodies: Mapping[str, Body], effects: Iterable[Effect], places: Mapping[str, Place]) -> dict[str, list]:
     """The description of these bodies at these places with these effects."""
-    seen: dict[str, list] = {"bodies": [entry for name in bodies for entry in _entries(name, places[name])]}
+    seen: dict[str, list] = {
+        "bodies": [entry for body in bodies.values() for entry in _entries(body, places[body.name])]
+    }
     seen |= {kind: [] for kind in KINDS}
     radii = {name: float(body.radius) for name, body in bodies.items() if body.radius is not None}
     for effect in effects:
@@ -44,10 +44,11 @@ def drawing(bodies: Mapping[str, Body], effects: Iterable[Effect], places: Mappi
     return seen
 
 
-def _entries(name: str, place: Place) -> list[dict]:
+def _entries(body: Body, place: Place) -> list[dict]:
     axes = [[place.part, place.start + i] for i in range(place.size)]
-    if place.size <= LARGEST_POINT:
-        return [{"name": name, "coordinates": axes}]
+    if body.is_point:
+        return [{"name": body.name, "coordinates": axes}]
     return [
-        {"name": f"{name}[{i}]", "coordinates": [[], axis], "offset": [float(i), 0.0]} for i, axis in enumerate(axes)
+        {"name": f"{body.name}[{i}]", "coordinates": [[], axis], "offset": [float(i), 0.0]}
+        for i, axis in enumerate(axes)
     ]

@@ -6,13 +6,13 @@ An effect of one's own is a function and one line:
         ball, coil = q
         return -params["strength"] / jnp.linalg.norm(ball - coil) ** 3
 
-    Potential(magnet, ("ball", "coil"), {"strength": 2.0})
+    Potential(magnet, ("ball", "coil"), {"strength": 2.0}, drawn_as="spring")
 """
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import combinations
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from itertools import combinations, pairwise
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -26,6 +26,8 @@ from vmri_jax.scene.terms import Term, choose
 
 Kind = Literal["kinetic", "potential", "constraint", "force"]
 Elements = tuple[tuple[str, ...], ...]
+DRAWN = {"link": "links", "spring": "springs"}
+"""What joins two bodies in a drawing, and its entry there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +48,8 @@ class Effect:
 
     Args:
         name: of this effect in its scene; by default the name of its class.
-        rate: of a potential, "slow" (V), "fast" (W) or "auto", by stiffness.
+        rate: of a potential, "slow" (V), "fast" (W) or "auto", by stiffness; of a kinetic effect likewise, but it only
+            makes bodies fast: these terms are all on the micro grid.
     """
 
     kind: ClassVar[Kind]
@@ -62,6 +65,8 @@ class Effect:
     rate: Literal["slow", "fast", "auto"] = field(default="auto", kw_only=True)
 
     def __post_init__(self):
+        for argument in fields(self):
+            object.__setattr__(self, argument.name, lasting(getattr(self, argument.name)))
         if not self.name:
             object.__setattr__(self, "name", self.default_name)
         if self.rate not in ("slow", "fast", "auto"):
@@ -177,11 +182,17 @@ class _Own(Effect):
         bodies: names of the bodies it touches, in the order in which the function takes them.
         params: numbers, arrays or trees of them that the function gets; traced.
         name: the name of the function by default.
+        drawn_as: "link" or "spring", between each of its bodies and the next one; None for nothing to see.
+
+    Raises:
+        TypeError: a function that cannot be called.
+        ValueError: another drawing; (of the scene) one of a single body, or of blocks of general coordinates.
     """
 
     function: Callable  # pyright: ignore[reportIncompatibleVariableOverride]
     bodies: Any
     params: Any = field(default_factory=dict)
+    drawn_as: Literal["link", "spring"] | None = field(default=None, kw_only=True)
     same_size: ClassVar[bool] = False
 
     def __post_init__(self):
@@ -190,12 +201,30 @@ class _Own(Effect):
         if not self.name:
             object.__setattr__(self, "name", getattr(self.function, "__name__", type(self).__name__.lower()))
         super().__post_init__()
+        if self.drawn_as not in (None, *DRAWN):
+            raise ValueError(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")
 
     def elements(self, bodies):
         return ((self.bodies,) if isinstance(self.bodies, str) else tuple(self.bodies),)
 
     def parameters(self, bodies):
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), self.params)
+
+    def check(self, bodies):
+        super().check(bodies)
+        if self.drawn_as is None:
+            return
+        (element,) = self.elements(bodies)
+        expected = "it is drawn between bodies, and {} is alone; leave it out"
+        self.require(len(element) > 1, "drawn_as", repr(self.drawn_as), expected.format(*element))
+        expected = "it is drawn between points, and {} has {} coordinates; leave it out"
+        for name in element:
+            sized = expected.format(name, bodies[name].size)
+            self.require(bodies[name].is_point, "drawn_as", repr(self.drawn_as), sized)
+
+    def drawing(self, bodies):
+        (element,) = self.elements(bodies)
+        return {DRAWN[self.drawn_as]: [list(pair) for pair in pairwise(element)]} if self.drawn_as else {}
 
 
 class Potential(_Own):
@@ -220,6 +249,13 @@ class Force(_Own):
     """A force of one's own, ``function(t, q, v, params)`` -> a tuple of one force per body, shaped like q."""
 
     kind = "force"
+
+
+def lasting(value):
+    """A value that can be gone through again: an iterator, or a list with iterators in it, as a tuple."""
+    if isinstance(value, Iterator) or (isinstance(value, list | tuple) and any(isinstance(v, Iterator) for v in value)):
+        return tuple(lasting(item) for item in value)
+    return value
 
 
 def groups(between, size: int, what: str) -> Elements:

@@ -130,7 +130,7 @@ def ledger(scene: "Scene", scheme: Scheme | Composition, macro_dt: float | None,
             else getattr(one, part.home)
         )
         alone = build(scene.by_name, scene.places, [part])
-        values = sum(alone.num_constraints(*_starts(scene)[:2]))
+        values = sum(alone.num_constraints(*scene.start[:2]))
         count = stages * evaluations(placed, one.num_micro)
         rows.append(
             Row(
@@ -154,12 +154,6 @@ def evaluations(placed, num_micro: int) -> int:
     return len(nodes) - int(shared)
 
 
-def _starts(scene) -> tuple:
-    """(q_s, q_f, v_s, v_f) of the scene."""
-    problem = scene.problem()
-    return problem.q_s, problem.q_f, problem.v_s, problem.v_f
-
-
 def _measure(scene, scheme, macro_dt) -> tuple[Program, Program, dict]:
     """The scene's program, that of its bodies alone, and shares of operations and time by effect."""
     from vmri_jax.study.timing import interleaved
@@ -169,7 +163,7 @@ def _measure(scene, scheme, macro_dt) -> tuple[Program, Program, dict]:
     kept = {key: [part for part in placed if part.effect.name != name] for name, key in names.items()}
     kept |= {whole: list(placed), bare: []}
     systems = {key: build(scene.by_name, scene.places, parts) for key, parts in kept.items()}
-    states = {key: initial_state(system, *_starts(scene)) for key, system in systems.items()}
+    states = {key: initial_state(system, *scene.start) for key, system in systems.items()}
     if macro_dt is None:
         fastest = float(frequencies(systems[whole], states[whole])[0])
         macro_dt = scheme.num_micro * 0.1 / fastest if fastest > 0 else 0.01

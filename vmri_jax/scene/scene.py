@@ -5,7 +5,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import jax
+
 from vmri_jax.composition import Composition
+from vmri_jax.quadrature import is_concrete
 from vmri_jax.scene import drawing as drawings
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
@@ -16,7 +19,7 @@ from vmri_jax.scene.redundancy import check_constraints
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
 from vmri_jax.scheme import Scheme
-from vmri_jax.state import State
+from vmri_jax.state import State, initial_state
 from vmri_jax.system import Problem, System
 
 
@@ -36,7 +39,7 @@ class Scene:
 
     Args:
         bodies: `Body` instances; slow ones become q_s and fast ones q_f, in this order.
-        effects: of `vmri_jax.scene.effects`, or one's own: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
+        effects: of `vmri_jax.scene`, also one's own: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
             summed and constraints joined in this order.
 
     Raises:
@@ -100,16 +103,22 @@ class Scene:
         """The system: ``T - V - W`` with constraints and forces, each None where no effect calls for it."""
         return build(self.by_name, self.places, self.sorting.placed)
 
-    def problem(self) -> Problem:
-        """The system with positions and velocities at the start."""
-        start = [
+    @property
+    def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """(q_s, q_f, v_s, v_f) at the start."""
+        q_s, q_f, v_s, v_f = (
             join(self.by_name, self.places, part, what) for what in ("position", "velocity") for part in ("s", "f")
-        ]
-        return Problem(self.system(), *start, drawing=self.drawing())
+        )
+        return q_s, q_f, v_s, v_f
+
+    def problem(self) -> Problem:
+        """The system with positions and velocities at the start, and with the drawing unless its numbers are traced."""
+        seen = is_concrete((self.params, [body.radius for body in self.bodies]))
+        return Problem(self.system(), *self.start, drawing=self.drawing() if seen else None)
 
     def state(self) -> State:
         """The consistent initial state: velocities are projected onto the constraints."""
-        return self.problem().state()
+        return initial_state(self.system(), *self.start)
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.

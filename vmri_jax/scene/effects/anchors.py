@@ -36,6 +36,14 @@ class _ToPoint(Effect):
     bodies: Any
     point: Any
 
+    def __post_init__(self):
+        super().__post_init__()
+        if callable(self.point):
+            raise TypeError(
+                f"{self.name}: point is {self.point!r}; {type(self).__name__} holds bodies at fixed points, give (d,) or (n, d). A "
+                "constraint or potential has no time; for a point that moves take MovingAnchor, an elastic hold."
+            )
+
     def elements(self, bodies):
         return groups(self.bodies, 1, self.name)
 
@@ -52,7 +60,8 @@ class _ToPoint(Effect):
             away > 0, "the distance of a body from its point", away, "bodies must not start there; move one of them"
         )
 
-    def drawn_as(self, kind: str, bodies):
+    def anchored(self, kind: str, bodies):
+        """The drawing of links or springs to the points."""
         points = np.atleast_2d(np.asarray(vector_of(self, "point", self.point, bodies)))
         pairs = zip(self.elements(bodies), points, strict=True)
         return {"anchors": [{"body": name, "point": point.tolist(), "kind": kind} for (name,), point in pairs]}
@@ -62,12 +71,15 @@ class _ToPoint(Effect):
 class Anchor(_ToPoint):
     """Rigid links to fixed points, ``g = (|q - a|^2 - l^2) / 2 = 0``: a pendulum's rod.
 
+    Constraints have no time, so the points stay where they are; `MovingAnchor` is an elastic hold of a point that moves.
+
     Args:
         bodies: a name, or a list of names.
         point: a, (d,); or one for each body, (n, d).
         length: l, positive; one number, or one for each. The distance at the start by default.
 
     Raises:
+        TypeError: a function as point.
         ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
     """
 
@@ -93,7 +105,7 @@ class Anchor(_ToPoint):
             self.require(right, "length", length, f"the bodies start {np.asarray(start)} from their points")
 
     def drawing(self, bodies):
-        return self.drawn_as("link", bodies)
+        return self.anchored("link", bodies)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +119,7 @@ class SpringAnchor(_ToPoint):
         length: l, at rest, positive; likewise; None for a spring that pulls down to the point itself.
 
     Raises:
+        TypeError: a function as point.
         ValueError: (of the scene) numbers that are not positive, bodies that start at the point of a spring with a length.
     """
 
@@ -131,7 +144,7 @@ class SpringAnchor(_ToPoint):
             self.require_away(bodies)
 
     def drawing(self, bodies):
-        return self.drawn_as("spring", bodies)
+        return self.anchored("spring", bodies)
 
 
 @dataclass(frozen=True)
@@ -147,9 +160,10 @@ class PullTo:
 
 @dataclass(frozen=True, eq=False)
 class MovingAnchor(Effect):
-    """Springs to a moving point, ``F = k (a(t) - q)``: a force, because it does work.
+    """Springs to a moving point, ``F = k (a(t) - q)``: an elastic hold, and a force, because it does work.
 
-    A rigid hold of a moving point is a prescribed motion: take a stiff spring, or coordinates that move along.
+    There is no rigid hold of a moving point, which would be a constraint with time: take a stiff spring here, or
+    coordinates that move along. `Anchor` is rigid, at a fixed point.
 
     Args:
         bodies: a name, or a list of names.

@@ -157,8 +157,8 @@ class Torsion(Effect):
         for a in range(3):
             require_apart(self, bodies, a, a + 1)
         self.require_positive(stiffness=self.stiffness, multiplicity=self.multiplicity)
-        multiplicity = np.asarray(self.multiplicity)
-        self.require(multiplicity == np.round(multiplicity), "multiplicity", multiplicity, "it must be an integer")
+        multiplicity = self.parameters(bodies)["multiplicity"]
+        self.require(multiplicity == jnp.round(multiplicity), "multiplicity", multiplicity, "it must be an integer")
         for element in self.elements(bodies):
             a, b, c, d = (bodies[name].position for name in element)
             for u, w, names in ((b - a, c - b, element[:3]), (c - b, d - c, element[1:])):

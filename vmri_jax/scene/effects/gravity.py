@@ -48,13 +48,12 @@ class Gravity(Effect):
         return {"acceleration": jnp.asarray(self.acceleration, dtype=float), "mass": mass_of(self, elements, 0, bodies)}
 
     def drawing(self, bodies):
-        if np.ndim(self.acceleration) == 0 or not is_concrete(self.acceleration) or not np.any(self.acceleration):
-            return {}
-        return {"up": (-np.asarray(self.acceleration, dtype=float)).tolist()}
+        up = -np.asarray(self.acceleration, dtype=float)
+        return {"up": up.tolist()} if up.ndim and up.any() else {}
 
     def check(self, bodies):
         super().check(bodies)
-        shape = np.shape(self.acceleration)
+        shape = self.parameters(bodies)["acceleration"].shape
         for (name,) in self.elements(bodies):
             if shape not in ((), (bodies[name].size,)):
                 raise ValueError(

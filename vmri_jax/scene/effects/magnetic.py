@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from vmri_jax.scene.effect import Effect, each
 from vmri_jax.scene.effects.geometry import check_points
@@ -53,7 +52,7 @@ class MagneticField(Effect):
     def check(self, bodies):
         super().check(bodies)
         check_points(self, bodies, (2, 3))
-        shape = np.shape(self.field)
+        shape = self.parameters(bodies)["field"].shape
         for (name,) in self.elements(bodies):
             needed = () if bodies[name].size == 2 else (3,)
             if shape != needed:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from vmri_jax.scene.effect import Effect, groups
 from vmri_jax.scene.effects.geometry import check_points, length_of, require_apart
@@ -100,7 +99,8 @@ class NonlinearSpring(Effect):
 
     def check(self, bodies):
         super().check(bodies)
-        if np.ndim(self.coefficients) != 1 or not np.size(self.coefficients):
+        coefficients = self.parameters(bodies)["coefficients"]
+        if coefficients.ndim != 1 or not coefficients.size:
             raise ValueError(
                 f"{self.name}: coefficients is {self.coefficients!r}; give (k_1, k_2, ...), at least one number."
             )

@@ -1,0 +1,152 @@
+"""Sorting by frequencies of kinetic effects, and the reasons that are given."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vmri_jax import fully_implicit
+from vmri_jax.scene import Body, Coulomb, Gravity, Kinetic, MagneticField, Potential, RigidLink, Scene, Spring
+from vmri_jax.scene.rates import measure
+
+
+def paces(scene) -> dict:
+    return {name: pace.value for name, pace in scene.sorting.paces.items()}
+
+
+def frequency(scene, name) -> np.ndarray:
+    """Of the elements of an effect."""
+    effects = [effect for effect in scene.effects if effect.kind in ("potential", "kinetic")]
+    return measure(scene.by_name, effects)[name].frequency
+
+
+IONS = Scene(
+    [
+        Body("heavy", 20.0, [1.2, 0.0, 0.6], [0.0, -0.3, 0.0]),
+        Body("light", 1.0, [0.5, 0.8, 0.4], [4.0, 0.0, 0.5]),
+        Body("neutral", 1.0, [-0.5, -0.8, -0.8]),
+    ],
+    [MagneticField([0.0, 57.0, 76.0], [-2.0, 1.0], ["heavy", "light"])],
+)
+
+
+def test_charges_that_gyrate_fast_are_fast():
+    assert frequency(IONS, "magnetic_field") == pytest.approx([2.0 * 95.0 / 20.0, 95.0], rel=1e-12)
+    assert paces(IONS) == {"heavy": "slow", "light": "fast", "neutral": "slow"}
+    assert IONS.sorting.paces["light"].reason == "touched by magnetic_field, 95 rad/s, above 30"
+    why = {row.name: row.why for row in IONS.explain(fully_implicit(2), measure=False).rows}
+    assert why["light"] == "fast: touched by magnetic_field, 95 rad/s, above 30"
+    assert paces(IONS.replace("magnetic_field", charge=[-20.0, 1.0])) == dict.fromkeys(IONS.by_name, "slow")
+    flat = [Body(name, m, [1.0, i]) for i, (name, m) in enumerate({"a": 1.0, "b": 2.0, "c": 40.0}.items())]
+    assert paces(Scene(flat, [MagneticField(-8.0, 1.0)])) == {"a": "fast", "b": "fast", "c": "slow"}
+
+
+def test_gyration_and_stiffness_share_the_border():
+    """A spring of 10 rad/s is stiff beside gravity alone; beside a gyration of 1000 rad/s it is not."""
+    bodies = [Body("ion", 1.0, [0.0, 0.0]), Body("a", 1.0, [5.0, 0.0]), Body("b", 1.0, [6.0, 0.0])]
+    scene = Scene(bodies, [Gravity(), Spring(("a", "b"), 50.0), MagneticField(1000.0, 1.0, "ion")])
+    assert paces(scene) == {"ion": "fast", "a": "slow", "b": "slow"}
+    assert paces(scene.without("magnetic_field")) == {"ion": "slow", "a": "fast", "b": "fast"}
+
+
+def test_declared_rate_of_a_kinetic_effect_wins():
+    fast = IONS.replace("magnetic_field", rate="fast")
+    assert paces(fast) == {"heavy": "fast", "light": "fast", "neutral": "slow"}
+    assert fast.sorting.paces["heavy"].reason == "touched by magnetic_field, declared fast"
+    assert set(paces(IONS.replace("magnetic_field", rate="slow")).values()) == {"slow"}
+
+
+def test_given_paces_win():
+    assert paces(IONS.replace("light", pace="slow")) == dict.fromkeys(IONS.by_name, "slow")
+
+
+def coupled(q, v, params):
+    """All bodies at once: ``L = w (x_a v_b - x_b v_a)`` and a total time derivative, which changes no motion."""
+    (a, b), (v_a, v_b) = q, v
+    gauge = jax.jvp(lambda a, b: params["gauge"] * jnp.sum(jnp.sin(a) * b**3), (a, b), (v_a, v_b))[1]
+    return params["w"] * jnp.sum(a * v_b - b * v_a) + gauge
+
+
+def test_kinetic_effects_of_ones_own():
+    """M^-1 (A^T - A) has eigenvalues +- 2 i w / sqrt(m_a m_b); gauge terms do not count."""
+    bodies = [Body("a", 4.0, [1.0], [2.0]), Body("b", 1.0, [3.0], [-1.0]), Body("c", 1.0, [9.0]), Body("d", 1.0, [8.0])]
+    effects = [Kinetic(coupled, ("a", "b"), {"w": 30.0, "gauge": 500.0}), Spring(("c", "d"), 1.0)]
+    scene = Scene(bodies, effects)
+    assert frequency(scene, "coupled") == pytest.approx([30.0], rel=1e-9)
+    assert paces(scene) == {"a": "fast", "b": "fast", "c": "slow", "d": "slow"}
+    assert paces(scene.replace("a", pace="slow"))["b"] == "fast"  # it is on the micro grid whatever a is
+
+
+def gradient_field(q, v, params):
+    """``A = (0, B' x^2 / 2)``, hence ``B = B' x``."""
+    (q,), (v,) = q, v
+    return params["gradient"] / 2 * v[1] * q[0] ** 2
+
+
+def test_velocity_dependent_forces_have_stiffness():
+    """Where the field is zero and v_y = u there is no gyration, but ``m x'' = Q u B' x``."""
+    scene = Scene([Body("ion", 2.0, [0.0, 0.0], [0.0, -9.0])], [Kinetic(gradient_field, "ion", {"gradient": 8.0})])
+    assert frequency(scene, "gradient_field") == pytest.approx([np.sqrt(9.0 * 8.0 / 2.0)], rel=1e-12)
+
+
+def added_mass(q, v, params):
+    return params["mass"] / 2 * jnp.sum((v[0] - v[1]) ** 2)
+
+
+def test_kinetic_effects_are_part_of_the_mass():
+    """An added mass m on the relative velocity of a spring's ends: ``w^2 = k / (1/2 + m)``."""
+    bodies = [Body("a", 1.0, [0.0]), Body("b", 1.0, [1.0])]
+    scene = Scene(bodies, [Spring(("a", "b"), 56.0), Kinetic(added_mass, ("b", "a"), {"mass": 3.0})])
+    assert frequency(scene, "springs") == pytest.approx([4.0], rel=1e-12)
+    assert frequency(scene, "added_mass") == [0.0]
+    with pytest.raises(ValueError, match=r"springs: the kinetic energy of a, b is not positive at the start"):
+        scene.replace("added_mass", params={"mass": -3.0})
+
+
+def norm_of(q, v, params):
+    return params["f"] * jnp.linalg.norm(v[0])
+
+
+def test_kinetic_effects_that_are_not_smooth():
+    with pytest.raises(ValueError, match="norm_of: its energy between neutral has no finite derivatives at the start"):
+        Scene(IONS.bodies, [Kinetic(norm_of, "neutral", {"f": 1.0})])
+
+
+CHAIN = [
+    Body(name, 1.0, [float(i), 0.0], pace="slow" if name in "abcde" else "fast") for i, name in enumerate("abcdefgh")
+]
+
+
+def reasons(*effects) -> dict:
+    return {(p.effect.name, p.home): p.reason for p in Scene(CHAIN, effects).sorting.placed}
+
+
+def test_all_reasons_are_given():
+    found = reasons(
+        Spring([("a", "f"), ("f", "g"), ("a", "g"), ("g", "h"), ("f", "h")], [1.0, 1e4, 1.0, 1e4, 1.0]),
+        Gravity(name="weight"),
+        RigidLink([("a", "b"), ("b", "c"), ("e", "f")]),
+    )
+    assert found == {
+        (
+            "springs",
+            "slow_potential",
+        ): "touches a, which is slow (2); between fast bodies but soft, below 14.1 rad/s (1)",
+        ("springs", "fast_potential"): "between fast bodies and stiff, above 14.1 rad/s",
+        (
+            "weight",
+            "slow_potential",
+        ): "touches a, b, c and 2 more, which are slow (5); between fast bodies but soft, below 14.1 rad/s (3)",
+        ("links", "slow_constraint"): "between slow bodies",
+        ("links", "constraint"): "touches a fast body",
+    }
+
+
+def well(q, params):
+    return params["k"] / 2 * sum(jnp.sum(x**2) for x in q)
+
+
+def test_a_single_element_has_one_reason():
+    found = reasons(Potential(well, ("a", "b", "f"), {"k": 1.0}), Coulomb({"g": 1.0, "h": 1.0}, 1.0, rate="slow"))
+    assert found["well", "slow_potential"] == "touches a, b, which are slow"
+    assert found["coulomb", "slow_potential"] == "as given"
