@@ -21,6 +21,14 @@ def history(t, params):
     return params["f"] * jnp.sin(t) * jnp.ones(3)
 
 
+def path_of_b(t, params):
+    return jnp.array([2.0, 0.0, 8.0]) + history(t, params)
+
+
+def moving_plane(t, q, params):
+    return q[0][:1] - 2.0 - params["f"] * jnp.sin(t)
+
+
 def rotor(q, v, params):
     return params["f"] * v[0][0] * q[0][1]
 
@@ -40,7 +48,10 @@ EFFECTS = [
     sc.RigidLink(("b", "c")),
     sc.Anchor("a", [0.0, 0.0, 0.0]),
     sc.SpringAnchor(["a", "b"], [0.0, 0.0, 0.0], 2.0),
-    sc.MovingAnchor("b", history, 2.0, {"f": 1.0}),
+    sc.MovingAnchor("b", history, 2.0, params={"f": 1.0}),
+    sc.MovingPivot("b", history, params={"f": 1.0}),
+    sc.Guide("b", path_of_b, params={"f": 1.0}),
+    sc.Constraint(moving_plane, "b", {"f": 1.0}, timed=True),
     sc.Angle(("a", "b", "c"), 2.0),
     sc.Bending(("a", "b", "c"), 2.0),
     sc.Torsion(("a", "b", "c", "d"), 2.0),

@@ -39,7 +39,7 @@ SCENE = Scene(
         SpringAnchor(["damped", "driven"], 0.0, STIFFNESS),
         LinearDamping(DAMPING, "damped"),
         HarmonicDrive("driven", FORCE, DRIVE),
-        MovingAnchor("pulled", wave, STIFFNESS, {"frequency": DRIVE}),
+        MovingAnchor("pulled", wave, STIFFNESS, params={"frequency": DRIVE}),
         Gravity(G, ["falling", "bouncing"]),
         QuadraticDrag(DRAG, "falling"),
         PlaneContact(point=0.0, normal=1.0, stiffness=200.0, smoothing=0.1, bodies="bouncing"),

@@ -1,6 +1,7 @@
 # pyright: reportArgumentType=false
 """Scenes that are wrong say what is wrong, with which names, before anything is computed."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,9 +12,11 @@ from vmri_jax.scene import (
     Body,
     Coulomb,
     Gravity,
+    Guide,
     HarmonicDrive,
     LinearDamping,
     MagneticField,
+    MovingPivot,
     PlaneContact,
     Potential,
     RigidLink,
@@ -22,6 +25,11 @@ from vmri_jax.scene import (
     SpringAnchor,
     Torsion,
 )
+
+
+def still(t, params):
+    return jnp.zeros(2)
+
 
 A, B, C = Body("bob", 1.0, [0.0, 0.0]), Body("tip", 1.0, [1.0, 0.0]), Body("load", 1.0, [1.0, 1.0])
 SPACE = [Body(name, 1.0, q) for name, q in zip("wxyz", np.eye(4)[:, :3] + 1, strict=True)]
@@ -76,6 +84,14 @@ def test_body(arguments, message):
         ),
         ([A, B], [RigidLink(("bob", "tip"), -1.0)], "links: length is -1.0; it must be positive"),
         ([A, B], [RigidLink(("bob", "tip"), 2.0)], "links: the link bob-tip is 2 long; bob and tip start 1 apart"),
+        (
+            [A, B],
+            [Guide("tip", still)],
+            r"guides: the distance of the body from its point at t = 0 is .*; it must start there",
+        ),
+        ([A, B], [MovingPivot("tip", still, 7.0)], "moving_pivots: length is 7.0; the bodies start .* from the point"),
+        ([A, B], [MovingPivot("tip", still, -2.0)], "moving_pivots: length is -2.0; it must be positive"),
+        (SPACE[:1], [MovingPivot("w", still)], r"moving_pivots: path returns shape \(2,\); w has dimension 3"),
         ([A, SPACE[0]], [RigidLink(("bob", "w"))], r"links: bodies of different dimension \(bob 2, w 3\)"),
         (
             [A, SPACE[0]],
@@ -134,10 +150,10 @@ def test_wrong_kinds():
     with pytest.raises(ValueError, match=r"height: drawn_as is 'rope'; it must be 'link', 'spring' or None"):
         Potential(height, ("bob", "tip"), drawn_as="rope")
     for kind, arguments in ((Anchor, ()), (SpringAnchor, (1.0,))):
-        with pytest.raises(
-            TypeError, match=r"anchors: point is <function height.*; for a point that moves take MovingAnchor"
-        ):
+        with pytest.raises(TypeError, match=r"anchors: point is <function height.* that moves take MovingPivot"):
             kind("bob", height, *arguments)
+    with pytest.raises(TypeError, match=r"guides: path is \[0.0, 1.0\]; give a function of \(t, params\)"):
+        Scene([A], [Guide("bob", [0.0, 1.0])])
     with pytest.raises(TypeError, match=r"Scene.explain: scheme is 'galerkin'"):
         Scene([A]).explain("galerkin", measure=False)
 

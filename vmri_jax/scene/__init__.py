@@ -2,7 +2,7 @@
 
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Constraint, Effect, Force, Kinetic, Potential
-from vmri_jax.scene.effects.anchors import Anchor, MovingAnchor, SpringAnchor
+from vmri_jax.scene.effects.anchors import Anchor, SpringAnchor
 from vmri_jax.scene.effects.bending import Angle, Bending, Torsion
 from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
 from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag
@@ -10,6 +10,7 @@ from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, H
 from vmri_jax.scene.effects.gravity import Gravity, NBodyGravity
 from vmri_jax.scene.effects.links import RigidLink
 from vmri_jax.scene.effects.magnetic import MagneticField
+from vmri_jax.scene.effects.moving import Guide, MovingAnchor, MovingPivot
 from vmri_jax.scene.effects.pairs import Coulomb, LennardJones
 from vmri_jax.scene.effects.rayleigh import RayleighDamping
 from vmri_jax.scene.effects.springs import NonlinearSpring, Spring
@@ -29,12 +30,14 @@ __all__ = [
     "FollowerForce",
     "Force",
     "Gravity",
+    "Guide",
     "HarmonicDrive",
     "Kinetic",
     "LennardJones",
     "LinearDamping",
     "MagneticField",
     "MovingAnchor",
+    "MovingPivot",
     "NBodyGravity",
     "NonlinearSpring",
     "PlaneContact",

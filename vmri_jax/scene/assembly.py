@@ -14,7 +14,7 @@ from vmri_jax.scene.terms import (
     SlowPotential,
     TotalForce,
 )
-from vmri_jax.system import ConstantMass, System
+from vmri_jax.system import ConstantMass, Rheonomic, System
 
 
 def build(bodies: Mapping[str, Body], places: Mapping[str, Place], placed: Sequence[Placed]) -> System:
@@ -30,6 +30,10 @@ def build(bodies: Mapping[str, Body], places: Mapping[str, Place], placed: Seque
     def made_of(home: str, function):
         return function(tuple(terms[home])) if terms.get(home) else None
 
+    def held_by(home: str, function):
+        made = made_of(home, function)
+        return Rheonomic(made) if made and any(term.timed for term in terms[home]) else made
+
     params = {part.effect.name: part.effect.parameters(bodies) for part in placed}
     slow, fast = (join(bodies, places, part, "mass") for part in ("s", "f"))
     kinetic = made_of("kinetic", KineticEnergy)
@@ -39,8 +43,8 @@ def build(bodies: Mapping[str, Body], places: Mapping[str, Place], placed: Seque
         ConstantMass(slow, fast) if kinetic is None else kinetic,
         slow_potential=made_of("slow_potential", SlowPotential),
         fast_potential=made_of("fast_potential", FastPotential),
-        constraint=made_of("constraint", MicroConstraint),
-        slow_constraint=made_of("slow_constraint", MacroConstraint),
+        constraint=held_by("constraint", MicroConstraint),
+        slow_constraint=held_by("slow_constraint", MacroConstraint),
         force=made_of("force", TotalForce),
         params=params,
     )

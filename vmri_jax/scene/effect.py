@@ -40,7 +40,7 @@ class Effect:
     | kind | function | returns |
     |---|---|---|
     | "potential" | ``function(q, params)`` | energy, () |
-    | "constraint" | ``function(q, params)`` | values that are kept zero, (k,) or () for each element |
+    | "constraint" | ``function(q, params)``, `timed` ``function(t, q, params)`` | values that are kept zero, (k,) or () for each element |
     | "kinetic" | ``function(q, v, params)`` | energy added to ``sum m v^2 / 2``, () |
     | "force" | ``function(t, q, v, params)`` | tuple of forces, shaped like q |
 
@@ -60,6 +60,8 @@ class Effect:
     vectors: ClassVar[tuple[str, ...]] = ()
     """Parameters that are one vector for each element, (n, d), of a single one (d,)."""
     function: ClassVar[Any]
+    timed: ClassVar[bool] = False
+    """Whether a constraint depends on time."""
 
     name: str = field(default="", kw_only=True)
     rate: Literal["slow", "fast", "auto"] = field(default="auto", kw_only=True)
@@ -148,6 +150,7 @@ class Effect:
                 tuple(Rows.of([places[elements[i][role]] for i in some]) for role in range(len(elements[some[0]]))),
                 None if len(some) == len(elements) else tuple(some),
                 self.numbers + self.vectors,
+                self.timed,
             )
             for some in by_size.values()
         )
@@ -233,8 +236,15 @@ class Potential(_Own):
     kind = "potential"
 
 
+@dataclass(frozen=True, eq=False)
 class Constraint(_Own):
-    """A holonomic constraint of one's own, ``function(q, params) -> (k,)``, kept zero."""
+    """A holonomic constraint of one's own, ``function(q, params) -> (k,)``, kept zero.
+
+    Args:
+        timed: it depends on time, ``function(t, q, params)``.
+    """
+
+    timed: bool = field(default=False, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     kind = "constraint"
 

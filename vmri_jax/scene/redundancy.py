@@ -54,7 +54,9 @@ def _rows(bodies, places, held: Sequence[Placed]) -> list[tuple[str, np.ndarray]
         elements, params = effect.elements(bodies), effect.parameters(bodies)
         for i in part.elements:
             own = effect.one(params, i, bodies)
-            jacobian = _jacobian(effect.function, tuple(bodies[name].position for name in elements[i]), own)
+            jacobian = _jacobian(
+                effect.function, effect.timed, tuple(bodies[name].position for name in elements[i]), own
+            )
             columns = [
                 (n_s if places[name].part == "f" else 0) + places[name].start + k
                 for name in elements[i]
@@ -68,10 +70,11 @@ def _rows(bodies, places, held: Sequence[Placed]) -> list[tuple[str, np.ndarray]
     return rows
 
 
-@partial(jax.jit, static_argnames="function")
-def _jacobian(function, q, params):
+@partial(jax.jit, static_argnames=("function", "timed"))
+def _jacobian(function, timed: bool, q, params):
     flat, unravel = ravel_pytree(q)
-    return jax.jacfwd(lambda flat: jnp.reshape(function(unravel(flat), params), (-1,)))(flat)
+    t = (jnp.zeros(()),) if timed else ()
+    return jax.jacfwd(lambda flat: jnp.reshape(function(*t, unravel(flat), params), (-1,)))(flat)
 
 
 def _refuse(names: list[str], matrix: np.ndarray, advice: str) -> None:

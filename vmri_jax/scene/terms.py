@@ -18,7 +18,8 @@ from vmri_jax.scene.layout import Rows
 class Term:
     """The function of an effect on the elements `select` (None: all of them), whose roles lie at `roles`.
 
-    `split` names the parameters that have an entry for each element.
+    `split` names the parameters that have an entry for each element. The function of a `timed` one has the time before its
+    other arguments.
     """
 
     name: str
@@ -26,6 +27,7 @@ class Term:
     roles: tuple[Rows, ...]
     select: tuple[int, ...] | None = None
     split: tuple[str, ...] = ()
+    timed: bool = False
 
     def own(self, params):
         """What the function gets as params."""
@@ -35,9 +37,9 @@ class Term:
         """The coordinates of every role."""
         return tuple(rows.take(q_s, q_f) for rows in self.roles)
 
-    def value(self, q_s, q_f, params):
+    def value(self, q_s, q_f, params, t=None):
         """Energy or constraint values."""
-        return self.function(self.take(q_s, q_f), self.own(params))
+        return self.function(*((t,) if self.timed else ()), self.take(q_s, q_f), self.own(params))
 
     def kinetic(self, q_s, q_f, v_s, v_f, params):
         """Velocity-dependent energy."""
@@ -115,22 +117,24 @@ class FastPotential:
 
 @dataclass(frozen=True)
 class MicroConstraint:
-    """``g(q_s, q_f, params)``, the values of its terms one after the other."""
+    """``g(q_s, q_f, params)``, or ``g(t, q_s, q_f, params)``: the values of its terms one after the other."""
 
     terms: tuple[Term, ...]
 
-    def __call__(self, q_s, q_f, params):
-        return join([term.value(q_s, q_f, params) for term in self.terms])
+    def __call__(self, *arguments):
+        *t, q_s, q_f, params = arguments
+        return join([term.value(q_s, q_f, params, *t) for term in self.terms])
 
 
 @dataclass(frozen=True)
 class MacroConstraint:
-    """``g_s(q_s, params)``, the values of its terms one after the other."""
+    """``g_s(q_s, params)``, or ``g_s(t, q_s, params)``: the values of its terms one after the other."""
 
     terms: tuple[Term, ...]
 
-    def __call__(self, q_s, params):
-        return join([term.value(q_s, None, params) for term in self.terms])
+    def __call__(self, *arguments):
+        *t, q_s, params = arguments
+        return join([term.value(q_s, None, params, *t) for term in self.terms])
 
 
 def join(values: Sequence):

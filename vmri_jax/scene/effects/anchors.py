@@ -1,10 +1,8 @@
-"""Anchors: points held at a distance of a fixed point, by a spring to it, or by a spring to a moving one."""
+"""Anchors: points held at a distance of a fixed point, or by a spring to it."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -40,8 +38,8 @@ class _ToPoint(Effect):
         super().__post_init__()
         if callable(self.point):
             raise TypeError(
-                f"{self.name}: point is {self.point!r}; {type(self).__name__} holds bodies at fixed points, give (d,) or (n, d). A "
-                "constraint or potential has no time; for a point that moves take MovingAnchor, an elastic hold."
+                f"{self.name}: point is {self.point!r}; {type(self).__name__} holds bodies at fixed points, give (d,) or (n, d). For a "
+                "point that moves take MovingPivot (a rigid link), Guide (the point itself) or MovingAnchor (a spring)."
             )
 
     def elements(self, bodies):
@@ -71,7 +69,7 @@ class _ToPoint(Effect):
 class Anchor(_ToPoint):
     """Rigid links to fixed points, ``g = (|q - a|^2 - l^2) / 2 = 0``: a pendulum's rod.
 
-    Constraints have no time, so the points stay where they are; `MovingAnchor` is an elastic hold of a point that moves.
+    The points stay where they are; `MovingPivot` is a rigid link to a point that moves.
 
     Args:
         bodies: a name, or a list of names.
@@ -145,56 +143,3 @@ class SpringAnchor(_ToPoint):
 
     def drawing(self, bodies):
         return self.anchored("spring", bodies)
-
-
-@dataclass(frozen=True)
-class PullTo:
-    """``F = k (a(t) - q)``, towards a moving point."""
-
-    path: Callable
-
-    def __call__(self, t, q, v, params):
-        (q,) = q
-        return (params["stiffness"][..., None] * (self.path(t, params["path"]) - q),)
-
-
-@dataclass(frozen=True, eq=False)
-class MovingAnchor(Effect):
-    """Springs to a moving point, ``F = k (a(t) - q)``: an elastic hold, and a force, because it does work.
-
-    There is no rigid hold of a moving point, which would be a constraint with time: take a stiff spring here, or
-    coordinates that move along. `Anchor` is rigid, at a fixed point.
-
-    Args:
-        bodies: a name, or a list of names.
-        path: ``path(t, params) -> (d,)``, the point; define it at module level.
-        stiffness: k, N/m, positive; one number, or one for each body.
-        params: what `path` gets as params.
-
-    Raises:
-        ValueError: (of the scene) a stiffness that is not positive.
-    """
-
-    bodies: Any
-    path: Callable
-    stiffness: Any
-    params: Any = field(default_factory=dict)
-
-    kind = "force"
-    default_name = "moving_anchors"
-    numbers = ("stiffness",)
-
-    @property
-    def function(self):
-        return PullTo(self.path)
-
-    def elements(self, bodies):
-        return groups(self.bodies, 1, self.name)
-
-    def parameters(self, bodies):
-        path = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), self.params)
-        return {"stiffness": jnp.asarray(self.stiffness, dtype=float), "path": path}
-
-    def check(self, bodies):
-        super().check(bodies)
-        self.require_positive(stiffness=self.stiffness)
