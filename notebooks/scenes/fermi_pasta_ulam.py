@@ -3,7 +3,7 @@
 Teaches: blocks of general coordinates with potentials of one's own, here the (scaled) centres and elongations of the
 stiff springs: Hairer, Lubich, Wanner, *Geometric Numerical Integration*, I.5.1.
 
-    vmri simulate notebooks/scenes/fermi_pasta_ulam.py:scene --scheme fully-explicit --num-micro 10 --macro-dt 0.02 --steps 5000 --save-every 1 --out fermi_pasta_ulam.npz
+    vmri simulate notebooks/scenes/fermi_pasta_ulam.py:scene --scheme fully-explicit --num-micro 5 --macro-dt 0.01 --steps 10000 --save-every 2 --out fermi_pasta_ulam.npz
     vmri animate fermi_pasta_ulam.npz
 """
 

@@ -2,7 +2,7 @@
 
 Teaches: the pace of a body may be given; soft springs and gravity are slow although they touch fast bodies.
 
-    vmri simulate notebooks/scenes/simple_atomic_model.py:scene --num-micro 10 --macro-dt 0.05 --steps 1000 --out simple_atomic_model.npz
+    vmri simulate notebooks/scenes/simple_atomic_model.py:scene --num-micro 10 --macro-dt 0.02 --steps 2500 --out simple_atomic_model.npz
     vmri animate simple_atomic_model.npz
 """
 
