@@ -13,18 +13,18 @@ import vmri_jax as vm
 from benchmarks import programs
 from benchmarks.measure import Tell, interleaved, ratio, silent
 from benchmarks.report import Claim, Report
-from tests.scene import reference_scenes
 from tests.scene.effect_scenes import BASE, EFFECTS, base_by_hand, scene_with
 from tests.scene.forced_bodies import EFFECT_OF, convergence
+from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax.diagnostics import fit_order
 from vmri_jax.scene import Effect, Scene
 from vmri_jax.scene.ledger import compile_run, operations, temporary_bytes
 
 MACRO_DT = 0.01
 SCENES = {
-    "FPU l=3": reference_scenes.fermi_pasta_ulam,
-    "TSP": reference_scenes.triple_spherical_pendulum,
-    "SAM": reference_scenes.simple_atomic_model,
+    "FPU l=3": partial(gallery_scene, "fermi_pasta_ulam"),
+    "TSP": partial(gallery_scene, "triple_spherical_pendulum"),
+    "SAM": partial(gallery_scene, "simple_atomic_model"),
 }
 MOST = 1.03
 """A scene over the system written by hand: time per micro step."""

@@ -120,8 +120,8 @@ def kept(scene: Scene, run: vm.Trajectory) -> Kept:
     kinetic, power = kinetic_and_power(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
     work = np.append(0.0, np.cumsum(np.diff(run.t) * (power[1:] + power[:-1]) / 2))
     balance = np.asarray(run.energy) - run.energy[0] - work
-    sizes = {body.size for body in scene.bodies}
-    maps = momentum_maps(system, run, sizes.pop()) if len(sizes) == 1 and system.force is None else []
+    sizes, points = {body.size for body in scene.bodies}, not any(body.block for body in scene.bodies)
+    maps = momentum_maps(system, run, sizes.pop()) if points and len(sizes) == 1 and system.force is None else []
     momentum = max((float(np.abs(values - values[0]).max()) for values in maps), default=0.0)
     energy = float(np.abs(balance).max() / kinetic.max())
     return Kept(energy, float(run.constraint_residual[:, 0].max()), len(maps), momentum)

@@ -59,7 +59,7 @@ def test_without_a_drawing_all_coordinates_are_shown(vmri):
     code, text = vmri("plain.npz", "--out", "run.html")
     assert code == 0
     assert "run.html 0.0" in text
-    assert names(page()) == ["s1", "s2", "f1", "f2"]
+    assert names(page()) == ["q_s[0]", "q_s[1]", "q_f[0]", "q_f[1]"]
 
 
 def test_a_drawing_of_ones_own_goes_first(vmri):

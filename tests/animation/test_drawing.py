@@ -75,8 +75,12 @@ def changed(path, value):
     [
         ("{", ["not valid JSON"]),
         ([], ["is list", "must be a dict"]),
-        ({}, ["lacks the entry 'bodies'"]),
-        ({"bodies": []}, ["bodies is empty"]),
+        ({}, ["no bodies and no blocks"]),
+        ({"bodies": [], "blocks": []}, ["no bodies and no blocks"]),
+        ({"blocks": [{"name": "modes"}]}, ["blocks[0] lacks the entry 'coordinates'"]),
+        ({"blocks": [{"name": "modes", "coordinates": []}]}, ["blocks[0]: coordinates", "['s' or 'f', index]"]),
+        ({"blocks": [{"name": "modes", "coordinates": [[[2.0, "s", 1]]]}]}, ["blocks[0]: coordinates"]),
+        (PENDULUM | {"blocks": [{"name": "bob", "coordinates": [["s", 0]]}]}, ["2 bodies are named 'bob'"]),
         (changed(["spring"], []), ["no entry 'spring'", "Did you mean springs?"]),
         (changed(["links"], [["bob", "tipp"]]), ["links[0]", "'tipp'", "does not exist", "Did you mean tip?"]),
         (changed(["links"], [["bob", "bob"]]), ["links[0]", "with itself"]),
@@ -147,13 +151,37 @@ def test_the_drawn_chain_stretches_as_its_potentials_say(fpu, monkeypatch):
 
 def test_without_a_drawing_every_coordinate_is_a_bar_at_its_scale():
     run = swinging()
-    drawing = Drawing.from_dict(bars(run))
-    moved = motion(run, drawing)
-    assert [body.name for body in drawing.bodies] == ["s1", "s2", "f1", "f2"]
+    moved = motion(run, Drawing.from_dict(bars(run)))
+    drawing = moved.drawing
+    assert [body.name for body in drawing.bodies] == ["q_s[0]", "q_s[1]", "q_f[0]", "q_f[1]"]
     np.testing.assert_allclose(moved.points[:, 0, 2], 2.0 * run.q_s[:, 0], atol=1e-14)
     np.testing.assert_allclose(moved.points[:, 3, 2], 0.5 * run.q_f[:, 1], atol=1e-14)
-    assert drawing.caption == "Heights are 2 slow coordinates times 2 and 2 fast coordinates times 0.5."
+    assert drawing.caption == "Heights are q_s times 2 and q_f times 0.5."
     assert len({float(x) for x in moved.points[0, :, 0]}) == 4
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "up"), [(1, None), (1, [-1.0]), (2, None), (2, [1.0, 2.0]), (3, None), (3, [0.0, 5.0, 0.0])]
+)
+def test_blocks_stand_upright_beside_the_points(coordinates, up):
+    run = swinging()
+    bob = {"name": "bob", "coordinates": [["s", i % 2] for i in range(coordinates)]}
+    blocks = [{"name": "modes", "coordinates": [["f", 0], ["f", 1]]}]
+    moved = motion(run, Drawing.from_dict({"bodies": [bob], "blocks": blocks, "up": up}))
+    point, bars = moved.points[:, 0], moved.points[:, 1:]
+    assert bars[..., 0].min() > point[:, 0].max()
+    feet = moved.drawing.place([anchor.point for anchor in moved.drawing.anchors])
+    heights = bars - feet
+    scale = heights[0, 1, 2] / run.q_f[0, 1]
+    np.testing.assert_allclose(heights[..., 2], scale * run.q_f, atol=1e-13)
+    np.testing.assert_allclose(heights[..., :2], 0.0, atol=1e-13)
+    assert moved.drawing.caption == f"Heights are modes times {scale:g}."
+
+
+def test_a_block_of_coordinates_that_the_run_does_not_have():
+    blocks = [{"name": "modes", "coordinates": [["f", 2]]}]
+    with pytest.raises(ValueError, match=r"'modes' uses \['f', 2\], but the run has 2 fast"):
+        motion(swinging(), Drawing.from_dict({"blocks": blocks}))
 
 
 def test_there_are_drawings_of_built_in_systems_only():

@@ -1,5 +1,7 @@
 """Pictures: bodies are where the camera sees them, and every moment is drawn."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -89,3 +91,10 @@ def test_a_gif_moves_and_takes_its_time(pendulum, tmp_path):
     assert done[-1] == (8, 8)
     with pytest.raises(ValueError, match="seconds is 0"):
         write_gif(pendulum, tmp_path / "no.gif", 0)
+
+
+def test_a_strip_says_its_caption(pendulum):
+    drawing = dataclasses.replace(pendulum.drawing, caption="Heights are modes times 2.")
+    figure = plot_strip(dataclasses.replace(pendulum, drawing=drawing), 3, "Pendulum")
+    assert [text.get_text() for text in figure.texts] == ["Pendulum", "Heights are modes times 2."]
+    assert figure.get_figheight() > plot_strip(pendulum, 3, "Pendulum").get_figheight()

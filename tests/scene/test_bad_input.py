@@ -108,7 +108,12 @@ def test_body(arguments, message):
         (
             [Body("block", 1.0, np.ones(5)), Body("b", 1.0, np.zeros(5))],
             [Spring(("block", "b"), 1.0)],
-            "springs: block has 5 coordinates",
+            "springs: block has 5 general coordinates",
+        ),
+        (
+            [Body("modes", 1.0, np.ones(2), block=True), A],
+            [Spring(("modes", "bob"), 1.0)],
+            "springs: modes has 2 general coordinates; this effect is between points",
         ),
         ([A], [LinearDamping(0.0)], "damping: coefficient is 0.0; it must be positive"),
         ([A], [HarmonicDrive("bob", [1.0], 1.0)], r"harmonic_drive: amplitude has shape \(1,\)"),

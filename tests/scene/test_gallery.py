@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import typer
 
+from tests.scene.gallery_scenes import FOLDER, gallery_scene
 from vmri_jax import simulate
-from vmri_jax.catalogue import find_scene, find_scheme
+from vmri_jax.catalogue import find_scheme
 from vmri_jax.cli import app
 
-FOLDER = Path(__file__).parents[2] / "notebooks" / "scenes"
 SPEC = importlib.util.spec_from_file_location("gallery", FOLDER / "gallery.py")
 assert SPEC is not None
 assert SPEC.loader is not None
@@ -20,9 +20,16 @@ gallery = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(gallery)
 
 NAMES = [path.stem for path in gallery.scenes()]
-ENERGY = {"bouncing_chain": 2e-3, "molecule": 3e-3, "valve_train": 3e-3}
+ENERGY = {"bouncing_chain": 2e-3, "fermi_pasta_ulam": 2e-3, "molecule": 3e-3, "valve_train": 3e-3}
 """Measured 2e-3 at most; the work of forces is summed up at macro nodes."""
-MAPS = {"satellite": 6, "molecule": 6, "bouncing_chain": 3, "ion_trap": 1}
+MAPS = {
+    "satellite": 6,
+    "molecule": 6,
+    "bouncing_chain": 3,
+    "ion_trap": 1,
+    "triple_spherical_pendulum": 1,
+    "simple_atomic_model": 1,
+}
 STEPS = 200
 
 
@@ -39,16 +46,15 @@ def parsed(words: list[str]) -> tuple[str, dict]:
 @cache
 def run(name: str):
     """The scene and a short run with the scheme and step of its command."""
-    path = FOLDER / f"{name}.py"
-    options = parsed(gallery.docstring(path)[1][0])[1]
+    options = parsed(gallery.docstring(FOLDER / f"{name}.py")[1][0])[1]
     names = ("alpha", "degree", "rule")
     scheme = find_scheme(options["scheme"], options["num_micro"], options["compose"], **{n: options[n] for n in names})
-    scene = find_scene(f"{path}:scene")
+    scene = gallery_scene(name)
     return scene, simulate(scene.system(), scheme, scene.state(), macro_dt=options["macro_dt"], num_steps=STEPS)
 
 
 def test_all_scenes_are_there():
-    assert len(NAMES) == 7
+    assert len(NAMES) == 10
     readme = (FOLDER / "README.md").read_text(encoding="utf-8")
     for name in NAMES:
         assert f"]({name}.png)" in readme

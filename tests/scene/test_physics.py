@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.scene.forced_bodies import DAMPING, STIFFNESS, convergence
-from tests.scene.reference_scenes import triple_spherical_pendulum
+from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax import fully_implicit, galerkin, simulate
 from vmri_jax.diagnostics import observed_order
 from vmri_jax.scene import Body, LinearDamping, MagneticField, Scene, SpringAnchor
@@ -57,7 +57,7 @@ def test_cyclotron_motion(scheme, steps):
 
 
 def test_damped_run_keeps_its_constraints():
-    scene = triple_spherical_pendulum()
+    scene = gallery_scene("triple_spherical_pendulum")
     scene = Scene(scene.bodies, (*scene.effects, LinearDamping([10.0, 0.5, 0.5])))
     trajectory = simulate(scene.system(), fully_implicit(2), scene.state(), macro_dt=0.02, num_steps=200)
     assert trajectory.constraint_residual.max() < 1e-11

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.scene import reference_scenes
+from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax import ConstantMass, explicit_slow, fully_explicit, fully_implicit, simulate, systems
 
 NAMES = ("fermi_pasta_ulam", "triple_spherical_pendulum", "simple_atomic_model")
@@ -17,7 +17,7 @@ MORE = [(FPU, fully_implicit(5)), (TSP, explicit_slow(5)), (TSP, fully_explicit(
 
 @pytest.mark.parametrize(("name", "scheme"), [*CASES, *(pytest.param(*case, marks=pytest.mark.full) for case in MORE)])
 def test_trajectories_are_equal(name, scheme):
-    scene, problem = getattr(reference_scenes, name)(), getattr(systems, name)()
+    scene, problem = gallery_scene(name), getattr(systems, name)()
     step = {"macro_dt": 0.01, "num_steps": 200}
     run = simulate(scene.system(), scheme, scene.state(), **step)
     expected = simulate(problem.system, scheme, problem.state(), **step)
@@ -28,11 +28,12 @@ def test_trajectories_are_equal(name, scheme):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_structure_is_that_of_the_system(name):
-    scene, problem = getattr(reference_scenes, name)(), getattr(systems, name)()
+    scene, problem = gallery_scene(name), getattr(systems, name)()
     system, hand = scene.system(), problem.system
     for field in dataclasses.fields(system):
         assert (getattr(system, field.name) is None) == (getattr(hand, field.name) is None), field.name
     assert isinstance(system.kinetic, ConstantMass)
+    assert system.fast_potential is not None
     assert all(map(np.array_equal, jax.tree.leaves(system.kinetic), jax.tree.leaves(hand.kinetic)))
     assert system.num_constraints(problem.q_s, problem.q_f) == hand.num_constraints(problem.q_s, problem.q_f)
     assert float(system.fast_potential(problem.q_f, system.params)) == pytest.approx(

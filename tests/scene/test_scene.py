@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.scene.reference_scenes import simple_atomic_model, triple_spherical_pendulum
+from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax import ConstantMass, compose, fully_explicit, fully_implicit, galerkin, initial_state
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.scene import (
@@ -34,7 +34,7 @@ from vmri_jax.scene import (
 )
 from vmri_jax.step import macro_step
 
-TSP = triple_spherical_pendulum()
+TSP = gallery_scene("triple_spherical_pendulum")
 
 
 def homes(scene) -> dict:
@@ -250,11 +250,13 @@ def test_drawing_is_plain_data():
             Body("a", 1.0, [0.0, 1.0], pace="fast"),
             Body("b", 1.0, [1.0, 1.0], pace="slow", radius=0.5),
             Body("block", 1.0, np.ones(4)),
+            Body("modes", 1.0, np.ones(2), pace="fast", block=True),
         ],
         [
             Gravity([1.0, -2.0], ["a", "b"]),
             RigidLink(("a", "b")),
             SpringAnchor("b", [0.0, 0.0], 3.0, 1.0),
+            SpringAnchor("modes", [0.0, 0.0], 1.0, name="well"),
             PlaneContact(point=[0, 0], normal=[0, 2], stiffness=1e4, smoothing=0.01, radius=0.1, bodies="a"),
         ],
     )
@@ -264,9 +266,11 @@ def test_drawing_is_plain_data():
     axes = {body["name"]: body["coordinates"] for body in drawing["bodies"]}
     assert axes["a"] == [["f", 0], ["f", 1]]
     assert axes["b"] == [["s", 0], ["s", 1]]
-    assert axes["block[3]"] == [[], ["s", 5]]
-    assert drawing["bodies"][-1]["offset"] == [3.0, 0.0]
-    assert [body.get("radius") for body in drawing["bodies"][:3]] == [0.1, 0.5, None]
+    assert drawing["blocks"] == [
+        {"name": "block", "coordinates": [["s", i] for i in range(2, 6)]},
+        {"name": "modes", "coordinates": [["f", 2], ["f", 3]]},
+    ]
+    assert [body["radius"] for body in drawing["bodies"]] == [0.1, 0.5]
     assert drawing["up"] == [-1.0, 2.0]
     assert drawing["links"] == [["a", "b"]]
     assert drawing["anchors"] == [{"body": "b", "point": [0.0, 0.0], "kind": "spring"}]
@@ -293,7 +297,7 @@ def test_effects_of_ones_own_are_drawn_as_they_say():
 
 
 def test_ledger_counts_unknowns_by_the_formula():
-    sam = simple_atomic_model()
+    sam = gallery_scene("simple_atomic_model")
     ledger = sam.explain(fully_implicit(20), measure=False)
     assert ledger.unknowns == 307  # the number that the reference study reports
     rows = {row.name: row for row in ledger.rows}

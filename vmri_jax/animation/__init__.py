@@ -1,13 +1,15 @@
 """Seeing a run: a self-contained page, strips of pictures and GIFs from a trajectory and a drawing of its bodies."""
 
-from vmri_jax.animation.defaults import bars, built_in
-from vmri_jax.animation.drawing import Anchor, Body, Drawing, Joint, Plane, Sphere
+from vmri_jax.animation.bars import bars
+from vmri_jax.animation.defaults import built_in
+from vmri_jax.animation.drawing import Anchor, Block, Body, Drawing, Joint, Plane, Sphere
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
 
 __all__ = [
     "Anchor",
+    "Block",
     "Body",
     "Drawing",
     "Joint",

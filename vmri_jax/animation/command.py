@@ -12,7 +12,8 @@ from rich.progress import Progress
 
 import vmri_jax as vm
 from vmri_jax import plots
-from vmri_jax.animation.defaults import bars, built_in
+from vmri_jax.animation.bars import bars
+from vmri_jax.animation.defaults import built_in
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html

@@ -1,11 +1,7 @@
-"""Drawings of the built-in systems, and of any system without a drawing: every coordinate as a bar."""
+"""Drawings of the built-in systems."""
 
 import math
 from itertools import pairwise
-
-import numpy as np
-
-import vmri_jax as vm
 
 MAGNIFIED = 10.0
 """The stiff springs of the Fermi-Pasta-Ulam chain stretch by a few percent: their elongations are drawn so much larger."""
@@ -75,29 +71,3 @@ def built_in(name: str, n_s: int) -> dict | None:
     if name == "fpu":
         return fermi_pasta_ulam(n_s)
     return {"tsp": triple_spherical_pendulum, "sam": simple_atomic_model}.get(name, lambda: None)()
-
-
-def bars(trajectory: vm.Trajectory) -> dict:
-    """Every coordinate of q as a point at its height over a base line, slow ones first, each pace in its own scale."""
-    bodies, anchors, captions = [], [], []
-    parts = {"s": ("slow", np.asarray(trajectory.q_s)), "f": ("fast", np.asarray(trajectory.q_f))}
-    count = sum(q.shape[1] for _, q in parts.values())
-    height, x = max(2.0, 0.22 * count), 0.0
-    for part, (pace, q) in parts.items():
-        size = np.nanmax(np.abs(q), initial=0.0)
-        scale = _round(height / size) if size > 0 else 1.0
-        if q.shape[1]:
-            captions.append(f"{q.shape[1]} {pace} {'coordinate' if q.shape[1] == 1 else 'coordinates'} times {scale:g}")
-        for i in range(q.shape[1]):
-            name = f"{part}{i + 1}"
-            bodies.append({"name": name, "coordinates": [[], [[scale, part, i]]], "offset": [x, 0.0], "radius": 0.24})
-            anchors.append({"body": name, "point": [x, 0.0], "kind": "link"})
-            x += 1.0
-        x += 1.0
-    return {"bodies": bodies, "anchors": anchors, "caption": f"Heights are {' and '.join(captions)}."}
-
-
-def _round(x: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above x."""
-    power = 10.0 ** math.floor(math.log10(x))
-    return max(digit * power for digit in (1, 2, 5) if digit * power <= x * (1 + 1e-12))

@@ -11,7 +11,8 @@ import numpy as np
 
 from vmri_jax.animation.checks import check_keys, direction, entries, near, numbers, positive
 
-KEYS = ("bodies", "links", "springs", "anchors", "planes", "spheres", "up", "caption")
+KEYS = ("bodies", "blocks", "links", "springs", "anchors", "planes", "spheres", "up", "caption")
+BLOCK_KEYS = ("name", "coordinates")
 BODY_KEYS = ("name", "coordinates", "offset", "radius", "color")
 KINDS = ("link", "spring")
 PACES = ("slow", "fast")
@@ -39,6 +40,14 @@ class Body:
     def pace(self) -> str:
         """ "slow" if all its coordinates are, else "fast"."""
         return "slow" if all(part == "s" for form in self.forms for _, part, _ in form) else "fast"
+
+
+@dataclass(frozen=True)
+class Block:
+    """General coordinates, ("s" or "f", index) each, that are not those of a point: each is shown as a bar."""
+
+    name: str
+    coordinates: tuple[tuple[str, int], ...]
 
 
 @dataclass(frozen=True)
@@ -77,7 +86,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Bodies, what joins them, fixed things around them.
+    """Bodies, blocks of general coordinates, what joins bodies, fixed things around them.
 
     Attributes:
         up: the direction that is shown upwards, in coordinates of the bodies; None for the last coordinate (bodies of one
@@ -86,6 +95,7 @@ class Drawing:
     """
 
     bodies: tuple[Body, ...]
+    blocks: tuple[Block, ...] = ()
     links: tuple[Joint, ...] = ()
     springs: tuple[Joint, ...] = ()
     anchors: tuple[Anchor, ...] = ()
@@ -103,6 +113,7 @@ class Drawing:
 
                 - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
                   ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``.
+                - ``blocks``: dicts of ``name``; ``coordinates``, any number of entries ``["s" or "f", index]``.
                 - ``links``, ``springs``: pairs of names, and a third entry "slow" or "fast" if wanted.
                 - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), and if wanted ``pace``.
                 - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
@@ -116,14 +127,15 @@ class Drawing:
                 data = json.loads(data)
             except json.JSONDecodeError as error:
                 raise ValueError(f"drawing: not valid JSON ({error}).") from error
-        check_keys(data, KEYS, ("bodies",), "drawing")
+        check_keys(data, KEYS, (), "drawing")
         bodies = tuple(_body(e, f"drawing: bodies[{i}]") for i, e in enumerate(entries(data, "bodies", "drawing")))
+        blocks = tuple(_block(e, f"drawing: blocks[{i}]") for i, e in enumerate(entries(data, "blocks", "drawing")))
         names = [body.name for body in bodies]
-        if not bodies:
-            raise ValueError("drawing: bodies is empty; there must be at least one.")
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"drawing: {names.count(name)} bodies are named {name!r}; names must be unique.")
+        if not bodies and not blocks:
+            raise ValueError("drawing: there are no bodies and no blocks; there must be at least one.")
+        for name in (every := [*names, *(block.name for block in blocks)]):
+            if every.count(name) > 1:
+                raise ValueError(f"drawing: {every.count(name)} bodies are named {name!r}; names must be unique.")
 
         def all_of(key: str, read: Callable) -> tuple:
             return tuple(
@@ -132,6 +144,7 @@ class Drawing:
 
         return cls(
             bodies=bodies,
+            blocks=blocks,
             links=all_of("links", _joint),
             springs=all_of("springs", _joint),
             anchors=all_of("anchors", _anchor),
@@ -153,15 +166,11 @@ class Drawing:
         points = [anchor.point for anchor in self.anchors] + [sphere.center for sphere in self.spheres]
         points += [vector for plane in self.planes for vector in (plane.point, plane.normal)]
         points += [vector for body in self.bodies for vector in (body.forms, body.offset)] + [self.up or ()]
-        return max(len(point) for point in points)
+        return max((len(point) for point in points), default=1)
 
     def frame(self) -> np.ndarray:
         """(3, dimension) matrix from coordinates of the bodies to those of the picture, where z points upwards."""
-        d = self.dimension
-        if self.up is None:
-            return np.array([[1.0], [0.0], [0.0]]) if d == 1 else _upright(np.eye(d)[-1])
-        up = np.pad(self.up, (0, d - len(self.up)))
-        return _upright(up / np.linalg.norm(up))
+        return frame(self.up, self.dimension)
 
     def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
         """(n, 3) points of the picture of given points or directions; missing coordinates are zero."""
@@ -175,19 +184,32 @@ class Drawing:
         Raises:
             ValueError: a body uses a coordinate that q does not have.
         """
-        sizes, first = {"s": n_s, "f": n_f}, {"s": 0, "f": n_s}
+        first = {"s": 0, "f": n_s}
         matrix = np.zeros((len(self.bodies), self.dimension, n_s + n_f))
         for i, body in enumerate(self.bodies):
             for axis, form in enumerate(body.forms):
                 for weight, part, index in form:
-                    if index >= sizes[part]:
-                        pace = "slow" if part == "s" else "fast"
-                        raise ValueError(
-                            f"drawing: the body {body.name!r} uses [{part!r}, {index}], but the run has {sizes[part]} "
-                            f"{pace} coordinates; is this the drawing of another system?"
-                        )
+                    check_index(body.name, part, index, n_s, n_f)
                     matrix[i, axis, first[part] + index] += weight
         return self.place([body.offset for body in self.bodies]), np.einsum("ad,idq->iaq", self.frame(), matrix)
+
+
+def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:
+    """(3, dimension) matrix of orthonormal columns from coordinates to those of the picture, see `Drawing.up`."""
+    if up is None:
+        return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
+    padded = np.pad(up, (0, dimension - len(up)))
+    return _upright(padded / np.linalg.norm(padded))
+
+
+def check_index(name: str, part: str, index: int, n_s: int, n_f: int) -> None:
+    """Refuse a coordinate of a body or block that a run does not have."""
+    size, pace = (n_s, "slow") if part == "s" else (n_f, "fast")
+    if index >= size:
+        raise ValueError(
+            f"drawing: the body {name!r} uses [{part!r}, {index}], but the run has {size} {pace} coordinates; is this the "
+            "drawing of another system?"
+        )
 
 
 def _upright(up: np.ndarray) -> np.ndarray:
@@ -214,6 +236,14 @@ def _body(data: Any, where: str) -> Body:
     forms = tuple(_form(entry, where) for entry in coordinates)
     offset = numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
     return Body(str(data["name"]), forms, offset, radius, color)
+
+
+def _block(data: Any, where: str) -> Block:
+    check_keys(data, BLOCK_KEYS, BLOCK_KEYS, where)
+    forms = [_form(entry, where) for entry in entries(data, "coordinates", where)]
+    if not forms or any(len(form) != 1 or form[0][0] != 1.0 for form in forms):
+        raise ValueError(f"{where}: coordinates is {data['coordinates']!r}; it must be a list of ['s' or 'f', index].")
+    return Block(str(data["name"]), tuple((part, index) for ((_, part, index),) in forms))
 
 
 def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:

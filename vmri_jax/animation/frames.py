@@ -44,9 +44,10 @@ def plot_strip(
     columns = min(columns, len(moments), 6)
     rows = -(-len(moments) // columns)
     trail = 0.5 * (motion.t[-1] - motion.t[0]) / max(len(moments), 4)
+    caption = motion.drawing.caption
     with plots.style(theme):
         width = WIDTH / columns
-        height = rows * width / aspect + (TITLE if title else 0.0)
+        height = rows * width / aspect + TITLE * (bool(title) + bool(caption))
         figure = plots.NotebookFigure(figsize=(WIDTH, height))
         figure.set_layout_engine("none")
         for k, time in enumerate(moments):
@@ -57,6 +58,9 @@ def plot_strip(
             draw_moment(panel, motion, sizes, camera, aspect, width, time, trail, theme)
         if title:
             figure.text(0.1 / WIDTH, 1 - 0.1 / height, title, va="top", fontsize=11, color=theme.ink)
+        if caption:
+            top = 0.1 + TITLE * bool(title)
+            figure.text(0.1 / WIDTH, 1 - top / height, caption, va="top", fontsize=9, color=theme.ink)
     return figure
 
 

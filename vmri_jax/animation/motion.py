@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from vmri_jax.animation.bars import with_bars
 from vmri_jax.animation.drawing import Drawing
 
 
@@ -17,6 +18,7 @@ class Motion:
     """Where the bodies of a drawing are, as a cubic Hermite polynomial between nodes.
 
     Attributes:
+        drawing: its blocks are bodies, see `vmri_jax.animation.bars`.
         t: (k,) times of the nodes.
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
         energy: (k,) change of the energy since the start, relative to the start where that is not zero.
@@ -92,11 +94,12 @@ def motion(trajectory: vm.Trajectory, drawing: Drawing, system: vm.System | None
             f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
         )
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.q_s, trajectory.q_f, trajectory.t))
-    offset, matrix = drawing.maps(q_s.shape[1], q_f.shape[1])
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
     count = len(t) if finite.all() else int(np.argmin(finite))
     if count == 0:
         raise ValueError("motion: the trajectory has no node with finite positions; there is nothing to draw.")
+    drawing = with_bars(drawing, q_s[:count], q_f[:count])
+    offset, matrix = drawing.maps(q_s.shape[1], q_f.shape[1])
     nodes, q = t[:count], np.concatenate([q_s, q_f], axis=1)[:count]
     v = _differences(nodes, q) if system is None else _velocities(system, trajectory, count)
     t, q, v = _with_micro_nodes(trajectory, nodes, q, v)

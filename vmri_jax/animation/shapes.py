@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 
 from vmri_jax import plots
 from vmri_jax.animation.camera import Camera
@@ -57,7 +59,7 @@ def draw_moment(
             pen.rod(a, b, reach, sizes.rod, sizes.size)
         else:
             pen.spring(a, b, reach, sizes.coil, sizes.wire, paces[connection.pace], connection.turns)
-        if connection.point is not None:
+        if connection.point is not None and np.linalg.norm(a - b) > reach[0]:  # else within the body
             pen.ball(connection.point, 1.5 * sizes.rod, ROD[theme])
     for point, radius, color in zip(points, sizes.radii, colors, strict=True):
         pen.ball(point, radius, color)
@@ -172,7 +174,7 @@ class _Pen:
             self.polygons([ground.center + corners @ ground.sides], self.theme.faint, 0.4, -4)
 
     def shadows(self, ground: Ground, points, radii, joints, rod: float) -> None:
-        """Straight down onto a plane that bears."""
+        """Straight down onto a plane that bears; where those of a kind overlap they are no darker."""
         angle = np.linspace(0, 2 * np.pi, 25)[:-1]
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ ground.sides
         color, strength = "#000000", 1.0 if self.theme is plots.LIGHT else 2.0
@@ -183,22 +185,26 @@ class _Pen:
                 if (point - ground.center) @ ground.normal > 0
             ]
             self.polygons(rings, color, 0.026 * strength, -2)
-        for a, b in joints:
-            places, scale = self.camera.project(np.array([_dropped(ground, a), _dropped(ground, b)]))
-            width = 2 * self.points * rod * scale.mean()
-            self.lines([places], color, width, -2, alpha=0.06 * strength, capstyle="round")
+        if joints:
+            ends = np.array([[_dropped(ground, a), _dropped(ground, b)] for a, b in joints]).reshape(-1, 3)
+            places, scale = self.camera.project(ends)
+            path = Path(places, [Path.MOVETO, Path.LINETO] * len(joints))
+            width = max(0.5, 2 * self.points * rod * float(scale.mean()))
+            style = {"capstyle": "round", "linewidth": width, "alpha": 0.06 * strength}
+            self.axes.add_patch(PathPatch(path, fill=False, edgecolor=color, zorder=-2, **style))
 
     def polygons(self, corners, color, alpha: float, zorder: float) -> None:
-        places = [self.camera.project(each)[0] for each in corners]
-        patches = PolyCollection(places, facecolors=color, linewidths=0, alpha=alpha, zorder=zorder)
-        self.axes.add_collection(patches, autolim=False)
+        """Of as many corners each, in one path."""
+        if len(corners):
+            path = Path.make_compound_path_from_polys(self.camera.project(np.array(corners))[0])
+            self.axes.add_patch(PathPatch(path, facecolor=color, linewidth=0, alpha=alpha, zorder=zorder))
 
 
 def _joint(a, b, reach):
-    """Where a joint of two balls starts and ends; None if they touch."""
+    """Where a joint of two balls starts and ends; None if they touch or an end lies within the other ball."""
     gap = b - a
     length = float(np.linalg.norm(gap))
-    if length <= SPAN * sum(reach):
+    if length <= max(SPAN * sum(reach), *reach):
         return None
     return a + SPAN * reach[0] / length * gap, b - SPAN * reach[1] / length * gap
 

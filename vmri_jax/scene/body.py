@@ -10,7 +10,7 @@ from vmri_jax.quadrature import is_concrete
 
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3
-"""Coordinates of a point; blocks have more."""
+"""Coordinates of a point at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +28,7 @@ class Body:
             estimates of frequencies.
         radius: how large it is drawn, in the unit of its position; by default as suits the picture. Of no effect on the
             motion: contacts have a radius of their own.
+        block: its coordinates are general ones, not those of a point; more than three always are.
 
     Raises:
         ValueError: an empty name, a mass or radius that is not positive, numbers that are not finite, shapes that do not
@@ -40,6 +41,7 @@ class Body:
     velocity: Any = None
     pace: Pace = "auto"
     radius: float | None = None
+    block: bool = False
 
     def __post_init__(self):
         if not isinstance(self.name, str) or not self.name:
@@ -68,15 +70,11 @@ class Body:
             raise ValueError(f"Body {self.name}: mass is {np.asarray(mass)}; every mass must be positive.")
         if self.radius is not None and is_concrete(self.radius) and not 0 < self.radius < np.inf:
             raise ValueError(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
-        for name, value in (("position", position), ("velocity", velocity), ("mass", mass)):
+        block = self.block or position.size > LARGEST_POINT
+        for name, value in (("position", position), ("velocity", velocity), ("mass", mass), ("block", block)):
             object.__setattr__(self, name, value)
 
     @property
     def size(self) -> int:
         """Number of coordinates."""
         return self.position.shape[0]
-
-    @property
-    def is_point(self) -> bool:
-        """Whether it is a point, rather than a block of general coordinates."""
-        return self.size <= LARGEST_POINT

@@ -2,6 +2,7 @@
 
     {
         "bodies":  [{"name": "bob", "coordinates": [["s", 0], ["s", 1], ["s", 2]], "radius": 0.1}, ...],
+        "blocks":  [{"name": "modes", "coordinates": [["f", 0], ["f", 1], ["f", 2], ["f", 3]]}, ...],
         "links":   [["bob", "tip"], ...],
         "springs": [["tip", "load"], ...],
         "anchors": [{"body": "bob", "point": [0.0, 0.0, 0.0], "kind": "link"}, ...],
@@ -10,10 +11,9 @@
         "up":      [0.0, 0.0, 1.0],
     }
 
-`coordinates` says for each axis (one to three of them) which entry of q_s ("s") or q_f ("f") it is; `radius` is only
-there where the body has one, `up` where gravity has a direction. A block of more than three general coordinates is drawn
-as that many bodies ``name[i]`` side by side, at `offset`, each as high as its coordinate. `kind` is "link" or "spring".
-Everything is lists, strings and numbers.
+`coordinates` says for each axis of a point (one to three of them), or for each general coordinate of a block, which entry
+of q_s ("s") or q_f ("f") it is; `radius` is only there where the body has one, `up` where gravity has a direction. `kind`
+is "link" or "spring". Everything is lists, strings and numbers.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,10 +27,10 @@ KINDS = ("links", "springs", "anchors", "planes", "spheres")
 
 def drawing(bodies: Mapping[str, Body], effects: Iterable[Effect], places: Mapping[str, Place]) -> dict[str, list]:
     """The description of these bodies at these places with these effects."""
-    seen: dict[str, list] = {
-        "bodies": [entry for body in bodies.values() for entry in _entries(body, places[body.name])]
-    }
-    seen |= {kind: [] for kind in KINDS}
+    seen: dict[str, list] = {kind: [] for kind in ("bodies", "blocks", *KINDS)}
+    for name, body in bodies.items():
+        axes = [[places[name].part, places[name].start + i] for i in range(body.size)]
+        seen["blocks" if body.block else "bodies"].append({"name": name, "coordinates": axes})
     radii = {name: float(body.radius) for name, body in bodies.items() if body.radius is not None}
     for effect in effects:
         parts = effect.drawing(bodies)
@@ -42,13 +42,3 @@ def drawing(bodies: Mapping[str, Body], effects: Iterable[Effect], places: Mappi
         if entry["name"] in radii:
             entry["radius"] = radii[entry["name"]]
     return seen
-
-
-def _entries(body: Body, place: Place) -> list[dict]:
-    axes = [[place.part, place.start + i] for i in range(place.size)]
-    if body.is_point:
-        return [{"name": body.name, "coordinates": axes}]
-    return [
-        {"name": f"{body.name}[{i}]", "coordinates": [[], axis], "offset": [float(i), 0.0]}
-        for i, axis in enumerate(axes)
-    ]

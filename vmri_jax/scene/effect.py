@@ -223,7 +223,7 @@ class _Own(Effect):
         expected = "it is drawn between points, and {} has {} coordinates; leave it out"
         for name in element:
             sized = expected.format(name, bodies[name].size)
-            self.require(bodies[name].is_point, "drawn_as", repr(self.drawn_as), sized)
+            self.require(not bodies[name].block, "drawn_as", repr(self.drawn_as), sized)
 
     def drawing(self, bodies):
         (element,) = self.elements(bodies)

@@ -135,5 +135,5 @@ def _derivatives(function, kinetic: bool, q, v, params):
 
 def _positions(bodies) -> np.ndarray:
     """Coordinates of all points in one array, blocks left out where there are points; padded with zeros."""
-    points = [np.asarray(body.position) for body in bodies.values() if body.is_point] or [np.zeros(1)]
+    points = [np.asarray(body.position) for body in bodies.values() if not body.block] or [np.zeros(1)]
     return np.stack([np.pad(point, (0, LARGEST_POINT - point.size)) for point in points])

@@ -1,10 +1,11 @@
 // Planes with a grid that fades outwards, shadows on those that bear, and fixed spheres.
 
 function drawPlane(painter, plane, positions) {
-  const { context, camera, colors, data } = painter, { center, sides, halves, step, normal, solid } = plane;
+  const { context, camera, colors } = painter, { center, sides, halves, step, normal, solid } = plane;
   const place = (u, v) => camera.project(plus(plus(center, sides[0], u), sides[1], v));
   const near = 0.02 * camera.distance;
   if (solid) {
+    context.beginPath();
     outline(context, [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([u, v]) => place(u * halves[0], v * halves[1])), near);
     context.fillStyle = painter.tone(colors.faint);
     context.globalAlpha = 0.45;
@@ -31,50 +32,46 @@ function drawPlane(painter, plane, positions) {
   }
   context.globalAlpha = 1;
   if (normal[2] > 0.5) shadows(painter, plane, positions);
-  for (const sphere of data.spheres) if (normal[2] > 0.5) spot(painter, plane, sphere.center, sphere.radius);
 }
 
 // Straight down onto the plane.
 const dropped = ({ center, normal }, p) => plus(p, [0, 0, 1], dot(plus(center, p, -1), normal) / normal[2]);
 
+// All of a kind in one path: where they overlap they are no darker.
 function shadows(painter, plane, positions) {
-  const { context, camera, colors, data } = painter, { bodies, connections } = data;
+  const { context, camera, colors, data } = painter, { bodies, connections, spheres } = data, near = 0.02 * camera.distance;
   const at = (i) => positions.subarray(3 * i, 3 * i + 3);
-  context.strokeStyle = painter.tone(colors.shadow);
+  context.strokeStyle = context.fillStyle = painter.tone(colors.shadow);
   context.globalAlpha = 0.06 * painter.shade;
-  const line = (a, b) => {
-    const [from, to] = [a, b].map((p) => camera.project(dropped(plane, p)));
-    if (Math.min(from[2], to[2]) < 0.02 * camera.distance) return;
-    context.lineWidth = Math.max(1, (2 * camera.scale * data.rod) / ((from[2] + to[2]) / 2));
-    context.beginPath();
+  context.lineWidth = Math.max(1, (2 * camera.scale * data.rod) / camera.distance);
+  context.beginPath();
+  for (const { body, other, point } of connections) {
+    const [from, to] = [at(body), point ?? at(other)].map((p) => camera.project(dropped(plane, p)));
+    if (Math.min(from[2], to[2]) < near) continue;
     context.moveTo(from[0], from[1]);
     context.lineTo(to[0], to[1]);
-    context.stroke();
-  };
-  for (const { body, other, point } of connections) line(at(body), point ?? at(other));
-  bodies.forEach((body, i) => spot(painter, plane, at(i), body.radius));
-}
-
-// A round shadow with a soft edge.
-function spot(painter, plane, center, radius) {
-  const { context, camera, colors } = painter, below = dropped(plane, center);
-  if (center[2] < below[2]) return;
-  context.fillStyle = painter.tone(colors.shadow);
+  }
+  context.stroke();
+  const balls = [...bodies.map(({ radius }, i) => ({ center: at(i), radius })), ...spheres];
+  const above = balls.map(({ center, radius }) => ({ center, radius, below: dropped(plane, center) })).filter(({ center, below }) => center[2] >= below[2]);
   context.globalAlpha = 0.026 * painter.shade;
-  for (let grown = 0.7; grown < 1.5; grown += 0.1) {
-    const ring = Array.from({ length: 28 }, (_, k) => {
-      const angle = (2 * Math.PI * k) / 28, [u, v] = [grown * radius * Math.cos(angle), grown * radius * Math.sin(angle)];
-      return camera.project(plus(plus(below, plane.sides[0], u), plane.sides[1], v));
-    });
-    outline(context, ring, 0.02 * camera.distance);
+  for (let grown = 0.7; grown < 1.5; grown += 0.1) { // a soft edge
+    context.beginPath();
+    for (const { below, radius } of above) outline(context, ring(painter, plane, below, grown * radius), near);
     context.fill();
   }
   context.globalAlpha = 1;
 }
 
-// The path of a polygon; empty if a corner lies behind the eye.
+function ring(painter, { sides }, center, radius) {
+  return Array.from({ length: 28 }, (_, k) => {
+    const angle = (2 * Math.PI * k) / 28, [u, v] = [radius * Math.cos(angle), radius * Math.sin(angle)];
+    return painter.camera.project(plus(plus(center, sides[0], u), sides[1], v));
+  });
+}
+
+// Adds a polygon to the path; nothing if a corner lies behind the eye.
 function outline(context, corners, near) {
-  context.beginPath();
   if (corners.some((corner) => corner[2] < near)) return;
   corners.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
   context.closePath();

@@ -63,7 +63,7 @@ class Painter {
       const ends = [at(body), point ?? at(other), bodies[body].radius, point ? 0 : bodies[other].radius];
       if (kind === "link") rod(this, ...ends);
       else spring(this, ...ends, this.colors[pace], turns);
-      if (point) ball(this, point, 1.5 * data.rod, this.colors.rod);
+      if (point && Math.hypot(...plus(point, ends[0], -1)) > ends[2]) ball(this, point, 1.5 * data.rod, this.colors.rod); // else within the body
     }
     bodies.forEach((body, i) => ball(this, at(i), body.radius, this.bodies[i]));
     this.items.sort((a, b) => b[0] - a[0]);

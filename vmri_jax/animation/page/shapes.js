@@ -15,10 +15,10 @@ function ball(painter, center, radius, color) {
   });
 }
 
-// Where a joint of two balls starts and ends, and its direction; null if they touch.
+// Where a joint of two balls starts and ends, and its direction; null if they touch or an end lies within the other ball.
 function joint(a, b, reachA, reachB) {
   const gap = plus(b, a, -1), length = Math.hypot(...gap);
-  if (length <= SPAN * (reachA + reachB)) return null;
+  if (length <= Math.max(SPAN * (reachA + reachB), reachA, reachB)) return null;
   const along = unit(gap);
   return [plus(a, along, SPAN * reachA), plus(b, along, -SPAN * reachB), along];
 }

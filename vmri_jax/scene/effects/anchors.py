@@ -62,7 +62,8 @@ class _ToPoint(Effect):
         """The drawing of links or springs to the points."""
         points = np.atleast_2d(np.asarray(vector_of(self, "point", self.point, bodies)))
         pairs = zip(self.elements(bodies), points, strict=True)
-        return {"anchors": [{"body": name, "point": point.tolist(), "kind": kind} for (name,), point in pairs]}
+        drawn = [(name, point) for (name,), point in pairs if not bodies[name].block]
+        return {"anchors": [{"body": name, "point": point.tolist(), "kind": kind} for name, point in drawn]}
 
 
 @dataclass(frozen=True, eq=False)

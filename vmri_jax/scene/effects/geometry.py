@@ -56,10 +56,11 @@ def check_points(effect: Effect, bodies: Mapping[str, Body], dimensions=(1, 2, 3
     """Refuse bodies that are not points of these dimensions."""
     for element in effect.elements(bodies):
         for name in element:
-            if bodies[name].size not in dimensions:
-                allowed = " or ".join(map(str, dimensions))
+            body = bodies[name]
+            if body.block or body.size not in dimensions:
+                has, allowed = "general " if body.block else "", " or ".join(map(str, dimensions))
                 raise ValueError(
-                    f"{effect.name}: {name} has {bodies[name].size} coordinates; this effect is between points of dimension {allowed}."
+                    f"{effect.name}: {name} has {body.size} {has}coordinates; this effect is between points of dimension {allowed}."
                 )
 
 

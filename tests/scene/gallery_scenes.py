@@ -1,0 +1,15 @@
+"""The scenes of `notebooks/scenes` by name."""
+
+from functools import cache
+from pathlib import Path
+
+from vmri_jax.catalogue import find_scene
+from vmri_jax.scene import Scene
+
+FOLDER = Path(__file__).parents[2] / "notebooks" / "scenes"
+
+
+@cache
+def gallery_scene(name: str) -> Scene:
+    """The scene in a file of the gallery."""
+    return find_scene(f"{FOLDER / name}.py:scene")

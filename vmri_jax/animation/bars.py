@@ -1,0 +1,79 @@
+"""General coordinates as bars: balls at their heights over a base line."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+import vmri_jax as vm
+from vmri_jax.animation.drawing import Anchor, Body, Drawing, check_index, frame
+
+RADIUS = 0.24
+"""Of a ball, in the distance between bars."""
+
+
+def bars(trajectory: vm.Trajectory) -> dict:
+    """A drawing of any run: all coordinates of q_s, and all of q_f, as bars."""
+    sizes = {part: np.shape(q)[1] for part, q in (("s", trajectory.q_s), ("f", trajectory.q_f))}
+    blocks = [{"name": f"q_{part}", "coordinates": [[part, i] for i in range(n)]} for part, n in sizes.items() if n > 0]
+    return {"blocks": blocks}
+
+
+def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
+    """The drawing with bodies ``name[i]`` for the coordinates of its blocks, to the right of all others.
+
+    Every block has its own scale, 1, 2 or 5 times a power of ten, by which its largest coordinate in the run is as high as
+    there is room; the caption says it.
+
+    Args:
+        q_s, q_f: (k, n_s) and (k, n_f) positions along the run.
+
+    Raises:
+        ValueError: a body or block uses a coordinate that the run does not have.
+    """
+    if not drawing.blocks:
+        return drawing
+    values = {"s": q_s, "f": q_f}
+    for block in drawing.blocks:
+        for part, i in block.coordinates:
+            check_index(block.name, part, i, q_s.shape[1], q_f.shape[1])
+    corner, height = _room(drawing, q_s, q_f)
+    unit = height / max(2.0, 0.22 * sum(len(block.coordinates) for block in drawing.blocks))
+    axes = frame(drawing.up, max(2, drawing.dimension))
+    bodies, anchors, scales, x = [], [], [], 0.0
+    for block in drawing.blocks:
+        largest = max(float(np.abs(values[part][:, i]).max()) for part, i in block.coordinates)
+        scale = _round(height / largest) if largest > 0 else 1.0
+        scales.append(f"{block.name} times {scale:g}")
+        for i, coordinate in enumerate(block.coordinates):
+            foot = tuple(((corner + np.array([x, 0.0, 0.0])) @ axes).tolist())
+            forms = tuple(((scale * float(weight), *coordinate),) if weight else () for weight in axes[2])
+            bodies.append(Body(f"{block.name}[{i}]", forms, foot, RADIUS * unit))
+            anchors.append(Anchor(bodies[-1].name, foot, "link"))
+            x += unit
+        x += unit
+    heights = f"Heights are {', '.join(scales[:-1])}{' and ' if scales[:-1] else ''}{scales[-1]}."
+    return replace(
+        drawing,
+        bodies=(*drawing.bodies, *bodies),
+        blocks=(),
+        anchors=(*drawing.anchors, *anchors),
+        caption=f"{drawing.caption} {heights}".strip(),
+    )
+
+
+def _room(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> tuple[np.ndarray, float]:
+    """Foot (3,) of the first bar in the picture, and how far up and down bars may reach."""
+    if not drawing.bodies:
+        return np.zeros(3), 2.0
+    offset, matrix = drawing.maps(q_s.shape[1], q_f.shape[1])
+    points = (offset + np.einsum("iaq,kq->kia", matrix, np.concatenate([q_s, q_f], axis=1))).reshape(-1, 3)
+    low, high = points.min(axis=0), points.max(axis=0)
+    height = float(np.linalg.norm(high - low)) / 3 or 1.0
+    return np.array([high[0] + height, *(low + high)[1:] / 2]), height
+
+
+def _round(x: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above x."""
+    power = 10.0 ** math.floor(math.log10(x))
+    return max(digit * power for digit in (1, 2, 5) if digit * power <= x * (1 + 1e-12))
