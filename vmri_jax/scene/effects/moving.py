@@ -188,6 +188,6 @@ class Guide(_ToPath):
     def check(self, bodies):
         super().check(bodies)
         away = self.away(bodies)
-        size = max([1.0, *(jnp.abs(bodies[name].position).max() for (name,) in self.elements(bodies))])
+        size = jnp.max(jnp.abs(jnp.stack([bodies[name].position for (name,) in self.elements(bodies)])))
         what = "the distance of the body from its point at t = 0"
-        self.require(away <= START * size, what, away, "it must start there")
+        self.require(away <= START * jnp.maximum(size, 1.0), what, away, "it must start there")
