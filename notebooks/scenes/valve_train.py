@@ -20,13 +20,6 @@ def tension(q, params):
     return params["stiffness"] / 2 * jnp.sum((crank - params["center"] - cam) ** 2)
 
 
-class Chain(Potential):
-    """A potential that is drawn as a spring."""
-
-    def drawing(self, bodies):
-        return {"springs": [list(self.bodies)]}
-
-
 def lobe(q, params):
     """A tappet rides on the cam: it is out by the lift where the pin points at it."""
     cam, tappet = q
@@ -67,7 +60,7 @@ scene = Scene(
     ],
     [
         Anchor(["crank", "cam"], [CRANK, [0.0, 0.0]], name="bearings"),
-        Chain(tension, ("crank", "cam"), {"stiffness": 200.0, "center": CRANK}, name="chain"),
+        Potential(tension, ("crank", "cam"), {"stiffness": 200.0, "center": CRANK}, name="chain", drawn_as="spring"),
         Force(engine, "crank", {"gain": 4.0, "speed": SPEED, "center": CRANK}),
         *on_left,
         *on_right,

@@ -1,7 +1,7 @@
 """Scenes: bodies and effects, turned into a `System` in which only what the scene calls for exists."""
 
 from vmri_jax.scene.body import Body
-from vmri_jax.scene.effect import Constraint, Effect, Force, Kinetic, Potential
+from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.anchors import Anchor, SpringAnchor
 from vmri_jax.scene.effects.bending import Angle, Bending, Torsion
 from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
@@ -11,6 +11,7 @@ from vmri_jax.scene.effects.gravity import Gravity, NBodyGravity
 from vmri_jax.scene.effects.links import RigidLink
 from vmri_jax.scene.effects.magnetic import MagneticField
 from vmri_jax.scene.effects.moving import Guide, MovingAnchor, MovingPivot
+from vmri_jax.scene.effects.own import Constraint, Force, Kinetic, Potential
 from vmri_jax.scene.effects.pairs import Coulomb, LennardJones
 from vmri_jax.scene.effects.rayleigh import RayleighDamping
 from vmri_jax.scene.effects.springs import NonlinearSpring, Spring
