@@ -160,14 +160,14 @@ def _summary(
     t_end = found[-1, 2]
     position, velocity, method, iterations = found[:, 5:].max(axis=0)
     absolute = abs(energy) <= 1e-12
-    error = max(found[:, 4].max() - energy, energy - found[:, 3].min()) / (1.0 if absolute else abs(energy))
+    change = max(found[:, 4].max() - energy, energy - found[:, 3].min()) / (1.0 if absolute else abs(energy))
     rows = {
         "macro steps": f"{steps}, of {num_micro} micro steps each",
         "simulated time": f"{t_start:g} to {t_end:g}",
         "wall time": f"{seconds:.2f} s, of which {compiling:.2f} s compiling",
         "per micro step": f"{1e6 * max(seconds - compiling, 0.0) / (now * num_micro):.3g} µs" if now else "",
         "Newton iterations": f"at most {int(iterations)} per step, {vm.Method(int(method)).name.lower()}",
-        "energy error": f"{error:.2e}{'' if absolute else ' of the energy at the start'}",
+        "energy change": f"at most {change:.2e}{'' if absolute else ' of the energy at the start'}",
         "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if position > 0 else "",
         "saved": ", ".join(saved) if saved else "nothing; give --out run.npz or --plot run.png",
     }
