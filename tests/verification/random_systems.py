@@ -98,6 +98,7 @@ class Structure:
     """What is compiled: a name of the tables above for every part, None where there is none.
 
     slow, fast: numbers of points, of so many coordinates each.
+    moving: whether what the constraints keep moves with time.
     lanes: None for `simulate`, else the number of lanes of `simulate_batch`.
     """
 
@@ -109,6 +110,7 @@ class Structure:
     fast_potential: str | None = None
     constraint: str | None = None
     slow_constraint: str | None = None
+    moving: bool = False
     force: str | None = None
     scheme: str = "fully implicit"
     num_micro: int = 1
@@ -160,6 +162,7 @@ def structure(random: Random) -> Structure:
         fast_potential=perhaps(ENERGIES, 0.8),
         constraint=perhaps(CONSTRAINTS, 0.7),
         slow_constraint=perhaps(SLOW_CONSTRAINTS, 0.2, 2),
+        moving=random.random() < 0.15,
         force=perhaps(FORCES, 0.2),
         scheme=scheme,
         num_micro=random.choice([1, 2, 3, 5, 10, 20]),
@@ -242,13 +245,27 @@ def functions(of: Structure) -> dict:
     return {f.__name__: f for f in made if names[f.__name__]} | {"kinetic": kinetic}
 
 
+@cache
+def moving(of: Structure) -> dict:
+    """The constraints of `functions` with values that move with time, as fast as the force is strong."""
+
+    def moved(values):
+        def at(t, *arguments):
+            params = arguments[-1]
+            return values(*arguments) - params["force"] * jnp.sin(t - params["time"])
+
+        return vm.Rheonomic(at)
+
+    return {name: moved(f) for name, f in functions(of).items() if name.endswith("constraint")}
+
+
 def problem(of: Structure, at: Draw) -> vm.Problem:
     """System and start. The constraints hold at the start up to ``off``."""
     n_s = of.dimension * of.slow
     q, v, masses = (np.array(x) for x in (at.positions, at.velocities, at.masses))
     params = {
         name: jnp.asarray(getattr(at, name), dtype=float)
-        for name in ("stiffness", "length", "small", "force", "masses")
+        for name in ("stiffness", "length", "small", "force", "masses", "time")
     }
     parts = functions(of)
     if of.constraint:
@@ -263,7 +280,8 @@ def problem(of: Structure, at: Draw) -> vm.Problem:
         kinetic = vm.ConstantMass(*(np.diag(m) + 0.3 * np.min(m) for m in (masses[:n_s], masses[n_s:])))
     else:
         kinetic = vm.ConstantMass(masses[:n_s], masses[n_s:])
-    system = vm.System(**parts | {"kinetic": kinetic}, params=params)
+    held = moving(of) if of.moving else {}
+    system = vm.System(**parts | held | {"kinetic": kinetic}, params=params)
     return vm.Problem(system, q[:n_s], q[n_s:], v[:n_s], v[n_s:], at.time)
 
 
