@@ -27,6 +27,7 @@ from vmri_jax import (
 )
 from vmri_jax.newton import interval
 from vmri_jax.newton.secant import Pairs
+from vmri_jax.step import Memory, advance, start_memory
 
 METHODS = ["auto", "march", "frozen", "decoupled"]
 
@@ -219,3 +220,27 @@ def test_no_library_call_in_a_compiled_run(tsp):
     text = str(run.lower(tsp.state()).compile().as_text())
     assert "custom-call" not in text
     assert " dot(" not in text
+
+
+def test_a_large_matrix_is_renewed_when_it_costs_passes(tsp):
+    """18 rows: kept from step to step, renewed after a step of too many passes; small ones are renewed by every step."""
+    system, state, newton = tsp.system, tsp.state(), Newton("march")
+
+    def matrices(scheme):
+        memory, now, found = start_memory(system, scheme, state, 0.02, newton), state, []
+        for passes in (None, None, 50):  # the last step finds that the one before took many
+            assert isinstance(memory, Memory)
+            if passes is not None:
+                memory = memory._replace(warm=memory.warm._replace(passes=memory.warm.passes.at[1].set(passes)))
+            now, info, memory = jax.jit(advance)(system, scheme, now, 0.02, newton, memory)
+            assert int(info.result) == Result.CONVERGED
+            found.append(np.asarray(memory.matrix.inverse))
+        return found
+
+    first, second, third = matrices(galerkin(1, 3))
+    assert first.shape == (18, 18)
+    assert np.array_equal(first, second)
+    assert not np.array_equal(second, third)
+    first, second, _ = matrices(galerkin(1, 2))
+    assert first.shape == (12, 12)
+    assert not np.array_equal(first, second)

@@ -42,8 +42,8 @@ def matmul(a, b):
 
 
 def matvec(a, x):
-    """``a @ x`` of (..., i, k) and (..., k), as a sum of products."""
-    if a.shape[-2] * a.shape[-1] > ELEMENTWISE**3:
+    """``a @ x`` of (..., i, k) and (..., k), as a sum of products up to `ELEMENTWISE` rows."""
+    if a.shape[-2] * a.shape[-1] > ELEMENTWISE**2:
         return jnp.matvec(a, x)
     return jnp.sum(a * x[..., None, :], axis=-1)
 

@@ -9,6 +9,7 @@ two nearly equal positions: momenta keep full relative precision however small t
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from typing import Any
 
 import equinox as eqx
@@ -154,16 +155,20 @@ class Nodes:
         """Times, positions and velocities of the path at all nodes, group after group."""
         r, micro_dt = self.degree, path.macro_dt / self.num_micro
         parts = []
-        for g in self.groups:
-            theta = self.theta(g)
-            start, steps = path.fast_start[g.first : g.stop], path.fast[g.first : g.stop]
+        for (first, stop), groups in groupby(self.groups, key=lambda g: (g.first, g.stop)):
+            groups = tuple(groups)  # on the same intervals: all at once
+            theta, c = np.concatenate([self.theta(g) for g in groups]), np.array([g.c for g in groups])
+            start, steps = path.fast_start[first:stop], path.fast[first:stop]
+            shape = (len(theta), steps.shape[-1])
+            moved = jnp.einsum("kj,mja->kma", lagrange_basis(r, c)[:, 1:], steps)
+            rates = jnp.einsum("kj,mja->kma", lagrange_derivative(r, c)[:, 1:], steps)
             parts.append(
                 Sample(
                     t=path.t + theta * path.macro_dt,
                     q_s=path.slow_start + lagrange_basis(r, theta)[:, 1:] @ path.slow,
-                    q_f=start + jnp.einsum("j,mja->ma", lagrange_basis(r, g.c)[1:], steps),
+                    q_f=(start + moved).reshape(shape),
                     v_s=lagrange_derivative(r, theta)[:, 1:] @ path.slow / path.macro_dt,
-                    v_f=jnp.einsum("j,mja->ma", lagrange_derivative(r, g.c)[1:], steps) / micro_dt,
+                    v_f=(rates / micro_dt).reshape(shape),
                 )
             )
         return Sample(*(jnp.concatenate([getattr(p, k) for p in parts]) for k in ("t", "q_s", "q_f", "v_s", "v_f")))

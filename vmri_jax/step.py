@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.algebra import ELEMENTWISE
 from vmri_jax.composition import Composition
 from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
@@ -55,7 +56,7 @@ class StepInfo(eqx.Module):
 class Memory(NamedTuple):
     """What a step hands to the next: gradients of the kicks at the node they share, and what Newton starts from.
 
-    matrix: of the micro intervals, computed once per run where it is constant, else once per macro step.
+    matrix: of the micro intervals, computed once per run where it is constant, else once per macro step or fewer.
     """
 
     kicks: Any
@@ -128,18 +129,27 @@ def start_memory(
     return Memory(kicks, kept, jnp.zeros(n_g), jnp.zeros(n_gs), matrix, warm, memories)
 
 
-def _renew_matrix(system, scheme, state, macro_dt, memory: Memory) -> Memory:
-    """The matrix of the micro intervals at the start of this macro step, unless it is constant."""
+def _renew_matrix(system, scheme, state, macro_dt, newton, memory: Memory) -> Memory:
+    """The matrix of the micro intervals at the start of this macro step, unless it is constant.
+
+    A large one is kept for as long as it costs no passes; a number of passes that is fixed needs a new one.
+    """
     parts = split(system, scheme, state.q_s, state.q_f)
     if parts is not None:
         slow, fast = _slow_and_fast(state)
         slow_memory, fast_memory = memory.parts
-        slow_memory = _renew_matrix(parts.slow, parts.slow_scheme, slow, macro_dt, slow_memory)
-        fast_memory = _renew_matrix(parts.fast, parts.fast_scheme, fast, macro_dt / scheme.num_micro, fast_memory)
+        slow_memory = _renew_matrix(parts.slow, parts.slow_scheme, slow, macro_dt, newton, slow_memory)
+        micro_dt = macro_dt / scheme.num_micro
+        fast_memory = _renew_matrix(parts.fast, parts.fast_scheme, fast, micro_dt, newton, fast_memory)
         return memory._replace(parts=(slow_memory, fast_memory))
     if memory.matrix is None or is_constant(system, scheme, state.q_s, state.q_f):
         return memory
-    return memory._replace(matrix=interval_matrix(_equations(system, scheme, state, macro_dt)))
+    equations = _equations(system, scheme, state, macro_dt)
+    if memory.matrix.inverse.ndim == 3 or len(memory.matrix.inverse) <= ELEMENTWISE or newton.fixed_iterations:
+        return memory._replace(matrix=interval_matrix(equations))
+    stale = memory.warm.is_stale
+    matrix = jax.lax.cond(stale, lambda: interval_matrix(equations), lambda: memory.matrix)
+    return memory._replace(matrix=matrix, warm=memory.warm.renewed(stale))
 
 
 def _equations(system, scheme, state, macro_dt) -> StepEquations:
@@ -150,7 +160,7 @@ def advance(system: System, scheme: Scheme | Composition, state: State, macro_dt
     """`macro_step` that takes and hands on a memory: (state, info, memory)."""
     if isinstance(scheme, Composition):
         return _advance_stages(system, scheme, state, macro_dt, newton, memory)
-    memory = _renew_matrix(system, scheme, state, macro_dt, memory)
+    memory = _renew_matrix(system, scheme, state, macro_dt, newton, memory)
     state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
     p_s, p_f, v_s, v_f = project_momentum(system, state, memory.velocity)
     state = State(state.t, state.q_s, state.q_f, p_s, p_f)

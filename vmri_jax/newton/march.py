@@ -38,6 +38,9 @@ ROUNDOFF = 4.0
 """Changes of the positions below so many units of round-off are accepted."""
 NOISE = 1e4
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
+MORE = 1
+"""A matrix is renewed after a step with more than so many passes above the fewest with it."""
+UNKNOWN = -1
 
 
 class Warm(NamedTuple):
@@ -46,12 +49,14 @@ class Warm(NamedTuple):
     slow (3, r, n_s), slow_multiplier (2, r, n_gs): unknowns of the last steps, the last one first.
     multiplier (2, r, n_g): multipliers lambda of the last micro intervals, the last one first.
     pairs: secant pairs of the slow unknowns.
+    passes: (2,) fewest of a step with this matrix of the micro intervals (UNKNOWN before one), and those of the last step.
     """
 
     slow: Any
     slow_multiplier: Any
     multiplier: Any
     pairs: Pairs
+    passes: Any
 
     @classmethod
     def straight(cls, increments, n_g: int, n_gs: int) -> "Warm":
@@ -59,7 +64,16 @@ class Warm(NamedTuple):
         r, n_s = increments.shape
         slow = jnp.broadcast_to(increments, (3, r, n_s))
         pairs = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
-        return cls(slow, jnp.zeros((2, r, n_gs)), jnp.zeros((2, r, n_g)), pairs)
+        return cls(slow, jnp.zeros((2, r, n_gs)), jnp.zeros((2, r, n_g)), pairs, jnp.array([0, 2 * MORE]))
+
+    @property
+    def is_stale(self):
+        """Whether the matrix has come to cost passes."""
+        return self.passes[1] > self.passes[0] + MORE
+
+    def renewed(self, matrix_is_new) -> "Warm":
+        """With a new matrix, or with the old one."""
+        return self._replace(passes=self.passes.at[0].set(jnp.where(matrix_is_new, UNKNOWN, self.passes[0])))
 
 
 class Pass(NamedTuple):
@@ -282,7 +296,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: one_pass(at), done)
     slow = jnp.concatenate([done.x.slow[None], warm.slow[:-1]])
     slow_multiplier = jnp.stack([done.x.slow_multiplier, warm.slow_multiplier[0]])
-    return done, Warm(slow, slow_multiplier, done.end.multiplier, done.pairs)
+    fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
+    return done, Warm(slow, slow_multiplier, done.end.multiplier, done.pairs, jnp.stack([fewest, done.passes]))
 
 
 def _inverse_mass(mass):
