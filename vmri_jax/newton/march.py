@@ -4,8 +4,9 @@ A pass takes the slow path as known. It marches over the micro intervals; each c
 multipliers once, by a Newton step on its exact residual, and adds its impulse to the slow equations. Then the slow
 increments and slow multipliers are corrected from what is left of their equations. The matrices are cheap ones:
 
-* micro interval: ``[K, -G^T; G, 0]`` with K from the start of the macro step (`IntervalMatrix`: the mass alone where the
-  fast equations are explicit, so that only the multipliers are solved for), and ``G K^-1 G^T`` from the first pass;
+* micro interval: ``[K, -G^T; G, 0]`` with K from the start of the macro step, or of one before it while that costs no passes
+  (`IntervalMatrix`: the mass alone where the fast equations are explicit, so that only the multipliers are solved for), and
+  ``G K^-1 G^T`` from the first pass;
 * slow equations: mass and slow constraint. What they miss, the response of the fast variables and the curvature of V,
   is learned from the passes (`Pairs`).
 
