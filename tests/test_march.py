@@ -29,7 +29,7 @@ from vmri_jax.newton import interval
 from vmri_jax.newton.secant import Pairs
 from vmri_jax.step import Memory, advance, start_memory
 
-METHODS = ["auto", "march", "frozen", "decoupled"]
+METHODS = ["march", *(pytest.param(method, marks=pytest.mark.full) for method in ("auto", "frozen", "decoupled"))]
 
 
 def ends_differ(a, b) -> float:

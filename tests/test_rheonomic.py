@@ -116,9 +116,9 @@ def test_order(name, scheme, steps):
     ("name", "scheme", "method"),
     [
         ("pivot on a sprung cart", galerkin(2, 2), "march"),
-        ("pivot on a sprung cart", galerkin(2, 2), "dense"),
+        pytest.param("pivot on a sprung cart", galerkin(2, 2), "dense", marks=pytest.mark.full),
         ("cart that is moved", fully_implicit(3), "march"),
-        ("cart that is moved", fully_implicit(3), "frozen"),
+        pytest.param("cart that is moved", fully_implicit(3), "frozen", marks=pytest.mark.full),
     ],
 )
 def test_all_methods_find_the_same(name, scheme, method):
@@ -128,6 +128,7 @@ def test_all_methods_find_the_same(name, scheme, method):
     assert np.abs(found.p_s - expected.p_s).max() < 1e-11
 
 
+@pytest.mark.full
 def test_kinetic_energy_as_a_function_gives_the_same():
     system = SYSTEMS["pivot on a sprung cart"]
     expected = run(system, fully_implicit(3), 20)

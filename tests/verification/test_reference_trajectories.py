@@ -19,7 +19,12 @@ def scheme_of(case):
     )
 
 
-@pytest.mark.parametrize("method", ["auto", "march", "frozen", "decoupled", "arrowhead", "dense"])
+OTHERS = ("march", "frozen", "decoupled")
+
+
+@pytest.mark.parametrize(
+    "method", ["auto", "arrowhead", "dense", *(pytest.param(method, marks=pytest.mark.full) for method in OTHERS)]
+)
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_trajectory_equals_the_reference(name, method):
     case = CASES[name]
