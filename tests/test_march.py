@@ -74,6 +74,7 @@ def link(q_s, q_f, params):
     return jnp.stack([jnp.sum((q_f[:2] - q_s) ** 2) - 2.0])
 
 
+@pytest.mark.full
 def test_full_masses_forces_and_coupled_fast_potential():
     mass = ConstantMass(jnp.array([[5.0, 1.0], [1.0, 4.0]]), jnp.array([[1.0, 0.2, 0], [0.2, 1.0, 0.1], [0, 0.1, 2.0]]))
     system = System(mass, fast_potential=skew, constraint=link, force=drag)

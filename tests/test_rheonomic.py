@@ -137,6 +137,7 @@ def test_kinetic_energy_as_a_function_gives_the_same():
     assert np.abs(found.p_f - expected.p_f).max() < 1e-10
 
 
+@pytest.mark.full
 def test_a_step_is_symplectic():
     system = SYSTEMS["pivot on a sprung cart"]
     state = run(system, fully_implicit(3), 3).final_state
