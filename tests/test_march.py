@@ -47,7 +47,7 @@ def ends_differ(a, b) -> float:
         ("tsp", galerkin(3, 2, "lobatto"), 0.006),
         ("tsp", galerkin(2, 3), 0.006),
         ("sam", fully_explicit(5), 0.002),
-        ("sam", galerkin(2, 2), 0.002),
+        pytest.param("sam", galerkin(2, 2), 0.002, marks=pytest.mark.full),
     ],
 )
 def test_methods_agree_with_the_exact_one(name, scheme, macro_dt, method, request):

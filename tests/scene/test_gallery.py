@@ -71,7 +71,15 @@ def test_commands(name):
     assert (command, options["run"]) == ("animate", Path(f"{name}.npz"))
 
 
-LONG = ("satellite", "valve_train", "ion_trap", "molecule", "simple_atomic_model", "bouncing_chain")
+LONG = (
+    "satellite",
+    "valve_train",
+    "ion_trap",
+    "molecule",
+    "simple_atomic_model",
+    "bouncing_chain",
+    "triple_spherical_pendulum",
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in LONG else ()) for n in NAMES])
