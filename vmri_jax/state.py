@@ -80,6 +80,8 @@ def project_momentum(system: System, state: State, guess=None):
 
 def _own_rates(system: System, t, q_s, q_f):
     """``dg/dt`` of all constraints (n_g + n_gs,) at fixed positions."""
+    if not system.is_rheonomic:
+        return jnp.zeros(sum(system.num_constraints(q_s, q_f)))
     return system.constraint_rates(t, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
 
 

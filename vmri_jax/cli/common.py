@@ -33,10 +33,12 @@ def progress_bar() -> Iterator[StudyProgress]:
 
 
 def print_failure(title: str, text: str) -> None:
+    """A red panel on the error stream."""
     Console(stderr=True).print(Panel(Text(text), title=title, title_align="left", border_style="red"))
 
 
 def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
+    """Refuse a file to be written that has another ending, no folder, or no permission, before anything is computed."""
     if path is None:
         return
     if path.suffix not in endings:

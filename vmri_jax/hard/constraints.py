@@ -25,6 +25,7 @@ def both_rods(q_s, q_f, params):
 
 
 def slow_only_constraint(full: bool) -> Outcome:
+    """A constraint of slow variables alone on the micro grid is refused, with what to do instead."""
     problem = vm.systems.triple_spherical_pendulum()
     system = problem.system.replace(constraint=both_rods, slow_constraint=None)
     said = refusal(vm.Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f))
@@ -35,6 +36,7 @@ def slow_only_constraint(full: bool) -> Outcome:
 
 
 def weak_fast_jacobian(full: bool) -> Outcome:
+    """A constraint that the fast variables enter ever more weakly."""
     macro_dt, values, said = 1e-3, {}, {}
     for eps in (1.0, 1e-2, 1e-4, 1e-6, 1e-8):
         trajectory = run(nearly_slow_constraint(eps), vm.fully_implicit(5), macro_dt, 10_000 if full else 1_000)
@@ -54,6 +56,7 @@ def weak_fast_jacobian(full: bool) -> Outcome:
 
 
 def redundant_constraints(full: bool) -> Outcome:
+    """A constraint given twice: the same motion, or a refusal that names the rows."""
     once, twice = (four_bar(angle=-1.0, kappa=20.0, redundant=redundant) for redundant in (False, True))
     said = refusal(twice)
     if said:

@@ -14,6 +14,7 @@ from vmri_jax.study.timing import interleaved
 
 
 def penalty_contact(full: bool) -> Outcome:
+    """A ball that bounces on a stiff floor: rebound height, and the jump of the energy at each contact."""
     problem, macro_dt, bounces = bouncing_ball(), 1e-4, 100 if full else 3
     period = 2 * np.sqrt(2 * 1.0 / 9.81)
     steps = int((bounces + 0.5) * period / macro_dt) // 20 * 20
@@ -37,6 +38,7 @@ def penalty_contact(full: bool) -> Outcome:
 
 
 def norm_at_zero(full: bool) -> Outcome:
+    """A spring of nearly no length: derivatives stay finite, coincident points fail plainly."""
     problem = vm.systems.triple_spherical_pendulum(lengths=(10.0, 2.0, 0.01))
     steps, scheme, newton = 500 if full else 50, vm.fully_explicit(2), vm.Newton(method="march")
 
@@ -67,6 +69,7 @@ def norm_at_zero(full: bool) -> Outcome:
 
 
 def close_encounter(full: bool) -> Outcome:
+    """A Kepler orbit of high eccentricity: energy error, and what it costs."""
     problem, orbits = two_body(0.9), 100 if full else 5
     settings = {
         "impulse, kahan-li8": (vm.compose(vm.fully_explicit(10), "kahan-li8"), 200),

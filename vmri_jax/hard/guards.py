@@ -64,6 +64,7 @@ def bad_lane(
 
 
 def one_bad_lane(full: bool) -> Outcome:
+    """One absurd start among those of a batch of the FPU chain."""
     problem = vm.systems.fermi_pasta_ulam()
     newton = vm.Newton() if full else vm.Newton(method="march")  # by default a lane that fails is tried again, exactly
     return bad_lane(problem, vm.fully_implicit(5), 0.01, 100, newton, compared=256 if full else 4)

@@ -14,6 +14,7 @@ EXACT = vm.Newton(method="arrowhead")
 
 
 def explicit_limit(full: bool) -> Outcome:
+    """The explicit chain below, at and above omega h = 2."""
     problem, num_micro, steps = vm.systems.fermi_pasta_ulam(), 2, 20_000 if full else 5_000
     scheme = vm.fully_explicit(num_micro)  # with more micro steps omega h = 1.9 meets an impulse resonance
     below, at, beyond = (run(problem, scheme, num_micro * wh / 50.0, steps, save_every=20) for wh in (1.9, 2.0, 2.1))
@@ -29,6 +30,7 @@ def explicit_limit(full: bool) -> Outcome:
 
 
 def large_macro_step(full: bool) -> Outcome:
+    """Newton's iterations where the macro step is many fast periods long."""
     problem, scheme, steps = vm.systems.fermi_pasta_ulam(), vm.fully_implicit(100), 100 if full else 20
     one, two = (run(problem, scheme, h, steps, newton=EXACT) for h in (1.0, 2.0))
     at_first = int(np.max(np.asarray(one.info.iterations)[:20]))
@@ -50,6 +52,7 @@ def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int) -> vm.Tr
 
 
 def large_constrained_step(full: bool) -> Outcome:
+    """Newton's iterations of the pendulum at steps far above the usual ones."""
     problem = vm.systems.triple_spherical_pendulum()
     usual, large = (_pendulum_run(problem, h, 400 if full else 40) for h in (0.05, 0.2))
     kept = float(np.nanmax(np.asarray(large.constraint_residual)[:, 0]))
@@ -61,6 +64,7 @@ def large_constrained_step(full: bool) -> Outcome:
 
 
 def mass_ratios(full: bool) -> Outcome:
+    """Iterations and condition as the slow mass grows against the fast ones."""
     values = {}
     for ratio in (1e4, 1e6, 1e8):
         problem = vm.systems.triple_spherical_pendulum(masses=(ratio, 1.0, 1.0))
@@ -77,6 +81,7 @@ def mass_ratios(full: bool) -> Outcome:
 
 
 def tiny_steps(full: bool) -> Outcome:
+    """Condition and round-off as the macro step shrinks to 1e-6."""
     problem = vm.systems.triple_spherical_pendulum()
     state, steps = problem.state(), 10.0 ** -np.arange(1.0, 7.0)
     conditions = np.array([step_condition(problem.system, PENDULUM, state, h) for h in steps])
@@ -92,6 +97,7 @@ def tiny_steps(full: bool) -> Outcome:
 
 
 def many_micro_steps(full: bool) -> Outcome:
+    """Time per macro step against num_micro, and the dense solve as an oracle."""
     problem, macro_dt, micro = vm.systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
 
     def end(num_micro, steps, newton=None):  # one saved node: one program for each num_micro

@@ -31,6 +31,7 @@ def hanging_pendulum() -> vm.Problem:
 
 
 def constraints_for_long(full: bool) -> Outcome:
+    """Constraints and energy of a pendulum, from a hanging start and from one that becomes chaotic."""
     steps = 1_000_000 if full else 20_000
     wild, calm = vm.systems.triple_spherical_pendulum(), hanging_pendulum()
     trajectory, regular = (long_run(problem, vm.fully_implicit(5), 0.01, steps) for problem in (wild, calm))
@@ -53,6 +54,7 @@ def constraints_for_long(full: bool) -> Outcome:
 
 
 def energy_for_long(full: bool) -> Outcome:
+    """The energy band of the whole run against that of its first tenth."""
     steps = 1_000_000 if full else 100_000
     trajectory = long_run(vm.systems.fermi_pasta_ulam(), vm.fully_implicit(10), CHAIN_DT, steps)
     e = np.abs(np.asarray(trajectory.energy) - trajectory.energy[0])
@@ -68,6 +70,7 @@ def energy_for_long(full: bool) -> Outcome:
 
 
 def loose_tolerance(full: bool) -> Outcome:
+    """The drift of the energy against the tolerance of Newton's iteration."""
     steps, problem = 1_000_000 if full else 100_000, vm.systems.fermi_pasta_ulam()
     changes, details = {}, {}
     for name, tolerance in {"1e-4": 1e-4, "1e-8": 1e-8, "1e-12, the default": vm.Newton().tolerance}.items():
@@ -86,6 +89,7 @@ def loose_tolerance(full: bool) -> Outcome:
 
 
 def chaotic_pendulum(full: bool) -> Outcome:
+    """The fall from nearly upright: constraints and energy; the order before chaos sets in."""
     problem = vm.systems.triple_spherical_pendulum()
     lengths = np.asarray(problem.system.params["lengths"])
     tilt = np.array([np.sin(1e-3), 0.0, np.cos(1e-3)])

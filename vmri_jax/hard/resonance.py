@@ -13,6 +13,7 @@ FIRST_UNSTABLE = {2: 1.248, 3: 1.089, 5: 1.025, 10: 0.999, 20: 0.993}
 
 
 def impulse_resonance(full: bool) -> Outcome:
+    """The first unstable step of explicit_slow for each num_micro, from the multipliers of the linear model."""
     model = linear_model(omega=50.0, kappa=25.0)
     expected = FIRST_UNSTABLE if full else {n: FIRST_UNSTABLE[n] for n in (2, 5)}
     omega_H = np.linspace(0.05, 4 * np.pi, 250)
@@ -31,6 +32,7 @@ def impulse_resonance(full: bool) -> Outcome:
 
 
 def chain_at_half_period(full: bool) -> Outcome:
+    """The chain where omega H is pi: what advice says, and what the implicit scheme does."""
     problem, macro_dt, num_micro = vm.systems.fermi_pasta_ulam(), 0.0628, 30
     steps = round((200 if full else 50) / macro_dt)
     implicit = long_run(problem, vm.fully_implicit(num_micro), macro_dt, steps)
@@ -46,6 +48,7 @@ def chain_at_half_period(full: bool) -> Outcome:
 
 
 def combination_resonance(full: bool) -> Outcome:
+    """A slow growth of the implicit scheme: in the multipliers, in a run, in the advice."""
     model, scheme, num_micro = linear_model(omega=50.0, kappa=25.0), vm.fully_implicit(57), 57
     at = 0.1 * num_micro
     found = stability_map(model, scheme, [0.99 * at, at])
@@ -64,6 +67,7 @@ def combination_resonance(full: bool) -> Outcome:
 
 
 def nonlinear_resonance(full: bool) -> Outcome:
+    """Drift of the energy where omega H is a third and a quarter of a turn."""
     problem, scheme, steps = cubic_chain(), vm.explicit_slow(10), 100_000
     values, said, fine = {}, [], True
     for name, phase in {"2 pi / 3": 2 * np.pi / 3, "pi / 2": np.pi / 2}.items():
@@ -80,6 +84,7 @@ def nonlinear_resonance(full: bool) -> Outcome:
 
 
 def swapped_labels(full: bool) -> Outcome:
+    """The chain with slow and fast exchanged: bounded, and noticed by the advice."""
     problem, scheme, macro_dt = swapped_chain(), vm.fully_implicit(10), 0.03
     steps = 100_000 if full else 10_000
     trajectory = long_run(problem, scheme, macro_dt, steps)

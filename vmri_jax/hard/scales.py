@@ -11,6 +11,7 @@ from vmri_jax.hard.systems import three_scales
 
 
 def three_time_scales(full: bool) -> Outcome:
+    """One frequency far above what the micro steps resolve; the actions of the others against a resolved run."""
     problem, omega = three_scales(), np.array([50.0, 70.0, 5000.0])
     coarse = run(problem, vm.fully_implicit(5), 0.1, 500)  # omega_3 h = 100
     fine = run(problem, vm.fully_explicit(100), 0.01, 5000, save_every=10)  # omega_3 h = 0.5
@@ -32,6 +33,7 @@ def slow_alone(q_s, q_f, params):
 
 
 def no_coupling(full: bool) -> Outcome:
+    """A slow potential of slow variables alone: the slow motion must not depend on num_micro."""
     problem = vm.systems.fermi_pasta_ulam()
     system = problem.system.replace(slow_potential=slow_alone)
     problem = vm.Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f)
@@ -112,6 +114,7 @@ def apart_from(method, problem: vm.Problem, scheme: vm.Scheme, h: float, steps: 
 
 
 def reductions(full: bool) -> Outcome:
+    """One micro step per macro step gives known integrators."""
     chain, pendulum = vm.systems.fermi_pasta_ulam(), vm.systems.triple_spherical_pendulum()
     steps = 200 if full else 25
     values = {
