@@ -10,8 +10,9 @@ increments and slow multipliers are corrected from what is left of their equatio
 * slow equations: mass and slow constraint. What they miss, the response of the fast variables and the curvature of V,
   is learned from the passes (`Pairs`).
 
-The residual is exact, so all of this decides only how many passes there are. A pass costs one gradient of each term at
-each of its nodes; nothing is stored but the path and those small matrices.
+Passes start from what the steps before extrapolate to (`Differences`), and end when what is left of all equations moves
+nothing any more. The residual is exact, so all of this decides only how many passes there are: about two. A pass costs one
+gradient of each term at each of its nodes; nothing is stored but the path and those small matrices.
 """
 
 from functools import partial
@@ -31,6 +32,7 @@ from vmri_jax.newton.interval import (
     is_explicit_given_multipliers,
     solve_saddle,
 )
+from vmri_jax.newton.extrapolation import Differences
 from vmri_jax.newton.secant import SIZE, Pairs
 from vmri_jax.path import control_nodes
 from vmri_jax.results import RUNNING, Result
@@ -42,19 +44,19 @@ NOISE = 1e4
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
 UNKNOWN = -1
+SAFETY = 10.0
 
 
 class Warm(NamedTuple):
     """What a macro step hands to the next one.
 
-    slow (3, r, n_s), slow_multiplier (2, r, n_gs): unknowns of the last steps, the last one first.
+    slow: slow unknowns (r n_s + r n_gs,) of the last steps.
     multiplier (2, r, n_g): multipliers lambda of the last micro intervals, the last one first.
     pairs: secant pairs of the slow unknowns.
     passes: (2,) fewest of a step with this matrix of the micro intervals (UNKNOWN before one), and those of the last step.
     """
 
-    slow: Any
-    slow_multiplier: Any
+    slow: Differences
     multiplier: Any
     pairs: Pairs
     passes: Any
@@ -63,9 +65,9 @@ class Warm(NamedTuple):
     def straight(cls, increments, n_g: int, n_gs: int) -> "Warm":
         """The start of a run: straight motion with slow increments (r, n_s), no multipliers."""
         r, n_s = increments.shape
-        slow = jnp.broadcast_to(increments, (3, r, n_s))
+        slow = Differences.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
         pairs = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
-        return cls(slow, jnp.zeros((2, r, n_gs)), jnp.zeros((2, r, n_g)), pairs, jnp.array([0, 2 * MORE]))
+        return cls(slow, jnp.zeros((2, r, n_g)), pairs, jnp.array([0, 2 * MORE]))
 
     @property
     def is_stale(self):
@@ -82,7 +84,7 @@ class Pass(NamedTuple):
 
     q_f, p_f: end of the last interval, momentum times h.
     start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path.
-    g: (n_g,) largest constraint values before the last correction.
+    moved: largest correction of an increment.
     multiplier: (2, r, n_g) multipliers lambda of the last two intervals, the last one first.
     """
 
@@ -90,7 +92,7 @@ class Pass(NamedTuple):
     p_f: Any
     start: Any
     increments: Any
-    g: Any
+    moved: Any
     multiplier: Any
 
 
@@ -152,6 +154,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
         dx += matrix.solve(more_f)
         inc, mu, coupling = inc + dx, mu + dmu, change(dx)
         q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
+        moved = jnp.maximum(carry.moved, _largest(dx))
 
         pull_s = -(pull_s + more_s)
         d_start = d.slow_start + coupling.slow_start + pull_s.sum(0)
@@ -165,11 +168,10 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
             start, p_f = start + weight * d_s, p_f + weight * d_f
             increments += basis[-1][:, None] * (weight * d_s)
 
-        g = jnp.maximum(carry.g, jnp.max(jnp.abs(g), axis=0, initial=0.0))
         multiplier = jnp.stack([mu / scale, carry.multiplier[0]])
-        return Pass(q_f, p_f, start, increments, g, multiplier), (inc, mu, schur if first else None)
+        return Pass(q_f, p_f, start, increments, moved, multiplier), (inc, mu, schur if first else None)
 
-    zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(multiplier.shape[2])
+    zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(())
     carry = Pass(equations.q_f, h * equations.p_f, *zero, multiplier)
     scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
     unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
@@ -194,7 +196,7 @@ class March(NamedTuple):
     schur: small matrices of the micro intervals, from the first pass.
     z, d: slow unknowns of the pass and the update they would get from mass and slow constraint alone.
     impulse: on the slow variables over the step, times h.
-    residual: largest row of the momentum equations (times h) and largest constraint value.
+    residual: largest row of the momentum equations (times h) and largest slow constraint value.
     """
 
     x: Unknowns
@@ -223,10 +225,12 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     n, r, n_s, n_f = scheme.num_micro, scheme.degree, equations.q_s.shape[0], equations.q_f.shape[0]
     eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
     mass = constant_mass(system)
+    largest_mass = _largest(mass.fast)
     inverse_slow, inverse_fast = _inverse_mass(mass.slow), _inverse_mass(mass.fast)
     kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
     inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
     times = equations.t + equations.macro_dt * control_nodes(r)
+    explicit, fast_motion = is_explicit_given_multipliers(system, scheme), _largest(inverse_fast(h * equations.p_f))
     accepted_slow, accepted_fast = ROUNDOFF * eps * _largest(equations.q_s), ROUNDOFF * eps * _largest(equations.q_f)
 
     def slow_update(x: Unknowns, end: Pass):
@@ -251,13 +255,16 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
             noise = NOISE * eps * (_largest(equations.q_s) + _largest(x.slow))
             pairs = pairs.add(z - last.z, d - last.d, noise, r * n_s)
 
-        motion = n * jnp.maximum(_largest(inverse_fast(last.end.p_f)), _largest(inverse_fast(end.p_f)))
-        others = eps * jnp.maximum(_largest(x.slow), motion) + tiny  # variables at rest have no size of their own
+        motion = jnp.maximum(fast_motion, _largest(inverse_fast(end.p_f)))
+        others = eps * jnp.maximum(_largest(x.slow), n * motion) + tiny  # variables at rest have no size of their own
+        contraction = 1.0 if first else jnp.minimum(SAFETY * end.moved / (last.end.moved + tiny), 1.0)
+        left = contraction * end.moved
         change = jnp.maximum(
             _largest(d[: r * n_s]) / (newton.tolerance * _largest(x.slow) + accepted_slow + others),
-            _largest(end.q_f - last.end.q_f) / (newton.tolerance * motion + accepted_fast + others),
+            left / (newton.tolerance * motion + accepted_fast + others),
         )
-        settled = jnp.asarray(False) if first else change <= 1
+        settled = change <= 1
+
         if newton.fixed_iterations is None:
             done, spent = settled, last.passes + 1 >= newton.max_iterations
             running = jnp.where(spent, Result.STAGNATED, RUNNING)
@@ -266,27 +273,18 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         result = jnp.where(jnp.isfinite(change), jnp.where(settled, Result.CONVERGED, running), Result.NON_FINITE)
         if n_s:
             z_new = jnp.where(done, z, z + pairs.corrected(d, r * n_s))
-            slow, nu = jnp.split(z_new, [r * n_s])
-            x = x._replace(slow=slow.reshape(x.slow.shape), slow_multiplier=nu.reshape(x.slow_multiplier.shape))
+            slow, nu = unknowns(z_new)
+            x = x._replace(slow=slow, slow_multiplier=nu)
         residual = (
-            jnp.maximum(_largest(rows), _largest(end.p_f - last.end.p_f)),
-            jnp.maximum(_largest(g), _largest(end.g)),
+            jnp.maximum(_largest(rows), largest_mass * left),
+            _largest(g),
         )
         return March(x, end, schur, z, d, pairs, impulse, residual, last.passes + 1, result)
 
-    x = Unknowns(
-        slow=3 * (warm.slow[0] - warm.slow[1]) + warm.slow[2],
-        slow_multiplier=2 * warm.slow_multiplier[0] - warm.slow_multiplier[1],
-        fast=jnp.zeros((n, r, n_f)),
-        multiplier=jnp.zeros((n, *warm.multiplier.shape[1:])),
-    )
-    zero, none = jnp.zeros(warm.pairs.moves.shape[1]), jnp.zeros(())
-    end = Pass(
-        equations.q_f, h * equations.p_f, equations.q_s, x.slow, jnp.zeros(x.multiplier.shape[2]), warm.multiplier
-    )
-    start = March(
-        x, end, None, zero, zero, warm.pairs, equations.p_s, (none, none), jnp.asarray(0), jnp.asarray(RUNNING)
-    )
+    unknowns = partial(slow_unknowns, r=r, n_s=n_s)
+    slow, nu = unknowns(warm.slow.next(r * n_s))
+    x = Unknowns(slow, nu, jnp.zeros((n, r, n_f)), jnp.zeros((n, *warm.multiplier.shape[1:])))
+    start = March(x, None, None, None, None, warm.pairs, None, None, jnp.asarray(0), jnp.asarray(RUNNING))
     done = one_pass(start)
     if linear:
         exact = np.zeros(()), np.zeros(())
@@ -295,10 +293,23 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         done = jax.lax.while_loop(lambda at: at.result == RUNNING, one_pass, done)
     else:
         done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: one_pass(at), done)
-    slow = jnp.concatenate([done.x.slow[None], warm.slow[:-1]])
-    slow_multiplier = jnp.stack([done.x.slow_multiplier, warm.slow_multiplier[0]])
+    rows, g = done.residual
+    done = done._replace(residual=(rows, jnp.maximum(g, _largest(_constraint_values(equations, done.x)))))
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
-    return done, Warm(slow, slow_multiplier, done.end.multiplier, done.pairs, jnp.stack([fewest, done.passes]))
+    return done, Warm(warm.slow.add(done.z), done.end.multiplier, done.pairs, jnp.stack([fewest, done.passes]))
+
+
+def _constraint_values(equations: StepEquations, x: Unknowns):
+    """g (num_micro, r, n_g) at the control nodes after the first."""
+    n, r, _ = x.fast.shape
+    path, slow = equations.path(x), equations.q_s + _along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], x.slow)
+    times = equations.t + equations.micro_dt * (np.arange(n)[:, None] + control_nodes(r)[1:])
+    return jax.vmap(jax.vmap(equations.system.g))(times, slow, path.fast_start[:, None] + path.fast)
+
+
+def slow_unknowns(z, r: int, n_s: int):
+    """Increments (r, n_s) and multipliers (r, n_gs) of the slow variables from z = (r n_s + r n_gs,)."""
+    return z[: r * n_s].reshape(r, n_s), z[r * n_s :].reshape(r, -1)
 
 
 def _inverse_mass(mass):
