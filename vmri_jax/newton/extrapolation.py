@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-ORDER = 8
+ORDER = 6
 """Highest order of the polynomials."""
 
 
@@ -25,7 +25,7 @@ class Differences(NamedTuple):
     def next(self, measured: int):
         """Where the values go on, by the order that missed the first `measured` entries of the last step least."""
         missed = jnp.max(jnp.abs(self.values[1:, :measured]), axis=1, initial=0.0)
-        taken = jnp.arange(ORDER + 2) <= jnp.argmin(missed)
+        taken = jnp.arange(ORDER + 2) <= jnp.argmin(jnp.where(jnp.isfinite(missed), missed, jnp.inf))
         return jnp.sum(jnp.where(taken[:, None], self.values, 0.0), axis=0)
 
     def add(self, x) -> "Differences":

@@ -10,9 +10,9 @@ increments and slow multipliers are corrected from what is left of their equatio
 * slow equations: mass and slow constraint. What they miss, the response of the fast variables and the curvature of V,
   is learned from the passes (`Pairs`).
 
-Passes start from what the steps before extrapolate to (`Differences`), and end when what is left of all equations moves
-nothing any more. The residual is exact, so all of this decides only how many passes there are: about two. A pass costs one
-gradient of each term at each of its nodes; nothing is stored but the path and those small matrices.
+The slow unknowns start from what the steps before extrapolate to (`Differences`). The residual is exact, so all of this
+decides only how many passes there are: two where the slow motion is smooth. A pass costs one gradient of each term at each
+of its nodes; nothing is stored but the path and those small matrices.
 """
 
 from functools import partial
@@ -25,6 +25,7 @@ import numpy as np
 from vmri_jax.algebra import inverse, matmul, matvec, regularized
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
+from vmri_jax.newton.extrapolation import Differences
 from vmri_jax.newton.interval import (
     IntervalMatrix,
     constant_mass,
@@ -32,19 +33,19 @@ from vmri_jax.newton.interval import (
     is_explicit_given_multipliers,
     solve_saddle,
 )
-from vmri_jax.newton.extrapolation import Differences
 from vmri_jax.newton.secant import SIZE, Pairs
 from vmri_jax.path import control_nodes
 from vmri_jax.results import RUNNING, Result
 
 ROUNDOFF = 4.0
 """Changes of the positions below so many units of round-off are accepted."""
-NOISE = 1e4
+NOISE = 1e3
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
 UNKNOWN = -1
 SAFETY = 10.0
+"""Corrections of a micro interval are taken to shrink from pass to pass by so many times less than they just did."""
 
 
 class Warm(NamedTuple):
@@ -200,7 +201,7 @@ class March(NamedTuple):
     """
 
     x: Unknowns
-    end: Pass
+    end: Any
     schur: Any
     z: Any
     d: Any
@@ -212,9 +213,11 @@ class March(NamedTuple):
 
 
 def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, linear: bool) -> tuple[March, Warm]:
-    """Passes until neither the slow increments nor the end of the fast path change.
+    """Passes until one more would change neither the slow increments nor those of the micro intervals.
 
-    Accepted are changes of ``newton.tolerance`` relative to the motion over the step, and round-off of the positions.
+    What it would change the slow ones by is known from the residual, and the others from how their corrections shrink, as in
+    stiff solvers (Hairer, Wanner, Solving Ordinary Differential Equations II, IV.8). Accepted are changes of
+    ``newton.tolerance`` relative to the motion over the macro step and over a micro interval, and round-off of the positions.
 
     Args:
         matrix, warm: K of the micro intervals, and what the step before handed on.
@@ -223,14 +226,13 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     """
     system, scheme, h = equations.system, equations.scheme, equations.micro_dt
     n, r, n_s, n_f = scheme.num_micro, scheme.degree, equations.q_s.shape[0], equations.q_f.shape[0]
+    n_g = warm.multiplier.shape[2]
     eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
     mass = constant_mass(system)
-    largest_mass = _largest(mass.fast)
     inverse_slow, inverse_fast = _inverse_mass(mass.slow), _inverse_mass(mass.fast)
     kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
     inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
     times = equations.t + equations.macro_dt * control_nodes(r)
-    explicit, fast_motion = is_explicit_given_multipliers(system, scheme), _largest(inverse_fast(h * equations.p_f))
     accepted_slow, accepted_fast = ROUNDOFF * eps * _largest(equations.q_s), ROUNDOFF * eps * _largest(equations.q_f)
 
     def slow_update(x: Unknowns, end: Pass):
@@ -255,16 +257,15 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
             noise = NOISE * eps * (_largest(equations.q_s) + _largest(x.slow))
             pairs = pairs.add(z - last.z, d - last.d, noise, r * n_s)
 
-        motion = jnp.maximum(fast_motion, _largest(inverse_fast(end.p_f)))
+        motion = jnp.maximum(_largest(inverse_fast(h * equations.p_f)), _largest(inverse_fast(end.p_f)))
         others = eps * jnp.maximum(_largest(x.slow), n * motion) + tiny  # variables at rest have no size of their own
-        contraction = 1.0 if first else jnp.minimum(SAFETY * end.moved / (last.end.moved + tiny), 1.0)
-        left = contraction * end.moved
+        shrink = 1.0 if first else jnp.minimum(SAFETY * end.moved / (last.end.moved + tiny), 1.0)
+        left = shrink * end.moved
         change = jnp.maximum(
             _largest(d[: r * n_s]) / (newton.tolerance * _largest(x.slow) + accepted_slow + others),
             left / (newton.tolerance * motion + accepted_fast + others),
         )
         settled = change <= 1
-
         if newton.fixed_iterations is None:
             done, spent = settled, last.passes + 1 >= newton.max_iterations
             running = jnp.where(spent, Result.STAGNATED, RUNNING)
@@ -273,17 +274,16 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         result = jnp.where(jnp.isfinite(change), jnp.where(settled, Result.CONVERGED, running), Result.NON_FINITE)
         if n_s:
             z_new = jnp.where(done, z, z + pairs.corrected(d, r * n_s))
-            slow, nu = unknowns(z_new)
+            slow, nu = slow_unknowns(z_new)
             x = x._replace(slow=slow, slow_multiplier=nu)
-        residual = (
-            jnp.maximum(_largest(rows), largest_mass * left),
-            _largest(g),
-        )
+        residual = jnp.maximum(_largest(rows), _largest(mass.fast) * left), _largest(g)
         return March(x, end, schur, z, d, pairs, impulse, residual, last.passes + 1, result)
 
-    unknowns = partial(slow_unknowns, r=r, n_s=n_s)
-    slow, nu = unknowns(warm.slow.next(r * n_s))
-    x = Unknowns(slow, nu, jnp.zeros((n, r, n_f)), jnp.zeros((n, *warm.multiplier.shape[1:])))
+    def slow_unknowns(z):
+        return z[: r * n_s].reshape(r, n_s), z[r * n_s :].reshape(r, -1)
+
+    slow, nu = slow_unknowns(warm.slow.next(r * n_s))
+    x = Unknowns(slow, nu, fast=jnp.zeros((n, r, n_f)), multiplier=jnp.zeros((n, r, n_g)))
     start = March(x, None, None, None, None, warm.pairs, None, None, jnp.asarray(0), jnp.asarray(RUNNING))
     done = one_pass(start)
     if linear:
@@ -305,11 +305,6 @@ def _constraint_values(equations: StepEquations, x: Unknowns):
     path, slow = equations.path(x), equations.q_s + _along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], x.slow)
     times = equations.t + equations.micro_dt * (np.arange(n)[:, None] + control_nodes(r)[1:])
     return jax.vmap(jax.vmap(equations.system.g))(times, slow, path.fast_start[:, None] + path.fast)
-
-
-def slow_unknowns(z, r: int, n_s: int):
-    """Increments (r, n_s) and multipliers (r, n_gs) of the slow variables from z = (r n_s + r n_gs,)."""
-    return z[: r * n_s].reshape(r, n_s), z[r * n_s :].reshape(r, -1)
 
 
 def _inverse_mass(mass):
