@@ -107,7 +107,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
         linear: one pass is exact, see `solve`.
 
     Returns:
-        (x, what the pass leaves, schur)
+        (x, what the pass leaves, fast positions (num_micro, n_f) at the micro nodes after the first, schur)
     """
     h, (n, r, _), n_g = equations.micro_dt, x.fast.shape, multiplier.shape[2]
     system, scheme = interval_problem(equations.system, equations.scheme)
@@ -170,14 +170,14 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
             increments += basis[-1][:, None] * (weight * d_s)
 
         multiplier = jnp.stack([mu / scale, carry.multiplier[0]])
-        return Pass(q_f, p_f, start, increments, moved, multiplier), (inc, mu, schur if first else None)
+        return Pass(q_f, p_f, start, increments, moved, multiplier), (inc, mu, q_f, schur if first else None)
 
     zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(())
     carry = Pass(equations.q_f, h * equations.p_f, *zero, multiplier)
     scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
     unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
-    end, (fast, mu, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
-    return x._replace(fast=fast, multiplier=mu), end, new if first else schur
+    end, (fast, mu, nodes, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
+    return x._replace(fast=fast, multiplier=mu), end, nodes, new if first else schur
 
 
 def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
@@ -194,16 +194,17 @@ def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
 class March(NamedTuple):
     """State of the iteration: unknowns of this pass, what it left and moved, secant pairs, and how it stands.
 
+    nodes: (num_micro, n_f) fast positions at the micro nodes after the first.
     schur: small matrices of the micro intervals, from the first pass.
-    z, d: slow unknowns of the pass and the update they would get from mass and slow constraint alone.
+    d: the update that the slow unknowns would get from mass and slow constraint alone.
     impulse: on the slow variables over the step, times h.
     residual: largest row of the momentum equations (times h) and largest slow constraint value.
     """
 
     x: Unknowns
-    end: Any
+    end: Pass
+    nodes: Any
     schur: Any
-    z: Any
     d: Any
     pairs: Pairs
     impulse: Any
@@ -247,15 +248,14 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         d, d_nu = solve_saddle(lambda rows: matmul(inverse_form, inverse_slow(rows)), jacobian, push, rows, g)
         return jnp.concatenate([d.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), end.start - pull.sum(0)
 
-    def one_pass(last: March) -> March:
-        first = last.schur is None
-        x, end, schur = march(equations, matrix, last.x, warm.multiplier, last.schur, linear)
+    def one_pass(x: Unknowns, last: March | None = None) -> March:
+        first = last is None
+        x, end, nodes, schur = march(equations, matrix, x, warm.multiplier, None if first else last.schur, linear)
         d, (rows, g), impulse = slow_update(x, end)
-        z = jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
-        pairs = last.pairs
+        pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
             noise = NOISE * eps * (_largest(equations.q_s) + _largest(x.slow))
-            pairs = pairs.add(z - last.z, d - last.d, noise, r * n_s)
+            pairs = pairs.add(joined(x) - joined(last.x), d - last.d, noise, r * n_s)
 
         motion = jnp.maximum(_largest(inverse_fast(h * equations.p_f)), _largest(inverse_fast(end.p_f)))
         others = eps * jnp.maximum(_largest(x.slow), n * motion) + tiny  # variables at rest have no size of their own
@@ -265,46 +265,48 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
             _largest(d[: r * n_s]) / (newton.tolerance * _largest(x.slow) + accepted_slow + others),
             left / (newton.tolerance * motion + accepted_fast + others),
         )
-        settled = change <= 1
-        if newton.fixed_iterations is None:
-            done, spent = settled, last.passes + 1 >= newton.max_iterations
-            running = jnp.where(spent, Result.STAGNATED, RUNNING)
-        else:
-            done, running = last.passes + 1 >= newton.fixed_iterations, jnp.asarray(int(Result.STAGNATED))
-        result = jnp.where(jnp.isfinite(change), jnp.where(settled, Result.CONVERGED, running), Result.NON_FINITE)
-        if n_s:
-            z_new = jnp.where(done, z, z + pairs.corrected(d, r * n_s))
-            slow, nu = slow_unknowns(z_new)
-            x = x._replace(slow=slow, slow_multiplier=nu)
+        goes_on = newton.fixed_iterations is None and passes < newton.max_iterations
+        otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
+        result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
         residual = jnp.maximum(_largest(rows), _largest(mass.fast) * left), _largest(g)
-        return March(x, end, schur, z, d, pairs, impulse, residual, last.passes + 1, result)
+        return March(x, end, nodes, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
 
-    def slow_unknowns(z):
-        return z[: r * n_s].reshape(r, n_s), z[r * n_s :].reshape(r, -1)
+    def next_pass(last: March) -> March:
+        x = last.x
+        if n_s:
+            x = separated(joined(x) + last.pairs.corrected(last.d, r * n_s), x)
+        return one_pass(x, last)
 
-    slow, nu = slow_unknowns(warm.slow.next(r * n_s))
-    x = Unknowns(slow, nu, fast=jnp.zeros((n, r, n_f)), multiplier=jnp.zeros((n, r, n_g)))
-    start = March(x, None, None, None, None, warm.pairs, None, None, jnp.asarray(0), jnp.asarray(RUNNING))
-    done = one_pass(start)
+    def joined(x: Unknowns):
+        return jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
+
+    def separated(z, x: Unknowns) -> Unknowns:
+        return x._replace(slow=z[: r * n_s].reshape(r, n_s), slow_multiplier=z[r * n_s :].reshape(r, -1))
+
+    x = Unknowns(None, None, fast=jnp.zeros((n, r, n_f)), multiplier=jnp.zeros((n, r, n_g)))
+    done = one_pass(separated(warm.slow.next(r * n_s), x))
     if linear:
         exact = np.zeros(()), np.zeros(())
         done = done._replace(residual=exact, passes=np.asarray(1), result=np.asarray(int(Result.CONVERGED)))
     elif newton.fixed_iterations is None:
-        done = jax.lax.while_loop(lambda at: at.result == RUNNING, one_pass, done)
+        done = jax.lax.while_loop(lambda at: at.result == RUNNING, next_pass, done)
     else:
-        done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: one_pass(at), done)
-    rows, g = done.residual
-    done = done._replace(residual=(rows, jnp.maximum(g, _largest(_constraint_values(equations, done.x)))))
+        done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: next_pass(at), done)
+    if n_g:
+        rows, g = done.residual
+        g = jnp.maximum(g, _largest(_constraint_values(equations, done.x, done.nodes)))
+        done = done._replace(residual=(rows, g))
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
-    return done, Warm(warm.slow.add(done.z), done.end.multiplier, done.pairs, jnp.stack([fewest, done.passes]))
+    return done, Warm(warm.slow.add(joined(done.x)), done.end.multiplier, done.pairs, jnp.stack([fewest, done.passes]))
 
 
-def _constraint_values(equations: StepEquations, x: Unknowns):
-    """g (num_micro, r, n_g) at the control nodes after the first."""
+def _constraint_values(equations: StepEquations, x: Unknowns, nodes):
+    """g (num_micro, r, n_g) at the control nodes after the first, with the fast positions at the micro nodes."""
     n, r, _ = x.fast.shape
-    path, slow = equations.path(x), equations.q_s + _along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], x.slow)
+    slow = equations.q_s + _along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], x.slow)
+    fast = jnp.concatenate([equations.q_f[None], nodes[:-1]])[:, None] + x.fast
     times = equations.t + equations.micro_dt * (np.arange(n)[:, None] + control_nodes(r)[1:])
-    return jax.vmap(jax.vmap(equations.system.g))(times, slow, path.fast_start[:, None] + path.fast)
+    return jax.vmap(jax.vmap(equations.system.g))(times, slow, fast)
 
 
 def _inverse_mass(mass):
