@@ -70,20 +70,20 @@ def energy_for_long(full: bool) -> Outcome:
 
 
 def loose_tolerance(full: bool) -> Outcome:
-    """The drift of the energy against the tolerance of Newton's iteration."""
+    """The drift of the energy against the tolerance, where the matrix of Newton's iteration is a crude one."""
     steps, problem = 1_000_000 if full else 100_000, vm.systems.fermi_pasta_ulam()
     changes, details = {}, {}
-    for name, tolerance in {"1e-4": 1e-4, "1e-8": 1e-8, "1e-12, the default": vm.Newton().tolerance}.items():
-        newton = vm.Newton(tolerance=tolerance)
+    newtons = {name: vm.Newton("decoupled", tolerance=float(name)) for name in ("1e-4", "1e-8", "1e-12")}
+    for name, newton in (newtons | {"the default": vm.Newton()}).items():
         trajectory = long_run(problem, vm.fully_implicit(10), CHAIN_DT, steps, newton=newton)
         changes[name] = energy(trajectory, steps)
         details |= {f"{key} {name}": value for key, value in _energy_picture(trajectory).items()}
-    loose, middle, default = changes.values()
+    loose, middle, _, default = changes.values()
     return Outcome(
         "drift of the energy per 1e5 steps: "
         + ", ".join(f"{c.drift:.0e} ({name}: {c.share:.0%} of the band)" for name, c in changes.items()),
         loose.drifts and abs(middle.drift) < abs(loose.drift) / 3 and not default.drifts,
-        {f"drift_{name[:5].strip(',')}": change.drift for name, change in changes.items()},
+        {f"drift_{name.split()[-1]}": change.drift for name, change in changes.items()},
         details,
     )
 
@@ -135,7 +135,7 @@ LONG_RUNS = (
     Case(
         18,
         "loose Newton tolerance",
-        "case 17 with tolerance 1e-4, 1e-8, 1e-12",
+        "case 17 with tolerance 1e-4, 1e-8, 1e-12 (method decoupled), and by default",
         "drift shrinks with the tolerance, the default shows none",
         loose_tolerance,
     ),

@@ -45,7 +45,7 @@ MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
 UNKNOWN = -1
 SAFETY = 10.0
-"""Corrections of a micro interval are taken to shrink from pass to pass by so many times less than they just did."""
+"""Of the tolerance, and of how the corrections of the micro intervals shrink from pass to pass."""
 
 
 class Warm(NamedTuple):
@@ -234,6 +234,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
     inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
     times = equations.t + equations.macro_dt * control_nodes(r)
+    tolerance = newton.tolerance / SAFETY  # what is left of every step adds up
     accepted_slow, accepted_fast = ROUNDOFF * eps * _largest(equations.q_s), ROUNDOFF * eps * _largest(equations.q_f)
 
     def slow_update(x: Unknowns, end: Pass):
@@ -262,8 +263,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         shrink = 1.0 if first else jnp.minimum(SAFETY * end.moved / (last.end.moved + tiny), 1.0)
         left = shrink * end.moved
         change = jnp.maximum(
-            _largest(d[: r * n_s]) / (newton.tolerance * _largest(x.slow) + accepted_slow + others),
-            left / (newton.tolerance * motion + accepted_fast + others),
+            _largest(d[: r * n_s]) / (tolerance * _largest(x.slow) + accepted_slow + others),
+            left / (tolerance * motion + accepted_fast + others),
         )
         goes_on = newton.fixed_iterations is None and passes < newton.max_iterations
         otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
