@@ -85,7 +85,7 @@ class Pass(NamedTuple):
 
     q_f, p_f: end of the last interval, momentum times h.
     start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path.
-    moved: largest correction of an increment.
+    g, moved: largest constraint value that is left, largest correction of an increment.
     multiplier: (2, r, n_g) multipliers lambda of the last two intervals, the last one first.
     """
 
@@ -93,6 +93,7 @@ class Pass(NamedTuple):
     p_f: Any
     start: Any
     increments: Any
+    g: Any
     moved: Any
     multiplier: Any
 
@@ -107,7 +108,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
         linear: one pass is exact, see `solve`.
 
     Returns:
-        (x, what the pass leaves, fast positions (num_micro, n_f) at the micro nodes after the first, schur)
+        (x, what the pass leaves, schur)
     """
     h, (n, r, _), n_g = equations.micro_dt, x.fast.shape, multiplier.shape[2]
     system, scheme = interval_problem(equations.system, equations.scheme)
@@ -156,6 +157,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
         inc, mu, coupling = inc + dx, mu + dmu, change(dx)
         q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
         moved = jnp.maximum(carry.moved, _largest(dx))
+        violated = jnp.maximum(carry.g, _largest(constraints(times[1:], slow_nodes[1:], carry.q_f + inc)))
 
         pull_s = -(pull_s + more_s)
         d_start = d.slow_start + coupling.slow_start + pull_s.sum(0)
@@ -170,14 +172,15 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
             increments += basis[-1][:, None] * (weight * d_s)
 
         multiplier = jnp.stack([mu / scale, carry.multiplier[0]])
-        return Pass(q_f, p_f, start, increments, moved, multiplier), (inc, mu, q_f, schur if first else None)
+        end = Pass(q_f, p_f, start, increments, violated, moved, multiplier)
+        return end, (inc, mu, schur if first else None)
 
-    zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(())
+    zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(()), jnp.zeros(())
     carry = Pass(equations.q_f, h * equations.p_f, *zero, multiplier)
     scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
     unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
-    end, (fast, mu, nodes, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
-    return x._replace(fast=fast, multiplier=mu), end, nodes, new if first else schur
+    end, (fast, mu, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
+    return x._replace(fast=fast, multiplier=mu), end, new if first else schur
 
 
 def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
@@ -194,16 +197,14 @@ def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
 class March(NamedTuple):
     """State of the iteration: unknowns of this pass, what it left and moved, secant pairs, and how it stands.
 
-    nodes: (num_micro, n_f) fast positions at the micro nodes after the first.
     schur: small matrices of the micro intervals, from the first pass.
     d: the update that the slow unknowns would get from mass and slow constraint alone.
     impulse: on the slow variables over the step, times h.
-    residual: largest row of the momentum equations (times h) and largest slow constraint value.
+    residual: largest row of the momentum equations (times h) and largest constraint value.
     """
 
     x: Unknowns
     end: Pass
-    nodes: Any
     schur: Any
     d: Any
     pairs: Pairs
@@ -251,7 +252,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
-        x, end, nodes, schur = march(equations, matrix, x, warm.multiplier, None if first else last.schur, linear)
+        x, end, schur = march(equations, matrix, x, warm.multiplier, None if first else last.schur, linear)
         d, (rows, g), impulse = slow_update(x, end)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
@@ -269,8 +270,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         goes_on = newton.fixed_iterations is None and passes < newton.max_iterations
         otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
         result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
-        residual = jnp.maximum(_largest(rows), _largest(mass.fast) * left), _largest(g)
-        return March(x, end, nodes, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
+        residual = jnp.maximum(_largest(rows), _largest(mass.fast) * left), jnp.maximum(end.g, _largest(g))
+        return March(x, end, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
 
     def next_pass(last: March) -> March:
         x = last.x
@@ -293,21 +294,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         done = jax.lax.while_loop(lambda at: at.result == RUNNING, next_pass, done)
     else:
         done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: next_pass(at), done)
-    if n_g:
-        rows, g = done.residual
-        g = jnp.maximum(g, _largest(_constraint_values(equations, done.x, done.nodes)))
-        done = done._replace(residual=(rows, g))
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
     return done, Warm(warm.slow.add(joined(done.x)), done.end.multiplier, done.pairs, jnp.stack([fewest, done.passes]))
-
-
-def _constraint_values(equations: StepEquations, x: Unknowns, nodes):
-    """g (num_micro, r, n_g) at the control nodes after the first, with the fast positions at the micro nodes."""
-    n, r, _ = x.fast.shape
-    slow = equations.q_s + _along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], x.slow)
-    fast = jnp.concatenate([equations.q_f[None], nodes[:-1]])[:, None] + x.fast
-    times = equations.t + equations.micro_dt * (np.arange(n)[:, None] + control_nodes(r)[1:])
-    return jax.vmap(jax.vmap(equations.system.g))(times, slow, fast)
 
 
 def _inverse_mass(mass):
