@@ -26,6 +26,7 @@ from vmri_jax import (
     systems,
 )
 from vmri_jax.newton import interval
+from vmri_jax.newton.extrapolation import Differences
 from vmri_jax.newton.secant import Pairs
 from vmri_jax.step import Memory, advance, start_memory
 
@@ -60,6 +61,42 @@ def test_methods_agree_with_the_exact_one(name, scheme, macro_dt, method, reques
         )
 
     assert ends_differ(end(method).final_state, end("arrowhead").final_state) < 1e-11  # measured 1e-12
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-9])
+@pytest.mark.parametrize(
+    ("name", "scheme", "macro_dt"),
+    [("fpu", galerkin(4, 2), 0.1), ("tsp", fully_explicit(5), 0.02), ("sam", explicit_slow(5), 0.01)],
+)
+def test_what_is_accepted_is_within_the_tolerance(name, scheme, macro_dt, tolerance, request):
+    problem = request.getfixturevalue(name)
+
+    def positions(newton):
+        run = simulate(problem.system, scheme, problem.state(), macro_dt=macro_dt, num_steps=20, newton=newton)
+        return np.concatenate([run.q_s, run.q_f], axis=1)
+
+    exact = positions(Newton("arrowhead"))
+    motion = np.abs(np.diff(exact, axis=0)).max()
+    assert (
+        np.abs(positions(Newton("march", tolerance)) - exact).max() < tolerance * motion
+    )  # measured at most 0.14 of it
+
+
+def test_two_passes_where_the_slow_motion_is_smooth(tsp):
+    run = simulate(tsp.system, fully_explicit(10), tsp.state(), macro_dt=0.002, num_steps=500)
+    assert np.asarray(run.info.iterations).mean() < 2.3  # measured 2.1
+
+
+def test_extrapolation_takes_the_order_that_was_best():
+    n = np.arange(12.0)
+    smooth, rough = 2 - n + 0.5 * n**3, np.random.default_rng(0).normal(size=12)
+    for values, error in ((smooth, 1e-10), (rough, 5.0)):
+        past = Differences.constant(jnp.asarray(values[:1]))
+        for x in values[1:-1]:
+            past = past.add(jnp.asarray([x]))
+        assert abs(past.next(1)[0] - values[-1]) < error
+    gap = past.add(jnp.asarray([jnp.nan])).add(jnp.asarray([7.0]))
+    assert gap.next(1)[0] == 7.0  # a step that failed leaves no trace in the ones after
 
 
 def drag(t, q_s, q_f, v_s, v_f, params):
