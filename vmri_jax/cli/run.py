@@ -95,7 +95,10 @@ def simulate(
         raise typer.Exit(_print_stop(stopped, saved, streamed))
     pieces = [trajectory] if isinstance(trajectory, vm.Trajectory) else trajectory.chunks()
     now = steps - (0 if before is None else before.step)
-    console.print(_summary(pieces, steps, chosen.num_micro, now, seconds, sum(compiling), saved))
+    summary = _summary(pieces, steps, chosen.num_micro, now, seconds, sum(compiling), saved)
+    if not problem.system.is_constrained:
+        del summary["constraint residual"]
+    console.print(_two_columns(summary))
 
 
 def _run(run, problem, scheme, arguments: dict):
@@ -153,7 +156,7 @@ def _summary(
     seconds: float,
     compiling: float,
     saved: list[str],
-) -> Table:
+) -> dict[str, str]:
     """About a run, read piece by piece, of which `now` macro steps took these seconds."""
     found = np.array([_extremes(piece) for piece in pieces])
     t_start, energy = found[0, :2]
@@ -161,16 +164,19 @@ def _summary(
     position, velocity, method, iterations = found[:, 5:].max(axis=0)
     absolute = abs(energy) <= 1e-12
     change = max(found[:, 4].max() - energy, energy - found[:, 3].min()) / (1.0 if absolute else abs(energy))
-    rows = {
+    return {
         "macro steps": f"{steps}, of {num_micro} micro steps each",
         "simulated time": f"{t_start:g} to {t_end:g}",
         "wall time": f"{seconds:.2f} s, of which {compiling:.2f} s compiling",
         "per micro step": f"{1e6 * max(seconds - compiling, 0.0) / (now * num_micro):.3g} µs" if now else "",
         "Newton iterations": f"at most {int(iterations)} per step, {vm.Method(int(method)).name.lower()}",
         "energy change": f"at most {change:.2e}{'' if absolute else ' of the energy at the start'}",
-        "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if position > 0 else "",
+        "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities",
         "saved": ", ".join(saved) if saved else "nothing; give --out run.npz or --plot run.png",
     }
+
+
+def _two_columns(rows: dict[str, str]) -> Table:
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in rows.items():
         if value:
