@@ -39,7 +39,7 @@ from vmri_jax.results import RUNNING, Result
 
 ROUNDOFF = 4.0
 """Changes of the positions below so many units of round-off are accepted."""
-NOISE = 1e3
+NOISE = 3e3
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
