@@ -99,13 +99,17 @@ def fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)
 
 
-def is_explicit(system: System, scheme: Scheme) -> bool:
-    """Whether a single micro interval is a straight drift between kicks."""
+def is_drift(system: System, scheme: Scheme) -> bool:
+    """Whether on a single micro interval, kicks aside, only kinetic energy of constant masses and constraints are left."""
     terms = lagrangian(system, scheme).terms
     return (
         scheme.num_micro == scheme.degree == 1
         and isinstance(system.kinetic, ConstantMass)
-        and not system.is_constrained
         and system.force is None
         and not any(term.inside.groups for term in terms if isinstance(term, Term))
     )
+
+
+def is_explicit(system: System, scheme: Scheme) -> bool:
+    """Whether a step is a straight drift between kicks."""
+    return is_drift(system, scheme) and not system.is_constrained

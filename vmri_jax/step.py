@@ -7,7 +7,7 @@ The route is chosen statically, by `split` and `is_explicit`:
 * *split*: if, kicks aside, the slow equations do not see the fast unknowns, the slow variables make one step over the
   macro interval and the fast ones num_micro steps over the micro intervals, each a problem of the same kind;
 * *explicit*: an interval on which nothing but constant-mass kinetic energy is left is a straight drift, no Newton;
-* *coupled*: everything else is solved at once by Newton's iteration.
+* *coupled*: everything else is solved at once by Newton's iteration; a drift along constraints for the multipliers alone.
 """
 
 import dataclasses
@@ -22,12 +22,12 @@ from vmri_jax.algebra import ELEMENTWISE
 from vmri_jax.composition import Composition
 from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
-from vmri_jax.newton import Newton, Warm, interval_matrix, is_constant, solve
+from vmri_jax.newton import Newton, drift, interval_matrix, is_constant, march, solve
 from vmri_jax.path import control_nodes
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
-from vmri_jax.split import fast_alone, is_explicit, split
+from vmri_jax.split import fast_alone, is_drift, is_explicit, split
 from vmri_jax.state import State, project_momentum
 from vmri_jax.system import ConstantMass, System
 
@@ -118,13 +118,16 @@ def start_memory(
     average = averaging(system, scheme, macro_dt, newton)
     kicks = _kick_gradients(own, scheme, state.q_s, state.q_f, average)
     matrix = warm = None
-    if parts is None and not is_explicit(system, scheme) and newton.marches(system, scheme):
+    solved = parts is None and not is_explicit(system, scheme) and newton.marches(system, scheme)
+    if solved and is_drift(system, scheme):
+        warm = drift.Warm.none(n_g + n_gs)
+    elif solved:
         equations = _equations(system, scheme, state, macro_dt)
         if is_constant(system, scheme, state.q_s, state.q_f):
             matrix = interval_matrix(equations)
         else:  # renewed by every macro step
             matrix = jax.tree.map(lambda a: jnp.zeros(a.shape), jax.eval_shape(interval_matrix, equations))
-        warm = Warm.straight(control_nodes(scheme.degree)[1:, None] * (macro_dt * velocity[0]), n_g, n_gs)
+        warm = march.Warm.straight(control_nodes(scheme.degree)[1:, None] * (macro_dt * velocity[0]), n_g, n_gs)
     kept = None if isinstance(system.kinetic, ConstantMass) else velocity  # there momenta say the same
     return Memory(kicks, kept, jnp.zeros(n_g), jnp.zeros(n_gs), matrix, warm, memories)
 

@@ -128,7 +128,7 @@ def tolerances(first: float, last: float, per_decade: int = 2) -> list[float]:
     return [float(x) for x in np.geomspace(first, last, count)]
 
 
-def step_counts(first: float, last: float, per_octave: int = 2) -> list[int]:
+def step_counts(first: float, last: float, per_octave: int = 4) -> list[int]:
     """Numbers of steps from `first` up to `last`."""
     count = round(per_octave * np.log2(last / first)) + 1
     return sorted({max(1, round(x)) for x in np.geomspace(first, last, count)})

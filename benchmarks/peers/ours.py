@@ -13,7 +13,7 @@ from benchmarks.peers.cases import Case, Ladder, step_counts
 from vmri_jax.composition import stage_scheme
 from vmri_jax.simulate import run, run_memory
 
-COMPOSED = {"kahan-li8": (2, 4), "kahan-li6": (2, 4), "suzuki4": (2, 4, 8)}
+COMPOSED = {"kahan-li8": (1, 2, 4), "kahan-li6": (1, 2, 4), "suzuki4": (1, 2, 4, 8)}
 """Compositions of `vm.fully_explicit` that are tried, with numbers of micro steps; the finest first."""
 EXPLICIT = (4, 8, 16)
 """Numbers of micro steps of `vm.fully_explicit` on its own."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import inverse, matvec, regularized, solve
+from vmri_jax.algebra import inverse, matmul, matvec, regularized, solve
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.equations import StepEquations
 from vmri_jax.linearization import linearize
@@ -15,6 +15,11 @@ from vmri_jax.quadrature import micro, midpoint
 from vmri_jax.scheme import Scheme
 from vmri_jax.structure import has_constant_hessian, has_diagonal_hessian
 from vmri_jax.system import ConstantMass, System
+
+ROUNDOFF = 4.0
+"""Changes of the positions below so many units of round-off are accepted."""
+SAFETY = 10.0
+"""Of the tolerance, and of how corrections shrink from one iteration to the next."""
 
 
 def can_be_cut(system: System, scheme: Scheme) -> bool:
@@ -29,6 +34,15 @@ def constant_mass(system: System) -> ConstantMass:
     """The masses of a system that can be cut."""
     assert isinstance(system.kinetic, ConstantMass)
     return system.kinetic
+
+
+def inverse_mass(mass):
+    """``p -> M^-1 p``, with the inverse computed once."""
+    if mass.ndim == 1:
+        inverse_diagonal = 1 / mass
+        return lambda p: inverse_diagonal * p
+    matrix = inverse(mass)
+    return lambda p: matmul(jnp.atleast_2d(p), matrix).reshape(p.shape)
 
 
 def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:

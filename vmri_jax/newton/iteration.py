@@ -9,10 +9,11 @@ import numpy as np
 
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
-from vmri_jax.newton import arrowhead, full, march
+from vmri_jax.newton import arrowhead, drift, full, march
 from vmri_jax.newton.interval import can_be_cut, is_linear
 from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result
+from vmri_jax.split import is_drift
 
 Choice = Literal["auto", "march", "frozen", "decoupled", "arrowhead", "dense"]
 
@@ -30,7 +31,8 @@ class Newton(eqx.Module):
 
     "auto" takes "march" where the terms can be cut into micro intervals (constant masses, potentials on the micro grid
     or kicks at the macro nodes), and "arrowhead" where they cannot or where "march" does not converge; which one it was
-    is in ``StepInfo.method`` and ``Trajectory.info.method``.
+    is in ``StepInfo.method`` and ``Trajectory.info.method``. Where a step is a single drift along the constraints between kicks
+    (``fully_explicit(1)``: RATTLE) "march" solves for the multipliers alone.
 
     Args:
         method: as above.
@@ -117,14 +119,10 @@ def solve(
 
     fixed, guess, matrix, warm = jax.lax.stop_gradient((equations, guess, matrix, warm))
     if marches:
-        done, warm = march.solve(fixed, matrix, warm, newton, linear=False)
-        p_s, p_f = _momenta_after(fixed, done)
-        residual, method = relative_residual(fixed, *done.residual), np.asarray(int(Method.MARCH))
-        result = _kept(done.result, equations, done.residual[1], newton)
-        found = Solution(done.x, done.end.q_f, p_s, p_f, residual, result, done.passes, method)
+        found, warm = _by_march(fixed, matrix, warm, newton)
         if newton.falls_back:
             found = jax.lax.cond(
-                result <= Result.CONVERGED_AT_ROUNDOFF,
+                found.result <= Result.CONVERGED_AT_ROUNDOFF,
                 lambda: found,
                 lambda: _over_all_unknowns(fixed, guess, newton, "arrowhead"),
             )
@@ -133,6 +131,21 @@ def solve(
         found = _over_all_unknowns(fixed, guess, newton, method)
     x, end = _differentiable(equations, found.x, (found.q_f, found.p_s, found.p_f))
     return Solution(x, *end, *found[4:]), warm
+
+
+def _by_march(equations: StepEquations, matrix, warm, newton: Newton) -> tuple[Solution, Any]:
+    """By the nested march; where a step is a drift only the multipliers are solved for."""
+    if is_drift(equations.system, equations.scheme):
+        done, x, end, warm = drift.solve(equations, warm, newton)
+        rows, g, iterations = 0.0, _largest(done.g), done.iterations
+    else:
+        done, warm = march.solve(equations, matrix, warm, newton, linear=False)
+        x, end, iterations = done.x, (done.end.q_f, *_momenta_after(equations, done)), done.passes
+        rows, g = done.residual
+    result = _kept(done.result, equations, g, newton)
+    return Solution(
+        x, *end, relative_residual(equations, rows, g), result, iterations, np.asarray(int(Method.MARCH))
+    ), warm
 
 
 def _momenta_after(equations: StepEquations, done: march.March):

@@ -27,9 +27,12 @@ from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.newton.extrapolation import Differences
 from vmri_jax.newton.interval import (
+    ROUNDOFF,
+    SAFETY,
     IntervalMatrix,
     constant_mass,
     interval_problem,
+    inverse_mass,
     is_explicit_given_multipliers,
     solve_saddle,
 )
@@ -37,15 +40,11 @@ from vmri_jax.newton.secant import SIZE, Pairs
 from vmri_jax.path import control_nodes
 from vmri_jax.results import RUNNING, Result
 
-ROUNDOFF = 4.0
-"""Changes of the positions below so many units of round-off are accepted."""
 NOISE = 3e3
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
 UNKNOWN = -1
-SAFETY = 10.0
-"""Of the tolerance, and of how the corrections of the micro intervals shrink from pass to pass."""
 
 
 class Warm(NamedTuple):
@@ -115,7 +114,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
     kicks = lagrangian(system, scheme).kicks if n > 1 else ()
     explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
     basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # (n, r + 1, r): slow position at each node by increments
-    inverse_mass = _inverse_mass(constant_mass(system).fast)
+    velocity = inverse_mass(constant_mass(system).fast)
     first = schur is None
     constraints = jax.vmap(system.g)
 
@@ -129,7 +128,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
             mu = scale * (2 * carry.multiplier[0] - carry.multiplier[1])
             inc = jnp.zeros((r, carry.q_f.size))
             if not linear:  # then any start does
-                inc += control_nodes(r)[1:, None] * inverse_mass(carry.p_f)
+                inc += control_nodes(r)[1:, None] * velocity(carry.p_f)
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
@@ -231,7 +230,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     n_g = warm.multiplier.shape[2]
     eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
     mass = constant_mass(system)
-    inverse_slow, inverse_fast = _inverse_mass(mass.slow), _inverse_mass(mass.fast)
+    inverse_slow, inverse_fast = inverse_mass(mass.slow), inverse_mass(mass.fast)
     kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
     inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
     times = equations.t + equations.macro_dt * control_nodes(r)
@@ -296,15 +295,6 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: next_pass(at), done)
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
     return done, Warm(warm.slow.add(joined(done.x)), done.end.multiplier, done.pairs, jnp.stack([fewest, done.passes]))
-
-
-def _inverse_mass(mass):
-    """``p -> M^-1 p``, with the inverse computed once."""
-    if mass.ndim == 1:
-        inverse_diagonal = 1 / mass
-        return lambda p: inverse_diagonal * p
-    matrix = inverse(mass)
-    return lambda p: matmul(jnp.atleast_2d(p), matrix).reshape(p.shape)
 
 
 def _along(weights, increments):

@@ -2,7 +2,7 @@
 
 Stage 1 takes every family of `menu.families` with a middling num_micro and finds the largest macro step that keeps the
 error, giving up on a family as soon as it is much slower than the best so far. Stage 2 varies num_micro of the best
-families, uphill from where they stand. Stage 3 times the best settings in turn.
+families, uphill from where they stand, and tries them with one micro step. Stage 3 times the best settings in turn.
 """
 
 import time
@@ -162,6 +162,7 @@ class Search:
         if not exhaustive:
             firsts = sorted(reached.values(), key=lambda s: s.row.seconds)[:KEPT]
             for i, first in enumerate(firsts):
+                attempt(first.family, 1, len(self.menu) + i, total)  # a case of its own: slow and fast share their grid
                 for direction in (1, -1):
                     at, best = NUM_MICRO.index(FIRST) + direction, first
                     while 0 <= at < len(NUM_MICRO):

@@ -1,0 +1,113 @@
+"""Drift along the constraints: a step on which nothing is left but kinetic energy of constant masses and constraints.
+
+The increments ``x = M^-1 (h p - G_0^T mu)`` follow from the multipliers, so that ``g(q + x) = 0`` is solved for these alone.
+The matrix is ``G_1 M^-1 G_0^T`` at the position that the multipliers of the steps before lead to. With kicks before and
+after this is RATTLE (Andersen 1983).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.algebra import inverse, matvec, regularized
+from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales
+from vmri_jax.newton.interval import ROUNDOFF, SAFETY, constant_mass, inverse_mass
+from vmri_jax.results import RUNNING, Result
+
+
+class Warm(NamedTuple):
+    """What a step hands to the next one: (2, n_g + n_gs) multipliers of the last steps, the last one first."""
+
+    multiplier: Any
+
+    @classmethod
+    def none(cls, num_constraints: int) -> "Warm":
+        """The start of a run."""
+        return cls(jnp.zeros((2, num_constraints)))
+
+
+class Drift(NamedTuple):
+    """State of the iteration: increments x (n_s + n_f,), scaled multipliers mu, constraint values g there, and its result.
+
+    dx, dmu: the corrections that g asks for.
+    """
+
+    x: Any
+    mu: Any
+    g: Any
+    dx: Any
+    dmu: Any
+    iterations: Any
+    result: Any
+
+
+def solve(equations: StepEquations, warm: Warm, newton):
+    """Correct the multipliers until one more correction would change no increment.
+
+    Accepted are changes of ``newton.tolerance / SAFETY`` relative to the motion of the slow and of the fast variables, and
+    round-off of the positions.
+
+    Returns:
+        (state of the iteration, unknowns, (q_f, p_s, p_f) at the end, warm)
+    """
+    system, h = equations.system, equations.macro_dt
+    q, n_s = jnp.concatenate([equations.q_s, equations.q_f]), equations.q_s.size
+    mass = constant_mass(system)
+    velocity_s, velocity_f = inverse_mass(mass.slow), inverse_mass(mass.fast)
+
+    def constraints(t, q):
+        return system.constraints(t, q[:n_s], q[n_s:])
+
+    jacobian = jax.jacrev(constraints, argnums=1)(equations.t, q)
+    columns = jnp.concatenate([velocity_s(jacobian[:, :n_s]), velocity_f(jacobian[:, n_s:])], axis=1)
+    free = h * jnp.concatenate([velocity_s(equations.p_s), velocity_f(equations.p_f)])
+
+    n_g, n_gs = system.num_constraints(equations.q_s, equations.q_f)
+    scales = multiplier_scales(equations.scheme, h)
+    scale = jnp.concatenate([jnp.broadcast_to(a.reshape(-1)[:1], n) for a, n in zip(scales, (n_g, n_gs), strict=True)])
+    mu = scale * (2 * warm.multiplier[0] - warm.multiplier[1])
+    x = free - _combined(mu, columns)
+    g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
+    schur = inverse(regularized(jax.vmap(push)(columns).T))
+    per = _inverse_of_accepted(q, free, n_s, newton.tolerance / SAFETY)
+
+    def at(x, mu, g, iterations) -> Drift:
+        dmu = matvec(schur, g)
+        dx = _combined(dmu, columns)
+        change = jnp.max(jnp.abs(dx) * per)
+        goes_on = newton.fixed_iterations is None and iterations < newton.max_iterations
+        otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
+        result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
+        return Drift(x, mu, g, dx, dmu, jnp.asarray(iterations), result)
+
+    def corrected(last: Drift) -> Drift:
+        x = last.x - last.dx
+        return at(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
+
+    done = at(x, mu, g, 0)
+    if newton.fixed_iterations is None:
+        done = jax.lax.while_loop(lambda last: last.result == RUNNING, corrected, done)
+    else:
+        done = jax.lax.fori_loop(0, newton.fixed_iterations, lambda _, last: corrected(last), done)
+
+    impulse = _combined(done.mu, jacobian) / h
+    x, mu = done.x, done.mu
+    end = equations.q_f + x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
+    unknowns = Unknowns(x[None, :n_s], mu[None, n_g:], x[None, None, n_s:], mu[None, None, :n_g])
+    return done, unknowns, end, Warm(jnp.stack([mu / scale, warm.multiplier[0]]))
+
+
+def _combined(mu, rows):
+    """``sum_j mu_j rows_j``."""
+    return jnp.sum(mu[:, None] * rows, axis=0)
+
+
+def _inverse_of_accepted(q, motion, n_s: int, tolerance):
+    """One over the changes of the increments that are accepted, per coordinate."""
+    eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
+    size = tolerance * jnp.abs(motion) + ROUNDOFF * eps * jnp.abs(q)
+    slow, fast = (jnp.max(part, initial=tiny) for part in (size[:n_s], size[n_s:]))
+    least = eps / tolerance * jnp.maximum(slow, fast)  # variables at rest have no size of their own
+    per = (1 / jnp.maximum(part, least) for part in (slow, fast))
+    return jnp.concatenate([jnp.broadcast_to(a, n) for a, n in zip(per, (n_s, q.size - n_s), strict=True)])
