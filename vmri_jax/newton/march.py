@@ -40,7 +40,7 @@ from vmri_jax.newton.secant import SIZE, Pairs
 from vmri_jax.path import control_nodes
 from vmri_jax.results import RUNNING, Result
 
-NOISE = 3e3
+NOISE = 1.5e3
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
