@@ -23,6 +23,10 @@ from vmri_jax.trajectory import Trajectory
 WORKING_SET = 32768
 """Numbers that the lanes of a chunk may hold together, 256 kB: well within the second-level cache."""
 
+COMPILER_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""} if jax.__version_info__[:2] == (0, 10) else {}
+"""Sums over some thousand numbers stay in the loop: handed to a library, as XLA does there, they keep a loop from being
+compiled into one kernel. The option is that of the versions of JAX it was tried with; others refuse what they do not know."""
+
 
 def simulate_batch(
     system: System,
@@ -191,7 +195,7 @@ def _join(pieces, lanes: int) -> Trajectory:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:lanes], *pieces)
 
 
-@partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"))
+@partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"), compiler_options=COMPILER_OPTIONS)
 def _side_by_side(system, scheme, macro_dt, newton, batch, devices, *, num_saves, save_every, save_micro) -> Trajectory:
     def together(system, scheme, macro_dt, newton, save_every, batch):
         def lane(batch):
