@@ -23,9 +23,12 @@ from vmri_jax.trajectory import Trajectory
 WORKING_SET = 32768
 """Numbers that the lanes of a chunk may hold together, 256 kB: well within the second-level cache."""
 
-COMPILER_OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""} if jax.__version_info__[:2] == (0, 10) else {}
-"""Sums over some thousand numbers stay in the loop: handed to a library, as XLA does there, they keep a loop from being
-compiled into one kernel. The option is that of the versions of JAX it was tried with; others refuse what they do not know."""
+COMPILER_OPTIONS: dict = {}
+"""For the program of a batch: vector registers are filled, where the compiler would else take half of the widest; and sums over
+some thousand numbers stay in the loop, since handed to a library, as XLA does, they keep it from being one kernel. The options
+are those of the versions of JAX they were tried with; others refuse what they do not know."""
+if jax.__version_info__[:2] == (0, 10):
+    COMPILER_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_experimental_ynn_fusion_type": ""}
 
 
 def simulate_batch(

@@ -12,7 +12,10 @@ from pathlib import Path
 
 import jax
 
-FAST_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000"
+FAST_LOOPS = (
+    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000,-memdep-block-scan-limit=10000"
+)
+"""An option of XLA and one of LLVM: how far back a load is traced to the store it could be replaced by."""
 DEVICES = "--xla_force_host_platform_device_count="
 
 
@@ -20,9 +23,9 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
     """Set up JAX for this toolkit; 64-bit floats are switched on.
 
     Args:
-        fast_loops: compile a loop whose buffers are below 100 MB (instead of a few kB) into one kernel. Loops here have
-            many small operations, and a call for each of them costs more than the operation: without, a macro step of a
-            small system takes 2 to 5 times as long.
+        fast_loops: compile a loop whose buffers are below 100 MB (instead of a few kB) into one kernel, and optimise memory
+            accesses across all of it. Loops here have many small operations, and a call for each of them costs more than the
+            operation: without, a macro step of a small system takes 2 to 5 times as long.
         devices: number of CPU devices, for `vmri_jax.simulate_batch(..., devices=...)`; one device uses one core.
         cache: folder in which compiled programs are kept between processes.
 

@@ -23,7 +23,6 @@ from vmri_jax.composition import Composition
 from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
 from vmri_jax.newton import Newton, drift, interval_matrix, is_constant, march, solve
-from vmri_jax.path import control_nodes
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
@@ -127,7 +126,7 @@ def start_memory(
             matrix = interval_matrix(equations)
         else:  # renewed by every macro step
             matrix = jax.tree.map(lambda a: jnp.zeros(a.shape), jax.eval_shape(interval_matrix, equations))
-        warm = march.Warm.straight(control_nodes(scheme.degree)[1:, None] * (macro_dt * velocity[0]), n_g, n_gs)
+        warm = march.Warm.straight(equations, velocity[0])
     kept = None if isinstance(system.kinetic, ConstantMass) else velocity  # there momenta say the same
     return Memory(kicks, kept, jnp.zeros(n_g), jnp.zeros(n_gs), matrix, warm, memories)
 
@@ -201,7 +200,7 @@ def _advance_stages(system, scheme, state, macro_dt, newton, memory: Stages):
 def _at_same_point(own: Memory, last: Memory) -> Memory:
     """What a stage learned in the macro step before, with what belongs to its starting point from the stage before."""
     parts = None if own.parts is None else tuple(map(_at_same_point, own.parts, last.parts))
-    warm = None if own.warm is None else own.warm._replace(multiplier=last.warm.multiplier)
+    warm = None if own.warm is None else own.warm.after(last.warm)
     return last._replace(matrix=own.matrix, warm=warm, parts=parts)
 
 

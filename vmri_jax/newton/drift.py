@@ -26,6 +26,10 @@ class Warm(NamedTuple):
         """The start of a run."""
         return cls(jnp.zeros((2, num_constraints)))
 
+    def after(self, last: "Warm") -> "Warm":
+        """What a stage of a composition starts from: all of it belongs to the stage before."""
+        return last
+
 
 class Drift(NamedTuple):
     """State of the iteration: increments x (n_s + n_f,), scaled multipliers mu, constraint values g there, and its result.

@@ -1,10 +1,10 @@
-"""Extrapolation of the unknowns from step to step, by backward differences of the order that was best in the last step."""
+"""Extrapolation of the unknowns: the slow ones from step to step, the fast ones from micro interval to micro interval."""
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-ORDER = 6
+ORDER = 10
 """Highest order of the polynomials."""
 
 
@@ -34,3 +34,38 @@ class Differences(NamedTuple):
         for before in self.values[:-1]:
             rows.append(rows[-1] - before)
         return Differences(jnp.stack(rows))
+
+
+class Line(NamedTuple):
+    """Values of the micro intervals one after the other, extrapolated by the line through the last two.
+
+    A kick at the macro nodes lets the first value of every macro step stand out from its neighbours.
+
+    last (2, ...): of the last two intervals, the last one first, without what stands out.
+    jump (...): by how much the first one stands out; None without kicks.
+    """
+
+    last: Any
+    jump: Any
+
+    @classmethod
+    def zero(cls, shape: tuple[int, ...], kicked: bool) -> "Line":
+        """The start of a run."""
+        return cls(jnp.zeros((2, *shape)), jnp.zeros(shape) if kicked else None)
+
+    def next(self, m):
+        """The value that is expected in interval m of a macro step."""
+        ahead = 2 * self.last[0] - self.last[1]
+        return ahead if self.jump is None else ahead + jnp.where(m == 0, self.jump, 0.0)
+
+    def add(self, m, value) -> "Line":
+        """With the value of interval m."""
+        before, jump = self.last, self.jump
+        if jump is not None:
+            value = value - jnp.where(m == 0, jump, 0.0)
+            jump = jump + jnp.where(m == 1, before[0] - (before[1] + value) / 2, 0.0)
+        return Line(jnp.stack([value, before[0]]), jump)
+
+    def after(self, other: "Line") -> "Line":
+        """Going on where another line ended."""
+        return self._replace(last=other.last)

@@ -30,6 +30,12 @@ def can_be_cut(system: System, scheme: Scheme) -> bool:
     return isinstance(system.kinetic, ConstantMass) and local and force
 
 
+def has_kicks(system: System, scheme: Scheme) -> bool:
+    """Whether a potential acts at the macro nodes."""
+    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
+    return any(f is not None and placed.grid == "macro" for f, placed in potentials)
+
+
 def constant_mass(system: System) -> ConstantMass:
     """The masses of a system that can be cut."""
     assert isinstance(system.kinetic, ConstantMass)

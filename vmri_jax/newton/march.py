@@ -25,12 +25,13 @@ import numpy as np
 from vmri_jax.algebra import inverse, matmul, matvec, regularized
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
-from vmri_jax.newton.extrapolation import Differences
+from vmri_jax.newton.extrapolation import Differences, Line
 from vmri_jax.newton.interval import (
     ROUNDOFF,
     SAFETY,
     IntervalMatrix,
     constant_mass,
+    has_kicks,
     interval_problem,
     inverse_mass,
     is_explicit_given_multipliers,
@@ -40,7 +41,7 @@ from vmri_jax.newton.secant import SIZE, Pairs
 from vmri_jax.path import control_nodes
 from vmri_jax.results import RUNNING, Result
 
-NOISE = 1.5e3
+NOISE = 3e2
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
@@ -51,23 +52,37 @@ class Warm(NamedTuple):
     """What a macro step hands to the next one.
 
     slow: slow unknowns (r n_s + r n_gs,) of the last steps.
-    multiplier (2, r, n_g): multipliers lambda of the last micro intervals, the last one first.
+    multiplier, bend: multipliers lambda (r, n_g) of the last micro intervals, and by how much their fast increments (r, n_f)
+        left the straight line, over h^2 (none of them where increments follow from the multipliers).
     pairs: secant pairs of the slow unknowns.
     passes: (2,) fewest of a step with this matrix of the micro intervals (UNKNOWN before one), and those of the last step.
     """
 
     slow: Differences
-    multiplier: Any
+    multiplier: Line
+    bend: Line
     pairs: Pairs
     passes: Any
 
     @classmethod
-    def straight(cls, increments, n_g: int, n_gs: int) -> "Warm":
-        """The start of a run: straight motion with slow increments (r, n_s), no multipliers."""
-        r, n_s = increments.shape
+    def straight(cls, equations: StepEquations, velocity) -> "Warm":
+        """The start of a run: straight motion with a slow velocity (n_s,), no multipliers."""
+        system, scheme, n_s, n_f = equations.system, equations.scheme, equations.q_s.size, equations.q_f.size
+        r, (n_g, n_gs) = scheme.degree, system.num_constraints(equations.q_s, equations.q_f)
+        increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity)
         slow = Differences.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
+        kicked = scheme.num_micro > 1 and has_kicks(system, scheme)
+        halved = (
+            scheme.num_micro > 1 and system.constraint is not None
+        )  # the constraint force of a macro node is shared
+        free = 0 if is_explicit_given_multipliers(system, scheme) else n_f
+        lines = Line.zero((r, n_g), kicked), Line.zero((r, free), kicked or halved)
         pairs = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
-        return cls(slow, jnp.zeros((2, r, n_g)), pairs, jnp.array([0, 2 * MORE]))
+        return cls(slow, *lines, pairs, jnp.array([0, 2 * MORE]))
+
+    def after(self, last: "Warm") -> "Warm":
+        """What a stage of a composition has learned, going on where the stage before it ended."""
+        return self._replace(multiplier=self.multiplier.after(last.multiplier), bend=self.bend.after(last.bend))
 
     @property
     def is_stale(self):
@@ -85,7 +100,7 @@ class Pass(NamedTuple):
     q_f, p_f: end of the last interval, momentum times h.
     start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path.
     g, moved: largest constraint value that is left, largest correction of an increment.
-    multiplier: (2, r, n_g) multipliers lambda of the last two intervals, the last one first.
+    multiplier, bend: as in `Warm`.
     """
 
     q_f: Any
@@ -94,22 +109,23 @@ class Pass(NamedTuple):
     increments: Any
     g: Any
     moved: Any
-    multiplier: Any
+    multiplier: Line
+    bend: Line
 
 
-def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multiplier, schur=None, linear=False):
+def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None, linear=False):
     """One pass over the micro intervals: fast unknowns corrected for the given slow ones, and what they leave.
 
     Args:
-        multiplier: (2, r, n_g) multipliers lambda of the last two intervals of the macro step before.
-        schur: (num_micro, r n_g, r n_g) inverses of ``G K^-1 G^T``. In the first pass there are none: they are computed,
-            fast increments start from straight motion, multipliers from the line through the last two.
+        warm: multipliers and bends of the macro step before.
+        schur: (num_micro, r n_g, r n_g) inverses of ``G K^-1 G^T``. In the first pass there are none: they are computed, and
+            multipliers and bends start from the line through the last two.
         linear: one pass is exact, see `solve`.
 
     Returns:
         (x, what the pass leaves, schur)
     """
-    h, (n, r, _), n_g = equations.micro_dt, x.fast.shape, multiplier.shape[2]
+    h, (n, r, _), n_g = equations.micro_dt, x.fast.shape, x.multiplier.shape[2]
     system, scheme = interval_problem(equations.system, equations.scheme)
     kicks = lagrangian(system, scheme).kicks if n > 1 else ()
     explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
@@ -124,11 +140,12 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
         none = jnp.zeros_like(q_s), jnp.zeros_like(carry.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, carry.q_f, *none, h)
         slow_nodes, times = jnp.concatenate([q_s[None], q_s + steps]), local.t + h * control_nodes(r)
+        straight = control_nodes(r)[1:, None] * velocity(carry.p_f)
         if first:
-            mu = scale * (2 * carry.multiplier[0] - carry.multiplier[1])
-            inc = jnp.zeros((r, carry.q_f.size))
-            if not linear:  # then any start does
-                inc += control_nodes(r)[1:, None] * velocity(carry.p_f)
+            mu = scale * carry.multiplier.next(m)
+            inc = jnp.zeros_like(straight)
+            if not linear and not explicit:  # then any start does
+                inc = straight + h**2 * carry.bend.next(m)
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
@@ -170,12 +187,14 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, multipl
             start, p_f = start + weight * d_s, p_f + weight * d_f
             increments += basis[-1][:, None] * (weight * d_s)
 
-        multiplier = jnp.stack([mu / scale, carry.multiplier[0]])
-        end = Pass(q_f, p_f, start, increments, violated, moved, multiplier)
+        multiplier, bend = carry.multiplier.add(m, mu / scale), carry.bend
+        if not explicit:
+            bend = bend.add(m, (inc - straight) / h**2)
+        end = Pass(q_f, p_f, start, increments, violated, moved, multiplier, bend)
         return end, (inc, mu, schur if first else None)
 
     zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(()), jnp.zeros(())
-    carry = Pass(equations.q_f, h * equations.p_f, *zero, multiplier)
+    carry = Pass(equations.q_f, h * equations.p_f, *zero, warm.multiplier, warm.bend)
     scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
     unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
     end, (fast, mu, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
@@ -227,7 +246,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     """
     system, scheme, h = equations.system, equations.scheme, equations.micro_dt
     n, r, n_s, n_f = scheme.num_micro, scheme.degree, equations.q_s.shape[0], equations.q_f.shape[0]
-    n_g = warm.multiplier.shape[2]
+    n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
     eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
     mass = constant_mass(system)
     inverse_slow, inverse_fast = inverse_mass(mass.slow), inverse_mass(mass.fast)
@@ -251,7 +270,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
-        x, end, schur = march(equations, matrix, x, warm.multiplier, None if first else last.schur, linear)
+        x, end, schur = march(equations, matrix, x, warm, None if first else last.schur, linear)
         d, (rows, g), impulse = slow_update(x, end)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
@@ -294,7 +313,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     else:
         done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: next_pass(at), done)
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
-    return done, Warm(warm.slow.add(joined(done.x)), done.end.multiplier, done.pairs, jnp.stack([fewest, done.passes]))
+    slow, passes = warm.slow.add(joined(done.x)), jnp.stack([fewest, done.passes])
+    return done, Warm(slow, done.end.multiplier, done.end.bend, done.pairs, passes)
 
 
 def _along(weights, increments):
