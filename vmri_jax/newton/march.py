@@ -35,6 +35,7 @@ from vmri_jax.newton.interval import (
     interval_problem,
     inverse_mass,
     is_explicit_given_multipliers,
+    is_linear,
     solve_saddle,
 )
 from vmri_jax.newton.secant import SIZE, Pairs
@@ -53,7 +54,7 @@ class Warm(NamedTuple):
 
     slow: slow unknowns (r n_s + r n_gs,) of the last steps.
     multiplier, bend: multipliers lambda (r, n_g) of the last micro intervals, and by how much their fast increments (r, n_f)
-        left the straight line, over h^2 (none of them where increments follow from the multipliers).
+        left the straight line, over h^2 (nothing is kept where any start does).
     pairs: secant pairs of the slow unknowns.
     passes: (2,) fewest of a step with this matrix of the micro intervals (UNKNOWN before one), and those of the last step.
     """
@@ -71,14 +72,13 @@ class Warm(NamedTuple):
         r, (n_g, n_gs) = scheme.degree, system.num_constraints(equations.q_s, equations.q_f)
         increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity)
         slow = Differences.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
-        kicked = scheme.num_micro > 1 and has_kicks(system, scheme)
-        halved = (
-            scheme.num_micro > 1 and system.constraint is not None
-        )  # the constraint force of a macro node is shared
-        free = 0 if is_explicit_given_multipliers(system, scheme) else n_f
-        lines = Line.zero((r, n_g), kicked), Line.zero((r, free), kicked or halved)
+        known = is_explicit_given_multipliers(system, scheme) or is_linear(system, scheme, equations.q_s, equations.q_f)
+        several, kicked = scheme.num_micro > 1, has_kicks(system, scheme)
+        shared = system.constraint is not None  # two macro steps share the constraint force of their node
+        multiplier = Line.zero((r, n_g), several and kicked)
+        bend = Line.zero((r, 0 if known else n_f), several and (kicked or shared))
         pairs = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
-        return cls(slow, *lines, pairs, jnp.array([0, 2 * MORE]))
+        return cls(slow, multiplier, bend, pairs, jnp.array([0, 2 * MORE]))
 
     def after(self, last: "Warm") -> "Warm":
         """What a stage of a composition has learned, going on where the stage before it ended."""
@@ -113,14 +113,13 @@ class Pass(NamedTuple):
     bend: Line
 
 
-def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None, linear=False):
+def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None):
     """One pass over the micro intervals: fast unknowns corrected for the given slow ones, and what they leave.
 
     Args:
         warm: multipliers and bends of the macro step before.
         schur: (num_micro, r n_g, r n_g) inverses of ``G K^-1 G^T``. In the first pass there are none: they are computed, and
             multipliers and bends start from the line through the last two.
-        linear: one pass is exact, see `solve`.
 
     Returns:
         (x, what the pass leaves, schur)
@@ -129,6 +128,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
     system, scheme = interval_problem(equations.system, equations.scheme)
     kicks = lagrangian(system, scheme).kicks if n > 1 else ()
     explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
+    bent = warm.bend.last.size > 0
     basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # (n, r + 1, r): slow position at each node by increments
     velocity = inverse_mass(constant_mass(system).fast)
     first = schur is None
@@ -144,7 +144,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
         if first:
             mu = scale * carry.multiplier.next(m)
             inc = jnp.zeros_like(straight)
-            if not linear and not explicit:  # then any start does
+            if bent:
                 inc = straight + h**2 * carry.bend.next(m)
 
         def gradient(inc):
@@ -188,7 +188,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
             increments += basis[-1][:, None] * (weight * d_s)
 
         multiplier, bend = carry.multiplier.add(m, mu / scale), carry.bend
-        if not explicit:
+        if bent:
             bend = bend.add(m, (inc - straight) / h**2)
         end = Pass(q_f, p_f, start, increments, violated, moved, multiplier, bend)
         return end, (inc, mu, schur if first else None)
@@ -270,7 +270,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
-        x, end, schur = march(equations, matrix, x, warm, None if first else last.schur, linear)
+        x, end, schur = march(equations, matrix, x, warm, None if first else last.schur)
         d, (rows, g), impulse = slow_update(x, end)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
