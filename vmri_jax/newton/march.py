@@ -99,7 +99,7 @@ class Pass(NamedTuple):
 
     q_f, p_f: end of the last interval, momentum times h.
     start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path.
-    g, moved: largest constraint value that is left, largest correction of an increment.
+    moved: largest correction of an increment.
     multiplier, bend: as in `Warm`.
     """
 
@@ -107,7 +107,6 @@ class Pass(NamedTuple):
     p_f: Any
     start: Any
     increments: Any
-    g: Any
     moved: Any
     multiplier: Line
     bend: Line
@@ -122,7 +121,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
             multipliers and bends start from the line through the last two.
 
     Returns:
-        (x, what the pass leaves, schur)
+        (x, what the pass leaves, fast positions (num_micro, r, n_f) at the nodes 1..r, schur)
     """
     h, (n, r, _), n_g = equations.micro_dt, x.fast.shape, x.multiplier.shape[2]
     system, scheme = interval_problem(equations.system, equations.scheme)
@@ -173,7 +172,6 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
         inc, mu, coupling = inc + dx, mu + dmu, change(dx)
         q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
         moved = jnp.maximum(carry.moved, _largest(dx))
-        violated = jnp.maximum(carry.g, _largest(constraints(times[1:], slow_nodes[1:], carry.q_f + inc)))
 
         pull_s = -(pull_s + more_s)
         d_start = d.slow_start + coupling.slow_start + pull_s.sum(0)
@@ -190,15 +188,15 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
         multiplier, bend = carry.multiplier.add(m, mu / scale), carry.bend
         if bent:
             bend = bend.add(m, (inc - straight) / h**2)
-        end = Pass(q_f, p_f, start, increments, violated, moved, multiplier, bend)
-        return end, (inc, mu, schur if first else None)
+        end = Pass(q_f, p_f, start, increments, moved, multiplier, bend)
+        return end, (inc, mu, carry.q_f + inc, schur if first else None)
 
-    zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(()), jnp.zeros(())
+    zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(())
     carry = Pass(equations.q_f, h * equations.p_f, *zero, warm.multiplier, warm.bend)
     scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
     unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
-    end, (fast, mu, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
-    return x._replace(fast=fast, multiplier=mu), end, new if first else schur
+    end, (fast, mu, nodes, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
+    return x._replace(fast=fast, multiplier=mu), end, nodes, new if first else schur
 
 
 def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
@@ -215,14 +213,16 @@ def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
 class March(NamedTuple):
     """State of the iteration: unknowns of this pass, what it left and moved, secant pairs, and how it stands.
 
+    nodes: fast positions (num_micro, r, n_f) at the nodes 1..r of the micro intervals.
     schur: small matrices of the micro intervals, from the first pass.
     d: the update that the slow unknowns would get from mass and slow constraint alone.
     impulse: on the slow variables over the step, times h.
-    residual: largest row of the momentum equations (times h) and largest constraint value.
+    residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
     """
 
     x: Unknowns
     end: Pass
+    nodes: Any
     schur: Any
     d: Any
     pairs: Pairs
@@ -270,7 +270,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
-        x, end, schur = march(equations, matrix, x, warm, None if first else last.schur)
+        x, end, nodes, schur = march(equations, matrix, x, warm, None if first else last.schur)
         d, (rows, g), impulse = slow_update(x, end)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
@@ -288,14 +288,20 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         goes_on = newton.fixed_iterations is None and passes < newton.max_iterations
         otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
         result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
-        residual = jnp.maximum(_largest(rows), _largest(mass.fast) * left), jnp.maximum(end.g, _largest(g))
-        return March(x, end, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
+        residual = jnp.maximum(_largest(rows), _largest(mass.fast) * left), _largest(g)
+        return March(x, end, nodes, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
 
     def next_pass(last: March) -> March:
         x = last.x
         if n_s:
             x = separated(joined(x) + last.pairs.corrected(last.d, r * n_s), x)
         return one_pass(x, last)
+
+    def constraints(done: March):
+        """(num_micro, r, n_g) at the nodes 1..r of the micro intervals."""
+        slow_nodes = equations.q_s + _along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], done.x.slow)
+        times = equations.t + h * (np.arange(n)[:, None] + control_nodes(r)[1:])
+        return jax.vmap(jax.vmap(system.g))(times, slow_nodes, done.nodes)
 
     def joined(x: Unknowns):
         return jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
@@ -312,6 +318,9 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         done = jax.lax.while_loop(lambda at: at.result == RUNNING, next_pass, done)
     else:
         done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: next_pass(at), done)
+    if n_g:
+        rows, g_slow = done.residual
+        done = done._replace(residual=(rows, jnp.maximum(_largest(constraints(done)), g_slow)))
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
     slow, passes = warm.slow.add(joined(done.x)), jnp.stack([fewest, done.passes])
     return done, Warm(slow, done.end.multiplier, done.end.bend, done.pairs, passes)
