@@ -39,19 +39,20 @@ class Differences(NamedTuple):
 class Line(NamedTuple):
     """Values of the micro intervals one after the other, extrapolated by the line through the last two.
 
-    A kick at the macro nodes lets the first value of every macro step stand out from its neighbours.
+    A kick at the macro nodes, or half of their constraint force, lets the first value of every macro step stand out from
+    its neighbours.
 
     last (2, ...): of the last two intervals, the last one first, without what stands out.
-    jump (...): by how much the first one stands out; None without kicks.
+    jump (...): by how much the first one stands out; None if it does not.
     """
 
     last: Any
     jump: Any
 
     @classmethod
-    def zero(cls, shape: tuple[int, ...], kicked: bool) -> "Line":
+    def zero(cls, shape: tuple[int, ...], stands_out: bool) -> "Line":
         """The start of a run."""
-        return cls(jnp.zeros((2, *shape)), jnp.zeros(shape) if kicked else None)
+        return cls(jnp.zeros((2, *shape)), jnp.zeros(shape) if stands_out else None)
 
     def next(self, m):
         """The value that is expected in interval m of a macro step."""

@@ -10,9 +10,9 @@ increments and slow multipliers are corrected from what is left of their equatio
 * slow equations: mass and slow constraint. What they miss, the response of the fast variables and the curvature of V,
   is learned from the passes (`Pairs`).
 
-The slow unknowns start from what the steps before extrapolate to (`Differences`). The residual is exact, so all of this
-decides only how many passes there are: two where the slow motion is smooth. A pass costs one gradient of each term at each
-of its nodes; nothing is stored but the path and those small matrices.
+The slow unknowns start from what the steps before extrapolate to (`Differences`), the fast ones from the micro intervals
+before (`Line`). The residual is exact, so all of this decides only how many passes there are: two where the slow motion is
+smooth. A pass costs one gradient of each term at each of its nodes; nothing is stored but the path and those small matrices.
 """
 
 from functools import partial
