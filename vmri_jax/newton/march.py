@@ -118,7 +118,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
     Args:
         warm: multipliers and bends of the macro step before.
         schur: (num_micro, r n_g, r n_g) inverses of ``G K^-1 G^T``. In the first pass there are none: they are computed, and
-            multipliers and bends start from the line through the last two.
+            multipliers start from the line through the last two, bends from the last one.
 
     Returns:
         (x, what the pass leaves, fast positions (num_micro, r, n_f) at the nodes 1..r, schur)
@@ -144,7 +144,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
             mu = scale * carry.multiplier.next(m)
             inc = jnp.zeros_like(straight)
             if bent:
-                inc = straight + h**2 * carry.bend.next(m)
+                inc = straight + h**2 * carry.bend.again(m)
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
