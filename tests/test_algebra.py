@@ -20,6 +20,26 @@ def test_solve_and_inverse(n):
     assert float(jnp.abs(algebra.inverse(a) @ a - jnp.eye(n)).max()) < 1e-13
 
 
+@pytest.mark.parametrize("n", [3, 12, 20])
+def test_inverses_of_several(n):
+    several = jnp.stack([definite(n), 2 * definite(n).T])
+    assert float(jnp.abs(algebra.inverse(several) @ several - jnp.eye(n)).max()) < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [([], 0.0), ([-0.0], 0.0), ([1.0, -3.5, 2.0], 3.5), ([1.0, -np.inf], np.inf), ([np.inf, np.nan, 1.0], np.nan)],
+)
+def test_largest(values, expected):
+    found = (algebra.largest(jnp.asarray(values)), jax.vmap(algebra.largest)(jnp.asarray([values, values]))[1])
+    assert np.array_equal(found, [expected] * 2, equal_nan=True)
+
+
+def test_largest_keeps_a_nan_among_many():
+    values = jnp.ones((300, 300)).at[7, 200].set(jnp.nan)
+    assert np.isnan(jax.jit(algebra.largest)(values))
+
+
 @pytest.mark.parametrize("n", [3, 12])
 def test_solve_is_differentiable_in_reverse(n):
     a, b = definite(n), jnp.ones((n, 1))

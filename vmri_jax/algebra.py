@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-UNROLLED = 4
-"""Largest system whose elimination is written out step by step; larger ones go through a loop."""
+UNROLLED = 8
+"""Largest system whose elimination is written out step by step; larger ones go through a loop, which compiles faster."""
 ELEMENTWISE = 16
 """Largest system that is eliminated by elementwise operations."""
 
@@ -18,12 +18,12 @@ REGULARIZATION = 2e-15
 
 
 def regularized(a):
-    """``G M^-1 G^T`` (n, n), kept invertible where rows of G become dependent.
+    """``G M^-1 G^T`` (..., n, n), kept invertible where rows of G become dependent.
 
     Multipliers are then nearly those of least norm. Residuals are exact, so that it decides on convergence alone, not
     on solutions: errors shrink by REGULARIZATION times the condition number, instead of at once.
     """
-    return a * (1 + REGULARIZATION * np.eye(a.shape[0]))
+    return a * (1 + REGULARIZATION * np.eye(a.shape[-1]))
 
 
 def saddle(a, b, c):
@@ -58,17 +58,40 @@ def solve(a, b):
         return jnp.linalg.solve(a, b)
 
     def eliminate(k, rows):
-        row = rows[k] / rows[k, k]
-        return rows - (rows[:, k] - (jnp.arange(n) == k))[:, None] * row
+        unit = np.arange(n)[:, None] == k
+        return rows - (rows[:, k, None] - unit) * (rows[k] / rows[k, k])
 
-    rows = jnp.concatenate([a, b], axis=1)
-    if n > UNROLLED:
-        return jax.lax.fori_loop(0, n, eliminate, rows)[:, n:]
-    for k in range(n):
-        rows = eliminate(k, rows)
-    return rows[:, n:]
+    return _repeated(n, eliminate, jnp.concatenate([a, b], axis=1))[:, n:]
 
 
 def inverse(a):
-    """The inverse of a (n, n), see `solve`."""
-    return solve(a, jnp.eye(a.shape[0]))
+    """The inverses of a (..., n, n), see `solve`: every pivot's column is replaced by one of the inverse."""
+    n = a.shape[-1]
+    if n > ELEMENTWISE:
+        return jnp.linalg.inv(a)
+
+    def exchange(k, a):
+        unit = np.arange(n) == k
+        row = jnp.where(unit, 1.0, a[..., k, None, :]) / a[..., k, k, None, None]
+        return jnp.where(unit, unit[:, None] * 1.0, a) - (a[..., :, k, None] - unit[:, None]) * row
+
+    return _repeated(n, exchange, a)
+
+
+def _repeated(n: int, step, a):
+    """``step(k, a)`` for k from 0 to n - 1."""
+    if n > UNROLLED:
+        return jax.lax.fori_loop(0, n, step, a)
+    for k in range(n):
+        a = step(k, a)
+    return a
+
+
+def largest(a):
+    """The largest absolute value in a, 0 of nothing, NaN if there is one.
+
+    Floats without a sign are ordered as the integers of the same bits, NaN above all. A maximum of integers may be taken in any
+    order, so that it fills vector registers; one of floats is taken number by number, and XLA loses NaN in some of them.
+    """
+    bits = jax.lax.bitcast_convert_type(jnp.abs(a), jnp.int64)
+    return jax.lax.bitcast_convert_type(jnp.max(bits, initial=0), jnp.float64)

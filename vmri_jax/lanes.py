@@ -154,6 +154,12 @@ def _elementwise(inputs, rank, size, **params):
     return [jnp.broadcast_to(a, shape) for a in arrays], params
 
 
+def _bitcast(inputs, rank, size, *, new_dtype):
+    if inputs[0].array.dtype.itemsize != np.dtype(new_dtype).itemsize:
+        return None
+    return _elementwise(inputs, rank, size, new_dtype=new_dtype)
+
+
 def _broadcast_in_dim(inputs, rank, size, *, shape, broadcast_dimensions, **params):
     if len(inputs) > 1:
         return None
@@ -244,6 +250,7 @@ def _select(inputs, rank, size):
 
 _RULES = {
     "broadcast_in_dim": _broadcast_in_dim,
+    "bitcast_convert_type": _bitcast,
     "reshape": _reshape,
     "transpose": _transpose,
     "concatenate": _concatenate,

@@ -101,9 +101,9 @@ def _velocity(system: System, q_s, q_f, jacobian, own, p, guess, max_iterations:
         v, k, _ = carry
         system, q_s, q_f, jacobian, own, p = fixed
         d = direction(fixed, v)
-        small = _largest(d) <= 1e-9 * _largest(v)  # the two steps at the end do the rest
+        small = algebra.largest(d) <= 1e-9 * algebra.largest(v)  # the two steps at the end do the rest
         merit = jax.vmap(lambda v: kinetic(system, q_s, q_f, v) - p @ v)(v + fractions[:, None] * d)
-        on_constraints = _largest(jacobian @ v + own) <= 1e-9 * _largest(v)
+        on_constraints = algebra.largest(jacobian @ v + own) <= 1e-9 * algebra.largest(v)
         better = jnp.isfinite(merit) & ((merit < merit[-1]) | ~on_constraints)
         stop = small | ~jnp.any(better)
         return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
@@ -116,11 +116,7 @@ def _velocity(system: System, q_s, q_f, jacobian, own, p, guess, max_iterations:
     for _ in range(2):  # Newton's map is flat at its fixed point: these two carry first and second derivatives
         d = direction(at, v)
         v = v + d
-    return jnp.where(_largest(d) <= 1e-6 * _largest(v) + 1e-300, v, jnp.nan)
-
-
-def _largest(a):
-    return jnp.max(jnp.abs(a), initial=0.0)
+    return jnp.where(algebra.largest(d) <= 1e-6 * algebra.largest(v) + 1e-300, v, jnp.nan)
 
 
 def project_positions(system: System, t, q_s, q_f, iterations: int = 20):

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from vmri_jax.algebra import largest
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
 from vmri_jax.newton import arrowhead, dense
@@ -105,17 +106,17 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton, method: str, lim
     factor = partial(arrowhead.factor, coupled=False) if method == "decoupled" else solver.factor
     factors = None if renewed else factor(linearize(equations, guess), guess)
     eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
-    positions = jnp.maximum(_largest(equations.q_s), _largest(equations.q_f))
+    positions = jnp.maximum(largest(equations.q_s), largest(equations.q_f))
 
     def size(d: Unknowns, x: Unknowns):
         """Largest update over what is accepted, slow and fast each by its own measure.
 
         Variables that only see round-off of the others (a centre of mass at rest) have no size of their own.
         """
-        others = eps * jnp.maximum(_largest(x.slow), _largest(x.fast)) + tiny
+        others = eps * jnp.maximum(largest(x.slow), largest(x.fast)) + tiny
         return jnp.maximum(
-            _largest(d.slow) / (newton.tolerance * _largest(x.slow) + eps * _largest(equations.q_s) + others),
-            _largest(d.fast) / (newton.tolerance * _largest(x.fast) + eps * _largest(equations.q_f) + others),
+            largest(d.slow) / (newton.tolerance * largest(x.slow) + eps * largest(equations.q_s) + others),
+            largest(d.fast) / (newton.tolerance * largest(x.fast) + eps * largest(equations.q_f) + others),
         )
 
     def iterate(at: Iterate) -> Iterate:
@@ -129,8 +130,8 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton, method: str, lim
             shrink = contraction * jnp.minimum(1.0, SAFETY * contraction)
             predicted = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
             error = jnp.where((at.iterations == 0) | (at.damping < 1), update, predicted)
-        largest = jnp.maximum(_largest(d.slow), _largest(d.fast))
-        at_floor = (contraction > 0.5) & (largest <= ROUNDOFF_FLOOR * eps * positions)
+        step = jnp.maximum(largest(d.slow), largest(d.fast))
+        at_floor = (contraction > 0.5) & (step <= ROUNDOFF_FLOOR * eps * positions)
         last = jnp.where(update > at.update, Result.DIVERGED, Result.STAGNATED)
         running = jnp.where(at.iterations + 1 >= limit, last, RUNNING)
 
@@ -140,7 +141,7 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton, method: str, lim
         result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, result)
         result = jnp.where(error <= 1, Result.CONVERGED, result)
         broken = jnp.where(
-            jnp.isfinite(_largest(residual.slow) + _largest(residual.fast)), Result.SINGULAR, Result.NON_FINITE
+            jnp.isfinite(largest(residual.slow) + largest(residual.fast)), Result.SINGULAR, Result.NON_FINITE
         )
         result = jnp.where(jnp.isfinite(update) | (back & (result == RUNNING)), result, broken)
         before, d = jax.tree.map(partial(jnp.where, back), (at.before, at.direction), (at.x, d))
@@ -174,7 +175,3 @@ def _is_dependent(jacobian, others=None):
     rows = jacobian / jnp.maximum(jnp.linalg.norm(whole, axis=1, keepdims=True), jnp.finfo(float).tiny)
     gram = rows @ rows.T
     return jnp.isfinite(gram).all() & (jnp.linalg.eigvalsh(gram)[0] < RANK**2)
-
-
-def _largest(a):
-    return jnp.max(jnp.abs(a), initial=0.0)

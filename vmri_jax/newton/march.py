@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import inverse, matmul, matvec, regularized
+from vmri_jax.algebra import inverse, largest, matmul, matvec, regularized
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.newton.extrapolation import Differences, Line
@@ -171,7 +171,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
         dx += matrix.solve(more_f)
         inc, mu, coupling = inc + dx, mu + dmu, change(dx)
         q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
-        moved = jnp.maximum(carry.moved, _largest(dx))
+        moved = jnp.maximum(carry.moved, largest(dx))
 
         pull_s = -(pull_s + more_s)
         d_start = d.slow_start + coupling.slow_start + pull_s.sum(0)
@@ -254,7 +254,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
     times = equations.t + equations.macro_dt * control_nodes(r)
     tolerance = newton.tolerance / SAFETY  # what is left of every step adds up
-    accepted_slow, accepted_fast = ROUNDOFF * eps * _largest(equations.q_s), ROUNDOFF * eps * _largest(equations.q_f)
+    accepted_slow, accepted_fast = ROUNDOFF * eps * largest(equations.q_s), ROUNDOFF * eps * largest(equations.q_f)
 
     def slow_update(x: Unknowns, end: Pass):
         """Update of the slow unknowns by mass and slow constraint, residuals of their equations, impulse."""
@@ -274,21 +274,21 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         d, (rows, g), impulse = slow_update(x, end)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
-            noise = NOISE * eps * (_largest(equations.q_s) + _largest(x.slow))
+            noise = NOISE * eps * (largest(equations.q_s) + largest(x.slow))
             pairs = pairs.add(joined(x) - joined(last.x), d - last.d, noise, r * n_s)
 
-        motion = jnp.maximum(_largest(inverse_fast(h * equations.p_f)), _largest(inverse_fast(end.p_f)))
-        others = eps * jnp.maximum(_largest(x.slow), n * motion) + tiny  # variables at rest have no size of their own
+        motion = jnp.maximum(largest(inverse_fast(h * equations.p_f)), largest(inverse_fast(end.p_f)))
+        others = eps * jnp.maximum(largest(x.slow), n * motion) + tiny  # variables at rest have no size of their own
         shrink = 1.0 if first else jnp.minimum(SAFETY * end.moved / (last.end.moved + tiny), 1.0)
         left = shrink * end.moved
         change = jnp.maximum(
-            _largest(d[: r * n_s]) / (tolerance * _largest(x.slow) + accepted_slow + others),
+            largest(d[: r * n_s]) / (tolerance * largest(x.slow) + accepted_slow + others),
             left / (tolerance * motion + accepted_fast + others),
         )
         goes_on = newton.fixed_iterations is None and passes < newton.max_iterations
         otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
         result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
-        residual = jnp.maximum(_largest(rows), _largest(mass.fast) * left), _largest(g)
+        residual = jnp.maximum(largest(rows), largest(mass.fast) * left), largest(g)
         return March(x, end, nodes, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
 
     def next_pass(last: March) -> March:
@@ -320,7 +320,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: next_pass(at), done)
     if n_g:
         rows, g_slow = done.residual
-        done = done._replace(residual=(rows, jnp.maximum(_largest(constraints(done)), g_slow)))
+        done = done._replace(residual=(rows, jnp.maximum(largest(constraints(done)), g_slow)))
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
     slow, passes = warm.slow.add(joined(done.x)), jnp.stack([fewest, done.passes])
     return done, Warm(slow, done.end.multiplier, done.end.bend, done.pairs, passes)
@@ -329,7 +329,3 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
 def _along(weights, increments):
     """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
     return jnp.sum(weights[..., None] * increments, axis=-2)
-
-
-def _largest(a):
-    return jnp.max(jnp.abs(a), initial=0.0)
