@@ -295,10 +295,10 @@ def test_a_large_matrix_is_renewed_when_it_costs_passes(tsp):
             found.append(np.asarray(memory.matrix.inverse))
         return found
 
-    first, second, third = matrices(galerkin(1, 3))
+    first, second, third = matrices(galerkin(2, 3))
     assert first.shape == (18, 18)
     assert np.array_equal(first, second)
     assert not np.array_equal(second, third)
-    first, second, _ = matrices(galerkin(1, 2))
+    first, second, _ = matrices(galerkin(2, 2))
     assert first.shape == (12, 12)
     assert not np.array_equal(first, second)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.algebra import matmul
 from vmri_jax.path import Nodes, Path, lagrange_derivative, position_nodes, velocity_nodes
 from vmri_jax.scheme import Scheme
 from vmri_jax.system import ConstantMass, System
@@ -105,8 +106,8 @@ class QuadraticKinetic:
 
     def __call__(self, path: Path):
         slow, fast = self.mass.momentum(path.slow, path.fast)
-        slow = jnp.einsum("ij,ia,ja->", self.slow_form[1:, 1:], path.slow, slow)
-        fast = jnp.einsum("ij,mia,mja->", self.fast_form[1:, 1:], path.fast, fast)
+        slow = jnp.sum(path.slow * matmul(self.slow_form[1:, 1:], slow))
+        fast = jnp.sum(path.fast * matmul(self.fast_form[1:, 1:], fast))
         return (slow + self.nodes.num_micro * fast) / (2 * path.macro_dt)
 
     at_nodes_inside = __call__

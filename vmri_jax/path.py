@@ -16,6 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.algebra import matmul
 from vmri_jax.quadrature import NODE_TOLERANCE, PlacedRule, Rule, lobatto
 
 
@@ -85,7 +86,7 @@ class Path(eqx.Module):
         """Slow and fast positions at the num_micro r + 1 micro control nodes, first to last."""
         n, r = self.num_micro, self.degree
         theta = (np.arange(n)[:, None] + control_nodes(r)[None, 1:]).reshape(-1) / n
-        slow = self.slow_start + lagrange_basis(r, np.concatenate([[0.0], theta]))[:, 1:] @ self.slow
+        slow = self.slow_start + matmul(lagrange_basis(r, np.concatenate([[0.0], theta]))[:, 1:], self.slow)
         fast = (self.fast_start[:, None] + self.fast).reshape(n * r, -1)
         return slow, jnp.concatenate([self.fast_start[:1], fast])
 
@@ -160,14 +161,14 @@ class Nodes:
             theta, c = np.concatenate([self.theta(g) for g in groups]), np.array([g.c for g in groups])
             start, steps = path.fast_start[first:stop], path.fast[first:stop]
             shape = (len(theta), steps.shape[-1])
-            moved = jnp.einsum("kj,mja->kma", lagrange_basis(r, c)[:, 1:], steps)
-            rates = jnp.einsum("kj,mja->kma", lagrange_derivative(r, c)[:, 1:], steps)
+            moved = jnp.swapaxes(matmul(lagrange_basis(r, c)[:, 1:], steps), 0, 1)
+            rates = jnp.swapaxes(matmul(lagrange_derivative(r, c)[:, 1:], steps), 0, 1)
             parts.append(
                 Sample(
                     t=path.t + theta * path.macro_dt,
-                    q_s=path.slow_start + lagrange_basis(r, theta)[:, 1:] @ path.slow,
+                    q_s=path.slow_start + matmul(lagrange_basis(r, theta)[:, 1:], path.slow),
                     q_f=(start + moved).reshape(shape),
-                    v_s=lagrange_derivative(r, theta)[:, 1:] @ path.slow / path.macro_dt,
+                    v_s=matmul(lagrange_derivative(r, theta)[:, 1:], path.slow) / path.macro_dt,
                     v_f=(rates / micro_dt).reshape(shape),
                 )
             )

@@ -144,10 +144,15 @@ def _merge(nodes: tuple[float, ...], weights: list) -> Rule:
 
 def interpolatory(nodes) -> Rule:
     """Rule on the given n nodes that is exact for polynomials of degree n - 1."""
+    return Rule(nodes, interpolatory_weights(nodes))
+
+
+def interpolatory_weights(nodes) -> np.ndarray:
+    """The weights of `interpolatory`."""
     x = 2 * np.asarray(nodes, dtype=float) - 1
     moments = np.zeros(len(x))
     moments[0] = 1.0
-    return Rule(nodes, np.linalg.solve(legendre.legvander(x, len(x) - 1).T, moments))
+    return np.linalg.solve(legendre.legvander(x, len(x) - 1).T, moments)
 
 
 def _roots(series) -> np.ndarray:

@@ -22,7 +22,7 @@ from vmri_jax.algebra import ELEMENTWISE
 from vmri_jax.composition import Composition
 from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
-from vmri_jax.newton import Newton, drift, interval_matrix, is_constant, march, solve
+from vmri_jax.newton import Newton, drift, interval_matrix, is_collocation, is_constant, march, solve
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
@@ -120,7 +120,7 @@ def start_memory(
     solved = parts is None and not is_explicit(system, scheme) and newton.marches(system, scheme)
     if solved and is_drift(system, scheme):
         warm = drift.Warm.none(n_g + n_gs)
-    elif solved:
+    elif solved and not is_collocation(system, scheme, state.q_s, state.q_f):
         equations = _equations(system, scheme, state, macro_dt)
         if is_constant(system, scheme, state.q_s, state.q_f):
             matrix = interval_matrix(equations)

@@ -1,7 +1,8 @@
 """Newton's iteration for the equations of a macro step: methods, linear solvers, derivative."""
 
 from vmri_jax.newton import drift, march
+from vmri_jax.newton.collocation import is_collocation
 from vmri_jax.newton.interval import interval_matrix, is_constant
 from vmri_jax.newton.iteration import Newton, solve
 
-__all__ = ["Newton", "drift", "interval_matrix", "is_constant", "march", "solve"]
+__all__ = ["Newton", "drift", "interval_matrix", "is_collocation", "is_constant", "march", "solve"]

@@ -97,7 +97,7 @@ class IntervalMatrix(NamedTuple):
         return matvec(self.last, increments.reshape(-1))
 
 
-def _is_per_coordinate(system: System, scheme: Scheme, q_f) -> bool:
+def is_per_coordinate(system: System, scheme: Scheme, q_f) -> bool:
     """Whether K is taken for every fast coordinate alone: explicit fast equations, or W a sum over the coordinates.
 
     V is then left out: it is the soft potential, and h^2 times its curvature is small beside the mass.
@@ -113,7 +113,7 @@ def is_constant(system: System, scheme: Scheme, q_s, q_f) -> bool:
     """Whether K is the same for a whole run."""
     q = {"q_s": q_s, "q_f": q_f}
     terms = implicit_terms(system, scheme)
-    if _is_per_coordinate(system, scheme, q_f):
+    if is_per_coordinate(system, scheme, q_f):
         terms = [term for term in terms if term.arguments == ("q_f",)]
     elif system.force is not None or (scheme.degree > 1 and system.constraint is not None):
         return False
@@ -124,7 +124,7 @@ def is_linear(system: System, scheme: Scheme, q_s, q_f) -> bool:
     """Whether there are only fast equations, linear ones with matrix K: one pass solves them."""
     alone = not system.is_constrained and system.force is None and not q_s.shape[0]
     complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
-    return alone and (complete or not _is_per_coordinate(system, scheme, q_f)) and is_constant(system, scheme, q_s, q_f)
+    return alone and (complete or not is_per_coordinate(system, scheme, q_f)) and is_constant(system, scheme, q_s, q_f)
 
 
 def interval_matrix(equations: StepEquations) -> IntervalMatrix:
@@ -136,7 +136,7 @@ def interval_matrix(equations: StepEquations) -> IntervalMatrix:
     v_s, v_f = constant_mass(system).velocity(equations.p_s, equations.p_f)
     x = local.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(0))
     r, n_f = scheme.degree, q_f.shape[0]
-    if not _is_per_coordinate(equations.system, equations.scheme, q_f):
+    if not is_per_coordinate(equations.system, equations.scheme, q_f):
         block = linearize(local, x).ff[0, :, :, 1:]
         return IntervalMatrix(inverse(block[:-1].reshape(r * n_f, r * n_f)), block[-1].reshape(n_f, r * n_f))
 

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.algebra import largest
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
-from vmri_jax.newton import arrowhead, drift, full, march
+from vmri_jax.newton import arrowhead, collocation, drift, full, march
 from vmri_jax.newton.interval import can_be_cut, is_linear
 from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result
@@ -32,7 +33,8 @@ class Newton(eqx.Module):
     "auto" takes "march" where the terms can be cut into micro intervals (constant masses, potentials on the micro grid
     or kicks at the macro nodes), and "arrowhead" where they cannot or where "march" does not converge; which one it was
     is in ``StepInfo.method`` and ``Trajectory.info.method``. Where a step is a single drift along the constraints between kicks
-    (``fully_explicit(1)``: RATTLE) "march" solves for the multipliers alone.
+    (``fully_explicit(1)``: RATTLE) "march" solves for the multipliers alone, and where it is a single interval of higher degree
+    (``galerkin(1, degree)``) for all variables at once, in modes of time (`vmri_jax.newton.collocation`).
 
     Args:
         method: as above.
@@ -119,7 +121,7 @@ def solve(
 
     fixed, guess, matrix, warm = jax.lax.stop_gradient((equations, guess, matrix, warm))
     if marches:
-        found, warm = _by_march(fixed, matrix, warm, newton)
+        found, warm = _by_march(fixed, guess, matrix, warm, newton)
         if newton.falls_back:
             found = jax.lax.cond(
                 found.result <= Result.CONVERGED_AT_ROUNDOFF,
@@ -133,19 +135,22 @@ def solve(
     return Solution(x, *end, *found[4:]), warm
 
 
-def _by_march(equations: StepEquations, matrix, warm, newton: Newton) -> tuple[Solution, Any]:
-    """By the nested march; where a step is a drift only the multipliers are solved for."""
+def _by_march(equations: StepEquations, guess: Unknowns, matrix, warm, newton: Newton) -> tuple[Solution, Any]:
+    """By the nested march; where a step is a drift only the multipliers are solved for, a single interval at once."""
     if is_drift(equations.system, equations.scheme):
         done, x, end, warm = drift.solve(equations, warm, newton)
-        rows, g, iterations = 0.0, _largest(done.g), done.iterations
+        rows, g, iterations = 0.0, largest(done.g), done.iterations
+    elif collocation.is_collocation(equations.system, equations.scheme, equations.q_s, equations.q_f):
+        done, x, end, (rows, g) = collocation.solve(equations, guess, newton)
+        iterations = done.iterations
     else:
         done, warm = march.solve(equations, matrix, warm, newton, linear=False)
         x, end, iterations = done.x, (done.end.q_f, *_momenta_after(equations, done)), done.passes
         rows, g = done.residual
+    q_f, p_s, p_f = end
     result = _kept(done.result, equations, g, newton)
-    return Solution(
-        x, *end, relative_residual(equations, rows, g), result, iterations, np.asarray(int(Method.MARCH))
-    ), warm
+    residual, method = relative_residual(equations, rows, g), np.asarray(int(Method.MARCH))
+    return Solution(x, q_f, p_s, p_f, residual, result, iterations, method), warm
 
 
 def _momenta_after(equations: StepEquations, done: march.March):
@@ -162,8 +167,8 @@ def _end(equations: StepEquations, x: Unknowns):
 def _over_all_unknowns(equations: StepEquations, guess: Unknowns, newton: Newton, method: str) -> Solution:
     x, result, iterations = full.solve(equations, guess, newton, method)
     residual, (p_s, p_f) = equations.evaluate(x)
-    rows = jnp.maximum(_largest(residual.slow), _largest(residual.fast))
-    g = jnp.maximum(_largest(residual.multiplier), _largest(residual.slow_multiplier))
+    rows = jnp.maximum(largest(residual.slow), largest(residual.fast))
+    g = jnp.maximum(largest(residual.multiplier), largest(residual.slow_multiplier))
     q_f = equations.q_f + x.fast[:, -1].sum(0)
     code = jnp.asarray(int(Method[method.upper()]))
     result = _kept(result, equations, g, newton)
@@ -182,13 +187,9 @@ def _kept(result, equations: StepEquations, g, newton: Newton):
     return jnp.where((result <= Result.CONVERGED_AT_ROUNDOFF) & violated, Result.CONSTRAINT_VIOLATED, result)
 
 
-def _largest(a):
-    return jnp.max(jnp.abs(a), initial=0.0)
-
-
 def relative_residual(equations: StepEquations, rows, g):
     """Largest residual left: of the momentum equations relative to the momentum, of the constraints in their unit."""
-    momentum = jnp.maximum(_largest(equations.p_s), _largest(equations.p_f)) * equations.micro_dt
+    momentum = jnp.maximum(largest(equations.p_s), largest(equations.p_f)) * equations.micro_dt
     return jnp.maximum(rows / jnp.where(momentum > 0, momentum, 1.0), g)
 
 

@@ -1,0 +1,315 @@
+"""One interval with a path of degree r > 1: all variables at once, by simplified Newton steps in modes of time.
+
+With the Hessian of the potentials by the fast variables and the Jacobian of the constraints taken at one point, in the middle of
+the step, the Newton matrix is
+
+    [A x M - h^2 B x W'',  -I x G^T;  I x G,  0]
+
+with A, B (r, r) the stiffness and the mass matrix of the polynomials in time, rows of the nodes 0..r-1, columns of 1..r. In the
+eigenvectors of A^-1 B, which are known once and for all, it falls apart into one complex saddle per pair of eigenvalues gamma,
+
+    [M - h^2 gamma W'',  -G^T;  G,  0],
+
+so that matrices are of the size of the system, whatever the degree (Butcher 1976; Hairer, Wanner, Solving
+Ordinary Differential Equations II, IV.8). The residual is exact, so that all of this decides only how many steps there are.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.algebra import ELEMENTWISE, inverse, largest, matmul, regularized
+from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
+from vmri_jax.equations import StepEquations, Unknowns
+from vmri_jax.lanes import over_lanes
+from vmri_jax.newton.interval import (
+    ROUNDOFF,
+    SAFETY,
+    constant_mass,
+    inverse_mass,
+    is_linear,
+    is_per_coordinate,
+)
+from vmri_jax.path import control_nodes, lagrange_basis, lagrange_derivative
+from vmri_jax.quadrature import interpolatory_weights
+from vmri_jax.results import RUNNING, Result
+from vmri_jax.scheme import Scheme
+from vmri_jax.system import System
+
+
+def is_collocation(system: System, scheme: Scheme, q_s, q_f) -> bool:
+    """Whether a step is a single interval of degree above one, with a small full matrix of the fast variables.
+
+    A large one is better kept for many steps, which the march does.
+    """
+    small = (q_f.size or q_s.size) <= ELEMENTWISE
+    if scheme.num_micro > 1 or scheme.degree == 1 or system.force is not None or not small:
+        return False
+    return not is_per_coordinate(system, scheme, q_f) and not is_linear(system, scheme, q_s, q_f)
+
+
+class TimeModes(NamedTuple):
+    """Eigenvectors of ``A^-1 B``: real ones, and one of every complex pair. Real and imaginary parts are one axis (2).
+
+    gamma (2, k): eigenvalues.
+    of_rows, of_values: (r, 2, k) from the rows of the momentum equations (through A^-1) and from values at the nodes to modes.
+    increments, multipliers: (2, k, r) from modes to increments, and (through A) to multipliers.
+    """
+
+    gamma: Any
+    of_rows: Any
+    of_values: Any
+    increments: Any
+    multipliers: Any
+
+    @classmethod
+    def of(cls, scheme: Scheme) -> "TimeModes":
+        """Of the polynomials and the nodes of the rules for T and W."""
+        a, b = (
+            _form(basis, scheme.degree, placed.rule.nodes)[:-1, 1:]
+            for basis, placed in ((lagrange_derivative, scheme.kinetic), (lagrange_basis, scheme.fast))
+        )
+        gamma, vectors = np.linalg.eig(np.linalg.solve(a, b))
+        kept, twice = np.imag(gamma) >= 0, np.where(np.imag(gamma) > 0, 2.0, 1.0)
+        to, back = (
+            np.linalg.inv(vectors)[kept],
+            (twice * vectors.conj())[:, kept],
+        )  # a mode and its conjugate: the real part
+
+        def parts(z):
+            return np.stack([z.real, z.imag])
+
+        of_rows, of_values = (np.moveaxis(parts(z), -1, 0) for z in (to @ np.linalg.inv(a), to))
+        return cls(parts(gamma[kept]), of_rows, of_values, parts(back.T), parts((a @ back).T))
+
+
+def _form(basis, degree: int, nodes) -> np.ndarray:
+    """``sum_n w_n l_i(c_n) l_j(c_n)`` (r + 1, r + 1) of the interpolatory rule on these nodes."""
+    at = basis(degree, np.array(nodes))
+    return at.T @ (interpolatory_weights(nodes)[:, None] * at)
+
+
+class Interval:
+    """The equations of the step, with the variables joined, q = (q_s, q_f), and nodes as the last axis.
+
+    num_soft: so many of them, the first, come without curvature in the matrix: the slow ones, where there are others.
+    """
+
+    def __init__(self, equations: StepEquations):
+        self.system, self.scheme, self.h = equations.system, equations.scheme, equations.macro_dt
+        self.n_s, self.r = equations.q_s.size, equations.scheme.degree
+        self.num_soft = self.n_s if equations.q_f.size else 0
+        self.q = jnp.concatenate([equations.q_s, equations.q_f])
+        self.p = jnp.concatenate([equations.p_s, equations.p_f])
+        self.times = equations.t + self.h * control_nodes(self.r)
+        self.terms = lagrangian(self.system, self.scheme).terms
+        self.at_start = self.jacobian(self.times[0], self.q)
+
+    def constraints(self, t, q):
+        """All constraints (n_c,) at one point."""
+        return self.system.constraints(t, q[: self.n_s], q[self.n_s :])
+
+    def jacobian(self, t, q):
+        """Their Jacobian G (n_c, n)."""
+        return jax.jacrev(self.constraints, argnums=1)(t, q)
+
+    def times_mass(self, x):
+        """``M x`` for (n, m)."""
+        mass, parts = constant_mass(self.system), (x[: self.n_s], x[self.n_s :])
+        return jnp.concatenate(
+            [
+                m[:, None] * a if m.ndim == 1 else matmul(m, a)
+                for m, a in zip((mass.slow, mass.fast), parts, strict=True)
+            ]
+        )
+
+    def over_mass(self, x):
+        """``M^-1 x`` for (n, m)."""
+        mass, parts = constant_mass(self.system), (x[: self.n_s], x[self.n_s :])
+        return jnp.concatenate([inverse_mass(m)(a.T).T for m, a in zip((mass.slow, mass.fast), parts, strict=True)])
+
+    def curvature(self, q):
+        """``M^-1`` times the Hessian of the potentials (m, m) by the variables that are not soft."""
+        soft, stiff = q[: self.num_soft], q[self.num_soft :]
+
+        def potential(stiff):
+            q = jnp.concatenate([soft, stiff])
+            at = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
+            terms = (term for term in self.terms if isinstance(term, Term) and term.inside.groups)
+            return sum(
+                (-term.sign * term.integrand(*(at[name] for name in term.arguments)) for term in terms), jnp.zeros(())
+            )
+
+        hessian = jax.hessian(potential)(stiff)
+        return self.over_mass(jnp.concatenate([jnp.zeros((self.num_soft, stiff.size)), hessian]))[self.num_soft :]
+
+    def slots(self, x):
+        """``h D_j L_d`` (n, r + 1) for increments (n, r)."""
+        total = jnp.zeros((self.q.size, self.r + 1))
+        for term in self.terms:
+            if isinstance(term, QuadraticKinetic):
+                total += self.times_mass(x) @ term.fast_form[1:]
+            elif term.inside.groups:
+                theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
+                basis = lagrange_basis(self.r, theta)
+                q = self.q[:, None] + x @ basis[:, 1:].T
+                at = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
+                gradient = jax.grad(lambda q, term=term: term.sign * term.integrand(*q))
+                d = over_lanes(gradient, len(theta))(tuple(at[name] for name in term.arguments))
+                at = {name: jnp.zeros_like(a) for name, a in at.items()} | dict(zip(term.arguments, d, strict=True))
+                total += jnp.concatenate(list(at.values())) @ (self.h**2 * term.inside.weights[:, None] * basis)
+        return total
+
+    def residual(self, x, mu):
+        """Rows of the momentum equations (n, r), constraints (n_c, r) at the nodes 1..r, and the momentum (n,) at the end.
+
+        Args:
+            x, mu: increments (n, r) and multipliers (n_c, r).
+        """
+
+        def at_node(at):
+            t, q, mu = at
+            g, pull = jax.vjp(lambda q: self.constraints(t, q), q)
+            return g, pull(mu)[0]
+
+        later = jnp.concatenate([mu[:, 1:], jnp.zeros_like(mu[:, :1])], axis=1)
+        g, pulls = over_lanes(at_node, self.r)((self.times[1:], self.q[:, None] + x, later))
+        slots, first = self.slots(x), self.h * self.p - jnp.sum(mu[:, :1] * self.at_start, axis=0)
+        others = jnp.concatenate([first[:, None], -pulls[:, :-1]], axis=1)
+        return slots[:, :-1] + others, g, slots[:, -1] / self.h
+
+
+class Saddles(NamedTuple):
+    """The saddles of all modes, eliminated: the n variables first (m of them with curvature), then the n_c constraints.
+
+    gamma (2, k): as in `TimeModes`.
+    curvature (m, m): ``w = h^2 M^-1 W''``.
+    denominator (m, m, k): inverses of ``|1 - gamma w|^2``.
+    push (n_c, n): G.
+    pull_soft (n - m, n_c), pull twice (m, n_c, k): G^T through the inverses of ``M`` and ``M - h^2 gamma W''``.
+    schur (2 n_c, 2 n_c, k): inverse of G times these.
+    """
+
+    gamma: Any
+    curvature: Any
+    denominator: Any
+    push: Any
+    pull_soft: Any
+    pull: Any
+    schur: Any
+
+    @classmethod
+    def at(cls, interval: Interval, modes: TimeModes, t, q) -> "Saddles":
+        """With Hessian and Jacobian at a point."""
+        w, push, soft = interval.h**2 * interval.curvature(q), interval.jacobian(t, q), interval.num_soft
+        re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
+        denominator = inverse(np.eye(len(w)) - 2 * re * w + (re**2 + im**2) * matmul(w, w))
+
+        over_mass, n_c = interval.over_mass(push.T), len(push)
+        pull_soft, pull = over_mass[:soft], over_mass[soft:]
+        bent = matmul(w, pull)
+        pull = matmul(denominator, jnp.concatenate([pull - re * bent, im * bent], axis=2))
+        parts = matmul(push[:, soft:], pull)
+        real, imaginary = parts[..., :n_c] + matmul(push[:, :soft], pull_soft), parts[..., n_c:]
+        rows = jnp.concatenate([real, -imaginary], axis=2), jnp.concatenate([imaginary, real], axis=2)
+        schur = inverse(regularized(jnp.concatenate(rows, axis=1)))
+
+        denominator, pull, schur = (jnp.moveaxis(a, 0, -1) for a in (denominator, pull, schur))
+        return cls(modes.gamma, w, denominator, push, pull_soft, (pull[:, :n_c], pull[:, n_c:]), schur)
+
+    def solve(self, y, g):
+        """x (n, 2, k) and nu (n_c, 2, k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
+        soft, (n_c, _, k) = len(self.pull_soft), g.shape
+        x_soft, y = y[:soft], y[soft:]
+        re, im = self.gamma
+        bent = _times(self.curvature, y)
+        conjugate = re * bent + im * jnp.stack([bent[:, 1], -bent[:, 0]], axis=1)
+        x = jnp.sum(self.denominator[:, :, None] * (y - conjugate), axis=1)
+
+        missing = g - _times(self.push[:, :soft], x_soft) - _times(self.push[:, soft:], x)
+        missing = jnp.swapaxes(missing, 0, 1).reshape(2 * n_c, k)
+        nu = jnp.swapaxes(jnp.sum(self.schur * missing, axis=1).reshape(2, n_c, k), 0, 1)
+        real, imaginary = (jnp.sum(part[:, :, None] * nu, axis=1) for part in self.pull)
+        x += real + jnp.stack([-imaginary[:, 1], imaginary[:, 0]], axis=1)
+        return jnp.concatenate([x_soft + _times(self.pull_soft, nu), x]), nu
+
+
+def _times(matrix, x):
+    """A real matrix (m, n) times (n, 2, k)."""
+    n, parts, k = x.shape
+    return matmul(matrix, x.reshape(n, parts * k)).reshape(len(matrix), parts, k)
+
+
+class Iterate(NamedTuple):
+    """State of the iteration: increments (n, r) and multipliers (n_c, r), largest corrections, and how it stands."""
+
+    x: Any
+    mu: Any
+    moved: Any
+    iterations: Any
+    result: Any
+
+
+def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, Unknowns, Any, Any]:
+    """Newton steps until one more would change no increment.
+
+    What it would change them by is known from how the corrections shrink. Accepted are changes of ``newton.tolerance``
+    relative to the motion over the step, and round-off of the positions.
+
+    Returns:
+        (state of the iteration, unknowns, (q_f, p_s, p_f) at the end of the step, largest row of the momentum equations (times h)
+        and largest value of a constraint)
+    """
+    interval, modes = Interval(equations), TimeModes.of(equations.scheme)
+    n_s, (n_g, _) = interval.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
+    x = jnp.concatenate([guess.slow, guess.fast[0]], axis=1).T
+    mu = jnp.concatenate([guess.multiplier[0], guess.slow_multiplier], axis=1).T
+    saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
+    eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
+    tolerance = newton.tolerance / SAFETY  # what is left of every step adds up
+    floors = ROUNDOFF * eps * largest(equations.q_s), ROUNDOFF * eps * largest(equations.q_f)
+
+    def slow_and_fast(x):
+        return largest(x[:n_s]), largest(x[n_s:])
+
+    def step(x, mu, last: Iterate | None = None) -> Iterate:
+        rows, g, _ = interval.residual(x, mu)
+        dx, nu = saddles.solve(_to(modes.of_rows, -interval.over_mass(rows)), _to(modes.of_values, -g))
+        dx, dmu = _back(modes.increments, dx), _back(modes.multipliers, nu)
+        moved, motion = slow_and_fast(dx), slow_and_fast(x)
+        rest = eps * jnp.maximum(*motion) + tiny  # variables at rest have no size of their own
+        changes = [
+            now / (tolerance * size + floor + rest) for now, size, floor in zip(moved, motion, floors, strict=True)
+        ]
+        if last is not None:
+            shrinks = [jnp.minimum(SAFETY * a / (b + tiny), 1.0) for a, b in zip(moved, last.moved, strict=True)]
+            changes = [shrink * change for shrink, change in zip(shrinks, changes, strict=True)]
+        change, iterations = jnp.maximum(*changes), 1 if last is None else last.iterations + 1
+        goes_on = newton.fixed_iterations is None and iterations < newton.max_iterations
+        otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
+        result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
+        return Iterate(x + dx, mu + dmu, moved, jnp.asarray(iterations), result)
+
+    done = step(x, mu)
+    if newton.fixed_iterations is None:
+        done = jax.lax.while_loop(lambda at: at.result == RUNNING, lambda at: step(at.x, at.mu, at), done)
+    else:
+        done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: step(at.x, at.mu, at), done)
+    rows, g, p = interval.residual(done.x, done.mu)
+    x, mu = done.x.T, done.mu.T
+    unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
+    return done, unknowns, (equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]), (largest(rows), largest(g))
+
+
+def _to(modes, x):
+    """Nodes (n, r) to modes (n, 2, k)."""
+    r, parts, k = modes.shape
+    return (x @ modes.reshape(r, parts * k)).reshape(len(x), parts, k)
+
+
+def _back(modes, x):
+    """Modes (n, 2, k) to nodes (n, r)."""
+    parts, k, r = modes.shape
+    return x.reshape(len(x), parts * k) @ modes.reshape(parts * k, r)
