@@ -17,18 +17,21 @@ COMPOSED = {"kahan-li8": (1, 2, 4), "kahan-li6": (1, 2, 4), "suzuki4": (1, 2, 4,
 """Compositions of `vm.fully_explicit` that are tried, with numbers of micro steps; the finest first."""
 EXPLICIT = (4, 8, 16)
 """Numbers of micro steps of `vm.fully_explicit` on its own."""
-LOOSE = 1e-6
-"""A Newton tolerance for moderate errors, where there are implicit equations; the others are solved to round-off."""
+LOBATTO = (5, 7, 9)
+"""Degrees of `vm.galerkin` with one interval to a step, where there are constraints."""
+LOOSE, LOOSE_HIGH = 1e-6, 1e-9
+"""Newton tolerances for moderate errors, where there are implicit equations; they are also solved to round-off. The second one
+for high degrees, whose steps are long: it is relative to the motion."""
 
 
 def schemes(case: Case) -> dict[str, vm.Scheme | vm.Composition]:
-    """Those that are the fastest somewhere on these problems, or close to it; implicit ones of high degree never are."""
+    """Those that are the fastest somewhere on these problems, or close to it."""
     explicit = vm.fully_explicit
     found: dict[str, vm.Scheme | vm.Composition] = {
         f"explicit {n}, {name}": vm.compose(explicit(n), name) for name, micro in COMPOSED.items() for n in micro
     }
     if not case.is_chain:
-        found |= {"Gauss 2": vm.galerkin(1, 2, "gauss"), "Lobatto 2": vm.galerkin(2, 2, "lobatto")}
+        found |= {f"Lobatto {degree}": vm.galerkin(1, degree, "lobatto") for degree in LOBATTO}
     return found | {f"explicit {n}": explicit(n) for n in EXPLICIT}
 
 
@@ -74,7 +77,8 @@ def ladders(case: Case) -> list[Ladder]:
             return Ladder(name, "steps", settings, build)
 
         tight = [ladder(name, vm.Newton().tolerance)]
-        return tight if case.is_chain else [*tight, ladder(f"{name}, tolerance {LOOSE:g}", LOOSE)]
+        loose = LOOSE_HIGH if stage_scheme(scheme).degree > 1 else LOOSE
+        return tight if case.is_chain else [*tight, ladder(f"{name}, tolerance {loose:g}", loose)]
 
     return [found for name, scheme in schemes(case).items() for found in of_scheme(name, scheme)]
 

@@ -1,6 +1,6 @@
 """The cheapest setting for the error one can accept: a staged search over schemes, num_micro and macro steps.
 
-Stage 1 takes every family of `menu.families` with a middling num_micro and finds the largest macro step that keeps the
+Stage 1 takes every family of `menu.families` with its first num_micro and finds the largest macro step that keeps the
 error, giving up on a family as soon as it is much slower than the best so far. Stage 2 varies num_micro of the best
 families, uphill from where they stand, and tries them with one micro step. Stage 3 times the best settings in turn.
 """
@@ -20,8 +20,6 @@ from vmri_jax.study.timing import interleaved
 from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
 
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
-FIRST = 5
-"""The num_micro of stage 1."""
 PATIENCE = 5.0
 """A setting that takes so many times the best one is given up."""
 KEPT = 4
@@ -156,15 +154,17 @@ class Search:
             return setting
 
         total = len(self.menu) + KEPT
-        for i, family in enumerate(sorted(self.menu, key=lambda family: -family.make(FIRST).order)):  # slow ones last
-            for num_micro in NUM_MICRO if exhaustive else (FIRST,):
+        for i, family in enumerate(
+            sorted(self.menu, key=lambda family: -family.make(family.first).order)
+        ):  # slow ones last
+            for num_micro in NUM_MICRO if exhaustive else (family.first,):
                 attempt(family, num_micro, i, total)
         if not exhaustive:
             firsts = sorted(reached.values(), key=lambda s: s.row.seconds)[:KEPT]
             for i, first in enumerate(firsts):
                 attempt(first.family, 1, len(self.menu) + i, total)  # a case of its own: slow and fast share their grid
                 for direction in (1, -1):
-                    at, best = NUM_MICRO.index(FIRST) + direction, first
+                    at, best = NUM_MICRO.index(first.num_micro) + direction, first
                     while 0 <= at < len(NUM_MICRO):
                         setting = attempt(first.family, NUM_MICRO[at], len(self.menu) + i, total)
                         if setting is None or setting.row.seconds > 1.05 * best.row.seconds:
