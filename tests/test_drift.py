@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.support import largest_difference
+from tests.user_systems import FULL_MASS, lifted, sphere
 from vmri_jax import (
-    ConstantMass,
     Method,
     Newton,
     Result,
@@ -34,22 +34,13 @@ def phases(problem_or_system, newton, scheme=None, state=None, macro_dt=DT, num_
     return np.concatenate([run.q_s, run.q_f, run.p_s, run.p_f], axis=1), run.info
 
 
-def lifted(t, q_s, q_f, params):
-    return jnp.stack([jnp.sum(q_f[:2] ** 2) - 1 - 0.1 * jnp.sin(t), q_f[2] - q_s[0] - q_f[0]])
-
-
-def sphere(q_s, params):
-    return jnp.sum(q_s**2, keepdims=True) - 1.0
-
-
 def pull(q_s, q_f, params):
     return params * (q_s[1] + q_f[1]) + jnp.sum(q_s) * jnp.sum(q_f) / 5
 
 
 def general():
     """Full mass matrices, all kinds of constraints, one of them moved; and a consistent start."""
-    mass = ConstantMass(jnp.array([[5.0, 1.0], [1.0, 4.0]]), jnp.array([[1.0, 0.2, 0], [0.2, 1.0, 0.1], [0, 0.1, 2.0]]))
-    system = System(mass, pull, constraint=Rheonomic(lifted), slow_constraint=sphere, params=jnp.asarray(3.0))
+    system = System(FULL_MASS, pull, constraint=Rheonomic(lifted), slow_constraint=sphere, params=jnp.asarray(3.0))
     return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1])
 
 

@@ -80,3 +80,19 @@ def bent_system() -> System:
         force=bent_force,
         params={"k": jnp.asarray(40.0), "b": jnp.asarray(0.1), "length": jnp.asarray(2.0)},
     )
+
+
+FULL_MASS = ConstantMass(
+    jnp.array([[5.0, 1.0], [1.0, 4.0]]), jnp.array([[1.0, 0.2, 0], [0.2, 1.0, 0.1], [0, 0.1, 2.0]])
+)
+"""For two slow and three fast variables."""
+
+
+def lifted(t, q_s, q_f, params):
+    """Two constraints of these, the first one moved."""
+    return jnp.stack([jnp.sum(q_f[:2] ** 2) - 1 - 0.1 * jnp.sin(t), q_f[2] - q_s[0] - q_f[0]])
+
+
+def sphere(q_s, params):
+    """The slow variables on a circle."""
+    return jnp.sum(q_s**2, keepdims=True) - 1.0

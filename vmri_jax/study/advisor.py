@@ -154,9 +154,8 @@ class Search:
             return setting
 
         total = len(self.menu) + KEPT
-        for i, family in enumerate(
-            sorted(self.menu, key=lambda family: -family.make(family.first).order)
-        ):  # slow ones last
+        slow_ones_last = sorted(self.menu, key=lambda family: -family.make(family.first).order)
+        for i, family in enumerate(slow_ones_last):
             for num_micro in NUM_MICRO if exhaustive else (family.first,):
                 attempt(family, num_micro, i, total)
         if not exhaustive:
