@@ -64,6 +64,24 @@ def test_what_is_accepted_is_within_the_tolerance(name, tolerance, request):
     assert largest_difference(found, exact) < tolerance * motion
 
 
+@pytest.mark.parametrize("coefficients", ["suzuki4", [1.0, -1.0, 1.0], None])
+@pytest.mark.parametrize("name", ["tsp", "sam", "general"])
+def test_momenta_are_projected_where_they_are_saved(name, coefficients, request):
+    """Between saved nodes they are not, which changes multipliers alone, also where two stages undo each other."""
+    problem, state = general() if name == "general" else (request.getfixturevalue(name), None)
+    system = getattr(problem, "system", problem)
+    scheme = fully_explicit(1) if coefficients is None else compose(fully_explicit(1), coefficients)
+    start, step = problem.state() if state is None else state, {"macro_dt": DT, "num_steps": 24}
+    often, rarely = (simulate(system, scheme, start, **step, save_every=k) for k in (1, 8))
+    for a, b in zip(
+        (often.q_s, often.q_f, often.p_s, often.p_f), (rarely.q_s, rarely.q_f, rarely.p_s, rarely.p_f), strict=True
+    ):
+        assert largest_difference(a[::8], b) / np.abs(a).max() < 1e-12
+    assert np.all(rarely.constraint_residual < 1e-11)
+    assert int(rarely.info.method.max()) == Method.MARCH
+    assert int(rarely.info.iterations.max()) <= int(often.info.iterations.max()) + 1
+
+
 def test_one_correction_where_the_motion_is_smooth(tsp):
     _, info = phases(tsp, Newton(), macro_dt=2.5e-4, num_steps=500)
     assert np.asarray(info.iterations).mean() < 1.1  # measured 1.0

@@ -132,12 +132,18 @@ def sum_before(increments):
     return jnp.concatenate([jnp.zeros_like(increments[:1]), jnp.cumsum(increments[:-1], axis=0)])
 
 
-def multiplier_scales(scheme: Scheme, macro_dt):
-    """What turns multipliers into unknowns: ``h H w_j`` (num_micro, r, 1) and ``num_micro h H w_i`` (r, 1)."""
+def multiplier_scales(scheme: Scheme, macro_dt, before=0.0):
+    """What turns multipliers into unknowns: ``h H w_j`` (num_micro, r, 1) and ``num_micro h H w_i`` (r, 1).
+
+    Args:
+        before: length of the macro step before, if the momenta have not been projected since: the multipliers of the node that
+            the two steps share are then those of both.
+    """
     n, h = scheme.num_micro, macro_dt / scheme.num_micro
-    w, w_slow = jnp.asarray(scheme.constraint.rule.weights), scheme.slow_constraint.rule.weights
-    shared = jnp.tile(w[:-1], (n, 1)).at[1:, 0].add(w[-1])  # intervals share their end nodes
-    return h**2 * shared[..., None], macro_dt**2 * w_slow[:-1, None]
+    w, w_slow = (jnp.asarray(placed.rule.weights) for placed in (scheme.constraint, scheme.slow_constraint))
+    shared = jnp.tile(w[:-1], (n, 1)).at[1:, 0].add(w[-1]).at[0, 0].add(before / macro_dt * w[-1])
+    slow_shared = w_slow[:-1].at[0].add(before / macro_dt * w_slow[-1])
+    return h**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
 
 
 def physical_multipliers(scheme: Scheme, macro_dt, multiplier, slow_multiplier):

@@ -25,7 +25,7 @@ from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result, SimulationError
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
-from vmri_jax.step import Memory, Stages, advance, start_memory
+from vmri_jax.step import Memory, Stages, advance, projected, projects_rarely, start_memory
 from vmri_jax.system import System
 from vmri_jax.trajectory import RunInfo, Trajectory, join
 
@@ -166,11 +166,11 @@ def run(
     system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro
 ) -> tuple[Trajectory, Memory | Stages]:
     """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one."""
-    n = scheme.num_micro
+    n, rarely = scheme.num_micro, projects_rarely(system, scheme, state, newton)
 
     def step(_, carry):
         state, memory, k, (result, failed_at), worst, _ = carry
-        state, info, memory = advance(system, scheme, state, macro_dt, newton, memory)
+        state, info, memory = advance(system, scheme, state, macro_dt, newton, memory, project=not rarely)
         alive = failed_at < 0  # until the step before
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
         now = (info.method, info.iterations, info.residual)
@@ -188,6 +188,8 @@ def run(
         micro = jnp.zeros((n, state.q_f.shape[0])) if save_micro else None
         carry = (state, memory, k, status, worst, micro)
         state, memory, k, status, worst, micro = jax.lax.fori_loop(0, save_every, step, carry)
+        if rarely:
+            state, memory = projected(system, state, memory)
         return (state, memory, k, status), (state, worst, micro)
 
     status = (jnp.asarray(int(Result.CONVERGED)), jnp.asarray(-1))

@@ -110,6 +110,15 @@ def is_drift(system: System, scheme: Scheme) -> bool:
     )
 
 
+def drifts(system: System, scheme: Scheme, q_s, q_f) -> bool:
+    """Whether nothing but drifts moves along constraints: these also take momenta that are not projected."""
+    parts = split(system, scheme, q_s, q_f)
+    if parts is None:
+        return is_drift(system, scheme)
+    pairs = (parts.slow, parts.slow_scheme), (parts.fast, parts.fast_scheme)
+    return all(is_drift(part, rules) for part, rules in pairs if part.is_constrained)
+
+
 def is_explicit(system: System, scheme: Scheme) -> bool:
     """Whether a step is a straight drift between kicks."""
     return is_drift(system, scheme) and not system.is_constrained

@@ -26,7 +26,7 @@ from vmri_jax.newton import Newton, drift, interval_matrix, is_collocation, is_c
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
-from vmri_jax.split import fast_alone, is_drift, is_explicit, split
+from vmri_jax.split import drifts, fast_alone, is_drift, is_explicit, split
 from vmri_jax.state import State, project_momentum
 from vmri_jax.system import ConstantMass, System
 
@@ -158,15 +158,45 @@ def _equations(system, scheme, state, macro_dt) -> StepEquations:
     return StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
 
 
-def advance(system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton, memory):
-    """`macro_step` that takes and hands on a memory: (state, info, memory)."""
+def projects_rarely(system: System, scheme: Scheme | Composition, state: State, newton: Newton) -> bool:
+    """Whether a run may project its momenta only where they are looked at.
+
+    A projection is a shift by ``G^T mu``, which the multipliers of the next step take back.
+    """
     if isinstance(scheme, Composition):
-        return _advance_stages(system, scheme, state, macro_dt, newton, memory)
+        return projects_rarely(system, scheme.scheme, state, newton)
+    held = system.is_constrained and newton.marches(system, scheme)
+    return held and drifts(system, scheme, state.q_s, state.q_f)
+
+
+def projected(system: System, state: State, memory):
+    """State and memory with momenta on the hidden constraints."""
+
+    def is_warm(part):
+        return isinstance(part, drift.Warm)
+
+    at_hand = isinstance(system.kinetic, ConstantMass)  # the velocity, with the momentum
+    p_s, p_f, *velocity = project_momentum(system, state, None if at_hand else memory.velocity)
+    memory = jax.tree.map(lambda part: part.projected() if is_warm(part) else part, memory, is_leaf=is_warm)
+    memory = memory if at_hand else memory._replace(velocity=tuple(velocity))
+    return State(state.t, state.q_s, state.q_f, p_s, p_f), memory
+
+
+def advance(
+    system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton, memory, project: bool = True
+):
+    """`macro_step` that takes and hands on a memory: (state, info, memory).
+
+    Args:
+        project: whether the momenta are projected, see `projects_rarely`.
+    """
+    if isinstance(scheme, Composition):
+        return _advance_stages(system, scheme, state, macro_dt, newton, memory, project)
     memory = _renew_matrix(system, scheme, state, macro_dt, newton, memory)
     state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
-    p_s, p_f, v_s, v_f = project_momentum(system, state, memory.velocity)
-    state = State(state.t, state.q_s, state.q_f, p_s, p_f)
-    finite = jnp.all(jnp.isfinite(p_s)) & jnp.all(jnp.isfinite(p_f))  # positions become infinite by momenta that are
+    if project:
+        state, memory = projected(system, state, memory)
+    finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))  # positions become infinite by these
     multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, info.multiplier, info.slow_multiplier)
     info = dataclasses.replace(
         info,
@@ -174,11 +204,10 @@ def advance(system: System, scheme: Scheme | Composition, state: State, macro_dt
         multiplier=multiplier,
         slow_multiplier=slow_multiplier,
     )
-    kept = None if isinstance(system.kinetic, ConstantMass) else (v_s, v_f)
-    return state, info, memory._replace(velocity=kept)
+    return state, info, memory
 
 
-def _advance_stages(system, scheme, state, macro_dt, newton, memory: Stages):
+def _advance_stages(system, scheme, state, macro_dt, newton, memory: Stages, project: bool):
     """The stages of a composition, one after the other."""
 
     def stage(carry, at):
@@ -187,7 +216,7 @@ def _advance_stages(system, scheme, state, macro_dt, newton, memory: Stages):
         if scheme.scheme.slow.mollified:  # the average depends on the length of the stage
             average = averaging(system, scheme.scheme, c * macro_dt, newton)
             memory = memory._replace(kicks=_kick_gradients(system, scheme.scheme, state.q_s, state.q_f, average))
-        state, info, memory = advance(system, scheme.scheme, state, c * macro_dt, newton, memory)
+        state, info, memory = advance(system, scheme.scheme, state, c * macro_dt, newton, memory, project)
         return (state, memory), (memory, info)
 
     stages = jnp.asarray(scheme.coefficients), memory.own

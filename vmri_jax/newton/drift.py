@@ -15,20 +15,33 @@ from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.newton.interval import ROUNDOFF, SAFETY, constant_mass, inverse_mass
 from vmri_jax.results import RUNNING, Result
 
+LEAST = 0.1
+"""Where two steps of a composition undo each other but for so much, their common multiplier says nothing about the force."""
+
 
 class Warm(NamedTuple):
-    """What a step hands to the next one: (2, n_g + n_gs) multipliers of the last steps, the last one first."""
+    """What a step hands to the next one.
+
+    multiplier: (2, n_g + n_gs) multipliers of the last steps, the last one first.
+    before: length of the last step, 0 where the momenta have been projected since. Its half of the constraint force at the
+        node between the two is left to the next one otherwise.
+    """
 
     multiplier: Any
+    before: Any
 
     @classmethod
     def none(cls, num_constraints: int) -> "Warm":
         """The start of a run."""
-        return cls(jnp.zeros((2, num_constraints)))
+        return cls(jnp.zeros((2, num_constraints)), jnp.zeros(()))
 
     def after(self, last: "Warm") -> "Warm":
         """What a stage of a composition starts from: all of it belongs to the stage before."""
         return last
+
+    def projected(self) -> "Warm":
+        """With momenta on the hidden constraints."""
+        return self._replace(before=jnp.zeros_like(self.before))
 
 
 class Drift(NamedTuple):
@@ -68,7 +81,7 @@ def solve(equations: StepEquations, warm: Warm, newton):
     free = h * jnp.concatenate([velocity_s(equations.p_s), velocity_f(equations.p_f)])
 
     n_g, n_gs = system.num_constraints(equations.q_s, equations.q_f)
-    scales = multiplier_scales(equations.scheme, h)
+    scales = multiplier_scales(equations.scheme, h, warm.before)
     scale = jnp.concatenate([jnp.broadcast_to(a.reshape(-1)[:1], n) for a, n in zip(scales, (n_g, n_gs), strict=True)])
     mu = scale * (2 * warm.multiplier[0] - warm.multiplier[1])
     x = free - _combined(mu, columns)
@@ -99,7 +112,9 @@ def solve(equations: StepEquations, warm: Warm, newton):
     x, mu = done.x, done.mu
     end = equations.q_f + x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
     unknowns = Unknowns(x[None, :n_s], mu[None, n_g:], x[None, None, n_s:], mu[None, None, :n_g])
-    return done, unknowns, end, Warm(jnp.stack([mu / scale, warm.multiplier[0]]))
+    tells = jnp.abs(scale) > LEAST * h**2
+    multiplier = jnp.where(tells, mu / jnp.where(tells, scale, 1.0), warm.multiplier[0])
+    return done, unknowns, end, Warm(jnp.stack([multiplier, warm.multiplier[0]]), jnp.asarray(h, dtype=float))
 
 
 def _combined(mu, rows):
