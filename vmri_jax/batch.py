@@ -20,8 +20,11 @@ from vmri_jax.state import State, check_constraints
 from vmri_jax.system import System
 from vmri_jax.trajectory import Trajectory
 
-WORKING_SET = 32768
-"""Numbers that the lanes of a chunk may hold together, 256 kB: well within the second-level cache."""
+WORKING_SET = 16384
+"""Numbers that the lanes of a chunk may hold together, 128 kB: well within the second-level cache."""
+FEWEST, MOST = 64, 1024
+"""Lanes of a chunk. Loops over fewer are written out instead of run, which takes twice the time per lane even where 64 do not fit
+into the cache."""
 
 COMPILER_OPTIONS: dict = {}
 """For the program of a batch: vector registers are filled, where the compiler would else take half of the widest; and sums over
@@ -158,11 +161,11 @@ def _check_states(states) -> int:
 
 
 def _chunk(system: System, scheme: Scheme, state: State) -> int:
-    """A power of two of lanes whose unknowns fit into the working set."""
+    """A power of two of lanes whose unknowns fit into the working set, if not too few."""
     leaves, structure = jax.tree.flatten((system, scheme, state))
     unknowns = _unknowns(structure, tuple((np.shape(a), jnp.result_type(a)) for a in leaves))
     variables = state.q_s.shape[0] + state.q_f.shape[0]
-    return 2 ** int(np.clip(np.log2(WORKING_SET / (8 * variables + unknowns)), 3, 10))
+    return int(np.clip(2 ** int(np.log2(WORKING_SET / (8 * variables + unknowns))), FEWEST, MOST))
 
 
 @lru_cache
