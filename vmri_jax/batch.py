@@ -13,6 +13,7 @@ from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.lanes import over_lanes
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import real_array
+from vmri_jax.runtime import IN_LOOPS, WIDE_VECTORS
 from vmri_jax.scheme import Scheme
 from vmri_jax.simulate import check_run, run, run_memory
 from vmri_jax.split import split
@@ -25,13 +26,6 @@ WORKING_SET = 16384
 FEWEST, MOST = 64, 1024
 """Lanes of a chunk. Loops over fewer are written out instead of run, which takes twice the time per lane even where 64 do not fit
 into the cache."""
-
-COMPILER_OPTIONS: dict = {}
-"""For the program of a batch: vector registers are filled, where the compiler would else take half of the widest; and sums over
-some thousand numbers stay in the loop, since handed to a library, as XLA does, they keep it from being one kernel. The options
-are those of the versions of JAX they were tried with; others refuse what they do not know."""
-if jax.__version_info__[:2] == (0, 10):
-    COMPILER_OPTIONS = {"xla_cpu_prefer_vector_width": 512, "xla_cpu_experimental_ynn_fusion_type": ""}
 
 
 def simulate_batch(
@@ -201,7 +195,7 @@ def _join(pieces, lanes: int) -> Trajectory:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:lanes], *pieces)
 
 
-@partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"), compiler_options=COMPILER_OPTIONS)
+@partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"), compiler_options={**WIDE_VECTORS, **IN_LOOPS})
 def _side_by_side(system, scheme, macro_dt, newton, batch, devices, *, num_saves, save_every, save_micro) -> Trajectory:
     def together(system, scheme, macro_dt, newton, save_every, batch):
         def lane(batch):

@@ -16,9 +16,12 @@ FAST_LOOPS = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000,-memdep-block-scan-limit=10000"
 )
 """An option of XLA and one of LLVM: how far back a load is traced to the store it could be replaced by."""
-IN_LOOPS = ["--xla_cpu_experimental_ynn_fusion_type="] if jax.__version_info__[:2] == (0, 10) else []
-"""Sums over some thousand numbers stay in their loop; handed to a library, as XLA does, they keep it from being one kernel.
-Other versions of JAX refuse to start with options they do not know."""
+KNOWN = jax.__version_info__[:2] == (0, 10)
+"""Whether this is the version of JAX that options were tried with; others refuse what they do not know."""
+IN_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""} if KNOWN else {}
+"""Sums over some thousand numbers stay in their loop; handed to a library, as XLA does, they keep it from being one kernel."""
+WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512} if KNOWN else {}
+"""Vector registers are filled, where the compiler would take half of the widest. For batches."""
 DEVICES = "--xla_force_host_platform_device_count="
 
 
@@ -38,7 +41,7 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
     flags = os.environ.get("XLA_FLAGS", "").split()
     wanted = list(flags)
     if fast_loops and not any(flag.startswith(FAST_LOOPS.split("=")[0]) for flag in flags):  # the user's own stays
-        wanted += [FAST_LOOPS, *IN_LOOPS]
+        wanted += [FAST_LOOPS, *(f"--{option}={value}" for option, value in IN_LOOPS.items())]
     if devices is not None:
         wanted = [flag for flag in wanted if not flag.startswith(DEVICES)] + [f"{DEVICES}{devices}"]
     if set(wanted) != set(flags):

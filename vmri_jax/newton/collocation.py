@@ -25,16 +25,15 @@ from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.lanes import over_lanes
 from vmri_jax.newton.interval import (
-    ROUNDOFF,
-    SAFETY,
+    Accepted,
     constant_mass,
+    expected,
     inverse_mass,
     is_linear,
     is_per_coordinate,
 )
 from vmri_jax.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.quadrature import interpolatory_weights
-from vmri_jax.results import RUNNING, Result
 from vmri_jax.scheme import Scheme
 from vmri_jax.system import System
 
@@ -267,9 +266,7 @@ def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, U
     x = jnp.concatenate([guess.slow, guess.fast[0]], axis=1).T
     mu = jnp.concatenate([guess.multiplier[0], guess.slow_multiplier], axis=1).T
     saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
-    eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
-    tolerance = newton.tolerance / SAFETY  # what is left of every step adds up
-    floors = ROUNDOFF * eps * largest(equations.q_s), ROUNDOFF * eps * largest(equations.q_f)
+    accepted = Accepted.of(equations, newton)
 
     def slow_and_fast(x):
         return largest(x[:n_s]), largest(x[n_s:])
@@ -278,25 +275,14 @@ def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, U
         rows, g, _ = interval.residual(x, mu)
         dx, nu = saddles.solve(_to(modes.of_rows, -interval.over_mass(rows)), _to(modes.of_values, -g))
         dx, dmu = _back(modes.increments, dx), _back(modes.multipliers, nu)
-        moved, motion = slow_and_fast(dx), slow_and_fast(x)
-        rest = eps * jnp.maximum(*motion) + tiny  # variables at rest have no size of their own
-        changes = [
-            now / (tolerance * size + floor + rest) for now, size, floor in zip(moved, motion, floors, strict=True)
-        ]
+        left = moved = slow_and_fast(dx)
         if last is not None:
-            shrinks = [jnp.minimum(SAFETY * a / (b + tiny), 1.0) for a, b in zip(moved, last.moved, strict=True)]
-            changes = [shrink * change for shrink, change in zip(shrinks, changes, strict=True)]
-        change, iterations = jnp.maximum(*changes), 1 if last is None else last.iterations + 1
-        goes_on = newton.fixed_iterations is None and iterations < newton.max_iterations
-        otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
-        result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
+            left = map(expected, moved, last.moved)
+        iterations = 1 if last is None else last.iterations + 1
+        result = newton.status(accepted.over(left, slow_and_fast(x)), iterations)
         return Iterate(x + dx, mu + dmu, moved, jnp.asarray(iterations), result)
 
-    done = step(x, mu)
-    if newton.fixed_iterations is None:
-        done = jax.lax.while_loop(lambda at: at.result == RUNNING, lambda at: step(at.x, at.mu, at), done)
-    else:
-        done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: step(at.x, at.mu, at), done)
+    done = newton.iterate(lambda at: step(at.x, at.mu, at), step(x, mu), done=1)
     rows, g, p = interval.residual(done.x, done.mu)
     x, mu = done.x.T, done.mu.T
     unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from vmri_jax.algebra import inverse, matvec, regularized
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.newton.interval import ROUNDOFF, SAFETY, constant_mass, inverse_mass
-from vmri_jax.results import RUNNING, Result
 
 LEAST = 0.1
 """Where two steps of a composition undo each other but for so much, their common multiplier says nothing about the force."""
@@ -93,21 +92,13 @@ def solve(equations: StepEquations, warm: Warm, newton):
         dmu = matvec(schur, g)
         dx = _combined(dmu, columns)
         change = jnp.max(jnp.abs(dx) * per)
-        goes_on = newton.fixed_iterations is None and iterations < newton.max_iterations
-        otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
-        result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
-        return Drift(x, mu, g, dx, dmu, jnp.asarray(iterations), result)
+        return Drift(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
 
     def corrected(last: Drift) -> Drift:
         x = last.x - last.dx
         return at(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
 
-    done = at(x, mu, g, 0)
-    if newton.fixed_iterations is None:
-        done = jax.lax.while_loop(lambda last: last.result == RUNNING, corrected, done)
-    else:
-        done = jax.lax.fori_loop(0, newton.fixed_iterations, lambda _, last: corrected(last), done)
-
+    done = newton.iterate(corrected, at(x, mu, g, 0))
     impulse = _combined(done.mu, jacobian) / h
     x, mu = done.x, done.mu
     end = equations.q_f + x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]

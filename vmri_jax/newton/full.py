@@ -149,10 +149,8 @@ def _iterate(equations: StepEquations, guess: Unknowns, newton, method: str, lim
         return Iterate(x, before, d, jnp.where(back, at.update, update), damping, at.iterations + 1, result)
 
     start = Iterate(guess, guess, guess, jnp.inf, jnp.ones(()), jnp.asarray(0), jnp.asarray(RUNNING))
-    if newton.fixed_iterations is None:
-        done = jax.lax.while_loop(lambda at: at.result == RUNNING, iterate, start)
-    else:
-        done = jax.lax.fori_loop(0, newton.fixed_iterations, lambda _, at: iterate(at), start)
+    done = newton.iterate(iterate, start)
+    if newton.fixed_iterations is not None:
         done = done._replace(result=jnp.where(done.result == RUNNING, Result.STAGNATED, done.result))
     return done.x, done.result, done.iterations
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import inverse, matmul, matvec, regularized, solve
+from vmri_jax.algebra import inverse, largest, matmul, matvec, regularized, solve
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.equations import StepEquations
 from vmri_jax.linearization import linearize
@@ -20,6 +20,36 @@ ROUNDOFF = 4.0
 """Changes of the positions below so many units of round-off are accepted."""
 SAFETY = 10.0
 """Of the tolerance, and of how corrections shrink from one iteration to the next."""
+
+
+class Accepted(NamedTuple):
+    """Changes of the increments that are accepted: relative to the motion over the step, and round-off of the positions.
+
+    tolerance: of Newton, over `SAFETY`, since what is left of every step adds up.
+    slow, fast: round-off.
+    """
+
+    tolerance: Any
+    slow: Any
+    fast: Any
+
+    @classmethod
+    def of(cls, equations: StepEquations, newton) -> "Accepted":
+        floors = (ROUNDOFF * jnp.finfo(float).eps * largest(q) for q in (equations.q_s, equations.q_f))
+        return cls(newton.tolerance / SAFETY, *floors)
+
+    def over(self, changes, motions):
+        """Changes (slow, fast) over what is accepted of them with such motions; the larger of the two."""
+        numbers = jnp.finfo(float)
+        rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny  # variables at rest have no size of their own
+        floors = self.slow, self.fast
+        parts = (c / (self.tolerance * m + floor + rest) for c, m, floor in zip(changes, motions, floors, strict=True))
+        return jnp.maximum(*parts)
+
+
+def expected(moved, before):
+    """The next correction, with a margin, after this one and the one before."""
+    return jnp.minimum(SAFETY * moved / (before + jnp.finfo(float).tiny), 1.0) * moved
 
 
 def can_be_cut(system: System, scheme: Scheme) -> bool:

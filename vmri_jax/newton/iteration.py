@@ -13,7 +13,7 @@ from vmri_jax.linearization import linearize
 from vmri_jax.newton import arrowhead, collocation, drift, full, march
 from vmri_jax.newton.interval import can_be_cut, is_linear
 from vmri_jax.quadrature import is_concrete, real_array
-from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result
+from vmri_jax.results import CONSTRAINT_TOLERANCE, RUNNING, Method, Result
 from vmri_jax.split import is_drift
 
 Choice = Literal["auto", "march", "frozen", "decoupled", "arrowhead", "dense"]
@@ -67,6 +67,18 @@ class Newton(eqx.Module):
                 and not real_array(f"Newton: {name}", value, 0) > 0
             ):
                 raise ValueError(f"Newton: {name} is {value}; it must be positive.")
+
+    def status(self, change, iterations):
+        """`Result` after so many iterations, from the largest change still to come over what is accepted, or RUNNING."""
+        goes_on = self.fixed_iterations is None and iterations < self.max_iterations
+        otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
+        return jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
+
+    def iterate(self, step, at, done: int = 0):
+        """``step(at)`` while ``at.result`` is RUNNING, or as often as was asked for; `done` iterations are behind."""
+        if self.fixed_iterations is None:
+            return jax.lax.while_loop(lambda at: at.result == RUNNING, step, at)
+        return jax.lax.fori_loop(done, self.fixed_iterations, lambda _, at: step(at), at)
 
     @property
     def falls_back(self) -> bool:

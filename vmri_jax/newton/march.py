@@ -27,10 +27,10 @@ from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.newton.extrapolation import Differences, Line
 from vmri_jax.newton.interval import (
-    ROUNDOFF,
-    SAFETY,
+    Accepted,
     IntervalMatrix,
     constant_mass,
+    expected,
     has_kicks,
     interval_problem,
     inverse_mass,
@@ -40,7 +40,7 @@ from vmri_jax.newton.interval import (
 )
 from vmri_jax.newton.secant import SIZE, Pairs
 from vmri_jax.path import control_nodes
-from vmri_jax.results import RUNNING, Result
+from vmri_jax.results import Result
 
 NOISE = 3e2
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
@@ -247,14 +247,13 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     system, scheme, h = equations.system, equations.scheme, equations.micro_dt
     n, r, n_s, n_f = scheme.num_micro, scheme.degree, equations.q_s.shape[0], equations.q_f.shape[0]
     n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
-    eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
+    eps = jnp.finfo(float).eps
     mass = constant_mass(system)
     inverse_slow, inverse_fast = inverse_mass(mass.slow), inverse_mass(mass.fast)
     kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
     inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
     times = equations.t + equations.macro_dt * control_nodes(r)
-    tolerance = newton.tolerance / SAFETY  # what is left of every step adds up
-    accepted_slow, accepted_fast = ROUNDOFF * eps * largest(equations.q_s), ROUNDOFF * eps * largest(equations.q_f)
+    accepted = Accepted.of(equations, newton)
 
     def slow_update(x: Unknowns, end: Pass):
         """Update of the slow unknowns by mass and slow constraint, residuals of their equations, impulse."""
@@ -278,16 +277,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
             pairs = pairs.add(joined(x) - joined(last.x), d - last.d, noise, r * n_s)
 
         motion = jnp.maximum(largest(inverse_fast(h * equations.p_f)), largest(inverse_fast(end.p_f)))
-        others = eps * jnp.maximum(largest(x.slow), n * motion) + tiny  # variables at rest have no size of their own
-        shrink = 1.0 if first else jnp.minimum(SAFETY * end.moved / (last.end.moved + tiny), 1.0)
-        left = shrink * end.moved
-        change = jnp.maximum(
-            largest(d[: r * n_s]) / (tolerance * largest(x.slow) + accepted_slow + others),
-            left / (tolerance * motion + accepted_fast + others),
-        )
-        goes_on = newton.fixed_iterations is None and passes < newton.max_iterations
-        otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
-        result = jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
+        left = end.moved if first else expected(end.moved, last.end.moved)
+        result = newton.status(accepted.over((largest(d[: r * n_s]), left), (largest(x.slow), motion)), passes)
         residual = jnp.maximum(largest(rows), largest(mass.fast) * left), largest(g)
         return March(x, end, nodes, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
 
@@ -314,10 +305,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     if linear:
         exact = np.zeros(()), np.zeros(())
         done = done._replace(residual=exact, passes=np.asarray(1), result=np.asarray(int(Result.CONVERGED)))
-    elif newton.fixed_iterations is None:
-        done = jax.lax.while_loop(lambda at: at.result == RUNNING, next_pass, done)
     else:
-        done = jax.lax.fori_loop(1, newton.fixed_iterations, lambda _, at: next_pass(at), done)
+        done = newton.iterate(next_pass, done, done=1)
     if n_g:
         rows, g_slow = done.residual
         done = done._replace(residual=(rows, jnp.maximum(largest(constraints(done)), g_slow)))
