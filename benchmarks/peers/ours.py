@@ -17,8 +17,8 @@ COMPOSED = {"kahan-li8": (1, 2, 4), "kahan-li6": (1, 2, 4), "suzuki4": (1, 2, 4,
 """Compositions of `vm.fully_explicit` that are tried, with numbers of micro steps; the finest first."""
 EXPLICIT = (4, 8, 16)
 """Numbers of micro steps of `vm.fully_explicit` on its own."""
-LOBATTO = (5, 7, 9)
-"""Degrees of `vm.galerkin` with one interval to a step, where there are constraints."""
+LOBATTO = (8, 12, 16, 20)
+"""Degrees of `vm.galerkin` with one interval to a step, where there are constraints; nodes fill vector registers of four."""
 LOOSE = (1e-4, 1e-6)
 """Newton tolerances for moderate errors, where there are constraints; equations are also solved to round-off."""
 LOOSE_HIGH = (*LOOSE, 1e-9)
