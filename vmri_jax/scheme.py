@@ -238,7 +238,7 @@ def galerkin(num_micro: int, degree: int, rule: Rule | str = "gauss") -> Scheme:
     iteration: num_micro times the number of nodes (lobatto shares the nodes where micro intervals meet).
 
     On small constrained systems the cheapest way to small errors is a single interval of high degree, e.g.
-    ``galerkin(1, 7, "lobatto")`` with steps somewhat shorter than a period of the fastest vibration.
+    ``galerkin(1, 12, "lobatto")`` with five or six nodes to a period of the fastest vibration: steps of two periods.
     """
     degree = _positive_integer("degree", degree)
     if isinstance(rule, str):

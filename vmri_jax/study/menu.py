@@ -46,7 +46,7 @@ BASES = {"fully explicit": vm.fully_explicit, "explicit slow": vm.explicit_slow,
 
 
 def families(
-    compositions: tuple[str, ...] = ("suzuki4", "kahan-li6", "kahan-li8"), degrees: tuple[int, ...] = (2, 4, 7)
+    compositions: tuple[str, ...] = ("suzuki4", "kahan-li6", "kahan-li8"), degrees: tuple[int, ...] = (2, 4, 12)
 ) -> list[Family]:
     """The second-order schemes, compositions of the first two of them, and Galerkin schemes."""
     menu = [Family(name, make, f"--scheme {name.replace(' ', '-')}") for name, make in BASES.items()]
