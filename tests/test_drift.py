@@ -44,12 +44,20 @@ def general():
     return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1])
 
 
+def started(name, request) -> tuple[System, State]:
+    """A system and its start."""
+    if name == "general":
+        return general()
+    problem = request.getfixturevalue(name)
+    return problem.system, problem.state()
+
+
 @pytest.mark.parametrize("composed", [False, True])
 @pytest.mark.parametrize("name", ["tsp", "sam", "general"])
 def test_it_solves_the_equations_of_the_step(name, composed, request):
-    problem, state = general() if name == "general" else (request.getfixturevalue(name), None)
+    system, start = started(name, request)
     scheme = compose(fully_explicit(1), "suzuki4") if composed else fully_explicit(1)
-    (found, info), (expected, _) = (phases(problem, Newton(method), scheme, state) for method in ("march", "arrowhead"))
+    (found, info), (expected, _) = (phases(system, Newton(method), scheme, start) for method in ("march", "arrowhead"))
     assert int(info.method.max()) == Method.MARCH
     assert largest_difference(found, expected) / np.abs(expected).max() < 1e-13  # measured 1.4e-14
 
@@ -68,10 +76,9 @@ def test_what_is_accepted_is_within_the_tolerance(name, tolerance, request):
 @pytest.mark.parametrize("name", ["tsp", "sam", "general"])
 def test_momenta_are_projected_where_they_are_saved(name, coefficients, request):
     """Between saved nodes they are not, which changes multipliers alone, also where two stages undo each other."""
-    problem, state = general() if name == "general" else (request.getfixturevalue(name), None)
-    system = getattr(problem, "system", problem)
+    system, start = started(name, request)
     scheme = fully_explicit(1) if coefficients is None else compose(fully_explicit(1), coefficients)
-    start, step = problem.state() if state is None else state, {"macro_dt": DT, "num_steps": 24}
+    step = {"macro_dt": DT, "num_steps": 24}
     often, rarely = (simulate(system, scheme, start, **step, save_every=k) for k in (1, 8))
     for a, b in zip(
         (often.q_s, often.q_f, often.p_s, often.p_f), (rarely.q_s, rarely.q_f, rarely.p_s, rarely.p_f), strict=True
