@@ -26,6 +26,8 @@ WORKING_SET = 16384
 FEWEST, MOST = 64, 1024
 """Lanes of a chunk. Loops over fewer are written out instead of run, which takes twice the time per lane even where 64 do not fit
 into the cache."""
+MATRICES = 10_000_000
+"""Numbers that the matrices of a chunk may hold together (80 MB), before the lanes become fewer than that."""
 
 
 def simulate_batch(
@@ -155,11 +157,13 @@ def _check_states(states) -> int:
 
 
 def _chunk(system: System, scheme: Scheme, state: State) -> int:
-    """A power of two of lanes whose unknowns fit into the working set, if not too few."""
+    """A power of two of lanes: those whose unknowns fit into the working set, but not too few."""
     leaves, structure = jax.tree.flatten((system, scheme, state))
     unknowns = _unknowns(structure, tuple((np.shape(a), jnp.result_type(a)) for a in leaves))
     variables = state.q_s.shape[0] + state.q_f.shape[0]
-    return int(np.clip(2 ** int(np.log2(WORKING_SET / (8 * variables + unknowns))), FEWEST, MOST))
+    fitting = WORKING_SET / (8 * variables + unknowns)
+    enough = min(FEWEST, max(8.0, MATRICES / (unknowns * variables + 1)))
+    return 2 ** int(np.log2(np.clip(fitting, enough, MOST)))
 
 
 @lru_cache
