@@ -72,8 +72,7 @@ def test_what_is_accepted_is_within_the_tolerance(name, tolerance, request):
     assert largest_difference(found, exact) < tolerance * motion
 
 
-@pytest.mark.parametrize("coefficients", ["suzuki4", [1.0, -1.0, 1.0], None])
-@pytest.mark.parametrize("name", ["tsp", "sam", "general"])
+@pytest.mark.parametrize(("name", "coefficients"), [("sam", "suzuki4"), ("tsp", [1.0, -1.0, 1.0]), ("general", None)])
 def test_momenta_are_projected_where_they_are_saved(name, coefficients, request):
     """Between saved nodes they are not, which changes multipliers alone, also where two stages undo each other."""
     system, start = started(name, request)
