@@ -18,10 +18,6 @@ CASES = {
 }
 
 
-LONG = ("fpu, fully implicit",)
-"""Only with --full: its system and its scheme are each in another case."""
-
-
 def final_position(name, scheme, macro_dt, parameter, entry, newton):
     """A function of one stiffness: the sum of cosines of the fast positions after 10 steps."""
     problem = PROBLEMS[name]()
@@ -44,7 +40,7 @@ def central_difference(function, x, step):
     return float((4 * d[1] - d[0]) / 3)
 
 
-@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.full if c in LONG else ()) for c in CASES])
+@pytest.mark.parametrize("case", CASES)
 def test_gradient_with_respect_to_a_stiffness(case):
     function, x = final_position(*CASES[case], Newton())
     function = jax.jit(function)
