@@ -34,6 +34,7 @@ from vmri_jax.newton.interval import (
 )
 from vmri_jax.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.quadrature import interpolatory_weights
+from vmri_jax.results import RUNNING
 from vmri_jax.scheme import Scheme
 from vmri_jax.system import System
 
@@ -97,13 +98,15 @@ class Interval:
     """
 
     def __init__(self, equations: StepEquations):
-        self.system, self.scheme, self.h = equations.system, equations.scheme, equations.macro_dt
+        self.system, self.h = equations.system, equations.macro_dt
         self.n_s, self.r = equations.q_s.size, equations.scheme.degree
         self.num_soft = self.n_s if equations.q_f.size else 0
         self.q = jnp.concatenate([equations.q_s, equations.q_f])
         self.p = jnp.concatenate([equations.p_s, equations.p_f])
         self.times = equations.t + self.h * control_nodes(self.r)
-        self.terms = lagrangian(self.system, self.scheme).terms
+        terms = lagrangian(self.system, equations.scheme).terms
+        self.kinetic = next(term for term in terms if isinstance(term, QuadraticKinetic))
+        self.potentials = [term for term in terms if isinstance(term, Term) and term.inside.groups]
         self.at_start = self.jacobian(self.times[0], self.q)
 
     def constraints(self, t, q):
@@ -129,55 +132,75 @@ class Interval:
         mass, parts = constant_mass(self.system), (x[: self.n_s], x[self.n_s :])
         return jnp.concatenate([inverse_mass(m)(a.T).T for m, a in zip((mass.slow, mass.fast), parts, strict=True)])
 
+    def by_name(self, term: Term, q) -> tuple:
+        """What a term takes of (n, ...) joined variables."""
+        at = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
+        return tuple(at[name] for name in term.arguments)
+
     def curvature(self, q):
         """``M^-1`` times the Hessian of the potentials (m, m) by the variables that are not soft."""
         soft, stiff = q[: self.num_soft], q[self.num_soft :]
 
         def potential(stiff):
             q = jnp.concatenate([soft, stiff])
-            at = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
-            terms = (term for term in self.terms if isinstance(term, Term) and term.inside.groups)
-            return sum(
-                (-term.sign * term.integrand(*(at[name] for name in term.arguments)) for term in terms), jnp.zeros(())
-            )
+            parts = (-term.sign * term.integrand(*self.by_name(term, q)) for term in self.potentials)
+            return sum(parts, jnp.zeros(()))
 
         hessian = jax.hessian(potential)(stiff)
         return self.over_mass(jnp.concatenate([jnp.zeros((self.num_soft, stiff.size)), hessian]))[self.num_soft :]
 
-    def slots(self, x):
-        """``h D_j L_d`` (n, r + 1) for increments (n, r)."""
-        total = jnp.zeros((self.q.size, self.r + 1))
-        for term in self.terms:
-            if isinstance(term, QuadraticKinetic):
-                total += self.times_mass(x) @ term.fast_form[1:]
-            elif term.inside.groups:
-                theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
-                basis = lagrange_basis(self.r, theta)
-                q = self.q[:, None] + x @ basis[:, 1:].T
-                at = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
-                gradient = jax.grad(lambda q, term=term: term.sign * term.integrand(*q))
-                d = over_lanes(gradient, len(theta))(tuple(at[name] for name in term.arguments))
-                at = {name: jnp.zeros_like(a) for name, a in at.items()} | dict(zip(term.arguments, d, strict=True))
-                total += jnp.concatenate(list(at.values())) @ (self.h**2 * term.inside.weights[:, None] * basis)
-        return total
-
-    def residual(self, x, mu):
-        """Rows of the momentum equations (n, r), constraints (n_c, r) at the nodes 1..r, and the momentum (n,) at the end.
+    def forces(self, q, x, mu):
+        """Of potentials and constraints, times h: (n,) at the start of the step and (n, r) at the nodes 1..r, and constraints (n_c, r).
 
         Args:
-            x, mu: increments (n, r) and multipliers (n_c, r).
+            q, x, mu: positions at the nodes 1..r and their increments (n, r), multipliers (n_c, r).
         """
 
         def at_node(at):
             t, q, mu = at
             g, pull = jax.vjp(lambda q: self.constraints(t, q), q)
-            return g, pull(mu)[0]
+            return g, -pull(mu)[0]
 
         later = jnp.concatenate([mu[:, 1:], jnp.zeros_like(mu[:, :1])], axis=1)
-        g, pulls = over_lanes(at_node, self.r)((self.times[1:], self.q[:, None] + x, later))
-        slots, first = self.slots(x), self.h * self.p - jnp.sum(mu[:, :1] * self.at_start, axis=0)
-        others = jnp.concatenate([first[:, None], -pulls[:, :-1]], axis=1)
-        return slots[:, :-1] + others, g, slots[:, -1] / self.h
+        g, total = over_lanes(at_node, self.r)((self.times[1:], q, later))
+        first = -jnp.sum(mu[:, :1] * self.at_start, axis=0)
+        for term in self.potentials:
+            theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
+            basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
+            on_nodes = not basis[:, 0].any() and np.isin(basis, (0.0, 1.0)).all()  # then at all of them, most in place
+            at = q if on_nodes else self.q[:, None] + x @ basis[:, 1:].T
+            gradient = jax.grad(lambda q, term=term: term.sign * term.integrand(*self.by_name(term, q)))
+            d = over_lanes(gradient, at.shape[1])(at)
+            if on_nodes:
+                total += (weights @ basis[:, 1:]) * d
+            else:
+                first += d @ (weights * basis[:, 0])
+                total += d @ (weights[:, None] * basis[:, 1:])
+        return first, total, g
+
+    def residual(self, x, mu) -> "Residual":
+        """Of increments (n, r) and multipliers (n_c, r)."""
+        first, later, g = self.forces(self.q[:, None] + x, x, mu)
+        others = jnp.concatenate([(self.h * self.p + first)[:, None], later[:, :-1]], axis=1)
+        rows = self.times_mass(x @ self.kinetic.fast_form[1:, :-1]) + others
+        return Residual(rows, g, later[:, -1])
+
+    def momentum(self, x, residual: "Residual"):
+        """At the end of the step (n,)."""
+        return (self.times_mass(x @ self.kinetic.fast_form[1:, -1:])[:, 0] + residual.last) / self.h
+
+
+class Residual(NamedTuple):
+    """Of the equations of a step.
+
+    rows (n, r): momentum equations of the nodes 0..r-1, times h.
+    g (n_c, r): constraints at the nodes 1..r.
+    last (n,): forces at the end of the step, times h.
+    """
+
+    rows: Any
+    g: Any
+    last: Any
 
 
 class Saddles(NamedTuple):
@@ -242,10 +265,11 @@ def _times(matrix, x):
 
 
 class Iterate(NamedTuple):
-    """State of the iteration: increments (n, r) and multipliers (n_c, r), largest corrections, and how it stands."""
+    """State of the iteration: increments x (n, r), multipliers mu (n_c, r), their residual, largest corrections, and how it stands."""
 
     x: Any
     mu: Any
+    residual: Residual
     moved: Any
     iterations: Any
     result: Any
@@ -271,19 +295,18 @@ def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, U
     def slow_and_fast(x):
         return largest(x[:n_s]), largest(x[n_s:])
 
-    def step(x, mu, last: Iterate | None = None) -> Iterate:
-        rows, g, _ = interval.residual(x, mu)
+    def step(last: Iterate) -> Iterate:
+        rows, g, _ = last.residual
         dx, nu = saddles.solve(_to(modes.of_rows, -interval.over_mass(rows)), _to(modes.of_values, -g))
         dx, dmu = _back(modes.increments, dx), _back(modes.multipliers, nu)
-        left = moved = slow_and_fast(dx)
-        if last is not None:
-            left = map(expected, moved, last.moved)
-        iterations = 1 if last is None else last.iterations + 1
+        x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
+        left = map(expected, moved, last.moved)
         result = newton.status(accepted.over(left, slow_and_fast(x)), iterations)
-        return Iterate(x + dx, mu + dmu, moved, jnp.asarray(iterations), result)
+        return Iterate(x, mu, interval.residual(x, mu), moved, iterations, result)
 
-    done = newton.iterate(lambda at: step(at.x, at.mu, at), step(x, mu), done=1)
-    rows, g, p = interval.residual(done.x, done.mu)
+    start = Iterate(x, mu, interval.residual(x, mu), (jnp.zeros(()),) * 2, jnp.asarray(0), jnp.asarray(RUNNING))
+    done = newton.iterate(step, start)
+    p, (rows, g, _) = interval.momentum(done.x, done.residual), done.residual
     x, mu = done.x.T, done.mu.T
     unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
     return done, unknowns, (equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]), (largest(rows), largest(g))
