@@ -10,6 +10,8 @@ import numpy as np
 
 UNROLLED = 8
 """Largest system whose elimination is written out step by step; larger ones go through a loop, which compiles faster."""
+TOGETHER = 3
+"""Steps of that loop that are written out."""
 ELEMENTWISE = 16
 """Largest system that is eliminated by elementwise operations."""
 
@@ -81,7 +83,7 @@ def inverse(a):
 def _repeated(n: int, step, a):
     """``step(k, a)`` for k from 0 to n - 1."""
     if n > UNROLLED:
-        return jax.lax.fori_loop(0, n, step, a)
+        return jax.lax.fori_loop(0, n, step, a, unroll=TOGETHER)
     for k in range(n):
         a = step(k, a)
     return a
