@@ -127,6 +127,11 @@ class Sum:
         return sum((term.at_nodes_inside(path) for term in self.terms), jnp.zeros(()))
 
     @property
+    def potentials(self) -> "Sum":
+        """The terms without the kinetic energy of constant masses."""
+        return Sum(tuple(term for term in self.terms if not isinstance(term, QuadraticKinetic)))
+
+    @property
     def kicks(self) -> tuple[Term, ...]:
         """The terms that have nodes at the ends of the macro interval."""
         return tuple(term for term in self.terms if term.start is not None or term.end is not None)

@@ -73,6 +73,10 @@ class StepEquations(eqx.Module):
         discrete_lagrangian = lagrangian(self.system, self.scheme).at_nodes_inside(path)
         return self.micro_dt * (discrete_lagrangian + self.virtual_work(path, at))
 
+    def potential_action(self, path: Path):
+        """The part of the potentials alone."""
+        return self.micro_dt * lagrangian(self.system, self.scheme).potentials.at_nodes_inside(path)
+
     def virtual_work(self, path: Path, at: Path):
         """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, with the forces along `at`."""
         if self.system.force is None:

@@ -127,6 +127,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
     system, scheme = interval_problem(equations.system, equations.scheme)
     kicks = lagrangian(system, scheme).kicks if n > 1 else ()
     explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
+    from_rest = is_linear(equations.system, equations.scheme, equations.q_s, equations.q_f)
     bent = warm.bend.last.size > 0
     basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # (n, r + 1, r): slow position at each node by increments
     velocity = inverse_mass(constant_mass(system).fast)
@@ -148,6 +149,8 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
+            if from_rest:  # increments are zero, where kinetic energy has no gradient
+                return jax.grad(local.potential_action)(path)
             return jax.grad(local.unconstrained)(path, path)
 
         fast_nodes = jnp.concatenate([carry.q_f[None], carry.q_f + inc[:-1]])
@@ -168,7 +171,8 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
             schur = inverse(regularized(columns.reshape(r * n_g, r * n_g))).T
         dmu = -matvec(schur, change_of_g.reshape(-1)).reshape(r, n_g)
         more_s, more_f = pull(dmu)
-        dx += matrix.solve(more_f)
+        if n_g:
+            dx += matrix.solve(more_f)
         inc, mu, coupling = inc + dx, mu + dmu, change(dx)
         q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
         moved = jnp.maximum(carry.moved, largest(dx))
