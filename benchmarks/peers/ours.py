@@ -21,7 +21,7 @@ LOBATTO = (8, 12, 16, 20)
 """Degrees of `vm.galerkin` with one interval to a step, where there are constraints; nodes fill vector registers of four."""
 LOOSE = (1e-4, 1e-6)
 """Newton tolerances for moderate errors, where there are constraints; equations are also solved to round-off."""
-LOOSE_HIGH = (*LOOSE, 1e-9)
+LOOSE_HIGH = (*LOOSE, 1e-8, 1e-9)
 """The same for high degrees, whose steps are long: tolerances are relative to the motion."""
 MARCH = vm.Newton("march")
 """As `vm.simulate` starts a run. What it does not solve fails here, and is not solved again in another way."""
