@@ -88,9 +88,8 @@ def test_modes_are_eigenvectors(degree, rule):
         return (at.T * weights @ at)[:-1, 1:]
 
     def back(matrix, gamma):
-        into, (re, im) = np.moveaxis(modes.of_values, 1, 0), gamma
-        scaled = re * into[0] - im * into[1], re * into[1] + im * into[0]
-        return np.sum([a @ m for a, m in zip(scaled, matrix, strict=True)], axis=0).T
+        (real, imaginary), (re, im) = np.split(modes.of_values, 2, axis=1), gamma
+        return (np.concatenate([re * real - im * imaginary, re * imaginary + im * real], axis=1) @ matrix).T
 
     a, b = form(True), form(False)
     one = np.stack([np.ones_like(modes.gamma[0]), np.zeros_like(modes.gamma[0])])
@@ -119,10 +118,8 @@ def test_saddles_solve_the_matrix_that_is_written_down(name, request):
     top = np.concatenate([np.kron(a, mass) - h**2 * np.kron(b, hessian), -np.kron(one, g.T)], axis=1)
     bottom = np.concatenate([np.kron(one, g), np.zeros((degree * n_c, degree * n_c))], axis=1)
     rows, values = np.random.default_rng(0).normal(size=(n, degree)), np.ones((n_c, degree))
-    x, nu = saddles.solve(
-        collocation._to(modes.of_rows, interval.over_mass(rows)), collocation._to(modes.of_values, values)
-    )
-    found = collocation._back(modes.increments, x), collocation._back(modes.multipliers, nu)
+    x, nu = saddles.solve(interval.over_mass(rows) @ modes.of_rows, values @ modes.of_values)
+    found = x @ modes.increments, nu @ modes.multipliers
     expected = np.linalg.solve(np.concatenate([top, bottom]), np.concatenate([rows.T.ravel(), values.T.ravel()]))
     assert largest_difference(np.concatenate([y.T.ravel() for y in found]), expected) < 1e-9 * np.abs(expected).max()
 

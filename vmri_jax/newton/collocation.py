@@ -51,11 +51,11 @@ def is_collocation(system: System, scheme: Scheme, q_s, q_f) -> bool:
 
 
 class TimeModes(NamedTuple):
-    """Eigenvectors of ``A^-1 B``: real ones, and one of every complex pair. Real and imaginary parts are one axis (2).
+    """Eigenvectors of ``A^-1 B``: real ones, and one of every complex pair. All real parts come before all imaginary ones.
 
     gamma (2, k): eigenvalues.
-    of_rows, of_values: (r, 2, k) from the rows of the momentum equations (through A^-1) and from values at the nodes to modes.
-    increments, multipliers: (2, k, r) from modes to increments, and (through A) to multipliers.
+    of_rows, of_values: (r, 2 k) from the rows of the momentum equations (through A^-1) and from values at the nodes to modes.
+    increments, multipliers: (2 k, r) from modes to increments, and (through A) to multipliers.
     """
 
     gamma: Any
@@ -73,16 +73,14 @@ class TimeModes(NamedTuple):
         )
         gamma, vectors = np.linalg.eig(np.linalg.solve(a, b))
         kept, twice = np.imag(gamma) >= 0, np.where(np.imag(gamma) > 0, 2.0, 1.0)
-        to, back = (
-            np.linalg.inv(vectors)[kept],
-            (twice * vectors.conj())[:, kept],
-        )  # a mode and its conjugate: the real part
+        to = np.linalg.inv(vectors)[kept]
+        back = (twice * vectors.conj())[:, kept].T  # a mode and its conjugate: the real part
 
         def parts(z):
-            return np.stack([z.real, z.imag])
+            return np.concatenate([z.real, z.imag])
 
-        of_rows, of_values = (np.moveaxis(parts(z), -1, 0) for z in (to @ np.linalg.inv(a), to))
-        return cls(parts(gamma[kept]), of_rows, of_values, parts(back.T), parts((a @ back).T))
+        gamma = np.stack([gamma.real, gamma.imag])[:, kept]
+        return cls(gamma, parts(to @ np.linalg.inv(a)).T, parts(to).T, parts(back), parts(back @ a.T))
 
 
 def _form(basis, degree: int, nodes) -> np.ndarray:
@@ -208,7 +206,7 @@ class Saddles(NamedTuple):
 
     gamma (2, k): as in `TimeModes`.
     curvature (m, m): ``w = h^2 M^-1 W''``.
-    denominator (m, m, k): inverses of ``|1 - gamma w|^2``.
+    denominator (m, m, 2 k): inverses of ``|1 - gamma w|^2``, for real and for imaginary parts.
     push (n_c, n): G.
     pull_soft (n - m, n_c), pull twice (m, n_c, k): G^T through the inverses of ``M`` and ``M - h^2 gamma W''``.
     schur (2 n_c, 2 n_c, k): inverse of G times these.
@@ -226,42 +224,43 @@ class Saddles(NamedTuple):
     def at(cls, interval: Interval, modes: TimeModes, t, q) -> "Saddles":
         """With Hessian and Jacobian at a point."""
         w, push, soft = interval.h**2 * interval.curvature(q), interval.jacobian(t, q), interval.num_soft
+        k, m, n_c = modes.gamma.shape[1], len(w), len(push)
         re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
-        denominator = inverse(np.eye(len(w)) - 2 * re * w + (re**2 + im**2) * matmul(w, w))
+        denominator = inverse(np.eye(m) - 2 * re * w + (re**2 + im**2) * matmul(w, w))
 
-        over_mass, n_c = interval.over_mass(push.T), len(push)
-        pull_soft, pull = over_mass[:soft], over_mass[soft:]
-        bent = matmul(w, pull)
-        pull = matmul(denominator, jnp.concatenate([pull - re * bent, im * bent], axis=2))
-        parts = matmul(push[:, soft:], pull)
-        real, imaginary = parts[..., :n_c] + matmul(push[:, :soft], pull_soft), parts[..., n_c:]
+        over_mass = interval.over_mass(push.T)
+        pull_soft, straight = over_mass[:soft], over_mass[soft:]
+        columns = jnp.concatenate([straight, matmul(w, straight)], axis=1)
+        through = (denominator.reshape(k * m, m) @ columns).reshape(k, m, 2 * n_c)
+
+        def parts(z):
+            """Real and imaginary part of ``(1 - conj(gamma) w) / |1 - gamma w|^2``, from the columns without and with w."""
+            return z[..., :n_c] - re * z[..., n_c:], im * z[..., n_c:]
+
+        real, imaginary = parts(matmul(push[:, soft:], through))
+        real += matmul(push[:, :soft], pull_soft)
         rows = jnp.concatenate([real, -imaginary], axis=2), jnp.concatenate([imaginary, real], axis=2)
         schur = inverse(regularized(jnp.concatenate(rows, axis=1)))
 
-        denominator, pull, schur = (jnp.moveaxis(a, 0, -1) for a in (denominator, pull, schur))
-        return cls(modes.gamma, w, denominator, push, pull_soft, (pull[:, :n_c], pull[:, n_c:]), schur)
+        denominator, *pull, schur = (jnp.moveaxis(a, 0, -1) for a in (denominator, *parts(through), schur))
+        return cls(modes.gamma, w, jnp.concatenate([denominator] * 2, axis=-1), push, pull_soft, pull, schur)
 
     def solve(self, y, g):
-        """x (n, 2, k) and nu (n_c, 2, k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
-        soft, (n_c, _, k) = len(self.pull_soft), g.shape
-        x_soft, y = y[:soft], y[soft:]
-        re, im = self.gamma
-        bent = _times(self.curvature, y)
-        conjugate = re * bent + im * jnp.stack([bent[:, 1], -bent[:, 0]], axis=1)
-        x = jnp.sum(self.denominator[:, :, None] * (y - conjugate), axis=1)
+        """x (n, 2 k) and nu (n_c, 2 k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
+        (re, im), soft, n_c = self.gamma, len(self.pull_soft), len(g)
+        k, x_soft, y = len(re), y[:soft], y[soft:]
+        bent = matmul(self.curvature, y)
+        turned = jnp.concatenate([im, -im]) * jnp.concatenate([bent[:, k:], bent[:, :k]], axis=1)
+        y = y - (jnp.concatenate([re, re]) * bent + turned)
+        x = sum(column * row for column, row in zip(jnp.moveaxis(self.denominator, 1, 0), y, strict=True))
 
-        missing = g - _times(self.push[:, :soft], x_soft) - _times(self.push[:, soft:], x)
-        missing = jnp.swapaxes(missing, 0, 1).reshape(2 * n_c, k)
+        missing = g - matmul(self.push[:, :soft], x_soft) - matmul(self.push[:, soft:], x)
+        missing = jnp.swapaxes(missing.reshape(n_c, 2, k), 0, 1).reshape(2 * n_c, k)
         nu = jnp.swapaxes(jnp.sum(self.schur * missing, axis=1).reshape(2, n_c, k), 0, 1)
         real, imaginary = (jnp.sum(part[:, :, None] * nu, axis=1) for part in self.pull)
-        x += real + jnp.stack([-imaginary[:, 1], imaginary[:, 0]], axis=1)
-        return jnp.concatenate([x_soft + _times(self.pull_soft, nu), x]), nu
-
-
-def _times(matrix, x):
-    """A real matrix (m, n) times (n, 2, k)."""
-    n, parts, k = x.shape
-    return matmul(matrix, x.reshape(n, parts * k)).reshape(len(matrix), parts, k)
+        x += (real + jnp.stack([-imaginary[:, 1], imaginary[:, 0]], axis=1)).reshape(x.shape)
+        nu = nu.reshape(g.shape)
+        return jnp.concatenate([x_soft + matmul(self.pull_soft, nu), x]), nu
 
 
 class Iterate(NamedTuple):
@@ -297,8 +296,8 @@ def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, U
 
     def step(last: Iterate) -> Iterate:
         rows, g, _ = last.residual
-        dx, nu = saddles.solve(_to(modes.of_rows, -interval.over_mass(rows)), _to(modes.of_values, -g))
-        dx, dmu = _back(modes.increments, dx), _back(modes.multipliers, nu)
+        dx, nu = saddles.solve(-interval.over_mass(rows) @ modes.of_rows, -g @ modes.of_values)
+        dx, dmu = dx @ modes.increments, nu @ modes.multipliers
         x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
         left = map(expected, moved, last.moved)
         result = newton.status(accepted.over(left, slow_and_fast(x)), iterations)
@@ -310,15 +309,3 @@ def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, U
     x, mu = done.x.T, done.mu.T
     unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
     return done, unknowns, (equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]), (largest(rows), largest(g))
-
-
-def _to(modes, x):
-    """Nodes (n, r) to modes (n, 2, k)."""
-    r, parts, k = modes.shape
-    return (x @ modes.reshape(r, parts * k)).reshape(len(x), parts, k)
-
-
-def _back(modes, x):
-    """Modes (n, 2, k) to nodes (n, r)."""
-    parts, k, r = modes.shape
-    return x.reshape(len(x), parts * k) @ modes.reshape(parts * k, r)
