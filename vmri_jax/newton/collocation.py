@@ -14,6 +14,7 @@ so that matrices are of the size of the system, whatever the degree (Butcher 197
 Ordinary Differential Equations II, IV.8). The residual is exact, so that all of this decides only how many steps there are.
 """
 
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -79,7 +80,7 @@ class TimeModes(NamedTuple):
         def parts(z):
             return np.concatenate([z.real, z.imag])
 
-        gamma = np.stack([gamma.real, gamma.imag])[:, kept]
+        gamma = np.stack([np.real(gamma), np.imag(gamma)])[:, kept]
         return cls(gamma, parts(to @ np.linalg.inv(a)).T, parts(to).T, parts(back), parts(back @ a.T))
 
 
@@ -252,7 +253,8 @@ class Saddles(NamedTuple):
         bent = matmul(self.curvature, y)
         turned = jnp.concatenate([im, -im]) * jnp.concatenate([bent[:, k:], bent[:, :k]], axis=1)
         y = y - (jnp.concatenate([re, re]) * bent + turned)
-        x = sum(column * row for column, row in zip(jnp.moveaxis(self.denominator, 1, 0), y, strict=True))
+        products = (a * row for a, row in zip(jnp.moveaxis(self.denominator, 1, 0), y, strict=True))
+        x = reduce(jnp.add, products)  # written out: within a sum y would be made anew for every row
 
         missing = g - matmul(self.push[:, :soft], x_soft) - matmul(self.push[:, soft:], x)
         missing = jnp.swapaxes(missing.reshape(n_c, 2, k), 0, 1).reshape(2 * n_c, k)
