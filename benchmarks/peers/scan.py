@@ -12,9 +12,9 @@ from benchmarks.peers.cases import LEVELS, Case, Ladder
 
 FINE = 0.1
 """A ladder ends at the first error below so many times the finest level."""
-CLOSE = 1.3
+CLOSE = 1.5
 """Settings that are at most so many times slower than the cheapest are timed too."""
-MOST = 3
+MOST = 6
 """Candidates per peer and level."""
 ENOUGH = 0.01
 """Seconds that the calls for a rough time take together, at least."""
