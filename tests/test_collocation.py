@@ -98,6 +98,19 @@ def test_modes_are_eigenvectors(degree, rule):
     assert largest_difference(back(modes.multipliers, one), a) / np.abs(a).max() < 1e-9
 
 
+@pytest.mark.parametrize("scheme", [galerkin(1, 4, "lobatto"), galerkin(1, 3, "gauss"), galerkin(1, 2, "gauss")])
+def test_potentials_are_taken_at_the_nodes_of_their_rule_alone(scheme):
+    """A potential that is undefined at the end of the step, where none of these rules has a node that is solved for."""
+    mass, n = ConstantMass(jnp.zeros(0), jnp.ones(2)), scheme.degree
+    system = System(mass, fast_potential=lambda q_f, params: jnp.sum(jnp.sqrt(q_f)))
+    none, one = jnp.zeros(0), jnp.ones(2)
+    equations = StepEquations(system, scheme, jnp.zeros(()), none, one, none, one, jnp.asarray(0.1))
+    x = jnp.broadcast_to(-1.05 * control_nodes(n)[1:] ** 8, (2, n))
+    assert not jnp.isfinite(jnp.sqrt(one + x[:, -1])).any()
+    residual = Interval(equations).residual(x, jnp.zeros((0, n)))
+    assert all(jnp.isfinite(a).all() for a in residual)
+
+
 @pytest.mark.parametrize("name", ["general", "free", "slow only"])
 def test_saddles_solve_the_matrix_that_is_written_down(name, request):
     """``[A x M - h^2 B x W'', -I x G^T; I x G, 0]`` as one dense matrix."""

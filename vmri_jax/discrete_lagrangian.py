@@ -127,6 +127,11 @@ class Sum:
         return sum((term.at_nodes_inside(path) for term in self.terms), jnp.zeros(()))
 
     @property
+    def kinetic(self) -> QuadraticKinetic:
+        """The kinetic energy of constant masses."""
+        return next(term for term in self.terms if isinstance(term, QuadraticKinetic))
+
+    @property
     def potentials(self) -> "Sum":
         """The terms without the kinetic energy of constant masses."""
         return Sum(tuple(term for term in self.terms if not isinstance(term, QuadraticKinetic)))

@@ -206,14 +206,13 @@ def _time(points: Mapping[str, Sequence[Point]], levels, size: Size) -> dict[tup
         if not keys:
             continue
         ours = [key for key in fastest if key[0] == OURS]
-        points_by_name = {f"{p.peer}: {p.label}": p for key in [*keys, *ours] for p in chosen[key]}
-        timed = interleaved({name: p.run for name, p in points_by_name.items()}, repeats)
-        samples_of = [(p, timed[name]) for name, p in points_by_name.items()]
+        named = {f"{p.peer}: {p.label}": p for key in [*keys, *ours] for p in chosen[key]}
+        timed = interleaved({name: p.run for name, p in named.items()}, repeats)
 
-        def best(key, samples_of=samples_of) -> tuple[Point, list[float]]:
+        def best(key, named=named, timed=timed) -> tuple[Point, list[float]]:
             """Of all that were timed: a setting chosen for a finer level may turn out to be faster."""
             peer, level = key
-            some = [(p, samples) for p, samples in samples_of if p.peer == peer and p.settled <= level]
+            some = [(p, timed[name]) for name, p in named.items() if p.peer == peer and p.settled <= level]
             return min(some, key=lambda pair: float(np.median(pair[1])))
 
         for key in keys:

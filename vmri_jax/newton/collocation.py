@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.algebra import ELEMENTWISE, inverse, largest, matmul, regularized
-from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
+from vmri_jax.discrete_lagrangian import Term, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.lanes import over_lanes
 from vmri_jax.newton.interval import (
@@ -103,9 +103,11 @@ class Interval:
         self.q = jnp.concatenate([equations.q_s, equations.q_f])
         self.p = jnp.concatenate([equations.p_s, equations.p_f])
         self.times = equations.t + self.h * control_nodes(self.r)
-        terms = lagrangian(self.system, equations.scheme).terms
-        self.kinetic = next(term for term in terms if isinstance(term, QuadraticKinetic))
-        self.potentials = [term for term in terms if isinstance(term, Term) and term.inside.groups]
+        terms = lagrangian(self.system, equations.scheme)
+        self.form = terms.kinetic.fast_form[1:]
+        self.potentials = [term for term in terms.potentials.terms if term.inside.groups]
+        mass = constant_mass(self.system)
+        self.velocities = inverse_mass(mass.slow), inverse_mass(mass.fast)
         self.at_start = self.jacobian(self.times[0], self.q)
 
     def constraints(self, t, q):
@@ -128,8 +130,8 @@ class Interval:
 
     def over_mass(self, x):
         """``M^-1 x`` for (n, m)."""
-        mass, parts = constant_mass(self.system), (x[: self.n_s], x[self.n_s :])
-        return jnp.concatenate([inverse_mass(m)(a.T).T for m, a in zip((mass.slow, mass.fast), parts, strict=True)])
+        parts = x[: self.n_s], x[self.n_s :]
+        return jnp.concatenate([velocity(a.T).T for velocity, a in zip(self.velocities, parts, strict=True)])
 
     def by_name(self, term: Term, q) -> tuple:
         """What a term takes of (n, ...) joined variables."""
@@ -148,12 +150,13 @@ class Interval:
         hessian = jax.hessian(potential)(stiff)
         return self.over_mass(jnp.concatenate([jnp.zeros((self.num_soft, stiff.size)), hessian]))[self.num_soft :]
 
-    def forces(self, q, x, mu):
+    def forces(self, x, mu):
         """Of potentials and constraints, times h: (n,) at the start of the step and (n, r) at the nodes 1..r, and constraints (n_c, r).
 
         Args:
-            q, x, mu: positions at the nodes 1..r and their increments (n, r), multipliers (n_c, r).
+            x, mu: increments (n, r) and multipliers (n_c, r).
         """
+        q = self.q[:, None] + x  # at the nodes 1..r
 
         def at_node(at):
             t, q, mu = at
@@ -166,27 +169,29 @@ class Interval:
         for term in self.potentials:
             theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
             basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
-            on_nodes = not basis[:, 0].any() and np.isin(basis, (0.0, 1.0)).all()  # then at all of them, most in place
-            at = q if on_nodes else self.q[:, None] + x @ basis[:, 1:].T
             gradient = jax.grad(lambda q, term=term: term.sign * term.integrand(*self.by_name(term, q)))
-            d = over_lanes(gradient, at.shape[1])(at)
-            if on_nodes:
-                total += (weights @ basis[:, 1:]) * d
+            before, k = int(np.argmax(basis[0, 1:])), len(theta)
+            if np.array_equal(
+                basis, np.eye(self.r + 1)[before + 1 : before + 1 + k]
+            ):  # nodes of the path, one after the other
+                d = over_lanes(gradient, k)(q[:, before : before + k])
+                total += jnp.pad(weights * d, ((0, 0), (before, self.r - before - k)))
             else:
+                d = over_lanes(gradient, k)(self.q[:, None] + x @ basis[:, 1:].T)
                 first += d @ (weights * basis[:, 0])
                 total += d @ (weights[:, None] * basis[:, 1:])
         return first, total, g
 
     def residual(self, x, mu) -> "Residual":
         """Of increments (n, r) and multipliers (n_c, r)."""
-        first, later, g = self.forces(self.q[:, None] + x, x, mu)
+        first, later, g = self.forces(x, mu)
         others = jnp.concatenate([(self.h * self.p + first)[:, None], later[:, :-1]], axis=1)
-        rows = self.times_mass(x @ self.kinetic.fast_form[1:, :-1]) + others
+        rows = self.times_mass(x @ self.form[:, :-1]) + others
         return Residual(rows, g, later[:, -1])
 
     def momentum(self, x, residual: "Residual"):
         """At the end of the step (n,)."""
-        return (self.times_mass(x @ self.kinetic.fast_form[1:, -1:])[:, 0] + residual.last) / self.h
+        return (self.times_mass(x @ self.form[:, -1:])[:, 0] + residual.last) / self.h
 
 
 class Residual(NamedTuple):

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.algebra import inverse, largest, matmul, matvec, regularized
-from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
+from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.newton.extrapolation import Differences, Line
 from vmri_jax.newton.interval import (
@@ -112,13 +112,14 @@ class Pass(NamedTuple):
     bend: Line
 
 
-def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None):
+def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None, linear=False):
     """One pass over the micro intervals: fast unknowns corrected for the given slow ones, and what they leave.
 
     Args:
         warm: multipliers and bends of the macro step before.
         schur: (num_micro, r n_g, r n_g) inverses of ``G K^-1 G^T``. In the first pass there are none: they are computed, and
             multipliers start from the line through the last two, bends from the last one.
+        linear: the equations are linear with the given matrix, and this is their only pass.
 
     Returns:
         (x, what the pass leaves, fast positions (num_micro, r, n_f) at the nodes 1..r, schur)
@@ -127,7 +128,6 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
     system, scheme = interval_problem(equations.system, equations.scheme)
     kicks = lagrangian(system, scheme).kicks if n > 1 else ()
     explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
-    from_rest = is_linear(equations.system, equations.scheme, equations.q_s, equations.q_f)
     bent = warm.bend.last.size > 0
     basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # (n, r + 1, r): slow position at each node by increments
     velocity = inverse_mass(constant_mass(system).fast)
@@ -149,7 +149,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
-            if from_rest:  # increments are zero, where kinetic energy has no gradient
+            if linear:  # the one pass is at zero increments, where kinetic energy has no gradient
                 return jax.grad(local.potential_action)(path)
             return jax.grad(local.unconstrained)(path, path)
 
@@ -254,8 +254,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     eps = jnp.finfo(float).eps
     mass = constant_mass(system)
     inverse_slow, inverse_fast = inverse_mass(mass.slow), inverse_mass(mass.fast)
-    kinetic = next(term for term in lagrangian(system, scheme).terms if isinstance(term, QuadraticKinetic))
-    inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
+    inverse_form = n * inverse(lagrangian(system, scheme).kinetic.slow_form[:-1, 1:])
     times = equations.t + equations.macro_dt * control_nodes(r)
     accepted = Accepted.of(equations, newton)
 
@@ -273,7 +272,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
-        x, end, nodes, schur = march(equations, matrix, x, warm, None if first else last.schur)
+        x, end, nodes, schur = march(equations, matrix, x, warm, None if first else last.schur, linear)
         d, (rows, g), impulse = slow_update(x, end)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:

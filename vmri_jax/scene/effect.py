@@ -1,6 +1,7 @@
 """Effects: what a scene calls for. Each contributes one function to the Lagrangian, the constraints or the forces."""
 
 import difflib
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import combinations
@@ -19,7 +20,7 @@ Elements = tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Effect:
+class Effect(ABC):
     """What every effect says: its function, the bodies it touches, its parameters.
 
     An effect has one or more *elements*, each between as many bodies as it has roles: a spring has the roles a and b, and
@@ -72,13 +73,13 @@ class Effect:
         """Names of the potentials that this effect builds on."""
         return ()
 
+    @abstractmethod
     def elements(self, bodies: Mapping[str, Body]) -> Elements:
         """Names of the bodies of every element."""
-        raise NotImplementedError
 
+    @abstractmethod
     def parameters(self, bodies: Mapping[str, Body]) -> dict[str, Any]:
         """What the function gets as params: arrays by name."""
-        raise NotImplementedError
 
     def check(self, bodies: Mapping[str, Body]) -> None:
         """Refuse what is wrong with this effect between these bodies.
