@@ -171,9 +171,8 @@ class Interval:
             basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
             gradient = jax.grad(lambda q, term=term: term.sign * term.integrand(*self.by_name(term, q)))
             before, k = int(np.argmax(basis[0, 1:])), len(theta)
-            if np.array_equal(
-                basis, np.eye(self.r + 1)[before + 1 : before + 1 + k]
-            ):  # nodes of the path, one after the other
+            consecutive = np.eye(self.r + 1)[before + 1 : before + 1 + k]
+            if np.array_equal(basis, consecutive):  # nodes of the path: nothing to interpolate
                 d = over_lanes(gradient, k)(q[:, before : before + k])
                 total += jnp.pad(weights * d, ((0, 0), (before, self.r - before - k)))
             else:
