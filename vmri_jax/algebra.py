@@ -59,11 +59,19 @@ def solve(a, b):
     if n > ELEMENTWISE:
         return jnp.linalg.solve(a, b)
 
-    def eliminate(k, rows):
-        unit = np.arange(n)[:, None] == k
-        return rows - (rows[:, k, None] - unit) * (rows[k] / rows[k, k])
+    rows = jnp.concatenate([a, b], axis=1)
+    if n > UNROLLED:
+        return jax.lax.fori_loop(0, n, _eliminated, rows, unroll=TOGETHER)[:, n:]
+    for _ in range(n):
+        row = rows[0, 1:] / rows[0, 0]
+        rows = jnp.concatenate([rows[1:, 1:] - rows[1:, :1] * row, row[None]])  # the first row becomes the last
+    return rows
 
-    return _repeated(n, eliminate, jnp.concatenate([a, b], axis=1))[:, n:]
+
+def _eliminated(k, rows):
+    """One step of `solve`, in place."""
+    unit = jnp.arange(rows.shape[0])[:, None] == k
+    return rows - (rows[:, k, None] - unit) * (rows[k] / rows[k, k])
 
 
 def inverse(a):
@@ -71,22 +79,26 @@ def inverse(a):
     n = a.shape[-1]
     if n > ELEMENTWISE:
         return jnp.linalg.inv(a)
-
-    def exchange(k, a):
-        unit = np.arange(n) == k
-        row = jnp.where(unit, 1.0, a[..., k, None, :]) / a[..., k, k, None, None]
-        return jnp.where(unit, unit[:, None] * 1.0, a) - (a[..., :, k, None] - unit[:, None]) * row
-
-    return _repeated(n, exchange, a)
-
-
-def _repeated(n: int, step, a):
-    """``step(k, a)`` for k from 0 to n - 1."""
     if n > UNROLLED:
-        return jax.lax.fori_loop(0, n, step, a, unroll=TOGETHER)
-    for k in range(n):
-        a = step(k, a)
+        return jax.lax.fori_loop(0, n, _exchanged, a, unroll=TOGETHER)
+    for _ in range(n):
+        a = _first_exchanged(a)
     return a
+
+
+def _exchanged(k, a):
+    """One step of `inverse`, in place."""
+    unit = jnp.arange(a.shape[-1]) == k
+    row = jnp.where(unit, 1.0, a[..., k, None, :]) / a[..., k, k, None, None]
+    return jnp.where(unit, unit[:, None] * 1.0, a) - (a[..., :, k, None] - unit[:, None]) * row
+
+
+def _first_exchanged(a):
+    """One step of `inverse` with the first pivot. All rows and columns move up by one, and the first ones become the last."""
+    pivot, one = 1 / a[..., :1, :1], jnp.ones((*a.shape[:-2], 1, 1))
+    row = jnp.concatenate([a[..., :1, 1:] * pivot, pivot], axis=-1)
+    column = jnp.concatenate([a[..., 1:, :1], -one], axis=-2)
+    return jax.lax.pad(a, 0.0, [(0, 0, 0)] * (a.ndim - 2) + [(-1, 1, 0)] * 2) - column * row
 
 
 def largest(a):

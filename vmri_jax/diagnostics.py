@@ -39,9 +39,9 @@ def oscillatory_energies(omega, q_f, p_f):
 
 def constraint_residual(system: System, state: State):
     """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,)."""
-    both = all_constraints(system, state)
+    both = jnp.abs(jnp.stack(all_constraints(system, state)))
     # In reductions over many rows XLA's maximum of 0 and NaN may be 0.
-    return jnp.stack([jnp.where(jnp.isnan(a).any(), jnp.nan, jnp.max(jnp.abs(a), initial=0.0)) for a in both])
+    return jnp.where(jnp.isnan(both).any(axis=1), jnp.nan, jnp.max(both, axis=1, initial=0.0))
 
 
 def all_constraints(system: System, state: State):

@@ -23,6 +23,7 @@ from vmri_jax.interrupts import Interrupted, interrupts_noted
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result, SimulationError
+from vmri_jax.runtime import in_one_kernel
 from vmri_jax.scheme import Scheme
 from vmri_jax.state import State, check_constraints
 from vmri_jax.step import Memory, Stages, advance, projected, projects_rarely, start_memory
@@ -234,9 +235,11 @@ _run_static = jax.jit(run, static_argnames=("num_saves", "save_micro", "save_eve
 @partial(jax.jit, static_argnames=("num_saves", "save_micro"))
 def _run_traced(system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro):
     """Also the state at the end."""
-    piece, memory = run(
-        system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro
-    )
+    @in_one_kernel
+    def pieces(*start):
+        return run(system, scheme, newton, *start, num_saves, save_every, save_micro)
+
+    piece, memory = pieces(macro_dt, t_start, at, memory, first_step)
     return piece, piece.final_state, memory
 
 

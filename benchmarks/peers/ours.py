@@ -11,6 +11,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.peers.cases import Case, Ladder, step_counts
 from vmri_jax.composition import stage_scheme
+from vmri_jax.runtime import in_one_kernel
 from vmri_jax.simulate import run, run_memory
 
 COMPOSED = {"kahan-li8": (1, 2, 4), "kahan-li6": (1, 2, 4), "suzuki4": (1, 2, 4, 8)}
@@ -52,6 +53,7 @@ def program(case: Case, scheme: vm.Scheme | vm.Composition):
     system, newton, n_s, n_f = case.problem.system, MARCH, case.problem.q_s.size, case.problem.q_f.size
 
     @jax.jit
+    @in_one_kernel
     def steps(start, t_end, num_steps, tolerance):
         q_s, q_f, p_s, p_f = jnp.split(start, np.cumsum([n_s, n_f, n_s]))
         state, macro_dt = vm.State(jnp.zeros(()), q_s, q_f, p_s, p_f), t_end / num_steps

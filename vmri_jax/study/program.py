@@ -10,6 +10,7 @@ import numpy as np
 
 import vmri_jax as vm
 from vmri_jax.composition import Composition, stage_scheme
+from vmri_jax.runtime import in_one_kernel
 from vmri_jax.simulate import check_run, run
 from vmri_jax.step import start_memory
 from vmri_jax.trajectory import RunInfo
@@ -27,6 +28,7 @@ def _compiled_for(structure, num_saves: int):
     """
 
     @jax.jit
+    @in_one_kernel
     def run_all(leaves, num_steps, save_every):
         system, scheme, newton, state, t_end = jax.tree.unflatten(structure, leaves)
         macro_dt = t_end / num_steps
