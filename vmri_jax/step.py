@@ -196,7 +196,7 @@ def advance(
     state, info, memory = _interval(system, scheme, state, macro_dt, newton, memory)
     if project:
         state, memory = projected(system, state, memory)
-    finite = jnp.isfinite(jnp.concatenate([state.p_s, state.p_f])).all()  # positions become infinite by these
+    finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))  # positions become infinite by these
     multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, info.multiplier, info.slow_multiplier)
     info = dataclasses.replace(
         info,
