@@ -12,6 +12,9 @@ import vmri_jax as vm
 from benchmarks import c_loops, programs
 from benchmarks.floor import c_loop
 from benchmarks.measure import Tell, interleaved, ratio, silent, steps_for
+from benchmarks.peers import cases, ours
+from benchmarks.peers.compare import OURS, batch_case
+from benchmarks.peers.scan import candidates, scan
 from benchmarks.report import Claim, Report
 from vmri_jax import plots
 
@@ -19,6 +22,8 @@ COLUMNS = ("system", "program", "batch", "ns/trajectory/micro step", "low", "hig
 NUM_MICRO = 10
 HELD = 256
 """The batch size that is held against C."""
+DEGREE = 8
+"""Of the Lobatto scheme that is held against C at the same accuracy."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +32,15 @@ class Case:
 
     target: the most that a trajectory in a batch of HELD may take over C.
     fixed: whether a fixed number of iterations is also run.
+    as_accurate: a problem of `benchmarks.peers.cases` on which the batch is also held against C at the error that C has with this
+        micro_dt, by any step and order.
     """
 
     system: str
     micro_dt: float
     target: float
     fixed: bool
+    as_accurate: str | None = None
 
 
 @dataclass(frozen=True)
@@ -50,7 +58,11 @@ class Size:
 
 def sizes(name: str, devices: int = 1) -> Size:
     """ "quick" or "full"."""
-    cases = (Case("FPU l=3", 0.001, 0.6, False), Case("TSP", 0.0002, 0.7, True), Case("SAM", 0.0002, 0.7, True))
+    cases = (
+        Case("FPU l=3", 0.001, 0.6, False),
+        Case("TSP", 0.0002, 0.7, True, "TSP t=1"),
+        Case("SAM", 0.0002, 0.7, True, "SAM t=1"),
+    )
     if name == "quick":
         return Size(cases, (1, 32, 256), 5, 0.05, devices)
     return Size(cases, (1, 4, 16, 64, 256, 1024), 15, 0.2, devices)
@@ -65,12 +77,16 @@ def run(size: Size, name: str, tell: Tell = silent) -> Report:
         some_rows, some_claims = _measure(case, size, tell)
         rows += some_rows
         claims += some_claims
+        if case.as_accurate and c_loops.compiler() is not None:
+            row, claim = _as_accurate(case, size, tell)
+            rows.append(row)
+            claims.append(claim)
     return Report("batch", name, rows, claims, notes, {"batch": lambda: draw(rows, size.devices)})
 
 
 def programs_of(size: Size) -> int:
     """How many programs are timed."""
-    return sum(len(size.batches) * (1 + case.fixed) for case in size.cases)
+    return sum(len(size.batches) * (1 + case.fixed) + bool(case.as_accurate) for case in size.cases)
 
 
 def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, devices: int) -> Callable:
@@ -136,6 +152,26 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     return rows, claims
 
 
+def _as_accurate(case: Case, size: Size, tell: Tell) -> tuple[dict, Claim]:
+    """One trajectory of a batch that is as accurate as C, by the cheapest setting of one scheme of high degree."""
+    tell(f"{case.system}, as accurate as C")
+    single, (truth, starts) = cases.case(case.as_accurate), batch_case(case.as_accurate, HELD)
+    loop = c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, round(single.t_end / case.micro_dt) // NUM_MICRO)
+    error = single.error(np.concatenate(loop()[:2]))
+    ladders = ours.batch_ladders(truth, *starts, schemes={f"Lobatto {DEGREE}": vm.galerkin(1, DEGREE, "lobatto")})
+    found = candidates(scan(OURS, ladders, truth, 1.0, (error,)), error)
+    timed = interleaved({point.label: point.run for point in found} | {"C": loop}, size.repeats)
+    best = min(found, key=lambda point: np.median(timed[point.label]))
+    per_lane = [s / HELD for s in timed[best.label]]
+    to_c, steps = ratio(per_lane, timed["C"]), single.t_end / case.micro_dt
+    low, middle, high = (1e9 / steps * float(x) for x in np.quantile(per_lane, (0.25, 0.5, 0.75)))
+    row = {"system": case.system, "program": "as accurate as C", "batch": HELD, "micro_dt": case.micro_dt}
+    row |= {"ns/trajectory/micro step": middle, "low": low, "high": high, "to C": to_c.value}
+    row |= {"iterations": None, "result": best.label, "error": best.error, "error of C": error}
+    what = f"{case.system}, batch of {HELD}, as accurate as C (error {error:.0e}): over C"
+    return row, Claim(what, to_c, at_most=case.target)
+
+
 def _steps(simulate: Callable, batch: int, size: Size) -> int:
     """Macro steps that last about long enough; few numbers are tried, since a batch is compiled for each."""
     steps = max(1, size.micro_steps // (batch * NUM_MICRO))
@@ -175,6 +211,9 @@ def draw(rows: list[dict], devices: int) -> Figure:
                     label = "fixed iterations" if option == "fixed" else option
                     axes.loglog(*zip(*points, strict=True), marker=plots.MARKERS[i], color=theme.curves[i], label=label)
             for row in here:
+                if row["program"] == "as accurate as C":
+                    point = {"marker": plots.MARKERS[2], "color": theme.curves[2], "label": row["program"]}
+                    axes.plot(row["batch"], row["ns/trajectory/micro step"], linestyle="none", **point)
                 if row["program"] == "C":
                     line = {"color": theme.ink, "linestyle": "--", "linewidth": 1.0, "label": "C, one trajectory"}
                     axes.axhline(row["ns/trajectory/micro step"], **line)

@@ -11,7 +11,7 @@ from jax.sharding import PartitionSpec
 from vmri_jax.checks import check_params, check_type
 from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.lanes import over_lanes
-from vmri_jax.newton import Newton
+from vmri_jax.newton import Newton, is_collocation
 from vmri_jax.quadrature import real_array
 from vmri_jax.runtime import IN_LOOPS, WIDE_VECTORS
 from vmri_jax.scheme import Scheme
@@ -28,6 +28,8 @@ FEWEST, MOST = 64, 1024
 into the cache."""
 MATRICES = 10_000_000
 """Numbers that the matrices of a chunk may hold together (80 MB), before the lanes become fewer than that."""
+CACHE = 130_000
+"""The same where all of them are read in every pass (`is_collocation`): the second-level cache, 1 MB."""
 
 
 def simulate_batch(
@@ -159,25 +161,30 @@ def _check_states(states) -> int:
 def _chunk(system: System, scheme: Scheme, state: State) -> int:
     """A power of two of lanes: those whose unknowns fit into the working set, but not too few."""
     leaves, structure = jax.tree.flatten((system, scheme, state))
-    unknowns = _unknowns(structure, tuple((np.shape(a), jnp.result_type(a)) for a in leaves))
+    unknowns, most = _unknowns(structure, tuple((np.shape(a), jnp.result_type(a)) for a in leaves))
     variables = state.q_s.shape[0] + state.q_f.shape[0]
     fitting = WORKING_SET / (8 * variables + unknowns)
-    enough = min(FEWEST, max(8.0, MATRICES / (unknowns * variables + 1)))
+    enough = min(FEWEST, max(8.0, most / (unknowns * variables + 1)))
     return 2 ** int(np.log2(np.clip(fitting, enough, MOST)))
 
 
 @lru_cache
-def _unknowns(structure, leaves) -> int:
-    """Fast unknowns of a macro step that are solved for together; the functions of a system are traced for it."""
-    found = []
+def _unknowns(structure, leaves) -> tuple[int, int]:
+    """Fast unknowns of a macro step that are solved for together, and numbers that their matrices may hold in all lanes.
+
+    The functions of a system are traced for it.
+    """
+    found = [(0, MATRICES)]
 
     def count(system, scheme, state):
         if split(system, scheme, state.q_s, state.q_f) is None:
             n_g = system.num_constraints(state.q_s, state.q_f)[0]
-            found.append(scheme.num_micro * scheme.degree * (state.q_f.shape[0] + n_g))
+            at_once = is_collocation(system, scheme, state.q_s, state.q_f)
+            unknowns = scheme.num_micro * scheme.degree * (state.q_f.shape[0] + n_g)
+            found.append((unknowns, CACHE if at_once else MATRICES))
 
     jax.eval_shape(count, *jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*a) for a in leaves]))
-    return sum(found)
+    return found[-1]
 
 
 def _in_chunks(system, scheme, macro_dt, newton, batch, *, chunk: int, devices: int, **static) -> Trajectory:

@@ -45,6 +45,13 @@ def batch_schemes() -> dict[str, vm.Scheme | vm.Composition]:
     return composed | {f"explicit {n}": vm.fully_explicit(n) for n in (4, 8)}
 
 
+def loose(case: Case, scheme: vm.Scheme | vm.Composition) -> tuple[float, ...]:
+    """Newton tolerances that are tried besides round-off."""
+    if case.is_chain:
+        return ()
+    return LOOSE_HIGH if stage_scheme(scheme).degree > 1 else LOOSE
+
+
 def program(case: Case, scheme: vm.Scheme | vm.Composition):
     """``run(start, t_end, num_steps, tolerance)``: positions at the end, NaN where a step failed; compiled once for all.
 
@@ -79,8 +86,8 @@ def ladders(case: Case) -> list[Ladder]:
 
             return Ladder(name, "steps", settings, build)
 
-        loose = () if case.is_chain else LOOSE_HIGH if stage_scheme(scheme).degree > 1 else LOOSE
-        return [ladder(name, MARCH.tolerance), *(ladder(f"{name}, tolerance {tol:g}", tol) for tol in loose)]
+        looser = [ladder(f"{name}, tolerance {tol:g}", tol) for tol in loose(case, scheme)]
+        return [ladder(name, MARCH.tolerance), *looser]
 
     return [found for name, scheme in schemes(case).items() for found in of_scheme(name, scheme)]
 
@@ -90,8 +97,9 @@ def energy(case: Case) -> float:
     return case.energy
 
 
-def batch_ladders(case: Case, states: vm.State, q, v) -> list[Ladder]:
-    """`vm.simulate_batch` with the same schemes."""
+def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladder]:
+    """`vm.simulate_batch` with these schemes, a dictionary like `batch_schemes`."""
+    del q, v  # known from the states
 
     def ladder(name: str, scheme, tolerance: float) -> Ladder:
         newton = dataclasses.replace(MARCH, tolerance=tolerance)
@@ -107,5 +115,8 @@ def batch_ladders(case: Case, states: vm.State, q, v) -> list[Ladder]:
 
         return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end), build)
 
-    tolerances = {"": MARCH.tolerance} | ({} if case.is_chain else {f", tolerance {tol:g}": tol for tol in LOOSE})
-    return [ladder(a + b, scheme, tol) for a, scheme in batch_schemes().items() for b, tol in tolerances.items()]
+    def tolerances(scheme):
+        return {"": MARCH.tolerance} | {f", tolerance {tol:g}": tol for tol in loose(case, scheme)}
+
+    schemes = batch_schemes() if schemes is None else schemes
+    return [ladder(a + b, scheme, tol) for a, scheme in schemes.items() for b, tol in tolerances(scheme).items()]
