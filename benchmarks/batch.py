@@ -78,7 +78,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Report:
         rows += some_rows
         claims += some_claims
         if case.as_accurate and c_loops.compiler() is not None:
-            row, claim = _as_accurate(case, size, tell)
+            row, claim = _as_accurate(case, case.as_accurate, size, tell)
             rows.append(row)
             claims.append(claim)
     return Report("batch", name, rows, claims, notes, {"batch": lambda: draw(rows, size.devices)})
@@ -152,18 +152,19 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     return rows, claims
 
 
-def _as_accurate(case: Case, size: Size, tell: Tell) -> tuple[dict, Claim]:
+def _as_accurate(case: Case, problem: str, size: Size, tell: Tell) -> tuple[dict, Claim]:
     """One trajectory of a batch that is as accurate as C, by the cheapest setting of one scheme of high degree."""
     tell(f"{case.system}, as accurate as C")
-    single, (truth, starts) = cases.case(case.as_accurate), batch_case(case.as_accurate, HELD)
-    loop = c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, round(single.t_end / case.micro_dt) // NUM_MICRO)
+    single, (truth, starts) = cases.case(problem), batch_case(problem, HELD)
+    steps = round(single.t_end / case.micro_dt)
+    loop = c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, steps // NUM_MICRO)
     error = single.error(np.concatenate(loop()[:2]))
     ladders = ours.batch_ladders(truth, *starts, schemes={f"Lobatto {DEGREE}": vm.galerkin(1, DEGREE, "lobatto")})
     found = candidates(scan(OURS, ladders, truth, 1.0, (error,)), error)
     timed = interleaved({point.label: point.run for point in found} | {"C": loop}, size.repeats)
     best = min(found, key=lambda point: np.median(timed[point.label]))
     per_lane = [s / HELD for s in timed[best.label]]
-    to_c, steps = ratio(per_lane, timed["C"]), single.t_end / case.micro_dt
+    to_c = ratio(per_lane, timed["C"])
     low, middle, high = (1e9 / steps * float(x) for x in np.quantile(per_lane, (0.25, 0.5, 0.75)))
     row = {"system": case.system, "program": "as accurate as C", "batch": HELD, "micro_dt": case.micro_dt}
     row |= {"ns/trajectory/micro step": middle, "low": low, "high": high, "to C": to_c.value}

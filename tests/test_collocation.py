@@ -123,10 +123,10 @@ def test_saddles_solve_the_matrix_that_is_written_down(name, request):
     a, b = (collocation._form(basis, degree, scheme.fast.rule.nodes)[:-1, 1:] for basis in (
         collocation.lagrange_derivative, collocation.lagrange_basis
     ))  # fmt: skip
-    n, m = interval.q.size, interval.num_soft
+    n, stiff = interval.q.size, np.ix_(interval.stiff, interval.stiff)
     mass, g = interval.times_mass(jnp.eye(n)), interval.jacobian(0.1, interval.q)
     hessian = np.zeros((n, n))
-    hessian[m:, m:] = (mass @ jnp.pad(interval.curvature(interval.q), [(m, 0), (m, 0)]))[m:, m:]
+    hessian[stiff] = mass[stiff] @ interval.curvature(interval.q)
     n_c, one = len(g), np.eye(degree)
     top = np.concatenate([np.kron(a, mass) - h**2 * np.kron(b, hessian), -np.kron(one, g.T)], axis=1)
     bottom = np.concatenate([np.kron(one, g), np.zeros((degree * n_c, degree * n_c))], axis=1)

@@ -235,11 +235,12 @@ _run_static = jax.jit(run, static_argnames=("num_saves", "save_micro", "save_eve
 @partial(jax.jit, static_argnames=("num_saves", "save_micro"))
 def _run_traced(system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro):
     """Also the state at the end."""
-    @in_one_kernel
-    def pieces(*start):
-        return run(system, scheme, newton, *start, num_saves, save_every, save_micro)
 
-    piece, memory = pieces(macro_dt, t_start, at, memory, first_step)
+    @in_one_kernel
+    def go(macro_dt, t_start, at, memory, first_step):
+        return run(system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro)
+
+    piece, memory = go(macro_dt, t_start, at, memory, first_step)
     return piece, piece.final_state, memory
 
 

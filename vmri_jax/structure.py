@@ -48,6 +48,70 @@ def has_diagonal_hessian(function: Callable, q) -> bool:
     return _classes(closed.jaxpr, [_ELEMENT])[0] <= _ELEMENT
 
 
+def has_curvature(function: Callable, q) -> np.ndarray:
+    """For every element of the vector q whether the gradient of ``function(q) -> ()`` by it can depend on q at all."""
+    closed = jax.make_jaxpr(jax.grad(function))(q)
+    return _seen(closed.jaxpr, [np.ones(q.shape, dtype=bool)])[0]
+
+
+def _seen(jaxpr, seen: list[np.ndarray]) -> list[np.ndarray]:
+    """For every element of each output whether it can depend on those elements of the inputs."""
+    known = dict(zip(map(id, jaxpr.invars), seen, strict=True))
+
+    def of(v) -> np.ndarray:
+        return known.get(id(v), np.zeros(v.aval.shape, dtype=bool))
+
+    for eqn in jaxpr.eqns:
+        inputs, shapes = [of(v) for v in eqn.invars], [v.aval.shape for v in eqn.outvars]
+        inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
+        moved = _MOVES.get(eqn.primitive.name)
+        if not any(a.any() for a in inputs):
+            outputs = [np.zeros(shape, dtype=bool) for shape in shapes]
+        elif eqn.primitive.name in _CALLS and inner is not None:
+            outputs = _seen(inner.jaxpr, inputs)
+        elif eqn.primitive.name in ELEMENTWISE_PRIMITIVES:
+            outputs = [np.broadcast_to(np.any(np.broadcast_arrays(*inputs), axis=0), shapes[0])]
+        elif moved is not None:
+            outputs = moved(shapes[0], *inputs, **eqn.params)
+            outputs = outputs if isinstance(outputs, list) else [outputs]
+        else:
+            outputs = [np.ones(shape, dtype=bool) for shape in shapes]
+        known.update(zip(map(id, eqn.outvars), outputs, strict=True))
+    return [of(v) for v in jaxpr.outvars]
+
+
+def _sliced(_, a, /, *, start_indices, limit_indices, strides):
+    strides = strides or (1,) * a.ndim
+    return a[tuple(slice(*at) for at in zip(start_indices, limit_indices, strides, strict=True))]
+
+
+def _padded(shape, a, value, /, *, padding_config):
+    if any(low < 0 or high < 0 for low, high, _ in padding_config):
+        return np.ones(shape, dtype=bool)
+    padded, config = np.full(shape, bool(value)), zip(shape, padding_config, strict=True)
+    padded[tuple(slice(low, size - high, inner + 1) for size, (low, high, inner) in config)] = a
+    return padded
+
+
+def _broadcast(shape, a, /, *, broadcast_dimensions, **_):
+    sizes = dict(zip(broadcast_dimensions, a.shape, strict=True))
+    return np.broadcast_to(a.reshape([sizes.get(i, 1) for i in range(len(shape))]), shape)
+
+
+_MOVES = {
+    "slice": _sliced,
+    "pad": _padded,
+    "broadcast_in_dim": _broadcast,
+    "reshape": lambda shape, a, /, **_: a.reshape(shape),
+    "squeeze": lambda shape, a, /, **_: a.reshape(shape),
+    "rev": lambda _, a, /, *, dimensions: np.flip(a, dimensions),
+    "split": lambda _, a, /, *, sizes, axis: np.split(a, np.cumsum(sizes)[:-1], axis),
+    "transpose": lambda _, a, /, *, permutation: a.transpose(permutation),
+    "concatenate": lambda _, /, *parts, dimension: np.concatenate(parts, axis=dimension),
+    "reduce_sum": lambda _, a, /, *, axes, **kinds: a.any(axis=axes),
+}
+_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call")
+
 _CONSTANT, _ELEMENT, _MIXED = range(3)
 
 
@@ -59,7 +123,7 @@ def _classes(jaxpr, classes: list[int]) -> list[int]:
         inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
         if max(inputs, default=_CONSTANT) == _CONSTANT:
             outputs = [_CONSTANT] * len(eqn.outvars)
-        elif eqn.primitive.name in ("jit", "pjit", "closed_call", "custom_jvp_call") and inner is not None:
+        elif eqn.primitive.name in _CALLS and inner is not None:
             outputs = _classes(inner.jaxpr, inputs)
         elif eqn.primitive.name in ELEMENTWISE_PRIMITIVES and _MIXED not in inputs:
             outputs = [_ELEMENT] * len(eqn.outvars)

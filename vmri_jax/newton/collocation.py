@@ -37,6 +37,7 @@ from vmri_jax.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.quadrature import interpolatory_weights
 from vmri_jax.results import RUNNING
 from vmri_jax.scheme import Scheme
+from vmri_jax.structure import has_curvature
 from vmri_jax.system import System
 
 
@@ -93,13 +94,13 @@ def _form(basis, degree: int, nodes) -> np.ndarray:
 class Interval:
     """The equations of the step, with the variables joined, q = (q_s, q_f), and nodes as the last axis.
 
-    num_soft: so many of them, the first, come without curvature in the matrix: the slow ones, where there are others.
+    soft, stiff: variables without curvature in the matrix, which are the slow ones, where there are others, and those that no
+        potential bends; and all others.
     """
 
     def __init__(self, equations: StepEquations):
         self.system, self.h = equations.system, equations.macro_dt
         self.n_s, self.r = equations.q_s.size, equations.scheme.degree
-        self.num_soft = self.n_s if equations.q_f.size else 0
         self.q = jnp.concatenate([equations.q_s, equations.q_f])
         self.p = jnp.concatenate([equations.p_s, equations.p_f])
         self.times = equations.t + self.h * control_nodes(self.r)
@@ -108,7 +109,15 @@ class Interval:
         self.potentials = [term for term in terms.potentials.terms if term.inside.groups]
         mass = constant_mass(self.system)
         self.velocities = inverse_mass(mass.slow), inverse_mass(mass.fast)
+        self.soft, self.stiff = self._soft_and_stiff(separate=mass.slow.ndim == mass.fast.ndim == 1)
         self.at_start = self.jacobian(self.times[0], self.q)
+
+    def _soft_and_stiff(self, separate: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Which variables these are; those that no potential bends are soft where masses are `separate`, not a matrix."""
+        stiff = np.arange(self.q.size) >= (self.n_s if self.q.size > self.n_s else 0)
+        bent = stiff & has_curvature(self.potential, self.q)
+        stiff = bent if separate and bent.any() else stiff
+        return np.flatnonzero(~stiff), np.flatnonzero(stiff)
 
     def constraints(self, t, q):
         """All constraints (n_c,) at one point."""
@@ -138,17 +147,19 @@ class Interval:
         at = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
         return tuple(at[name] for name in term.arguments)
 
+    def potential(self, q):
+        """All potentials at one point."""
+        return sum((-term.sign * term.integrand(*self.by_name(term, q)) for term in self.potentials), jnp.zeros(()))
+
     def curvature(self, q):
-        """``M^-1`` times the Hessian of the potentials (m, m) by the variables that are not soft."""
-        soft, stiff = q[: self.num_soft], q[self.num_soft :]
+        """``M^-1`` times the Hessian of the potentials (m, m) by the stiff variables."""
+        soft = taken(q, self.soft)
+        hessian = jax.hessian(lambda stiff: self.potential(self.joined(soft, stiff)))(taken(q, self.stiff))
+        return taken(self.over_mass(self.joined(jnp.zeros((self.soft.size, self.stiff.size)), hessian)), self.stiff)
 
-        def potential(stiff):
-            q = jnp.concatenate([soft, stiff])
-            parts = (-term.sign * term.integrand(*self.by_name(term, q)) for term in self.potentials)
-            return sum(parts, jnp.zeros(()))
-
-        hessian = jax.hessian(potential)(stiff)
-        return self.over_mass(jnp.concatenate([jnp.zeros((self.num_soft, stiff.size)), hessian]))[self.num_soft :]
+    def joined(self, soft, stiff):
+        """All variables from the soft and the stiff ones."""
+        return taken(jnp.concatenate([soft, stiff]), np.argsort(np.concatenate([self.soft, self.stiff])))
 
     def forces(self, x, mu):
         """Of potentials and constraints, times h: (n,) at the start of the step and (n, r) at the nodes 1..r, and constraints (n_c, r).
@@ -193,6 +204,12 @@ class Interval:
         return (self.times_mass(x @ self.form[:, -1:])[:, 0] + residual.last) / self.h
 
 
+def taken(a, index: np.ndarray):
+    """``a[index]`` of known rows, as slices."""
+    runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
+    return jnp.concatenate([a[run[0] : run[-1] + 1] if run.size else a[:0] for run in runs])
+
+
 class Residual(NamedTuple):
     """Of the equations of a step.
 
@@ -209,14 +226,16 @@ class Residual(NamedTuple):
 class Saddles(NamedTuple):
     """The saddles of all modes, eliminated: the n variables first (m of them with curvature), then the n_c constraints.
 
+    interval: which variables are soft and which are stiff.
     gamma (2, k): as in `TimeModes`.
     curvature (m, m): ``w = h^2 M^-1 W''``.
     denominator (m, m, 2 k): inverses of ``|1 - gamma w|^2``, for real and for imaginary parts.
-    push (n_c, n): G.
+    push: G by the soft (n_c, n - m) and by the stiff variables (n_c, m).
     pull_soft (n - m, n_c), pull twice (m, n_c, k): G^T through the inverses of ``M`` and ``M - h^2 gamma W''``.
     schur (2 n_c, 2 n_c, k): inverse of G times these.
     """
 
+    interval: Interval
     gamma: Any
     curvature: Any
     denominator: Any
@@ -228,13 +247,14 @@ class Saddles(NamedTuple):
     @classmethod
     def at(cls, interval: Interval, modes: TimeModes, t, q) -> "Saddles":
         """With Hessian and Jacobian at a point."""
-        w, push, soft = interval.h**2 * interval.curvature(q), interval.jacobian(t, q), interval.num_soft
+        w, push = interval.h**2 * interval.curvature(q), interval.jacobian(t, q)
+        push_soft, push_stiff = taken(push.T, interval.soft).T, taken(push.T, interval.stiff).T
         k, m, n_c = modes.gamma.shape[1], len(w), len(push)
         re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
         denominator = inverse(np.eye(m) - 2 * re * w + (re**2 + im**2) * matmul(w, w))
 
         over_mass = interval.over_mass(push.T)
-        pull_soft, straight = over_mass[:soft], over_mass[soft:]
+        pull_soft, straight = taken(over_mass, interval.soft), taken(over_mass, interval.stiff)
         columns = jnp.concatenate([straight, matmul(w, straight)], axis=1)
         through = (denominator.reshape(k * m, m) @ columns).reshape(k, m, 2 * n_c)
 
@@ -242,31 +262,32 @@ class Saddles(NamedTuple):
             """Real and imaginary part of ``(1 - conj(gamma) w) / |1 - gamma w|^2``, from the columns without and with w."""
             return z[..., :n_c] - re * z[..., n_c:], im * z[..., n_c:]
 
-        real, imaginary = parts(matmul(push[:, soft:], through))
-        real += matmul(push[:, :soft], pull_soft)
-        rows = jnp.concatenate([real, -imaginary], axis=2), jnp.concatenate([imaginary, real], axis=2)
-        schur = inverse(regularized(jnp.concatenate(rows, axis=1)))
+        real, imaginary = parts(matmul(push_stiff, through))
+        real += matmul(push_soft, pull_soft)
+        both = jnp.concatenate([real, -imaginary], axis=2), jnp.concatenate([imaginary, real], axis=2)
+        schur = inverse(regularized(jnp.concatenate(both, axis=1)))
 
         denominator, *pull, schur = (jnp.moveaxis(a, 0, -1) for a in (denominator, *parts(through), schur))
-        return cls(modes.gamma, w, jnp.concatenate([denominator] * 2, axis=-1), push, pull_soft, pull, schur)
+        denominator, push = jnp.concatenate([denominator] * 2, axis=-1), (push_soft, push_stiff)
+        return cls(interval, modes.gamma, w, denominator, push, pull_soft, pull, schur)
 
     def solve(self, y, g):
         """x (n, 2 k) and nu (n_c, 2 k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
-        (re, im), soft, n_c = self.gamma, len(self.pull_soft), len(g)
-        k, x_soft, y = len(re), y[:soft], y[soft:]
+        (re, im), n_c, (push_soft, push_stiff) = self.gamma, len(g), self.push
+        k, x_soft, y = len(re), taken(y, self.interval.soft), taken(y, self.interval.stiff)
         bent = matmul(self.curvature, y)
         turned = jnp.concatenate([im, -im]) * jnp.concatenate([bent[:, k:], bent[:, :k]], axis=1)
         y = y - (jnp.concatenate([re, re]) * bent + turned)
         products = (a * row for a, row in zip(jnp.moveaxis(self.denominator, 1, 0), y, strict=True))
         x = reduce(jnp.add, products)  # written out: within a sum y would be made anew for every row
 
-        missing = g - matmul(self.push[:, :soft], x_soft) - matmul(self.push[:, soft:], x)
+        missing = g - matmul(push_soft, x_soft) - matmul(push_stiff, x)
         missing = jnp.swapaxes(missing.reshape(n_c, 2, k), 0, 1).reshape(2 * n_c, k)
         nu = jnp.swapaxes(jnp.sum(self.schur * missing, axis=1).reshape(2, n_c, k), 0, 1)
         real, imaginary = (jnp.sum(part[:, :, None] * nu, axis=1) for part in self.pull)
         x += (real + jnp.stack([-imaginary[:, 1], imaginary[:, 0]], axis=1)).reshape(x.shape)
         nu = nu.reshape(g.shape)
-        return jnp.concatenate([x_soft + matmul(self.pull_soft, nu), x]), nu
+        return self.interval.joined(x_soft + matmul(self.pull_soft, nu), x), nu
 
 
 class Iterate(NamedTuple):
