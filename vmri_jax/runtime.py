@@ -70,11 +70,13 @@ def in_one_kernel(function: Callable) -> Callable:
     start and the end of a run of a small system. Here they are in a loop of one pass; the barrier hides that it is one.
     """
 
+    traced = jax.jit(function)  # once for its shapes and for the loop
+
     @wraps(function)
     def once(*args):
-        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(function, *args))
+        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(traced, *args))
         go = jax.lax.optimization_barrier(jnp.asarray(True))
-        return jax.lax.while_loop(lambda c: c[0], lambda _: (jnp.asarray(False), function(*args)), (go, nothing))[1]
+        return jax.lax.while_loop(lambda c: c[0], lambda _: (jnp.asarray(False), traced(*args)), (go, nothing))[1]
 
     return once
 
