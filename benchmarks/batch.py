@@ -58,14 +58,14 @@ class Size:
 
 def sizes(name: str, devices: int = 1) -> Size:
     """ "quick" or "full"."""
-    cases = (
+    chosen = (
         Case("FPU l=3", 0.001, 0.6, False),
         Case("TSP", 0.0002, 0.7, True, "TSP t=1"),
         Case("SAM", 0.0002, 0.7, True, "SAM t=1"),
     )
     if name == "quick":
-        return Size(cases, (1, 32, 256), 5, 0.05, devices)
-    return Size(cases, (1, 4, 16, 64, 256, 1024), 15, 0.2, devices)
+        return Size(chosen, (1, 32, 256), 5, 0.05, devices)
+    return Size(chosen, (1, 4, 16, 64, 256, 1024), 15, 0.2, devices)
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Report:

@@ -111,7 +111,7 @@ def test_potentials_are_taken_at_the_nodes_of_their_rule_alone(scheme):
     assert all(jnp.isfinite(a).all() for a in residual)
 
 
-@pytest.mark.parametrize("name", ["general", "free", "slow only"])
+@pytest.mark.parametrize("name", ["general", "free", "slow only", "sam"])
 def test_saddles_solve_the_matrix_that_is_written_down(name, request):
     """``[A x M - h^2 B x W'', -I x G^T; I x G, 0]`` as one dense matrix."""
     system, state = start_of(name, request)
@@ -126,6 +126,7 @@ def test_saddles_solve_the_matrix_that_is_written_down(name, request):
     n, stiff = interval.q.size, np.ix_(interval.stiff, interval.stiff)
     mass, g = interval.times_mass(jnp.eye(n)), interval.jacobian(0.1, interval.q)
     hessian = np.zeros((n, n))
+    assert name != "sam" or interval.soft.tolist() == [0, 1, 2, 3, 4, 5, 15, 16, 17]  # no potential bends the last atom
     hessian[stiff] = mass[stiff] @ interval.curvature(interval.q)
     n_c, one = len(g), np.eye(degree)
     top = np.concatenate([np.kron(a, mass) - h**2 * np.kron(b, hessian), -np.kron(one, g.T)], axis=1)

@@ -69,7 +69,6 @@ def in_one_kernel(function: Callable) -> Callable:
     Outside of loops XLA launches operations one by one, some of them through its pool of threads: 20 microseconds for the
     start and the end of a run of a small system. Here they are in a loop of one pass; the barrier hides that it is one.
     """
-
     traced = jax.jit(function)  # once for its shapes and for the loop
 
     @wraps(function)
