@@ -79,8 +79,9 @@ def inverse(a):
     n = a.shape[-1]
     if n > ELEMENTWISE:
         return jnp.linalg.inv(a)
-    if n > UNROLLED:
-        return jax.lax.fori_loop(0, n, _exchanged, a, unroll=TOGETHER)
+    if n > UNROLLED:  # rows of even length fill vector registers
+        even = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, n % 2)])
+        return jax.lax.fori_loop(0, n, _exchanged, even, unroll=TOGETHER)[..., :n]
     for _ in range(n):
         a = _first_exchanged(a)
     return a
@@ -88,9 +89,9 @@ def inverse(a):
 
 def _exchanged(k, a):
     """One step of `inverse`, in place."""
-    unit = jnp.arange(a.shape[-1]) == k
-    row = jnp.where(unit, 1.0, a[..., k, None, :]) / a[..., k, k, None, None]
-    return jnp.where(unit, unit[:, None] * 1.0, a) - (a[..., :, k, None] - unit[:, None]) * row
+    rows, columns = (jnp.arange(m) == k for m in a.shape[-2:])
+    row = jnp.where(columns, 1.0, a[..., k, None, :]) / a[..., k, k, None, None]
+    return jnp.where(columns, rows[:, None] * 1.0, a) - (a[..., :, k, None] - rows[:, None]) * row
 
 
 def _first_exchanged(a):
