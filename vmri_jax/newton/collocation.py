@@ -227,12 +227,12 @@ class Saddles(NamedTuple):
     """The saddles of all modes, eliminated: the n variables first (m of them with curvature), then the n_c constraints.
 
     interval: which variables are soft and which are stiff.
-    gamma (2, k): as in `TimeModes`.
+    gamma (2, 2 k): as in `TimeModes`, for real and for imaginary parts of modes, as all that has 2 k.
     curvature (m, m): ``w = h^2 M^-1 W''``.
-    denominator (m, m, 2 k): inverses of ``|1 - gamma w|^2``, for real and for imaginary parts.
+    denominator (m, m, 2 k): inverses of ``|1 - gamma w|^2``.
     push: G by the soft (n_c, n - m) and by the stiff variables (n_c, m).
-    pull_soft (n - m, n_c), pull twice (m, n_c, k): G^T through the inverses of ``M`` and ``M - h^2 gamma W''``.
-    schur (2 n_c, 2 n_c, k): inverse of G times these.
+    pull_soft (n - m, n_c), pull two of (n_c, m, 2 k): G^T through the inverses of ``M`` and ``M - h^2 gamma W''``.
+    schur two of (n_c, n_c, 2 k): inverse of G times these.
     """
 
     interval: Interval
@@ -251,6 +251,12 @@ class Saddles(NamedTuple):
         push_soft, push_stiff = taken(push.T, interval.soft).T, taken(push.T, interval.stiff).T
         k, m, n_c = modes.gamma.shape[1], len(w), len(push)
         re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
+
+        def twice(z):
+            """(k, rows, columns) as (columns, rows, 2 k): for real and for imaginary parts."""
+            z = jnp.swapaxes(z, 0, 2)
+            return jnp.concatenate([z, z], axis=-1)
+
         denominator = inverse(np.eye(m) - 2 * re * w + (re**2 + im**2) * matmul(w, w))
 
         over_mass = interval.over_mass(push.T)
@@ -265,29 +271,38 @@ class Saddles(NamedTuple):
         real, imaginary = parts(matmul(push_stiff, through))
         real += matmul(push_soft, pull_soft)
         both = jnp.concatenate([real, -imaginary], axis=2), jnp.concatenate([imaginary, real], axis=2)
-        schur = inverse(regularized(jnp.concatenate(both, axis=1)))
+        schur = inverse(regularized(jnp.concatenate(both, axis=1)))[..., :n_c]
 
-        denominator, *pull, schur = (jnp.moveaxis(a, 0, -1) for a in (denominator, *parts(through), schur))
-        denominator, push = jnp.concatenate([denominator] * 2, axis=-1), (push_soft, push_stiff)
-        return cls(interval, modes.gamma, w, denominator, push, pull_soft, pull, schur)
+        pull = [twice(a) for a in parts(through)]
+        schur = [twice(a) for a in (schur[:, :n_c], schur[:, n_c:])]
+        return cls(interval, jnp.concatenate([modes.gamma] * 2, axis=1), w, twice(denominator), (push_soft, push_stiff), pull_soft, pull, schur)
 
     def solve(self, y, g):
         """x (n, 2 k) and nu (n_c, 2 k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
-        (re, im), n_c, (push_soft, push_stiff) = self.gamma, len(g), self.push
-        k, x_soft, y = len(re), taken(y, self.interval.soft), taken(y, self.interval.stiff)
-        bent = matmul(self.curvature, y)
-        turned = jnp.concatenate([im, -im]) * jnp.concatenate([bent[:, k:], bent[:, :k]], axis=1)
-        y = y - (jnp.concatenate([re, re]) * bent + turned)
-        products = (a * row for a, row in zip(jnp.moveaxis(self.denominator, 1, 0), y, strict=True))
-        x = reduce(jnp.add, products)  # written out: within a sum y would be made anew for every row
+        push_soft, push_stiff = self.push
+        x_soft, y = taken(y, self.interval.soft), taken(y, self.interval.stiff)
+        bent, (re, im) = matmul(self.curvature, y), self.gamma
+        y = y - (re * bent - im * times_i(bent))
+        x = reduce(jnp.add, (a * row for a, row in zip(self.denominator, y, strict=True)))
 
-        missing = g - matmul(push_soft, x_soft) - matmul(push_stiff, x)
-        missing = jnp.swapaxes(missing.reshape(n_c, 2, k), 0, 1).reshape(2 * n_c, k)
-        nu = jnp.swapaxes(jnp.sum(self.schur * missing, axis=1).reshape(2, n_c, k), 0, 1)
-        real, imaginary = (jnp.sum(part[:, :, None] * nu, axis=1) for part in self.pull)
-        x += (real + jnp.stack([-imaginary[:, 1], imaginary[:, 0]], axis=1)).reshape(x.shape)
-        nu = nu.reshape(g.shape)
+        nu = product(self.schur, g - matmul(push_soft, x_soft) - matmul(push_stiff, x))
+        x += product(self.pull, nu)
         return self.interval.joined(x_soft + matmul(self.pull_soft, nu), x), nu
+
+
+def times_i(z):
+    """Complex numbers, all real parts before all imaginary ones."""
+    re, im = jnp.split(z, 2, axis=-1)
+    return jnp.concatenate([-im, re], axis=-1)
+
+
+def product(matrix, z):
+    """Of complex matrices, their real and their imaginary parts (columns, rows, 2 k) twice over, and vectors (columns, 2 k).
+
+    Written out: within a sum z would be made anew for every row.
+    """
+    parts = (re * row + im * turned for re, im, row, turned in zip(*matrix, z, times_i(z), strict=True))
+    return reduce(jnp.add, parts, jnp.zeros(matrix[0].shape[1:]))
 
 
 class Iterate(NamedTuple):
