@@ -75,7 +75,7 @@ def _eliminated(k, rows):
 
 
 def inverse(a):
-    """The inverses of a (..., n, n), see `solve`: every pivot's column is replaced by one of the inverse."""
+    """The inverses of a (..., n, n), real or complex, see `solve`: every pivot's column is replaced by one of the inverse."""
     n = a.shape[-1]
     if n > ELEMENTWISE:
         return jnp.linalg.inv(a)
@@ -99,7 +99,8 @@ def _first_exchanged(a):
     pivot, one = 1 / a[..., :1, :1], jnp.ones((*a.shape[:-2], 1, 1))
     row = jnp.concatenate([a[..., :1, 1:] * pivot, pivot], axis=-1)
     column = jnp.concatenate([a[..., 1:, :1], -one], axis=-2)
-    return jax.lax.pad(a, 0.0, [(0, 0, 0)] * (a.ndim - 2) + [(-1, 1, 0)] * 2) - column * row
+    moved = jax.lax.pad(a, jnp.zeros((), a.dtype), [(0, 0, 0)] * (a.ndim - 2) + [(-1, 1, 0)] * 2)
+    return moved - column * row
 
 
 def largest(a):

@@ -270,12 +270,11 @@ class Saddles(NamedTuple):
 
         real, imaginary = parts(matmul(push_stiff, through))
         real += matmul(push_soft, pull_soft)
-        both = jnp.concatenate([real, -imaginary], axis=2), jnp.concatenate([imaginary, real], axis=2)
-        schur = inverse(regularized(jnp.concatenate(both, axis=1)))[..., :n_c]
+        schur = inverse(regularized(jax.lax.complex(real, imaginary)))
 
-        pull = [twice(a) for a in parts(through)]
-        schur = [twice(a) for a in (schur[:, :n_c], schur[:, n_c:])]
-        return cls(interval, jnp.concatenate([modes.gamma] * 2, axis=1), w, twice(denominator), (push_soft, push_stiff), pull_soft, pull, schur)
+        gamma = jnp.concatenate([modes.gamma] * 2, axis=1)
+        pull, schur = ([twice(a) for a in both] for both in (parts(through), (schur.real, schur.imag)))
+        return cls(interval, gamma, w, twice(denominator), (push_soft, push_stiff), pull_soft, pull, schur)
 
     def solve(self, y, g):
         """x (n, 2 k) and nu (n_c, 2 k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
