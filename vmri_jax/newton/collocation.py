@@ -282,7 +282,8 @@ class Saddles(NamedTuple):
         x_soft, y = taken(y, self.interval.soft), taken(y, self.interval.stiff)
         bent, (re, im) = matmul(self.curvature, y), self.gamma
         y = y - (re * bent - im * times_i(bent))
-        x = reduce(jnp.add, (a * row for a, row in zip(self.denominator, y, strict=True)))
+        products = (a * row for a, row in zip(self.denominator, y, strict=True))
+        x = reduce(jnp.add, products)  # written out: within a sum y would be made anew for every row
 
         nu = product(self.schur, g - matmul(push_soft, x_soft) - matmul(push_stiff, x))
         x += product(self.pull, nu)
@@ -296,12 +297,9 @@ def times_i(z):
 
 
 def product(matrix, z):
-    """Of complex matrices, their real and their imaginary parts (columns, rows, 2 k) twice over, and vectors (columns, 2 k).
-
-    Written out: within a sum z would be made anew for every row.
-    """
-    parts = (re * row + im * turned for re, im, row, turned in zip(*matrix, z, times_i(z), strict=True))
-    return reduce(jnp.add, parts, jnp.zeros(matrix[0].shape[1:]))
+    """Of complex matrices, their real and their imaginary parts (columns, rows, 2 k) twice over, and vectors (columns, 2 k)."""
+    re, im = matrix
+    return jnp.sum(re * z[:, None] + im * times_i(z)[:, None], axis=0)
 
 
 class Iterate(NamedTuple):
