@@ -145,8 +145,9 @@ def multiplier_scales(scheme: Scheme, macro_dt, before=0.0):
     """
     n, h = scheme.num_micro, macro_dt / scheme.num_micro
     w, w_slow = (jnp.asarray(placed.rule.weights) for placed in (scheme.constraint, scheme.slow_constraint))
-    shared = jnp.tile(w[:-1], (n, 1)).at[1:, 0].add(w[-1]).at[0, 0].add(before / macro_dt * w[-1])
-    slow_shared = w_slow[:-1].at[0].add(before / macro_dt * w_slow[-1])
+    starts, first = np.eye(1, w.size - 1), np.eye(n, 1)
+    shared = w[:-1] + (1 + first * (before / macro_dt - 1)) * starts * w[-1]
+    slow_shared = w_slow[:-1] + before / macro_dt * np.eye(1, w_slow.size - 1)[0] * w_slow[-1]
     return h**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
 
 

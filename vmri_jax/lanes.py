@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from vmri_jax.algebra import ELEMENTWISE
-from vmri_jax.structure import ELEMENTWISE_PRIMITIVES
+from vmri_jax.structure import ELEMENTWISE_PRIMITIVES, called
 
 
 class _Value(NamedTuple):
@@ -94,11 +94,11 @@ def _run(size: int, jaxpr, consts, values: list[_Value]) -> list[_Value]:
             known[id(eqn.outvars[0])] = padded
             continue
         inputs, name = [read(v) for v in eqn.invars], eqn.primitive.name
-        inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
+        inner = called(eqn)
         if name in _LOOPS:
             outputs = _LOOPS[name](size, inputs, **eqn.params)
-        elif inner is not None and name in _CALLS:
-            outputs = _run(size, getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs)
+        elif inner is not None:
+            outputs = _run(size, *inner, inputs)
         elif not any(x.lanes for x in inputs):
             outputs = _results(eqn.primitive, [x.array for x in inputs], eqn.params, False)
         else:
@@ -266,7 +266,6 @@ _AXES_NAMED = (
     "squeeze split unstack rev argmax argmin cumsum cummax cumprod reduce_sum reduce_max reduce_min reduce_and"
 )
 _RULES |= dict.fromkeys([*_AXES_NAMED.split(), "reduce_or"], _same)
-_CALLS = {"jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint"}
 
 
 def _while(size, inputs, *, cond_jaxpr, body_jaxpr, cond_nconsts, body_nconsts):

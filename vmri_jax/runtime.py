@@ -7,13 +7,17 @@ first, before anything is computed:
     runtime.configure()
 """
 
+import math
 import os
 from collections.abc import Callable
-from functools import wraps
+from functools import reduce, wraps
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.structure import called
 
 FAST_LOOPS = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000,-memdep-block-scan-limit=10000"
@@ -25,6 +29,7 @@ IN_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""} if KNOWN else {}
 """Sums over some thousand numbers stay in their loop; handed to a library, as XLA does, they keep it from being one kernel."""
 WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512} if KNOWN else {}
 """Vector registers are filled, where the compiler would take half of the widest. For batches."""
+SHORT = 12
 DEVICES = "--xla_force_host_platform_device_count="
 
 
@@ -64,20 +69,76 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
 
 
 def in_one_kernel(function: Callable) -> Callable:
-    """`function` of arrays with all of it in one kernel, where loops are (`configure`); not for reverse mode.
+    """`function` of arrays with all of it in one kernel, where loops are (`configure`); not for derivatives.
 
     Outside of loops XLA launches operations one by one, some of them through its pool of threads: 20 microseconds for the
     start and the end of a run of a small system. Here they are in a loop of one pass; the barrier hides that it is one.
+
+    Whenever a program is called XLA also makes objects for every reduction in it, which takes ten times as long as a short
+    reduction itself. Those are written out.
     """
-    traced = jax.jit(function)  # once for its shapes and for the loop
 
     @wraps(function)
     def once(*args):
-        nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(traced, *args))
+        traced, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        shapes, structure = jax.tree.flatten(shape)
+        nothing = [jnp.zeros(a.shape, a.dtype) for a in shapes]
         go = jax.lax.optimization_barrier(jnp.asarray(True))
-        return jax.lax.while_loop(lambda c: c[0], lambda _: (jnp.asarray(False), traced(*args)), (go, nothing))[1]
+
+        def only_pass(_):
+            return jnp.asarray(False), _evaluated(traced.jaxpr, traced.consts, jax.tree.leaves(args))
+
+        return jax.tree.unflatten(structure, jax.lax.while_loop(lambda c: c[0], only_pass, (go, nothing))[1])
 
     return once
+
+
+def _evaluated(jaxpr, consts, values, in_loop: bool = False) -> list:
+    """The outputs of a jaxpr, with short reductions written out.
+
+    In loops only those to one number are: XLA would repeat what comes before them for each.
+    """
+    known = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(zip(jaxpr.invars, values, strict=True))
+
+    def read(v):
+        return v.val if hasattr(v, "val") else known[v]
+
+    def body(loop):
+        return jax.make_jaxpr(lambda *values: _evaluated(loop.jaxpr, loop.consts, values, True))(*loop.in_avals)
+
+    for eqn in jaxpr.eqns:
+        inputs, name, params, inner = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params, called(eqn)
+        if inner is not None:
+            outputs = _evaluated(*inner, inputs, in_loop)
+        elif name in _WRITTEN_OUT and _is_short(inputs[0].size, eqn.outvars[0].aval.size, in_loop):
+            outputs = [_written_out(_WRITTEN_OUT[name], inputs[0], params["axes"])]
+        else:
+            if name in ("while", "scan"):
+                params = {key: body(value) if key.endswith("jaxpr") else value for key, value in params.items()}
+            elif name == "cond":
+                params = {**params, "branches": tuple(map(body, params["branches"]))}
+            outputs = eqn.primitive.bind(*inputs, **params)
+            outputs = outputs if eqn.primitive.multiple_results else [outputs]
+        known |= zip(eqn.outvars, outputs, strict=True)
+    return [read(v) for v in jaxpr.outvars]
+
+
+def _is_short(size: int, reduced: int, in_loop: bool) -> bool:
+    return 0 < size <= SHORT * reduced and (reduced == 1 or not in_loop)
+
+
+_WRITTEN_OUT = {
+    "reduce_sum": jax.lax.add,
+    "reduce_max": jax.lax.max,
+    "reduce_and": jax.lax.bitwise_and,
+    "reduce_or": jax.lax.bitwise_or,
+}
+
+
+def _written_out(operation: Callable, a, axes: tuple[int, ...]):
+    """A reduction over some axes as operations on its parts."""
+    a = jnp.moveaxis(a, axes, range(len(axes)))
+    return reduce(operation, (a[index] for index in np.ndindex(a.shape[: len(axes)])))
 
 
 def cache_folder() -> Path:

@@ -18,6 +18,15 @@ ELEMENTWISE_PRIMITIVES = frozenset([
     "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh",
 ])
 # fmt: on
+CALLS = frozenset("jit pjit closed_call core_call custom_jvp_call custom_vjp_call remat checkpoint".split())
+
+
+def called(eqn) -> tuple | None:
+    """(jaxpr, consts) of what an equation of a jaxpr calls, None if it is no call."""
+    inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
+    if eqn.primitive.name not in CALLS or inner is None:
+        return None
+    return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
 
 
 def depends_on(function: Callable, *args) -> tuple[bool, ...]:
@@ -63,12 +72,12 @@ def _seen(jaxpr, seen: list[np.ndarray]) -> list[np.ndarray]:
 
     for eqn in jaxpr.eqns:
         inputs, shapes = [of(v) for v in eqn.invars], [v.aval.shape for v in eqn.outvars]
-        inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
+        inner = called(eqn)
         moved = _MOVES.get(eqn.primitive.name)
         if not any(a.any() for a in inputs):
             outputs = [np.zeros(shape, dtype=bool) for shape in shapes]
-        elif eqn.primitive.name in _CALLS and inner is not None:
-            outputs = _seen(inner.jaxpr, inputs)
+        elif inner is not None:
+            outputs = _seen(inner[0], inputs)
         elif eqn.primitive.name in ELEMENTWISE_PRIMITIVES:
             outputs = [np.broadcast_to(np.any(np.broadcast_arrays(*inputs), axis=0), shapes[0])]
         elif moved is not None:
@@ -110,7 +119,6 @@ _MOVES = {
     "concatenate": lambda _, /, *parts, dimension: np.concatenate(parts, axis=dimension),
     "reduce_sum": lambda _, a, /, *, axes, **kinds: a.any(axis=axes),
 }
-_CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call")
 
 _CONSTANT, _ELEMENT, _MIXED = range(3)
 
@@ -120,11 +128,11 @@ def _classes(jaxpr, classes: list[int]) -> list[int]:
     known = dict(zip(map(id, jaxpr.invars), classes, strict=True))
     for eqn in jaxpr.eqns:
         inputs = [known.get(id(v), _CONSTANT) for v in eqn.invars]
-        inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
+        inner = called(eqn)
         if max(inputs, default=_CONSTANT) == _CONSTANT:
             outputs = [_CONSTANT] * len(eqn.outvars)
-        elif eqn.primitive.name in _CALLS and inner is not None:
-            outputs = _classes(inner.jaxpr, inputs)
+        elif inner is not None:
+            outputs = _classes(inner[0], inputs)
         elif eqn.primitive.name in ELEMENTWISE_PRIMITIVES and _MIXED not in inputs:
             outputs = [_ELEMENT] * len(eqn.outvars)
         else:
