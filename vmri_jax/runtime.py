@@ -7,7 +7,6 @@ first, before anything is computed:
     runtime.configure()
 """
 
-import math
 import os
 from collections.abc import Callable
 from functools import reduce, wraps
@@ -30,6 +29,7 @@ IN_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""} if KNOWN else {}
 WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512} if KNOWN else {}
 """Vector registers are filled, where the compiler would take half of the widest. For batches."""
 SHORT = 12
+"""Most numbers of a reduction that is written out, see `in_one_kernel`."""
 DEVICES = "--xla_force_host_platform_device_count="
 
 
@@ -130,6 +130,7 @@ def _is_short(size: int, reduced: int, in_loop: bool) -> bool:
 _WRITTEN_OUT = {
     "reduce_sum": jax.lax.add,
     "reduce_max": jax.lax.max,
+    "reduce_min": jax.lax.min,
     "reduce_and": jax.lax.bitwise_and,
     "reduce_or": jax.lax.bitwise_or,
 }

@@ -5,6 +5,7 @@ called independent, constant or diagonal is so.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,10 +19,10 @@ ELEMENTWISE_PRIMITIVES = frozenset([
     "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh",
 ])
 # fmt: on
-CALLS = frozenset("jit pjit closed_call core_call custom_jvp_call custom_vjp_call remat checkpoint".split())
+CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
 
 
-def called(eqn) -> tuple | None:
+def called(eqn) -> tuple[Any, Any] | None:
     """(jaxpr, consts) of what an equation of a jaxpr calls, None if it is no call."""
     inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
     if eqn.primitive.name not in CALLS or inner is None:
