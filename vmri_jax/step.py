@@ -329,8 +329,7 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
     fast, fast_memory, status, q_f, multiplier = _march_fast(
         parts.fast, parts.fast_scheme, num_micro, fast, macro_dt / num_micro, newton, fast_memory
     )
-    status = (jnp.maximum(a, b) for a, b in zip(_status(slow_info), status, strict=True))
-    info = StepInfo(*status, q_f, multiplier, slow_info.multiplier[0])  # pyright: ignore[reportCallIssue]
+    info = StepInfo(*_worse(_status(slow_info), status), q_f, multiplier, slow_info.multiplier[0])  # pyright: ignore[reportCallIssue]
     end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
     return end, info, memory._replace(parts=(slow_memory, fast_memory))
 
@@ -344,24 +343,28 @@ def _march_fast(system, scheme, num_micro, fast, micro_dt, newton, memory):
         return _kick(system, scheme, fast, micro_dt, kicks, ends), info, memory, kicks
 
     def inside(carry, _):
-        fast, memory = carry
+        fast, memory, worst = carry
         fast, info, memory, _ = micro_step(fast, memory, ("end", "start"))
-        status = None if is_concrete(_status(info)) else _status(info)  # known beforehand: not worth arrays
-        return (fast, memory), (status, info.q_f_micro[0], info.multiplier[0])
+        return (fast, memory, _worse(worst, _status(info))), (info.q_f_micro[0], info.multiplier[0])
 
     fast = _kick(system, scheme, fast, micro_dt, memory.kicks, ("start",))
     memory = memory._replace(kicks=None)  # needed again only at the last node
-    (fast, memory), (before, q_f, multiplier) = jax.lax.scan(inside, (fast, memory), length=num_micro - 1)
+    none = jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(())
+    (fast, memory, worst), (q_f, multiplier) = jax.lax.scan(inside, (fast, memory, none), length=num_micro - 1)
     fast, last, memory, kicks = micro_step(fast, memory, ("end",))
     status = _status(last)
-    if before is not None:
-        status = tuple(jnp.maximum(jnp.max(a, initial=0), b) for a, b in zip(before, status, strict=True))
+    if not is_concrete(status):  # known beforehand it is that of all
+        status = _worse(worst, status)
     q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
     return fast, memory._replace(kicks=kicks), status, q_f, multiplier
 
 
 def _status(info: StepInfo) -> tuple:
     return info.result, info.method, info.iterations, info.residual
+
+
+def _worse(a: tuple, b: tuple) -> tuple:
+    return tuple(jnp.maximum(x, y) for x, y in zip(a, b, strict=True))
 
 
 def _move_coupled(system, scheme, state, macro_dt, newton, memory):
