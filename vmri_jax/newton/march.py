@@ -295,7 +295,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         """(num_micro, r, n_g) at the nodes 1..r of the micro intervals."""
         slow_nodes = equations.q_s + _along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], done.x.slow)
         times = equations.t + h * (np.arange(n)[:, None] + control_nodes(r)[1:])
-        return jax.lax.map(lambda at: jax.vmap(system.g)(*at), (times, slow_nodes, done.nodes))
+        return jax.vmap(jax.vmap(system.g))(times, slow_nodes, done.nodes)
 
     def joined(x: Unknowns):
         return jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
