@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-ORDER = 10
+ORDER = 8
 """Highest order of the polynomials."""
 
 
