@@ -1,5 +1,6 @@
 """One macro step: the route chosen from rules and system, its end, its multipliers."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,10 +18,13 @@ from vmri_jax import (
     galerkin,
     initial_state,
     macro,
+    macro_step,
     micro,
     quadrature,
+    systems,
 )
 from vmri_jax.split import split
+from vmri_jax.step import LARGE
 
 
 def step(problem, scheme, macro_dt):
@@ -89,6 +93,19 @@ def test_the_step_is_the_discrete_legendre_transform(fpu, scheme):
         assert largest_difference(a, b) < 1e-12  # measured 1e-14
     assert np.array_equal(info.q_f_micro[-1], end.q_f)
     assert float(end.t) == 0.05
+
+
+@pytest.mark.parametrize("num_micro", [1, 2, 5, 6])
+def test_linear_micro_steps_two_at_a_time(num_micro, monkeypatch):
+    problem = systems.fermi_pasta_ulam(LARGE)
+    ends = []
+    for large in (LARGE, LARGE + 1):
+        monkeypatch.setattr("vmri_jax.step.LARGE", large)
+        trace_anew = jax.jit(lambda: macro_step(problem.system, explicit_slow(num_micro), problem.state(), 0.05))
+        ends.append(trace_anew())
+    (state, info), (other, other_info) = ends
+    np.testing.assert_allclose(info.q_f_micro, other_info.q_f_micro, atol=1e-14)
+    np.testing.assert_allclose(state.p_f, other.p_f, rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("degree", [1, 2])
