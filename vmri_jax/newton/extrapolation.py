@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-ORDER = 8
+ORDER = 10
 """Highest order of the polynomials."""
 
 
