@@ -32,8 +32,7 @@ from vmri_jax.state import State, project_momentum
 from vmri_jax.system import ConstantMass, System
 
 LARGE = 1000
-"""From so many fast variables on, which do not fit into the first-level cache, linear micro steps come two at a time: fewer numbers are
-moved for more operations on them."""
+"""From so many fast variables on, too many for the first-level cache, linear micro steps come two at a time."""
 
 
 class StepInfo(eqx.Module):
@@ -355,12 +354,9 @@ def _march_fast(system, scheme, num_micro, fast, micro_dt, newton, memory):
     fast = _kick(system, scheme, fast, micro_dt, memory.kicks, ("start",))
     memory = memory._replace(kicks=None)  # needed again only at the last node
     none = jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(())
-    in_pairs = (
-        fast.q_f.size >= LARGE and not is_explicit(system, scheme) and is_linear(system, scheme, fast.q_s, fast.q_f)
-    )
-    (fast, memory, worst), (q_f, multiplier) = jax.lax.scan(
-        inside, (fast, memory, none), length=num_micro - 1, unroll=2 if in_pairs else 1
-    )
+    pairs = fast.q_f.size >= LARGE and not is_explicit(system, scheme) and is_linear(system, scheme, fast.q_s, fast.q_f)
+    together, start = 2 if pairs else 1, (fast, memory, none)
+    (fast, memory, worst), (q_f, multiplier) = jax.lax.scan(inside, start, length=num_micro - 1, unroll=together)
     fast, last, memory, kicks = micro_step(fast, memory, ("end",))
     status = _status(last)
     if not is_concrete(status):  # known beforehand it is that of all
