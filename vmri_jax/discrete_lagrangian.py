@@ -104,11 +104,14 @@ class QuadraticKinetic:
         slopes = lagrange_derivative(self.nodes.degree, at)
         return jnp.einsum("n,ni,nj->ij", weights, slopes, slopes)
 
+    def rows(self, slow, fast):
+        """Derivative by the slow increments (r, n_s) times H, and by the fast ones (..., r, n_f) times h."""
+        slow, fast = self.mass.momentum(slow, fast)
+        return matmul(self.slow_form[1:, 1:], slow), matmul(self.fast_form[1:, 1:], fast)
+
     def __call__(self, path: Path):
-        slow, fast = self.mass.momentum(path.slow, path.fast)
-        slow = jnp.sum(path.slow * matmul(self.slow_form[1:, 1:], slow))
-        fast = jnp.sum(path.fast * matmul(self.fast_form[1:, 1:], fast))
-        return (slow + self.nodes.num_micro * fast) / (2 * path.macro_dt)
+        slow, fast = self.rows(path.slow, path.fast)
+        return (jnp.sum(path.slow * slow) + self.nodes.num_micro * jnp.sum(path.fast * fast)) / (2 * path.macro_dt)
 
     at_nodes_inside = __call__
 

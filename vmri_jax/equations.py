@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.discrete_lagrangian import lagrangian
+from vmri_jax.discrete_lagrangian import Sum, lagrangian
 from vmri_jax.path import Nodes, Path, control_nodes, lagrange_basis, velocity_nodes
 from vmri_jax.scheme import Scheme
 from vmri_jax.system import System
@@ -70,12 +70,14 @@ class StepEquations(eqx.Module):
 
     def unconstrained(self, path: Path, at: Path):
         """The action times h without constraints."""
-        discrete_lagrangian = lagrangian(self.system, self.scheme).at_nodes_inside(path)
-        return self.micro_dt * (discrete_lagrangian + self.virtual_work(path, at))
+        return self._action(lagrangian(self.system, self.scheme), path, at)
 
-    def potential_action(self, path: Path):
-        """The part of the potentials alone."""
-        return self.micro_dt * lagrangian(self.system, self.scheme).potentials.at_nodes_inside(path)
+    def without_kinetic(self, path: Path, at: Path):
+        """The same without the kinetic energy of constant masses."""
+        return self._action(lagrangian(self.system, self.scheme).potentials, path, at)
+
+    def _action(self, terms: Sum, path: Path, at: Path):
+        return self.micro_dt * (terms.at_nodes_inside(path) + self.virtual_work(path, at))
 
     def virtual_work(self, path: Path, at: Path):
         """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, with the forces along `at`."""

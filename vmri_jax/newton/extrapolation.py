@@ -43,7 +43,7 @@ class Line(NamedTuple):
     its neighbours.
 
     last (2, ...): of the last two intervals, the last one first, without what stands out.
-    jump (...): by how much the first one stands out; None if it does not.
+    jump (...): by how much the first one of a macro step stands out; None if it does not.
     """
 
     last: Any
@@ -67,11 +67,18 @@ class Line(NamedTuple):
 
     def add(self, m, value) -> "Line":
         """With the value of interval m."""
-        before, jump = self.last, self.jump
-        if jump is not None:
-            value = value - jnp.where(m == 0, jump, 0.0)
-            jump = jump + jnp.where(m == 1, before[0] - (before[1] + value) / 2, 0.0)
-        return Line(jnp.stack([value, before[0]]), jump)
+        if self.jump is not None:
+            value = value - jnp.where(m == 0, self.jump, 0.0)
+        return self._replace(last=jnp.stack([value, self.last[0]]))
+
+    def after_step(self, values) -> "Line":
+        """With the values (num_micro, ...) of a macro step, and the jump at its start."""
+        line, n = self, len(values)
+        if self.jump is not None:
+            line = self._replace(jump=values[0] - (self.last[0] + values[1]) / 2)
+        for m in range(max(n - 2, 0), n):
+            line = line.add(m, values[m])
+        return line
 
     def after(self, other: "Line") -> "Line":
         """Going on where another line ended."""

@@ -98,9 +98,9 @@ class Pass(NamedTuple):
     """What a march over the micro intervals leaves.
 
     q_f, p_f: end of the last interval, momentum times h.
-    start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path.
+    start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path,
+        without their kinetic energy.
     moved: largest correction of an increment.
-    multiplier, bend: as in `Warm`.
     """
 
     q_f: Any
@@ -108,8 +108,6 @@ class Pass(NamedTuple):
     start: Any
     increments: Any
     moved: Any
-    multiplier: Line
-    bend: Line
 
 
 def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None, linear=False):
@@ -122,11 +120,12 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
         linear: the equations are linear with the given matrix, and this is their only pass.
 
     Returns:
-        (x, what the pass leaves, fast positions (num_micro, r, n_f) at the nodes 1..r, schur)
+        (x, what the pass leaves, fast positions (num_micro, r, n_f) at the nodes 1..r, bends, schur)
     """
     h, (n, r, _), n_g = equations.micro_dt, x.fast.shape, x.multiplier.shape[2]
     system, scheme = interval_problem(equations.system, equations.scheme)
-    kicks = lagrangian(system, scheme).kicks if n > 1 else ()
+    terms = lagrangian(system, scheme)
+    kinetic, kicks = terms.kinetic, terms.kicks if n > 1 else ()
     explicit = is_explicit_given_multipliers(equations.system, equations.scheme)
     bent = warm.bend.last.size > 0
     basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # (n, r + 1, r): slow position at each node by increments
@@ -134,24 +133,23 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
     first = schur is None
     constraints = jax.vmap(system.g)
 
-    def interval(carry: Pass, at):
-        m, basis, scale, inside, inc, mu, schur = at
+    def interval(carry, at):
+        (carry, lines), (m, basis, scale, inside, inc, mu, schur) = carry, at
         q_s, steps = equations.q_s + _along(basis[0], x.slow), _along(basis[1:] - basis[0], x.slow)
         none = jnp.zeros_like(q_s), jnp.zeros_like(carry.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, carry.q_f, *none, h)
         slow_nodes, times = jnp.concatenate([q_s[None], q_s + steps]), local.t + h * control_nodes(r)
         straight = control_nodes(r)[1:, None] * velocity(carry.p_f)
         if first:
-            mu = scale * carry.multiplier.next(m)
+            multipliers, bends = lines
+            mu = scale * multipliers.next(m)
             inc = jnp.zeros_like(straight)
             if bent:
-                inc = straight + h**2 * carry.bend.again(m)
+                inc = straight + h**2 * bends.again(m)
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
-            if linear:  # the one pass is at zero increments, where kinetic energy has no gradient
-                return jax.grad(local.potential_action)(path)
-            return jax.grad(local.unconstrained)(path, path)
+            return jax.grad(local.without_kinetic)(path, path)
 
         fast_nodes = jnp.concatenate([carry.q_f[None], carry.q_f + inc[:-1]])
         pull = _forces(system, times[:-1], slow_nodes[:-1], fast_nodes, stored=not explicit)
@@ -159,10 +157,11 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
         if explicit:  # the increment follows from the multipliers
             inc = -matrix.solve(carry.p_f - pull_f)
         d, change = jax.linearize(gradient, inc)
+        d_fast = d.fast[0] if linear else d.fast[0] + kinetic.rows(steps, inc)[1]  # the one pass is at zero increments
         g, push = jax.linearize(lambda inc: constraints(times[1:], slow_nodes[1:], carry.q_f + inc), inc)
         dx, change_of_g = jnp.zeros_like(inc), g
         if not explicit:
-            rows = jnp.concatenate([(d.fast_start - d.fast.sum(1)) + carry.p_f, d.fast[0, :-1]])
+            rows = jnp.concatenate([(d.fast_start - d_fast.sum(0)) + carry.p_f, d_fast[:-1]])
             dx = -matrix.solve(rows - pull_f)
             change_of_g = g + push(dx)
         if first:
@@ -174,7 +173,7 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
         if n_g:
             dx += matrix.solve(more_f)
         inc, mu, coupling = inc + dx, mu + dmu, change(dx)
-        q_f, p_f = carry.q_f + inc[-1], d.fast[0, -1] + matrix.outgoing(dx)
+        q_f, p_f = carry.q_f + inc[-1], d_fast[-1] + matrix.outgoing(dx)
         moved = jnp.maximum(carry.moved, largest(dx))
 
         pull_s = -(pull_s + more_s)
@@ -189,18 +188,19 @@ def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: W
             start, p_f = start + weight * d_s, p_f + weight * d_f
             increments += basis[-1][:, None] * (weight * d_s)
 
-        multiplier, bend = carry.multiplier.add(m, mu / scale), carry.bend
-        if bent:
-            bend = bend.add(m, (inc - straight) / h**2)
-        end = Pass(q_f, p_f, start, increments, moved, multiplier, bend)
-        return end, (inc, mu, carry.q_f + inc, schur if first else None)
+        bend = (inc - straight) / h**2 if bent else None
+        if first:
+            lines = multipliers.add(m, mu / scale), bends.add(m, bend) if bent else bends
+        end = Pass(q_f, p_f, start, increments, moved)
+        return (end, lines), (inc, mu, carry.q_f + inc, bend, schur if first else None)
 
     zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(())
-    carry = Pass(equations.q_f, h * equations.p_f, *zero, warm.multiplier, warm.bend)
+    carry = Pass(equations.q_f, h * equations.p_f, *zero), (warm.multiplier, warm.bend) if first else None
     scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
     unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
-    end, (fast, mu, nodes, new) = jax.lax.scan(interval, carry, (m, jnp.asarray(basis), scale, m < n - 1, *unknowns))
-    return x._replace(fast=fast, multiplier=mu), end, nodes, new if first else schur
+    intervals = m, jnp.asarray(basis), scale, m < n - 1, *unknowns
+    (end, _), (fast, mu, nodes, bends, new) = jax.lax.scan(interval, carry, intervals)
+    return x._replace(fast=fast, multiplier=mu), end, nodes, bends, new if first else schur
 
 
 def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
@@ -217,7 +217,7 @@ def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
 class March(NamedTuple):
     """State of the iteration: unknowns of this pass, what it left and moved, secant pairs, and how it stands.
 
-    nodes: fast positions (num_micro, r, n_f) at the nodes 1..r of the micro intervals.
+    nodes, bends: fast positions (num_micro, r, n_f) at the nodes 1..r of the micro intervals, and what `Warm` keeps of them.
     schur: small matrices of the micro intervals, from the first pass.
     d: the update that the slow unknowns would get from mass and slow constraint alone.
     impulse: on the slow variables over the step, times h.
@@ -227,6 +227,7 @@ class March(NamedTuple):
     x: Unknowns
     end: Pass
     nodes: Any
+    bends: Any
     schur: Any
     d: Any
     pairs: Pairs
@@ -254,7 +255,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     eps = jnp.finfo(float).eps
     mass = constant_mass(system)
     inverse_slow, inverse_fast = inverse_mass(mass.slow), inverse_mass(mass.fast)
-    inverse_form = n * inverse(lagrangian(system, scheme).kinetic.slow_form[:-1, 1:])
+    kinetic = lagrangian(system, scheme).kinetic
+    inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
     times = equations.t + equations.macro_dt * control_nodes(r)
     accepted = Accepted.of(equations, newton)
 
@@ -264,15 +266,14 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         nodes = jnp.concatenate([equations.q_s[None], equations.q_s + x.slow[:-1]])
         jacobian = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(times[:-1], nodes)
         pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
-        rows = (
-            jnp.concatenate([(end.start - end.increments.sum(0) + h * equations.p_s)[None], end.increments[:-1]]) - pull
-        )
+        d_steps = end.increments + kinetic.rows(x.slow, x.fast)[0] / n
+        rows = jnp.concatenate([(end.start - d_steps.sum(0) + h * equations.p_s)[None], d_steps[:-1]]) - pull
         d, d_nu = solve_saddle(lambda rows: matmul(inverse_form, inverse_slow(rows)), jacobian, push, rows, g)
         return jnp.concatenate([d.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), end.start - pull.sum(0)
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
-        x, end, nodes, schur = march(equations, matrix, x, warm, None if first else last.schur, linear)
+        x, end, nodes, bends, schur = march(equations, matrix, x, warm, None if first else last.schur, linear)
         d, (rows, g), impulse = slow_update(x, end)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
@@ -283,7 +284,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         left = end.moved if first else expected(end.moved, last.end.moved)
         result = newton.status(accepted.over((largest(d[: r * n_s]), left), (largest(x.slow), motion)), passes)
         residual = jnp.maximum(largest(rows), largest(mass.fast) * left), largest(g)
-        return March(x, end, nodes, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
+        return March(x, end, nodes, bends, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
 
     def next_pass(last: March) -> March:
         x = last.x
@@ -315,7 +316,9 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         done = done._replace(residual=(rows, jnp.maximum(largest(constraints(done)), g_slow)))
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
     slow, passes = warm.slow.add(joined(done.x)), jnp.stack([fewest, done.passes])
-    return done, Warm(slow, done.end.multiplier, done.end.bend, done.pairs, passes)
+    multiplier = warm.multiplier.after_step(done.x.multiplier / multiplier_scales(scheme, equations.macro_dt)[0])
+    bend = warm.bend if done.bends is None else warm.bend.after_step(done.bends)
+    return done, Warm(slow, multiplier, bend, done.pairs, passes)
 
 
 def _along(weights, increments):
