@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.algebra import inverse, largest, matmul, matvec, regularized
+from vmri_jax.algebra import solve as solve_dense
 from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.newton.extrapolation import Differences, Line
@@ -46,6 +47,8 @@ NOISE = 3e2
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
+EASY = 2
+"""Steps with so few passes do without secant pairs."""
 UNKNOWN = -1
 
 
@@ -229,6 +232,7 @@ class March(NamedTuple):
     nodes: Any
     bends: Any
     schur: Any
+    tied: Any
     d: Any
     pairs: Pairs
     impulse: Any
@@ -260,37 +264,65 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     times = equations.t + equations.macro_dt * control_nodes(r)
     accepted = Accepted.of(equations, newton)
 
-    def slow_update(x: Unknowns, end: Pass):
-        """Update of the slow unknowns by mass and slow constraint, residuals of their equations, impulse."""
+    def slow_increments(rows, tied):
+        """Slow increments for given rows, by the masses and what is tied to them."""
+        dx = matmul(inverse_form, inverse_slow(rows))
+        if tied is None:
+            return dx
+        columns, weights = tied
+        return dx - jnp.sum(jnp.sum(weights * dx, axis=(1, 2))[:, None, None] * columns, axis=0)
+
+    def masses_tied(schur):
+        """``(U, P)``: with the fast masses that constraints tie to the slow ones, increments are ``(1 - U P)`` times as large.
+
+        In the first micro interval the constraints give the fast variables the velocity that the slow path asks for, and later
+        ones let them keep it. So the multipliers there, ``-S G dx``, stand for the inertia of what is tied.
+        """
+        jacobian = jax.jacrev(system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
+        basis = slow_basis_at_control_nodes(n, r)[0]
+        forces, values = (b[:, None, :, None] * jacobian[:, None, :] for b in (basis[:-1, :-1], basis[1:, 1:]))
+        columns = jax.vmap(lambda rows: slow_increments(rows, None))(forces.reshape(r * n_g, r, n_s))
+        multipliers = matmul(schur, values.reshape(r * n_g, r * n_s))
+        tie = np.eye(r * n_g) + matmul(multipliers, columns.reshape(r * n_g, r * n_s).T)
+        return columns, solve_dense(tie, multipliers).reshape(columns.shape)
+
+    def slow_update(x: Unknowns, end: Pass, tied):
+        """Update of the slow unknowns by masses and slow constraint, residuals of their equations, impulse."""
         g, push = jax.linearize(lambda inc: jax.vmap(system.g_slow)(times[1:], equations.q_s + inc), x.slow)
         nodes = jnp.concatenate([equations.q_s[None], equations.q_s + x.slow[:-1]])
         jacobian = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(times[:-1], nodes)
         pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
         d_steps = end.increments + kinetic.rows(x.slow, x.fast)[0] / n
         rows = jnp.concatenate([(end.start - d_steps.sum(0) + h * equations.p_s)[None], d_steps[:-1]]) - pull
-        d, d_nu = solve_saddle(lambda rows: matmul(inverse_form, inverse_slow(rows)), jacobian, push, rows, g)
+        d, d_nu = solve_saddle(lambda rows: slow_increments(rows, tied), jacobian, push, rows, g)
         return jnp.concatenate([d.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), end.start - pull.sum(0)
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
         x, end, nodes, bends, schur = march(equations, matrix, x, warm, None if first else last.schur, linear)
-        d, (rows, g), impulse = slow_update(x, end)
+        tied = last.tied if last else masses_tied(schur[0]) if n_g and n_s else None
+        d, (rows, g), impulse = slow_update(x, end, tied)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
             noise = NOISE * eps * (largest(equations.q_s) + largest(x.slow))
-            pairs = pairs.add(joined(x) - joined(last.x), d - last.d, noise, r * n_s)
+            move, change = joined(x) - joined(last.x), d - last.d
+            pairs = jax.lax.cond(is_hard(last), lambda: pairs.add(move, change, noise, r * n_s), lambda: pairs)
 
         motion = jnp.maximum(largest(inverse_fast(h * equations.p_f)), largest(inverse_fast(end.p_f)))
         left = end.moved if first else expected(end.moved, last.end.moved)
         result = newton.status(accepted.over((largest(d[: r * n_s]), left), (largest(x.slow), motion)), passes)
         residual = jnp.maximum(largest(rows), largest(mass.fast) * left), largest(g)
-        return March(x, end, nodes, bends, schur, d, pairs, impulse, residual, jnp.asarray(passes), result)
+        return March(x, end, nodes, bends, schur, tied, d, pairs, impulse, residual, jnp.asarray(passes), result)
 
     def next_pass(last: March) -> March:
         x = last.x
         if n_s:
-            x = separated(joined(x) + last.pairs.corrected(last.d, r * n_s), x)
+            d = jax.lax.cond(is_hard(last), lambda: last.pairs.corrected(last.d, r * n_s), lambda: last.d)
+            x = separated(joined(x) + d, x)
         return one_pass(x, last)
+
+    def is_hard(last: March):
+        return (warm.passes[1] > EASY) | (last.passes >= EASY)
 
     def constraints(done: March):
         """(num_micro, r, n_g) at the nodes 1..r of the micro intervals."""
