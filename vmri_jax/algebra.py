@@ -104,10 +104,14 @@ def _first_exchanged(a):
 
 
 def largest(a):
-    """The largest absolute value in a, 0 of nothing, NaN if there is one.
+    """The largest absolute value in a, 0 of nothing, NaN if there is one."""
+    return jax.lax.bitcast_convert_type(jnp.max(ordered(a), initial=0), jnp.float64)
 
-    Floats without a sign are ordered as the integers of the same bits, NaN above all. A maximum of integers may be taken in any
-    order, so that it fills vector registers; one of floats is taken number by number, and XLA loses NaN in some of them.
+
+def ordered(a):
+    """Integers with the order of ``|a|``, NaN above all: those of the same bits.
+
+    A maximum of integers may be taken in any order, so that it fills vector registers; one of floats is taken number by number,
+    and XLA loses NaN in some of them.
     """
-    bits = jax.lax.bitcast_convert_type(jnp.abs(a), jnp.int64)
-    return jax.lax.bitcast_convert_type(jnp.max(bits, initial=0), jnp.float64)
+    return jax.lax.bitcast_convert_type(jnp.abs(a), jnp.int64)

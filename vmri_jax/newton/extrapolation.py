@@ -4,8 +4,12 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from vmri_jax.algebra import ordered
+
 ORDER = 10
 """Highest order of the polynomials."""
+PLACES = 16
+"""A power of two, more than there are orders."""
 
 
 class Differences(NamedTuple):
@@ -24,8 +28,9 @@ class Differences(NamedTuple):
 
     def next(self, measured: int):
         """Where the values go on, by the order that missed the first `measured` entries of the last step least."""
-        missed = jnp.max(jnp.abs(self.values[1:, :measured]), axis=1, initial=0.0)
-        taken = jnp.arange(ORDER + 2) <= jnp.argmin(jnp.where(jnp.isfinite(missed), missed, jnp.inf))
+        missed = jnp.max(ordered(self.values[1:, :measured]), axis=1, initial=0)
+        best = jnp.min((missed & -PLACES) + jnp.arange(ORDER + 1)) & (PLACES - 1)  # the last places hold the order
+        taken = jnp.arange(ORDER + 2) <= best
         return jnp.sum(jnp.where(taken[:, None], self.values, 0.0), axis=0)
 
     def add(self, x) -> "Differences":
