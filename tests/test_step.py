@@ -96,16 +96,23 @@ def test_the_step_is_the_discrete_legendre_transform(fpu, scheme):
 
 
 @pytest.mark.parametrize("num_micro", [1, 2, 5, 6])
-def test_linear_micro_steps_two_at_a_time(num_micro, monkeypatch):
+def test_linear_micro_steps_some_at_a_time(num_micro, monkeypatch):
+    """Complex numbers of position and momentum, of which nothing is to be seen outside."""
     problem = systems.fermi_pasta_ulam(LARGE)
-    ends = []
+    ends, numbers = [], []
     for large in (LARGE, LARGE + 1):
         monkeypatch.setattr("vmri_jax.step.LARGE", large)
-        trace_anew = jax.jit(lambda: macro_step(problem.system, explicit_slow(num_micro), problem.state(), 0.05))
-        ends.append(trace_anew())
-    (state, info), (other, other_info) = ends
+
+        def end(macro_dt):
+            return macro_step(problem.system, explicit_slow(num_micro), problem.state(), macro_dt)
+
+        numbers.append(str(jax.make_jaxpr(end)(0.05)))
+        ends.append((end(0.05), jax.jacrev(lambda dt: end(dt)[0].p_f)(0.05)))
+    assert ["c128" in jaxpr for jaxpr in numbers] == [True, False]
+    ((state, info), slope), ((other, other_info), other_slope) = ends
     np.testing.assert_allclose(info.q_f_micro, other_info.q_f_micro, atol=1e-14)
     np.testing.assert_allclose(state.p_f, other.p_f, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(slope, other_slope, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("degree", [1, 2])

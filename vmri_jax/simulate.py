@@ -23,10 +23,11 @@ from vmri_jax.interrupts import Interrupted, interrupts_noted
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result, SimulationError
-from vmri_jax.runtime import in_one_kernel
+from vmri_jax.runtime import WIDE_VECTORS, in_one_kernel
 from vmri_jax.scheme import Scheme
+from vmri_jax.split import drifts
 from vmri_jax.state import State, check_constraints
-from vmri_jax.step import Memory, Stages, advance, projected, projects_rarely, start_memory
+from vmri_jax.step import LARGE, Memory, Stages, advance, projected, start_memory
 from vmri_jax.system import System
 from vmri_jax.trajectory import RunInfo, Trajectory, join
 
@@ -149,7 +150,8 @@ class Simulation:
         return join([*good, rest]), end
 
     def _advance(self, at: Checkpoint, saves: int, newton: Newton) -> tuple[Trajectory, Checkpoint]:
-        piece, state, memory = _run_traced(
+        run_piece = _run_large if at.state.q_f.size >= LARGE else _run_traced
+        piece, state, memory = run_piece(
             self.system, self.scheme, newton, self.macro_dt, self.t_start, at.state, at.memory, at.step, saves,
             self.save_every, self.save_micro,
         )  # fmt: skip
@@ -161,6 +163,16 @@ class Simulation:
             self.system, self.scheme, self.newton, self.macro_dt, self.t_start, start.state, start.memory, 0, saves,
             self.save_every, self.save_micro,
         )[0]  # fmt: skip
+
+
+def projects_rarely(system: System, scheme: Scheme | Composition, state: State, newton: Newton) -> bool:
+    """Whether a run may project its momenta only where they are looked at.
+
+    A projection is a shift by ``G^T mu``, which the multipliers of the next step take back.
+    """
+    scheme = stage_scheme(scheme)
+    held = system.is_constrained and newton.marches(system, scheme)
+    return held and drifts(system, scheme, state.q_s, state.q_f)
 
 
 def run(
@@ -232,8 +244,9 @@ def run(
 _run_static = jax.jit(run, static_argnames=("num_saves", "save_micro", "save_every"))
 
 
-@partial(jax.jit, static_argnames=("num_saves", "save_micro"))
-def _run_traced(system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro):
+def _run_in_one_kernel(
+    system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro
+):
     """Also the state at the end."""
 
     @in_one_kernel
@@ -242,6 +255,12 @@ def _run_traced(system, scheme, newton, macro_dt, t_start, at, memory, first_ste
 
     piece, memory = go(macro_dt, t_start, at, memory, first_step)
     return piece, piece.final_state, memory
+
+
+_run_traced, _run_large = (
+    jax.jit(_run_in_one_kernel, static_argnames=("num_saves", "save_micro"), compiler_options=options)
+    for options in (None, WIDE_VECTORS)
+)
 
 
 @jax.jit

@@ -27,12 +27,14 @@ from vmri_jax.newton.interval import is_linear
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
-from vmri_jax.split import drifts, fast_alone, is_drift, is_explicit, split
+from vmri_jax.split import fast_alone, is_drift, is_explicit, split
 from vmri_jax.state import State, project_momentum
 from vmri_jax.system import ConstantMass, System
 
-LARGE = 1000
-"""From so many fast variables on, too many for the first-level cache, linear micro steps come two at a time."""
+LARGE = 200
+"""From so many fast variables on it matters what goes through the vector registers and the caches."""
+TOGETHER = 4
+"""So many linear micro steps of a large system come at a time."""
 
 
 class StepInfo(eqx.Module):
@@ -162,17 +164,6 @@ def _equations(system, scheme, state, macro_dt) -> StepEquations:
     return StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
 
 
-def projects_rarely(system: System, scheme: Scheme | Composition, state: State, newton: Newton) -> bool:
-    """Whether a run may project its momenta only where they are looked at.
-
-    A projection is a shift by ``G^T mu``, which the multipliers of the next step take back.
-    """
-    if isinstance(scheme, Composition):
-        return projects_rarely(system, scheme.scheme, state, newton)
-    held = system.is_constrained and newton.marches(system, scheme)
-    return held and drifts(system, scheme, state.q_s, state.q_f)
-
-
 def projected(system: System, state: State, memory):
     """State and memory with momenta on the hidden constraints."""
 
@@ -192,7 +183,7 @@ def advance(
     """`macro_step` that takes and hands on a memory: (state, info, memory).
 
     Args:
-        project: whether the momenta are projected, see `projects_rarely`.
+        project: whether the momenta are projected.
     """
     if isinstance(scheme, Composition):
         return _advance_stages(system, scheme, state, macro_dt, newton, memory, project)
@@ -346,23 +337,34 @@ def _march_fast(system, scheme, num_micro, fast, micro_dt, newton, memory):
         kicks = _kick_gradients(system, scheme, fast.q_s, fast.q_f)
         return _kick(system, scheme, fast, micro_dt, kicks, ends), info, memory, kicks
 
+    large = fast.q_f.size >= LARGE and not is_explicit(system, scheme) and is_linear(system, scheme, fast.q_s, fast.q_f)
+    pack, unpack, together = (_packed, _unpacked, TOGETHER) if large else (lambda fast: fast, lambda fast: fast, 1)
+
     def inside(carry, _):
         fast, memory, worst = carry
-        fast, info, memory, _ = micro_step(fast, memory, ("end", "start"))
-        return (fast, memory, _worse(worst, _status(info))), (info.q_f_micro[0], info.multiplier[0])
+        fast, info, memory, _ = micro_step(unpack(fast), memory, ("end", "start"))
+        return (pack(fast), memory, _worse(worst, _status(info))), (info.q_f_micro[0], info.multiplier[0])
 
     fast = _kick(system, scheme, fast, micro_dt, memory.kicks, ("start",))
     memory = memory._replace(kicks=None)  # needed again only at the last node
-    none = jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(())
-    pairs = fast.q_f.size >= LARGE and not is_explicit(system, scheme) and is_linear(system, scheme, fast.q_s, fast.q_f)
-    together, start = 2 if pairs else 1, (fast, memory, none)
+    start = pack(fast), memory, (jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
     (fast, memory, worst), (q_f, multiplier) = jax.lax.scan(inside, start, length=num_micro - 1, unroll=together)
-    fast, last, memory, kicks = micro_step(fast, memory, ("end",))
+    fast, last, memory, kicks = micro_step(unpack(fast), memory, ("end",))
     status = _status(last)
     if not is_concrete(status):  # known beforehand it is that of all
         status = _worse(worst, status)
     q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
     return fast, memory._replace(kicks=kicks), status, q_f, multiplier
+
+
+def _packed(fast: State):
+    """Position and momentum side by side as one complex number: one loop over the coordinates then makes both."""
+    return fast.t, jax.lax.complex(fast.q_f, fast.p_f)
+
+
+def _unpacked(packed) -> State:
+    (t, z), none = packed, jnp.zeros(0)
+    return State(t, none, jnp.real(z), none, jnp.imag(z))
 
 
 def _status(info: StepInfo) -> tuple:

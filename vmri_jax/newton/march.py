@@ -7,8 +7,8 @@ increments and slow multipliers are corrected from what is left of their equatio
 * micro interval: ``[K, -G^T; G, 0]`` with K from the start of the macro step, or of one before it while that costs no passes
   (`IntervalMatrix`: the mass alone where the fast equations are explicit, so that only the multipliers are solved for), and
   ``G K^-1 G^T`` from the first pass;
-* slow equations: mass and slow constraint. What they miss, the response of the fast variables and the curvature of V,
-  is learned from the passes (`Pairs`).
+* slow equations: masses, with those that constraints tie to the slow ones, and slow constraint (`SlowEquations`). What they
+  miss, the rest of what the fast variables answer and the curvature of V, is learned from steps with many passes (`Pairs`).
 
 The slow unknowns start from what the steps before extrapolate to (`Differences`), the fast ones from the micro intervals
 before (`Line`). The residual is exact, so all of this decides only how many passes there are: two where the slow motion is
@@ -22,8 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import inverse, largest, matmul, matvec, regularized
-from vmri_jax.algebra import solve as solve_dense
+from vmri_jax.algebra import inverse, largest, matvec, regularized
 from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.newton.extrapolation import Differences, Line
@@ -37,9 +36,9 @@ from vmri_jax.newton.interval import (
     inverse_mass,
     is_explicit_given_multipliers,
     is_linear,
-    solve_saddle,
 )
 from vmri_jax.newton.secant import SIZE, Pairs
+from vmri_jax.newton.slow import SlowEquations
 from vmri_jax.path import control_nodes
 from vmri_jax.results import Result
 
@@ -113,7 +112,9 @@ class Pass(NamedTuple):
     moved: Any
 
 
-def march(equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None, linear=False):
+def march(
+    equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None, linear=False
+) -> tuple[Any, ...]:
     """One pass over the micro intervals: fast unknowns corrected for the given slow ones, and what they leave.
 
     Args:
@@ -222,7 +223,8 @@ class March(NamedTuple):
 
     nodes, bends: fast positions (num_micro, r, n_f) at the nodes 1..r of the micro intervals, and what `Warm` keeps of them.
     schur: small matrices of the micro intervals, from the first pass.
-    d: the update that the slow unknowns would get from mass and slow constraint alone.
+    tied: masses that constraints tie to the slow variables, from the first pass.
+    d: the update of the slow unknowns by the cheap matrix.
     impulse: on the slow variables over the step, times h.
     residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
     """
@@ -258,50 +260,14 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
     eps = jnp.finfo(float).eps
     mass = constant_mass(system)
-    inverse_slow, inverse_fast = inverse_mass(mass.slow), inverse_mass(mass.fast)
-    kinetic = lagrangian(system, scheme).kinetic
-    inverse_form = n * inverse(kinetic.slow_form[:-1, 1:])
-    times = equations.t + equations.macro_dt * control_nodes(r)
+    inverse_fast, outer = inverse_mass(mass.fast), SlowEquations.of(equations)
     accepted = Accepted.of(equations, newton)
-
-    def slow_increments(rows, tied):
-        """Slow increments for given rows, by the masses and what is tied to them."""
-        dx = matmul(inverse_form, inverse_slow(rows))
-        if tied is None:
-            return dx
-        columns, weights = tied
-        return dx - jnp.sum(jnp.sum(weights * dx, axis=(1, 2))[:, None, None] * columns, axis=0)
-
-    def masses_tied(schur):
-        """``(U, P)``: with the fast masses that constraints tie to the slow ones, increments are ``(1 - U P)`` times as large.
-
-        In the first micro interval the constraints give the fast variables the velocity that the slow path asks for, and later
-        ones let them keep it. So the multipliers there, ``-S G dx``, stand for the inertia of what is tied.
-        """
-        jacobian = jax.jacrev(system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
-        basis = slow_basis_at_control_nodes(n, r)[0]
-        forces, values = (b[:, None, :, None] * jacobian[:, None, :] for b in (basis[:-1, :-1], basis[1:, 1:]))
-        columns = jax.vmap(lambda rows: slow_increments(rows, None))(forces.reshape(r * n_g, r, n_s))
-        multipliers = matmul(schur, values.reshape(r * n_g, r * n_s))
-        tie = np.eye(r * n_g) + matmul(multipliers, columns.reshape(r * n_g, r * n_s).T)
-        return columns, solve_dense(tie, multipliers).reshape(columns.shape)
-
-    def slow_update(x: Unknowns, end: Pass, tied):
-        """Update of the slow unknowns by masses and slow constraint, residuals of their equations, impulse."""
-        g, push = jax.linearize(lambda inc: jax.vmap(system.g_slow)(times[1:], equations.q_s + inc), x.slow)
-        nodes = jnp.concatenate([equations.q_s[None], equations.q_s + x.slow[:-1]])
-        jacobian = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(times[:-1], nodes)
-        pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
-        d_steps = end.increments + kinetic.rows(x.slow, x.fast)[0] / n
-        rows = jnp.concatenate([(end.start - d_steps.sum(0) + h * equations.p_s)[None], d_steps[:-1]]) - pull
-        d, d_nu = solve_saddle(lambda rows: slow_increments(rows, tied), jacobian, push, rows, g)
-        return jnp.concatenate([d.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), end.start - pull.sum(0)
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
         x, end, nodes, bends, schur = march(equations, matrix, x, warm, None if first else last.schur, linear)
-        tied = last.tied if last else masses_tied(schur[0]) if n_g and n_s else None
-        d, (rows, g), impulse = slow_update(x, end, tied)
+        tied = outer.tied(schur[0]) if first else last.tied
+        d, (rows, g), impulse = outer.update(x, end.start, end.increments, tied)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
         if n_s and not first:
             noise = NOISE * eps * (largest(equations.q_s) + largest(x.slow))
