@@ -9,7 +9,6 @@ import numpy as np
 from vmri_jax.algebra import inverse, largest, matmul, matvec, regularized, solve
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.equations import StepEquations
-from vmri_jax.linearization import linearize
 from vmri_jax.path import lagrange_basis
 from vmri_jax.quadrature import micro, midpoint
 from vmri_jax.scheme import Scheme
@@ -167,7 +166,15 @@ def interval_matrix(equations: StepEquations) -> IntervalMatrix:
     x = local.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(0))
     r, n_f = scheme.degree, q_f.shape[0]
     if not is_per_coordinate(equations.system, equations.scheme, q_f):
-        block = linearize(local, x).ff[0, :, :, 1:]
+        kinetic = lagrangian(system, scheme).kinetic
+
+        def slots(increments):
+            path = local.path(x._replace(fast=increments[None]))
+            d = jax.grad(local.without_kinetic)(path, path)
+            d_fast = d.fast[0] + kinetic.rows(x.slow, increments)[1]
+            return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast])
+
+        block = jax.jacfwd(slots)(x.fast[0])
         return IntervalMatrix(inverse(block[:-1].reshape(r * n_f, r * n_f)), block[-1].reshape(n_f, r * n_f))
 
     block = jnp.zeros((r + 1, r, n_f))
