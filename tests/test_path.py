@@ -70,14 +70,13 @@ def by_hand(slow, fast, degree, num_micro, theta, m):
 def test_velocity_nodes_sample_the_path(degree, num_micro, placed):
     path, slow, fast = random_path(degree, num_micro)
     nodes = velocity_nodes(placed, num_micro, degree)
-    sample, k = nodes.sample(path), 0
+    sample, k = nodes.sample(path, ("t", "q_s", "q_f", "v_s", "v_f")), 0
     for group in nodes.groups:
         for m in range(group.first, group.stop):
             theta = (m + group.c) / num_micro
             expected = by_hand(slow, fast, degree, num_micro, theta, m)
-            got = (sample.t[k], sample.q_s[k], sample.q_f[k], sample.v_s[k], sample.v_f[k])
-            for a, b in zip(got, expected, strict=True):
-                assert np.allclose(a, b, rtol=1e-12, atol=1e-12)
+            for got, value in zip(sample.values(), expected, strict=True):
+                assert np.allclose(got[k], value, rtol=1e-12, atol=1e-12)
             k += 1
     # node positions and weights are those of the composite rule (velocity nodes do not merge)
     thetas = np.concatenate([nodes.theta(g) for g in nodes.groups])

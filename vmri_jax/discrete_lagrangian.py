@@ -43,8 +43,7 @@ class Term:
         """The part of the sum that the unknowns of a step enter."""
         if not self.inside.groups:
             return jnp.zeros(())
-        sample = self.inside.sample(path)
-        values = jax.vmap(self.integrand)(*sample.arguments(self.arguments).values())
+        values = jax.vmap(self.integrand)(*self.inside.sample(path, self.arguments).values())
         return self.sign * path.macro_dt * jnp.sum(self.inside.weights * values)
 
     def at_ends(self, path: Path):

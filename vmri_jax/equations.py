@@ -84,9 +84,9 @@ class StepEquations(eqx.Module):
         if self.system.force is None:
             return 0.0
         nodes = self.force_nodes
-        z, q = nodes.sample(at), nodes.sample(path)
-        f_s, f_f = jax.vmap(self.system.forces)(z.t, z.q_s, z.q_f, z.v_s, z.v_f)
-        return self.macro_dt * jnp.sum(nodes.weights * (jnp.sum(f_s * q.q_s, axis=1) + jnp.sum(f_f * q.q_f, axis=1)))
+        f_s, f_f = jax.vmap(self.system.forces)(*nodes.sample(at, ("t", "q_s", "q_f", "v_s", "v_f")).values())
+        q_s, q_f = nodes.sample(path, ("q_s", "q_f")).values()
+        return self.macro_dt * jnp.sum(nodes.weights * (jnp.sum(f_s * q_s, axis=1) + jnp.sum(f_f * q_f, axis=1)))
 
     def constraint_work(self, path: Path, x: Unknowns):
         """``sum mu . g + sum nu . g_s / num_micro`` at all control nodes but the last."""

@@ -61,13 +61,13 @@ def linearize(equations: StepEquations, x: Unknowns) -> Blocks:
             blocks["ff"] += _constant_block(term.fast_form, term.mass.fast)
             blocks["ss"] += _constant_block(term.slow_form / n, term.mass.slow)
         elif term.inside.groups:
-            z = term.inside.sample(path).arguments(term.arguments)
+            z = term.inside.sample(path, term.arguments)
             hessian = jax.vmap(jax.jacfwd(jax.grad(_of_dict(term.integrand, term.arguments))))(z)
             add(term.inside, hessian, term.sign * path.macro_dt * equations.micro_dt * term.inside.weights)
 
     if system.force is not None:
         nodes = equations.force_nodes
-        z = nodes.sample(path).arguments(("t", "q_s", "q_f", "v_s", "v_f"))
+        z = nodes.sample(path, ("t", "q_s", "q_f", "v_s", "v_f"))
         force = _of_dict(system.forces, tuple(z))
         jacobian = jax.vmap(jax.jacfwd(lambda z: dict(zip(("q_s", "q_f"), force(z), strict=True))))(z)
         jacobian = {row: {c: d for c, d in columns.items() if c != "t"} for row, columns in jacobian.items()}

@@ -7,6 +7,7 @@ velocities ``sum_j l_j'(c) Delta_j / dt`` come from increments directly, never f
 two nearly equal positions: momenta keep full relative precision however small the step.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -104,20 +105,6 @@ class Path(eqx.Module):
         return jnp.concatenate([self.slow_start[None], self.slow_start + self.slow])
 
 
-class Sample(eqx.Module):
-    """The path at a list of nodes: times (k,), positions and velocities (k, n)."""
-
-    t: Any
-    q_s: Any
-    q_f: Any
-    v_s: Any
-    v_f: Any
-
-    def arguments(self, names: tuple[str, ...]) -> dict:
-        """Some of the fields, by name."""
-        return {name: getattr(self, name) for name in names}
-
-
 @dataclass(frozen=True)
 class NodeGroup:
     """Nodes at one local coordinate ``c`` of the micro intervals ``first <= m < stop``."""
@@ -152,27 +139,25 @@ class Nodes:
         """Positions of a group's nodes on the macro interval."""
         return (np.arange(group.first, group.stop) + group.c) / self.num_micro
 
-    def sample(self, path: Path) -> Sample:
-        """Times, positions and velocities of the path at all nodes, group after group."""
-        r, micro_dt = self.degree, path.macro_dt / self.num_micro
-        parts = []
-        for (first, stop), groups in groupby(self.groups, key=lambda g: (g.first, g.stop)):
-            groups = tuple(groups)  # on the same intervals: all at once
-            theta, c = np.concatenate([self.theta(g) for g in groups]), np.array([g.c for g in groups])
-            start, steps = path.fast_start[first:stop], path.fast[first:stop]
-            shape = (len(theta), steps.shape[-1])
-            moved = jnp.swapaxes(matmul(lagrange_basis(r, c)[:, 1:], steps), 0, 1)
-            rates = jnp.swapaxes(matmul(lagrange_derivative(r, c)[:, 1:], steps), 0, 1)
-            parts.append(
-                Sample(
-                    t=path.t + theta * path.macro_dt,
-                    q_s=path.slow_start + matmul(lagrange_basis(r, theta)[:, 1:], path.slow),
-                    q_f=(start + moved).reshape(shape),
-                    v_s=matmul(lagrange_derivative(r, theta)[:, 1:], path.slow) / path.macro_dt,
-                    v_f=(rates / micro_dt).reshape(shape),
-                )
-            )
-        return Sample(*(jnp.concatenate([getattr(p, k) for p in parts]) for k in ("t", "q_s", "q_f", "v_s", "v_f")))
+    def sample(self, path: Path, names: Iterable[str]) -> dict:
+        """By name, of the path at all nodes, group after group: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
+        together = [tuple(groups) for _, groups in groupby(self.groups, key=lambda g: (g.first, g.stop))]
+        return {name: jnp.concatenate([self._at(groups, path, name) for groups in together]) for name in names}
+
+    def _at(self, groups: tuple[NodeGroup, ...], path: Path, name: str):
+        """One of them at groups on the same micro intervals."""
+        theta, c = np.concatenate([self.theta(g) for g in groups]), np.array([g.c for g in groups])
+        if name == "t":
+            return path.t + path.macro_dt * theta
+        velocity = name[0] == "v"
+        basis = lagrange_derivative if velocity else lagrange_basis
+        if name[2] == "s":
+            moved = matmul(basis(self.degree, theta)[:, 1:], path.slow)
+            return moved / path.macro_dt if velocity else path.slow_start + moved
+        inside = slice(groups[0].first, groups[0].stop)
+        moved = jnp.swapaxes(matmul(basis(self.degree, c)[:, 1:], path.fast[inside]), 0, 1)
+        q_f = moved / (path.macro_dt / self.num_micro) if velocity else path.fast_start[inside] + moved
+        return q_f.reshape(len(theta), path.fast.shape[-1])
 
 
 def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:

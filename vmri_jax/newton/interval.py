@@ -182,7 +182,7 @@ def interval_matrix(equations: StepEquations) -> IntervalMatrix:
         if isinstance(term, QuadraticKinetic):
             block += term.fast_form[:, 1:, None] * term.mass.fast
         elif term.inside.groups and term.arguments == ("q_f",):
-            q = term.inside.sample(local.path(x)).q_f
+            q = term.inside.sample(local.path(x), ("q_f",))["q_f"]
             gradient = jax.vmap(jax.grad(term.integrand))
             curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]  # the diagonal of each Hessian
             basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))

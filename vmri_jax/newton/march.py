@@ -113,12 +113,13 @@ class Pass(NamedTuple):
 
 
 def march(
-    equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, schur=None, linear=False
+    equations: StepEquations, matrix: IntervalMatrix, x: Unknowns, warm: Warm, scale, schur=None, linear=False
 ) -> tuple[Any, ...]:
     """One pass over the micro intervals: fast unknowns corrected for the given slow ones, and what they leave.
 
     Args:
         warm: multipliers and bends of the macro step before.
+        scale: (num_micro, r, 1) what turns multipliers into unknowns.
         schur: (num_micro, r n_g, r n_g) inverses of ``G K^-1 G^T``. In the first pass there are none: they are computed, and
             multipliers start from the line through the last two, bends from the last one.
         linear: the equations are linear with the given matrix, and this is their only pass.
@@ -200,7 +201,7 @@ def march(
 
     zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(x.slow), jnp.zeros(())
     carry = Pass(equations.q_f, h * equations.p_f, *zero), (warm.multiplier, warm.bend) if first else None
-    scale, m = multiplier_scales(equations.scheme, equations.macro_dt)[0], jnp.arange(n)
+    m = jnp.arange(n)
     unknowns = (None, None, None) if first else (x.fast, x.multiplier, schur)
     intervals = m, jnp.asarray(basis), scale, m < n - 1, *unknowns
     (end, _), (fast, mu, nodes, bends, new) = jax.lax.scan(interval, carry, intervals)
@@ -262,10 +263,11 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     mass = constant_mass(system)
     inverse_fast, outer = inverse_mass(mass.fast), SlowEquations.of(equations)
     accepted = Accepted.of(equations, newton)
+    scale, _ = multiplier_scales(scheme, equations.macro_dt)
 
     def one_pass(x: Unknowns, last: March | None = None) -> March:
         first = last is None
-        x, end, nodes, bends, schur = march(equations, matrix, x, warm, None if first else last.schur, linear)
+        x, end, nodes, bends, schur = march(equations, matrix, x, warm, scale, None if first else last.schur, linear)
         tied = outer.tied(schur[0]) if first else last.tied
         d, (rows, g), impulse = outer.update(x, end.start, end.increments, tied)
         pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
@@ -314,7 +316,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         done = done._replace(residual=(rows, jnp.maximum(largest(constraints(done)), g_slow)))
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
     slow, passes = warm.slow.add(joined(done.x)), jnp.stack([fewest, done.passes])
-    multiplier = warm.multiplier.after_step(done.x.multiplier / multiplier_scales(scheme, equations.macro_dt)[0])
+    multiplier = warm.multiplier.after_step(done.x.multiplier / scale)
     bend = warm.bend if done.bends is None else warm.bend.after_step(done.bends)
     return done, Warm(slow, multiplier, bend, done.pairs, passes)
 
