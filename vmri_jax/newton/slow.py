@@ -51,6 +51,7 @@ class SlowEquations(NamedTuple):
         jacobian = jax.jacrev(equations.system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
         if not jacobian.size:
             return None
+        jacobian = jax.lax.optimization_barrier(jacobian)  # round-off is not to depend on how the constraint is written
         basis = slow_basis_at_control_nodes(equations.scheme.num_micro, r)[0]
         forces, values = (b[:, None, :, None] * jacobian[:, None, :] for b in (basis[:-1, :-1], basis[1:, 1:]))
         responses = jax.vmap(self._by_masses)(forces.reshape(-1, r, n_s))
