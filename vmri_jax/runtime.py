@@ -7,14 +7,17 @@ first, before anything is computed:
     runtime.configure()
 """
 
+import math
 import os
 from collections.abc import Callable
-from functools import reduce, wraps
+from functools import lru_cache, reduce, wraps
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
 
 from vmri_jax.structure import called
 
@@ -81,50 +84,63 @@ def in_one_kernel(function: Callable) -> Callable:
     @wraps(function)
     def once(*args):
         traced, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        rewritten = traced.replace(jaxpr=_rewritten(traced.jaxpr))
         shapes, structure = jax.tree.flatten(shape)
-        nothing = [jnp.zeros(a.shape, a.dtype) for a in shapes]
+        given = {(a.shape, a.dtype): a for a in map(jnp.asarray, jax.tree.leaves(args))}  # spares kernels for zeros
+        nothing = [given.get((a.shape, a.dtype), jnp.zeros(a.shape, a.dtype)) for a in shapes]
         go = jax.lax.optimization_barrier(jnp.asarray(True))
 
         def only_pass(_):
-            return jnp.asarray(False), _evaluated(traced.jaxpr, traced.consts, jax.tree.leaves(args))
+            return jnp.asarray(False), core.jaxpr_as_fun(rewritten)(*jax.tree.leaves(args))
 
         return jax.tree.unflatten(structure, jax.lax.while_loop(lambda c: c[0], only_pass, (go, nothing))[1])
 
     return once
 
 
-def _evaluated(jaxpr, consts, values, in_loop: bool = False) -> list:
-    """The outputs of a jaxpr, with short reductions written out.
+def _rewritten(jaxpr: core.Jaxpr, in_loop: bool = False) -> core.Jaxpr:
+    """A jaxpr with what it calls in place, and short reductions written out.
 
     In loops only those to one number are: XLA would repeat what comes before them for each.
     """
-    known = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(zip(jaxpr.invars, values, strict=True))
+    eqns = []
 
-    def read(v):
-        return v.val if hasattr(v, "val") else known[v]
+    def body(loop: core.ClosedJaxpr) -> core.ClosedJaxpr:
+        return loop.replace(jaxpr=_rewritten(loop.jaxpr, in_loop=True))
 
-    def body(loop):
-        return jax.make_jaxpr(lambda *values: _evaluated(loop.jaxpr, loop.consts, values, True))(*loop.in_avals)
+    def copied(jaxpr: core.Jaxpr, inputs) -> list:
+        known = dict(zip(jaxpr.invars, inputs, strict=True)) | {v: v for v in jaxpr.constvars}
 
-    for eqn in jaxpr.eqns:
-        inputs, name, params, inner = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params, called(eqn)
-        if inner is not None:
-            outputs = _evaluated(*inner, inputs, in_loop)
-        elif name in _WRITTEN_OUT and _is_short(inputs[0].size, eqn.outvars[0].aval.size, in_loop):
-            outputs = [_written_out(_WRITTEN_OUT[name], inputs[0], params["axes"])]
-        else:
-            if name in ("while", "scan"):
-                params = {key: body(value) if key.endswith("jaxpr") else value for key, value in params.items()}
-            elif name == "cond":
-                params = {**params, "branches": tuple(map(body, params["branches"]))}
-            outputs = eqn.primitive.bind(*inputs, **params)
-            outputs = outputs if eqn.primitive.multiple_results else [outputs]
-        known |= zip(eqn.outvars, outputs, strict=True)
-    return [read(v) for v in jaxpr.outvars]
+        def read(v):
+            return v if isinstance(v, core.Literal) else known[v]
+
+        for eqn in jaxpr.eqns:
+            values, name, params, inner = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params, called(eqn)
+            if inner is not None and not inner[1]:
+                outputs = copied(inner[0], values)
+            elif name in _WRITTEN_OUT and _is_short(_of(eqn).shape, params["axes"], in_loop):
+                outputs = copied(_written_out(name, _of(eqn).shape, _of(eqn).dtype, params["axes"]), values)
+            else:
+                if name in ("while", "scan"):
+                    params = {key: body(value) if key.endswith("jaxpr") else value for key, value in params.items()}
+                elif name == "cond":
+                    params = {**params, "branches": tuple(map(body, params["branches"]))}
+                outputs = [core.Var(v.aval) for v in eqn.outvars]
+                eqns.append(eqn.replace(invars=values, outvars=outputs, params=params))
+            known |= zip(eqn.outvars, outputs, strict=True)
+        return [read(v) for v in jaxpr.outvars]
+
+    return jaxpr.replace(outvars=copied(jaxpr, jaxpr.invars), eqns=eqns)
 
 
-def _is_short(size: int, reduced: int, in_loop: bool) -> bool:
-    return 0 < size <= SHORT * reduced and (reduced == 1 or not in_loop)
+def _of(eqn: core.JaxprEqn) -> Any:
+    """Shape and type of what is reduced."""
+    return eqn.invars[0].aval
+
+
+def _is_short(shape: tuple[int, ...], axes: tuple[int, ...], in_loop: bool) -> bool:
+    size, reduced = math.prod(shape), math.prod(shape[axis] for axis in axes)
+    return size > 0 and reduced <= SHORT and (reduced == size or not in_loop)
 
 
 _WRITTEN_OUT = {
@@ -136,10 +152,15 @@ _WRITTEN_OUT = {
 }
 
 
-def _written_out(operation: Callable, a, axes: tuple[int, ...]):
+@lru_cache
+def _written_out(name: str, shape: tuple[int, ...], dtype, axes: tuple[int, ...]) -> core.Jaxpr:
     """A reduction over some axes as operations on its parts."""
-    a = jnp.moveaxis(a, axes, range(len(axes)))
-    return reduce(operation, (a[index] for index in np.ndindex(a.shape[: len(axes)])))
+
+    def parts(a):
+        a = jnp.moveaxis(a, axes, range(len(axes)))
+        return reduce(_WRITTEN_OUT[name], (a[index] for index in np.ndindex(a.shape[: len(axes)])))
+
+    return jax.make_jaxpr(parts)(jax.ShapeDtypeStruct(shape, dtype)).jaxpr
 
 
 def cache_folder() -> Path:

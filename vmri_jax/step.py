@@ -22,7 +22,7 @@ from vmri_jax.algebra import ELEMENTWISE
 from vmri_jax.composition import Composition
 from vmri_jax.discrete_lagrangian import lagrangian
 from vmri_jax.equations import StepEquations, physical_multipliers
-from vmri_jax.newton import Newton, drift, interval_matrix, is_collocation, is_constant, march, solve
+from vmri_jax.newton import IntervalMatrix, Newton, drift, interval_matrix, is_collocation, is_constant, march, solve
 from vmri_jax.newton.interval import is_linear
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Method, Result
@@ -110,7 +110,10 @@ def start_memory(
         )
         return Stages(jax.tree.map(lambda a: a[0], own), own)  # pyright: ignore[reportArgumentType]
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    velocity = project_momentum(system, state)[2:]
+    if isinstance(system.kinetic, ConstantMass):  # the velocity is at hand, with the momentum
+        velocity, kept = system.kinetic.velocity(state.p_s, state.p_f), None
+    else:
+        velocity = kept = project_momentum(system, state)[2:]
     parts = split(system, scheme, state.q_s, state.q_f)
     own = system if parts is None else parts.kicks
     memories = None
@@ -131,9 +134,8 @@ def start_memory(
         if is_constant(system, scheme, state.q_s, state.q_f):
             matrix = interval_matrix(equations)
         else:  # renewed by every macro step
-            matrix = jax.tree.map(lambda a: jnp.zeros(a.shape), jax.eval_shape(interval_matrix, equations))
+            matrix = IntervalMatrix.none(system, scheme, state.q_f)
         warm = march.Warm.straight(equations, velocity[0])
-    kept = None if isinstance(system.kinetic, ConstantMass) else velocity  # there momenta say the same
     return Memory(kicks, kept, jnp.zeros(n_g), jnp.zeros(n_gs), matrix, warm, memories)
 
 
@@ -192,14 +194,7 @@ def advance(
     if project:
         state, memory = projected(system, state, memory)
     finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))  # positions become infinite by these
-    multiplier, slow_multiplier = physical_multipliers(scheme, macro_dt, info.multiplier, info.slow_multiplier)
-    info = dataclasses.replace(
-        info,
-        result=jnp.where(finite, info.result, Result.NON_FINITE),
-        multiplier=multiplier,
-        slow_multiplier=slow_multiplier,
-    )
-    return state, info, memory
+    return state, dataclasses.replace(info, result=jnp.where(finite, info.result, Result.NON_FINITE)), memory
 
 
 def _advance_stages(system, scheme, state, macro_dt, newton, memory: Stages, project: bool):
@@ -229,7 +224,7 @@ def _at_same_point(own: Memory, last: Memory) -> Memory:
 
 
 def _interval(system, scheme, state, macro_dt, newton, memory):
-    """Kick, move, kick. Multipliers in the info are scaled; momenta are not projected."""
+    """Kick, move, kick; momenta are not projected."""
     parts = split(system, scheme, state.q_s, state.q_f)
     own = system if parts is None else parts.kicks
     state = _kick(own, scheme, state, macro_dt, memory.kicks, ("start",))
@@ -393,8 +388,8 @@ def _move_coupled(system, scheme, state, macro_dt, newton, memory):
         found.iterations,
         found.residual,
         q_f_micro=jnp.concatenate([equations.path(x).fast_start[1:], found.q_f[None]]),
-        multiplier=x.multiplier,
-        slow_multiplier=x.slow_multiplier,
+        multiplier=multiplier,
+        slow_multiplier=slow_multiplier,
     )
     end = State(state.t + macro_dt, state.q_s + x.slow[-1], found.q_f, found.p_s, found.p_f)
     return end, info, memory

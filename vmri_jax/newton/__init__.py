@@ -2,7 +2,7 @@
 
 from vmri_jax.newton import drift, march
 from vmri_jax.newton.collocation import is_collocation
-from vmri_jax.newton.interval import interval_matrix, is_constant
+from vmri_jax.newton.interval import IntervalMatrix, interval_matrix, is_constant
 from vmri_jax.newton.iteration import Newton, solve
 
-__all__ = ["Newton", "drift", "interval_matrix", "is_collocation", "is_constant", "march", "solve"]
+__all__ = ["IntervalMatrix", "Newton", "drift", "interval_matrix", "is_collocation", "is_constant", "march", "solve"]

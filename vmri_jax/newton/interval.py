@@ -1,5 +1,6 @@
 """One micro interval as a problem of its own, and the Newton matrix its fast increments are corrected with."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -8,8 +9,8 @@ import numpy as np
 
 from vmri_jax.algebra import inverse, largest, matmul, matvec, regularized, solve
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
-from vmri_jax.equations import StepEquations
-from vmri_jax.path import lagrange_basis
+from vmri_jax.equations import StepEquations, Unknowns
+from vmri_jax.path import control_nodes, lagrange_basis
 from vmri_jax.quadrature import micro, midpoint
 from vmri_jax.scheme import Scheme
 from vmri_jax.structure import has_constant_hessian, has_diagonal_hessian
@@ -113,6 +114,14 @@ class IntervalMatrix(NamedTuple):
     inverse: Any
     last: Any
 
+    @classmethod
+    def none(cls, system: System, scheme: Scheme, q_f) -> "IntervalMatrix":
+        """Where it comes with every macro step: the shapes, all zero."""
+        r, n_f = scheme.degree, q_f.shape[0]
+        if is_per_coordinate(system, scheme, q_f):
+            return cls(jnp.zeros((r, r, n_f)), jnp.zeros((r, n_f)))
+        return cls(jnp.zeros((r * n_f, r * n_f)), jnp.zeros((n_f, r * n_f)))
+
     def solve(self, rows):
         """The increments (r, n_f) for given rows (r, n_f)."""
         if self.inverse.ndim == 3:
@@ -158,23 +167,22 @@ def is_linear(system: System, scheme: Scheme, q_s, q_f) -> bool:
 
 def interval_matrix(equations: StepEquations) -> IntervalMatrix:
     """K on the first micro interval of a macro step, on the straight path from its start."""
-    q_s, q_f = equations.q_s, equations.q_f
+    q_s, q_f, p_s, p_f, h = equations.q_s, equations.q_f, equations.p_s, equations.p_f, equations.micro_dt
     system, scheme = interval_problem(equations.system, equations.scheme)
-    local = StepEquations(system, scheme, equations.t, q_s, q_f, equations.p_s, equations.p_f, equations.micro_dt)
-    n_g, _ = system.num_constraints(q_s, q_f)
-    v_s, v_f = constant_mass(system).velocity(equations.p_s, equations.p_f)
-    x = local.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(0))
+    local = StepEquations(system, scheme, equations.t, q_s, q_f, p_s, p_f, h)
     r, n_f = scheme.degree, q_f.shape[0]
+    slow, fast = (h * control_nodes(r)[1:, None] * v for v in constant_mass(system).velocity(p_s, p_f))
+    path = local.path(Unknowns(slow, None, fast[None], None))
     if not is_per_coordinate(equations.system, equations.scheme, q_f):
         kinetic = lagrangian(system, scheme).kinetic
 
         def slots(increments):
-            path = local.path(x._replace(fast=increments[None]))
-            d = jax.grad(local.without_kinetic)(path, path)
-            d_fast = d.fast[0] + kinetic.rows(x.slow, increments)[1]
+            at = replace(path, fast=increments[None])
+            d = jax.grad(local.without_kinetic)(at, at)
+            d_fast = d.fast[0] + kinetic.rows(slow, increments)[1]
             return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast])
 
-        block = jax.jacfwd(slots)(x.fast[0])
+        block = jax.jacfwd(slots)(fast)
         return IntervalMatrix(inverse(block[:-1].reshape(r * n_f, r * n_f)), block[-1].reshape(n_f, r * n_f))
 
     block = jnp.zeros((r + 1, r, n_f))
@@ -182,11 +190,11 @@ def interval_matrix(equations: StepEquations) -> IntervalMatrix:
         if isinstance(term, QuadraticKinetic):
             block += term.fast_form[:, 1:, None] * term.mass.fast
         elif term.inside.groups and term.arguments == ("q_f",):
-            q = term.inside.sample(local.path(x), ("q_f",))["q_f"]
+            q = term.inside.sample(path, ("q_f",))["q_f"]
             gradient = jax.vmap(jax.grad(term.integrand))
             curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]  # the diagonal of each Hessian
             basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))
-            weights = term.sign * equations.micro_dt**2 * term.inside.weights
+            weights = term.sign * h**2 * term.inside.weights
             block += jnp.einsum("k,ki,kj,ka->ija", weights, basis, basis[:, 1:], curvature)
     if r == 1:
         return IntervalMatrix(1 / block[:1], block[-1])
