@@ -7,7 +7,6 @@ as in the interface quasi-Newton methods of fluid-structure interaction (Degroot
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 SIZE = 4
@@ -33,23 +32,23 @@ class Pairs(NamedTuple):
         """With one more pair, unless its change is below the noise."""
         length = jnp.sqrt(jnp.sum(change[:measured] ** 2))
         scale = 1 / jnp.where(length > noise, length, 1.0)
-        new = self._with_first(scale * move, scale * change)
+        new = Pairs(
+            jnp.concatenate([scale * move[None], self.moves[:-1]]),
+            jnp.concatenate([scale * change[None], self.changes[:-1]]),
+        )
         return Pairs(*(jnp.where(length > noise, a, b) for a, b in zip(new, self, strict=True)))
 
     def corrected(self, d, measured: int):
-        """The update d with what the pairs know: ``d - sum_j w_j (move_j + change_j)``, w the best fit of the changes to d."""
-
-        def orthogonal(found: Pairs, pair: Pairs):
-            """Gram-Schmidt: the pair without what newer ones contain."""
-            along = jnp.sum(found.changes[:, :measured] * pair.changes[:measured], axis=1)[:, None]
-            move, change = (a - jnp.sum(along * b, axis=0) for a, b in zip(pair, found, strict=True))
-            square = jnp.sum(change[:measured] ** 2)
-            scale = jnp.where(square > FILTER, jax.lax.rsqrt(square), 0.0)
-            return found._with_first(scale * move, scale * change), None
-
-        pairs, _ = jax.lax.scan(orthogonal, jax.tree.map(jnp.zeros_like, self), self)
-        w = jnp.sum(pairs.changes[:, :measured] * d[:measured], axis=1)[:, None]
-        return d - jnp.sum(w * (pairs.moves + pairs.changes), axis=0)
-
-    def _with_first(self, move, change) -> "Pairs":
-        return Pairs(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip((move, change), self, strict=True)))
+        """The update d with what the pairs know: ``d - sum_j w_j (move_j + change_j)``, w the best fit to d."""
+        size = len(self.changes)
+        seen = jnp.concatenate([self.changes, d[None]])[:, :measured]
+        rows = jnp.stack([jnp.sum(seen * pair, axis=-1) for pair in seen[:-1]])
+        eliminated = []
+        for _ in range(size):  # normal equations; the pivot is what newer pairs do not contain
+            row = jnp.where(rows[0, 0] > FILTER, rows[0, 1:] / rows[0, 0], 0.0)
+            rows = rows[1:, 1:] - rows[1:, :1] * row
+            eliminated.append(row)
+        w = jnp.zeros(0)
+        for row in eliminated[::-1]:
+            w = jnp.concatenate([row[-1:] - jnp.sum(row[:-1] * w, keepdims=True), w])
+        return d - jnp.sum(w[:, None] * (self.moves + self.changes), axis=0)
