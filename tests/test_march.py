@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 
 from tests.support import compiled_step, largest_difference
 from tests.user_systems import bent_system, double_pendulum, two_oscillators
@@ -198,6 +199,30 @@ def test_auto_falls_back_where_the_march_does_not_converge(fpu):
     run = simulate(problem.system, scheme, state, macro_dt=40.0, num_steps=3, newton=newton)
     assert run.success
     assert int(run.info.method.max()) == Method.ARROWHEAD
+    inside = jax.jit(lambda state: simulate(problem.system, scheme, state, macro_dt=40.0, num_steps=3, newton=newton))
+    assert int(inside(state).info.method.max()) == Method.ARROWHEAD
+    assert largest_difference(inside(state).q_f, run.q_f) < 1e-11
+
+
+def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
+    """A library call in it would keep the loop over macro steps from being one kernel."""
+
+    def loops_around(jaxpr, name, around: tuple[str, ...] = ()):
+        """For every equation of this name the loops and conditions that it is in, the outermost first."""
+        for eqn in jaxpr.eqns:
+            kind = eqn.primitive.name
+            if kind == name:
+                yield around
+            inside = (*around, kind) if kind in ("while", "scan", "cond") else around
+            for part in jaxprs_in_params(eqn.params):
+                yield from loops_around(part, name, inside)
+
+    def run(state):
+        return simulate(tsp.system, fully_explicit(5), state, macro_dt=0.001, num_steps=5).q_f
+
+    found = list(loops_around(jax.make_jaxpr(run)(tsp.state()).jaxpr, "eigh"))
+    assert found
+    assert all(around[:1] == ("cond",) for around in found)
 
 
 def test_a_fallback_keeps_what_was_computed(fpu):

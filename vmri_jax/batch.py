@@ -104,16 +104,14 @@ def simulate_batch(
     size = _chunk(system, stage_scheme(scheme), first) if chunk is None else chunk
     static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}
     go = partial(_in_chunks, system, scheme, chunk=size, devices=devices, **static)
-    cheap = newton
-    if newton.falls_back and newton.marches(system, stage_scheme(scheme)):
-        cheap = dataclasses.replace(newton, method="march")
+    alone = newton.alone(system, stage_scheme(scheme))
     batch = {"state": states}  # what differs between the lanes
     batch |= {} if params is None else {"params": params}
     batch |= {} if dt.ndim == 0 else {"macro_dt": macro_dt}
     go = partial(go, macro_dt)
-    trajectory = go(cheap, batch)
+    trajectory = go(alone, batch)
     failed = np.flatnonzero(np.asarray(trajectory.failed_at) >= 0)
-    if failed.size and cheap is not newton:
+    if failed.size and alone is not newton:
         exact = dataclasses.replace(newton, method="arrowhead")
         again = go(exact, jax.tree.map(lambda a: a[failed], batch))
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b), trajectory, again)

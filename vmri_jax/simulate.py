@@ -20,7 +20,7 @@ from vmri_jax.checks import (
 )
 from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.interrupts import Interrupted, interrupts_noted
-from vmri_jax.newton import Newton
+from vmri_jax.newton import Newton, is_solved
 from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result, SimulationError
 from vmri_jax.runtime import WIDE_VECTORS, in_one_kernel
@@ -76,12 +76,12 @@ def simulate(
     """
     check_flags(throw=throw, progress=progress)
     simulation, start = prepare(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
-    at, num_saves = simulation.start(start), num_steps // save_every
+    num_saves = num_steps // save_every
     if not simulation.is_concrete(start):
-        return simulation.all(at, num_saves)
+        return simulation.all(start, num_saves)
 
     check_constraints(system, start, "simulate: the state")
-    pieces = []
+    at, pieces = simulation.start(start), []
     with interrupts_noted(progress) as interrupted:
         for saves in _sizes(num_saves, progress):
             piece, at = simulation.advance(at, saves)
@@ -134,13 +134,12 @@ class Simulation:
         "auto" is first the march alone (its fallback takes long to compile); where that fails the run goes on from the
         last saved node before with the fallback.
         """
-        cheap = self.newton
-        if not at.fell_back and self.newton.falls_back and self.newton.marches(self.system, stage_scheme(self.scheme)):
-            cheap = dataclasses.replace(self.newton, method="march")
-        piece, end = self._advance(at, saves, cheap)
+        alone = self.newton if at.fell_back else self.newton.alone(self.system, stage_scheme(self.scheme))
+        piece, end = self._advance(at, saves, alone)
         failed = int(piece.failed_at)
-        nothing_solved = int(jnp.max(piece.info.method)) < Method.MARCH  # explicit or linear: no other method helps
-        if failed < 0 or cheap is self.newton or nothing_solved:
+        if (
+            failed < 0 or alone is self.newton or int(jnp.max(piece.info.method)) < Method.MARCH
+        ):  # no other method helps
             return piece, end
         kept = (failed - at.step) // self.save_every
         good = [piece.first(kept)] if kept else []
@@ -157,12 +156,14 @@ class Simulation:
         )  # fmt: skip
         return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
 
-    def all(self, start: Checkpoint, saves: int) -> Trajectory:
+    def all(self, state: State, saves: int) -> Trajectory:
         """The whole run as one piece, under transformations of JAX."""
-        return _run_static(
-            self.system, self.scheme, self.newton, self.macro_dt, self.t_start, start.state, start.memory, 0, saves,
-            self.save_every, self.save_micro,
-        )[0]  # fmt: skip
+        at = self.system, self.scheme, self.newton, self.macro_dt, self.t_start, state
+        rules = stage_scheme(self.scheme)
+        falls_back = self.newton.alone(self.system, rules) is not self.newton
+        solved = is_solved(self.system, rules, state.q_s, state.q_f)
+        whole = _march_first if falls_back and solved else _whole
+        return whole(saves, self.save_every, self.save_micro, at)
 
 
 def projects_rarely(system: System, scheme: Scheme | Composition, state: State, newton: Newton) -> bool:
@@ -242,6 +243,33 @@ def run(
 # A traced save_every lets a sweep over step sizes compile once; under a transformation it is static instead, so that
 # the trip count of the loop is known and reverse mode works.
 _run_static = jax.jit(run, static_argnames=("num_saves", "save_micro", "save_every"))
+
+
+def _whole(num_saves: int, save_every: int, save_micro: bool, at) -> Trajectory:
+    system, scheme, newton, macro_dt, t_start, state = at
+    memory = run_memory(system, scheme, state, macro_dt, newton)
+    return _run_static(system, scheme, newton, macro_dt, t_start, state, memory, 0, num_saves, save_every, save_micro)[
+        0
+    ]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
+def _march_first(num_saves: int, save_every: int, save_micro: bool, at) -> Trajectory:
+    """`_whole` by the nested march alone, whose loops are single kernels; by the arrowhead if that fails."""
+
+    def by(newton: Newton) -> Trajectory:
+        return _whole(num_saves, save_every, save_micro, (system, scheme, newton, *rest))
+
+    system, scheme, newton, *rest = at
+    found = by(newton.alone(system, stage_scheme(scheme)))
+    exact = dataclasses.replace(newton, method="arrowhead")
+    return jax.lax.cond(found.failed_at < 0, lambda: found, lambda: by(exact))
+
+
+@_march_first.defjvp
+def _of_each_step(num_saves, save_every, save_micro, primals, tangents):
+    """Derivatives are those of the run that falls back step by step: one program instead of two."""
+    return jax.jvp(partial(_whole, num_saves, save_every, save_micro), primals, tangents)
 
 
 def _run_in_one_kernel(

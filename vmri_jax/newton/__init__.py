@@ -3,6 +3,16 @@
 from vmri_jax.newton import drift, march
 from vmri_jax.newton.collocation import is_collocation
 from vmri_jax.newton.interval import IntervalMatrix, interval_matrix, is_constant
-from vmri_jax.newton.iteration import Newton, solve
+from vmri_jax.newton.iteration import Newton, is_solved, solve
 
-__all__ = ["IntervalMatrix", "Newton", "drift", "interval_matrix", "is_collocation", "is_constant", "march", "solve"]
+__all__ = [
+    "IntervalMatrix",
+    "Newton",
+    "drift",
+    "interval_matrix",
+    "is_collocation",
+    "is_constant",
+    "is_solved",
+    "march",
+    "solve",
+]

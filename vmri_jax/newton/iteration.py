@@ -1,5 +1,6 @@
 """Newton's iteration for the equations of a macro step: its flavours, its convergence test, its derivative."""
 
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from vmri_jax.newton import arrowhead, collocation, drift, full, march
 from vmri_jax.newton.interval import can_be_cut, is_linear
 from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, RUNNING, Method, Result
-from vmri_jax.split import is_drift
+from vmri_jax.split import is_drift, is_explicit, split
 
 Choice = Literal["auto", "march", "frozen", "decoupled", "arrowhead", "dense"]
 
@@ -85,6 +86,10 @@ class Newton(eqx.Module):
         """Whether a step that the nested march does not solve is solved by the exact arrowhead."""
         return self.method == "auto" and self.fixed_iterations is None
 
+    def alone(self, system, scheme) -> "Newton":
+        """The nested march alone where this method falls back from it (which takes long to compile), else the same."""
+        return replace(self, method="march") if self.falls_back and self.marches(system, scheme) else self
+
     def marches(self, system, scheme) -> bool:
         """Whether the nested march is what this method starts with.
 
@@ -98,6 +103,16 @@ class Newton(eqx.Module):
                 "macro nodes; a term of this scheme has nodes inside the macro interval. Take 'auto' or 'arrowhead'."
             )
         return possible and self.method in ("auto", "march")
+
+
+def is_solved(system, scheme, q_s, q_f) -> bool:
+    """Whether a step iterates at all: whether it is neither explicit nor linear, nor are its parts."""
+    parts = split(system, scheme, q_s, q_f)
+    if parts is not None:
+        none = jnp.zeros(0)
+        pairs = (parts.slow, parts.slow_scheme, q_s), (parts.fast, parts.fast_scheme, q_f)
+        return any(is_solved(part, rules, none, q) for part, rules, q in pairs)
+    return not is_explicit(system, scheme) and not (can_be_cut(system, scheme) and is_linear(system, scheme, q_s, q_f))
 
 
 class Solution(NamedTuple):

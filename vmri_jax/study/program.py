@@ -1,7 +1,6 @@
 """One problem under one scheme, compiled once for every number of steps: what studies run and time."""
 
 import time
-from dataclasses import replace
 from functools import cached_property, lru_cache
 
 import jax
@@ -67,13 +66,12 @@ class Program:
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
         self.newton, self.state = newton or vm.Newton(), problem.state()
         check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, 1)
-        cheap = self.newton.falls_back and self.newton.marches(problem.system, stage_scheme(scheme))
-        self._cheap = replace(self.newton, method="march") if cheap else self.newton
+        self._alone = self.newton.alone(problem.system, stage_scheme(scheme))
         self.compile_seconds = float("nan")
 
     @cached_property
     def _compiled(self):
-        return self._compile(self._cheap)
+        return self._compile(self._alone)
 
     @cached_property
     def _exact(self):
@@ -92,7 +90,7 @@ class Program:
     def _chosen(self, num_steps: int):
         """The program that solves this run, and its arrays."""
         arrays = self._compiled(num_steps)
-        if self._cheap is self.newton or int(jax.tree.unflatten(TRAJECTORY, arrays).failed_at) < 0:
+        if self._alone is self.newton or int(jax.tree.unflatten(TRAJECTORY, arrays).failed_at) < 0:
             return self._compiled, arrays
         return self._exact, self._exact(num_steps)
 
