@@ -137,9 +137,9 @@ class Simulation:
         alone = self.newton if at.fell_back else self.newton.alone(self.system, stage_scheme(self.scheme))
         piece, end = self._advance(at, saves, alone)
         failed = int(piece.failed_at)
-        if (
-            failed < 0 or alone is self.newton or int(jnp.max(piece.info.method)) < Method.MARCH
-        ):  # no other method helps
+        if failed < 0 or alone is self.newton:
+            return piece, end
+        if int(jnp.max(piece.info.method)) < Method.MARCH:  # explicit or linear: no other method helps
             return piece, end
         kept = (failed - at.step) // self.save_every
         good = [piece.first(kept)] if kept else []
@@ -161,8 +161,8 @@ class Simulation:
         at = self.system, self.scheme, self.newton, self.macro_dt, self.t_start, state
         rules = stage_scheme(self.scheme)
         falls_back = self.newton.alone(self.system, rules) is not self.newton
-        solved = is_solved(self.system, rules, state.q_s, state.q_f)
-        whole = _march_first if falls_back and solved else _whole
+        iterates = is_solved(self.system, rules, state.q_s, state.q_f)
+        whole = _march_first if falls_back and iterates else _whole
         return whole(saves, self.save_every, self.save_micro, at)
 
 
@@ -246,11 +246,11 @@ _run_static = jax.jit(run, static_argnames=("num_saves", "save_micro", "save_eve
 
 
 def _whole(num_saves: int, save_every: int, save_micro: bool, at) -> Trajectory:
+    """All of a run at once, with one Newton for every step."""
     system, scheme, newton, macro_dt, t_start, state = at
-    memory = run_memory(system, scheme, state, macro_dt, newton)
-    return _run_static(system, scheme, newton, macro_dt, t_start, state, memory, 0, num_saves, save_every, save_micro)[
-        0
-    ]
+    memory, saves = run_memory(system, scheme, state, macro_dt, newton), (num_saves, save_every, save_micro)
+    trajectory, _ = _run_static(system, scheme, newton, macro_dt, t_start, state, memory, 0, *saves)
+    return trajectory
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
