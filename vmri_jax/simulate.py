@@ -80,8 +80,8 @@ def simulate(
     if not simulation.is_concrete(start):
         return simulation.all(start, num_saves)
 
-    check_constraints(system, start, "simulate: the state")
     at, pieces = simulation.start(start), []
+    check_constraints(system, start, "simulate: the state")
     with interrupts_noted(progress) as interrupted:
         for saves in _sizes(num_saves, progress):
             piece, at = simulation.advance(at, saves)
@@ -158,6 +158,7 @@ class Simulation:
 
     def all(self, state: State, saves: int) -> Trajectory:
         """The whole run as one piece, under transformations of JAX."""
+        check_system(self.system, state.q_s, state.q_f)
         at = self.system, self.scheme, self.newton, self.macro_dt, self.t_start, state
         rules = stage_scheme(self.scheme)
         falls_back = self.newton.alone(self.system, rules) is not self.newton
