@@ -57,14 +57,15 @@ class Warm(NamedTuple):
     slow: slow unknowns (r n_s + r n_gs,) of the last steps.
     multiplier, bend: multipliers lambda (r, n_g) of the last micro intervals, and by how much their fast increments (r, n_f)
         left the straight line, over h^2 (nothing is kept where any start does).
-    pairs: secant pairs of the slow unknowns.
+    missed: what the cheap matrix of the slow equations misses: secant pairs of the slow unknowns, or, where nothing constrains
+        them, the part of an update that it leaves.
     passes: (2,) fewest of a step with this matrix of the micro intervals (UNKNOWN before one), and those of the last step.
     """
 
     slow: Differences
     multiplier: Line
     bend: Line
-    pairs: Pairs
+    missed: Any
     passes: Any
 
     @classmethod
@@ -79,8 +80,10 @@ class Warm(NamedTuple):
         shared = system.constraint is not None  # two macro steps share the constraint force of their node
         multiplier = Line.zero((r, n_g), several and kicked)
         bend = Line.zero((r, 0 if known else n_f), several and (kicked or shared))
-        pairs = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
-        return cls(slow, multiplier, bend, pairs, jnp.array([0, 2 * MORE]))
+        missed = jnp.ones(())
+        if system.is_constrained:
+            missed = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
+        return cls(slow, multiplier, bend, missed, jnp.array([0, 2 * MORE]))
 
     def after(self, last: "Warm") -> "Warm":
         """What a stage of a composition has learned, going on where the stage before it ended."""
@@ -220,12 +223,13 @@ def _forces(system, times, slow_nodes, fast_nodes, stored: bool):
 
 
 class March(NamedTuple):
-    """State of the iteration: unknowns of this pass, what it left and moved, secant pairs, and how it stands.
+    """State of the iteration: unknowns of this pass, what it left and moved, and how it stands.
 
     nodes, bends: fast positions (num_micro, r, n_f) at the nodes 1..r of the micro intervals, and what `Warm` keeps of them.
     schur: small matrices of the micro intervals, from the first pass.
     tied: masses that constraints tie to the slow variables, from the first pass.
     d: the update of the slow unknowns by the cheap matrix.
+    missed: as in `Warm`.
     impulse: on the slow variables over the step, times h.
     residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
     """
@@ -237,7 +241,7 @@ class March(NamedTuple):
     schur: Any
     tied: Any
     d: Any
-    pairs: Pairs
+    missed: Any
     impulse: Any
     residual: Any
     passes: Any
@@ -270,27 +274,35 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         x, end, nodes, bends, schur = march(equations, matrix, x, warm, scale, None if first else last.schur, linear)
         tied = outer.tied(schur[0]) if first else last.tied
         d, (rows, g), impulse = outer.update(x, end.start, end.increments, tied)
-        pairs, passes = (warm.pairs, 1) if first else (last.pairs, last.passes + 1)
-        if n_s and not first:
-            noise = NOISE * eps * (largest(equations.q_s) + largest(x.slow))
-            move, change = joined(x) - joined(last.x), d - last.d
-            pairs = jax.lax.cond(is_hard(last), lambda: pairs.add(move, change, noise, r * n_s), lambda: pairs)
-
         motion = jnp.maximum(largest(inverse_fast(h * equations.p_f)), largest(inverse_fast(end.p_f)))
         left = end.moved if first else expected(end.moved, last.end.moved)
+        missed, passes = (warm.missed, 1) if first else (last.missed, last.passes + 1)
         result = newton.status(accepted.over((largest(d[: r * n_s]), left), (largest(x.slow), motion)), passes)
         residual = jnp.maximum(largest(rows), largest(mass.fast) * left), largest(g)
-        return March(x, end, nodes, bends, schur, tied, d, pairs, impulse, residual, jnp.asarray(passes), result)
+        return March(x, end, nodes, bends, schur, tied, d, missed, impulse, residual, jnp.asarray(passes), result)
 
     def next_pass(last: March) -> March:
-        x = last.x
-        if n_s:
-            d = jax.lax.cond(is_hard(last), lambda: last.pairs.corrected(last.d, r * n_s), lambda: last.d)
-            x = separated(joined(x) + d, x)
-        return one_pass(x, last)
+        if not n_s:
+            return one_pass(last.x, last)
+        return with_pairs(last) if system.is_constrained else with_forces(last)
 
-    def is_hard(last: March):
-        return (warm.passes[1] > EASY) | (last.passes >= EASY)
+    def with_pairs(last: March) -> March:
+        is_hard, pairs = (warm.passes[1] > EASY) | (last.passes >= EASY), last.missed
+        d = jax.lax.cond(is_hard, lambda: pairs.corrected(last.d, r * n_s), lambda: last.d)
+        now, noise = moved_by(d, last), NOISE * eps * (largest(equations.q_s) + largest(last.x.slow))
+        pairs = jax.lax.cond(is_hard, lambda: pairs.add(d, now.d - last.d, noise, r * n_s), lambda: pairs)
+        return now._replace(missed=pairs)
+
+    def with_forces(last: March) -> March:
+        left = jnp.where(last.passes == 1, last.missed**2, last.missed)  # the fast unknowns take three passes
+        is_hard = left * accepted.over((largest(last.d), 0.0), (largest(last.x.slow), 0.0)) > 1
+        d = jax.lax.cond(is_hard, lambda: outer.with_forces(last.d, last.x), lambda: last.d)
+        now, tiny = moved_by(d, last), jnp.finfo(float).tiny
+        change, size = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
+        return now._replace(missed=largest(change) / (largest(size) + tiny))
+
+    def moved_by(d, last: March) -> March:
+        return one_pass(separated(joined(last.x) + d, last.x), last)
 
     def constraints(done: March):
         """(num_micro, r, n_g) at the nodes 1..r of the micro intervals."""
@@ -318,7 +330,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     slow, passes = warm.slow.add(joined(done.x)), jnp.stack([fewest, done.passes])
     multiplier = warm.multiplier.after_step(done.x.multiplier / scale)
     bend = warm.bend if done.bends is None else warm.bend.after_step(done.bends)
-    return done, Warm(slow, multiplier, bend, done.pairs, passes)
+    return done, Warm(slow, multiplier, bend, done.missed, passes)
 
 
 def _along(weights, increments):

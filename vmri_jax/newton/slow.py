@@ -7,17 +7,24 @@ the slow variables; the rest of what the fast ones answer is small.
 """
 
 from collections.abc import Callable
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import inverse, matmul, solve
+from vmri_jax.algebra import inverse, largest, matmul, solve
 from vmri_jax.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
-from vmri_jax.newton.interval import constant_mass, inverse_mass, solve_saddle
-from vmri_jax.path import control_nodes
+from vmri_jax.newton.interval import constant_mass, interval_problem, inverse_mass, solve_saddle
+from vmri_jax.path import control_nodes, lagrange_basis, lagrange_derivative
+from vmri_jax.quadrature import gauss
+
+NODES = 4
+"""At so many Gauss nodes of a macro step the slow forces are linearised."""
+ITERATIONS = 3
+"""Of minimal residuals."""
 
 
 class Tied(NamedTuple):
@@ -78,6 +85,59 @@ class SlowEquations(NamedTuple):
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, tied), jacobian, push, rows, g)
         return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), start - pull.sum(0)
 
+    def with_forces(self, d, x: Unknowns):
+        """``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone: C dx is how V and F on the micro grid answer dx,
+
+            ``(C dx)_i = h H sum_k w_k l_i(c_k) dF_s(sum_j l_j(c_k) dx_j, sum_j l_j'(c_k) dx_j / H)``
+
+        on few Gauss nodes, with ``F_s = F - dV/dq_s`` along the fast path as it is. By the iteration of minimal residuals
+        Orthomin(1) (Vinsome 1976), which needs no more than the product with C.
+
+        Args:
+            d: (r n_s,) update.
+            x: the path.
+        """
+        equations, H, r, n = self.equations, self.equations.macro_dt, len(x.slow), len(x.fast)
+        system, _ = interval_problem(equations.system, equations.scheme)
+        rule = gauss(min(n, NODES))
+        c, basis, slopes = np.array(rule.nodes), lagrange_basis(r, rule.nodes), lagrange_derivative(r, rule.nodes)
+        m = np.minimum(c * n, n - 1).astype(int)
+        t, v_f = equations.t + c * H, x.fast[m, -1] / equations.micro_dt
+        parts = [jnp.sum(part, axis=0) for part in jnp.split(x.fast[:, -1], m)[:-1]]
+        q_f = equations.q_f + jnp.stack(list(accumulate(parts)))
+        q_s, v_s = equations.q_s + matmul(basis[:, 1:], x.slow), matmul(slopes[:, 1:], x.slow) / H
+
+        def force(q_s, v_s):
+            total = jax.vmap(system.forces)(t, q_s, q_f, v_s, v_f)[0]
+            if system.slow_potential is not None:
+                total -= jax.vmap(jax.grad(lambda *q: system.slow_potential(*q, system.params)))(q_s, q_f)
+            return total
+
+        _, change = jax.linearize(force, q_s, v_s)
+        weights = equations.micro_dt * H * np.array(rule.weights)[:, None] * basis[:, :-1]
+
+        def operator(dx):
+            answer = change(matmul(basis[:, 1:], dx), matmul(slopes[:, 1:], dx) / H)
+            return dx + self._by_masses(matmul(weights.T, answer))
+
+        def iterate(at):
+            i, dx, rest, move, answer, squared = at
+            turned = operator(rest)
+            part = jnp.sum(turned * answer) / squared
+            move, answer = rest - part * move, turned - part * answer
+            squared = jnp.sum(answer**2) + jnp.finfo(float).tiny
+            part = jnp.sum(rest * answer) / squared
+            return i + 1, dx + part * move, rest - part * answer, move, answer, squared
+
+        none, d = jnp.zeros_like(x.slow), d.reshape(x.slow.shape)
+        enough = 1e-5 * largest(d)
+
+        def goes_on(at):
+            i, _, rest, *_ = at
+            return (i < ITERATIONS) & (largest(rest) > enough)
+
+        return jax.lax.while_loop(goes_on, iterate, (0, none, d, none, none, 1.0))[1].reshape(-1)
+
     def _by_masses(self, rows, tied: Tied | None = None):
         """Slow increments (r, n_s) for given rows (r, n_s)."""
         dx = matmul(self.inverse_form, self.inverse_mass(rows))
@@ -85,3 +145,4 @@ class SlowEquations(NamedTuple):
             return dx
         mu = jnp.sum(tied.multipliers * dx, axis=(1, 2))
         return dx - jnp.sum(mu[:, None, None] * tied.responses, axis=0)
+
