@@ -8,7 +8,8 @@ increments and slow multipliers are corrected from what is left of their equatio
   (`IntervalMatrix`: the mass alone where the fast equations are explicit, so that only the multipliers are solved for), and
   ``G K^-1 G^T`` from the first pass;
 * slow equations: masses, with those that constraints tie to the slow ones, and slow constraint (`SlowEquations`). What they
-  miss, the rest of what the fast variables answer and the curvature of V, is learned from steps with many passes (`Pairs`).
+  miss is learned from steps with many passes where there are constraints (`Pairs`); elsewhere it is the derivative of the slow
+  forces, which is taken where updates by the masses alone would cost a pass (`SlowEquations.with_forces`).
 
 The slow unknowns start from what the steps before extrapolate to (`Differences`), the fast ones from the micro intervals
 before (`Line`). The residual is exact, so all of this decides only how many passes there are: two where the slow motion is
@@ -57,8 +58,8 @@ class Warm(NamedTuple):
     slow: slow unknowns (r n_s + r n_gs,) of the last steps.
     multiplier, bend: multipliers lambda (r, n_g) of the last micro intervals, and by how much their fast increments (r, n_f)
         left the straight line, over h^2 (nothing is kept where any start does).
-    missed: what the cheap matrix of the slow equations misses: secant pairs of the slow unknowns, or, where nothing constrains
-        them, the part of an update that it leaves.
+    missed: what the cheap matrix of the slow equations misses: secant pairs of the slow unknowns, or without constraints the
+        part of an update that it leaves to the next one.
     passes: (2,) fewest of a step with this matrix of the micro intervals (UNKNOWN before one), and those of the last step.
     """
 
@@ -263,7 +264,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     system, scheme, h = equations.system, equations.scheme, equations.micro_dt
     n, r, n_s, n_f = scheme.num_micro, scheme.degree, equations.q_s.shape[0], equations.q_f.shape[0]
     n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
-    eps = jnp.finfo(float).eps
+    numbers = jnp.finfo(float)
     mass = constant_mass(system)
     inverse_fast, outer = inverse_mass(mass.fast), SlowEquations.of(equations)
     accepted = Accepted.of(equations, newton)
@@ -287,19 +288,19 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         return with_pairs(last) if system.is_constrained else with_forces(last)
 
     def with_pairs(last: March) -> March:
-        is_hard, pairs = (warm.passes[1] > EASY) | (last.passes >= EASY), last.missed
+        pairs, is_hard = last.missed, (warm.passes[1] > EASY) | (last.passes >= EASY)
         d = jax.lax.cond(is_hard, lambda: pairs.corrected(last.d, r * n_s), lambda: last.d)
-        now, noise = moved_by(d, last), NOISE * eps * (largest(equations.q_s) + largest(last.x.slow))
+        now, noise = moved_by(d, last), NOISE * numbers.eps * (largest(equations.q_s) + largest(last.x.slow))
         pairs = jax.lax.cond(is_hard, lambda: pairs.add(d, now.d - last.d, noise, r * n_s), lambda: pairs)
         return now._replace(missed=pairs)
 
     def with_forces(last: March) -> March:
-        left = jnp.where(last.passes == 1, last.missed**2, last.missed)  # the fast unknowns take three passes
-        is_hard = left * accepted.over((largest(last.d), 0.0), (largest(last.x.slow), 0.0)) > 1
+        part = jnp.where(last.passes == 1, last.missed**2, last.missed)  # the fast unknowns take three passes anyway
+        is_hard = part * accepted.over((largest(last.d), 0.0), (largest(last.x.slow), 0.0)) > 1
         d = jax.lax.cond(is_hard, lambda: outer.with_forces(last.d, last.x), lambda: last.d)
-        now, tiny = moved_by(d, last), jnp.finfo(float).tiny
-        change, size = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
-        return now._replace(missed=largest(change) / (largest(size) + tiny))
+        now = moved_by(d, last)
+        missed, of = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
+        return now._replace(missed=largest(missed) / (largest(of) + numbers.tiny))
 
     def moved_by(d, last: March) -> March:
         return one_pass(separated(joined(last.x) + d, last.x), last)

@@ -22,9 +22,11 @@ from vmri_jax.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.quadrature import gauss
 
 NODES = 4
-"""At so many Gauss nodes of a macro step the slow forces are linearised."""
-ITERATIONS = 3
-"""Of minimal residuals."""
+"""Gauss nodes of a macro step at which the slow forces are linearised."""
+ITERATIONS = 6
+"""Most iterations of `minimal_residuals`."""
+ENOUGH = 1e-5
+"""Part of an update that may be left by them."""
 
 
 class Tied(NamedTuple):
@@ -86,12 +88,11 @@ class SlowEquations(NamedTuple):
         return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), start - pull.sum(0)
 
     def with_forces(self, d, x: Unknowns):
-        """``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone: C dx is how V and F on the micro grid answer dx,
+        """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces.
 
             ``(C dx)_i = h H sum_k w_k l_i(c_k) dF_s(sum_j l_j(c_k) dx_j, sum_j l_j'(c_k) dx_j / H)``
 
-        on few Gauss nodes, with ``F_s = F - dV/dq_s`` along the fast path as it is. By the iteration of minimal residuals
-        Orthomin(1) (Vinsome 1976), which needs no more than the product with C.
+        on a few Gauss nodes c_k, ``F_s = F - dV/dq_s`` of V and F on the micro grid, with the fast path as it is.
 
         Args:
             d: (r n_s,) update.
@@ -101,42 +102,25 @@ class SlowEquations(NamedTuple):
         system, _ = interval_problem(equations.system, equations.scheme)
         rule = gauss(min(n, NODES))
         c, basis, slopes = np.array(rule.nodes), lagrange_basis(r, rule.nodes), lagrange_derivative(r, rule.nodes)
-        m = np.minimum(c * n, n - 1).astype(int)
-        t, v_f = equations.t + c * H, x.fast[m, -1] / equations.micro_dt
-        parts = [jnp.sum(part, axis=0) for part in jnp.split(x.fast[:, -1], m)[:-1]]
-        q_f = equations.q_f + jnp.stack(list(accumulate(parts)))
-        q_s, v_s = equations.q_s + matmul(basis[:, 1:], x.slow), matmul(slopes[:, 1:], x.slow) / H
+        weights = equations.micro_dt * H * (np.array(rule.weights)[:, None] * basis[:, :-1]).T
 
-        def force(q_s, v_s):
-            total = jax.vmap(system.forces)(t, q_s, q_f, v_s, v_f)[0]
+        m = (c * n).astype(int)  # the micro intervals that the nodes are in
+        moved = [jnp.sum(part, axis=0) for part in jnp.split(x.fast[:, -1], m)[:-1]]
+        q_f, v_f = equations.q_f + jnp.stack(list(accumulate(moved))), x.fast[m, -1] / equations.micro_dt
+
+        def sample(increments):
+            return matmul(basis[:, 1:], increments), matmul(slopes[:, 1:], increments) / H
+
+        def forces(q_s, v_s):
+            total = jax.vmap(system.forces)(equations.t + c * H, q_s, q_f, v_s, v_f)[0]
             if system.slow_potential is not None:
-                total -= jax.vmap(jax.grad(lambda *q: system.slow_potential(*q, system.params)))(q_s, q_f)
+                total -= jax.vmap(jax.grad(system.slow_potential), (0, 0, None))(q_s, q_f, system.params)
             return total
 
-        _, change = jax.linearize(force, q_s, v_s)
-        weights = equations.micro_dt * H * np.array(rule.weights)[:, None] * basis[:, :-1]
-
-        def operator(dx):
-            answer = change(matmul(basis[:, 1:], dx), matmul(slopes[:, 1:], dx) / H)
-            return dx + self._by_masses(matmul(weights.T, answer))
-
-        def iterate(at):
-            i, dx, rest, move, answer, squared = at
-            turned = operator(rest)
-            part = jnp.sum(turned * answer) / squared
-            move, answer = rest - part * move, turned - part * answer
-            squared = jnp.sum(answer**2) + jnp.finfo(float).tiny
-            part = jnp.sum(rest * answer) / squared
-            return i + 1, dx + part * move, rest - part * answer, move, answer, squared
-
-        none, d = jnp.zeros_like(x.slow), d.reshape(x.slow.shape)
-        enough = 1e-5 * largest(d)
-
-        def goes_on(at):
-            i, _, rest, *_ = at
-            return (i < ITERATIONS) & (largest(rest) > enough)
-
-        return jax.lax.while_loop(goes_on, iterate, (0, none, d, none, none, 1.0))[1].reshape(-1)
+        q_s, v_s = sample(x.slow)
+        _, answer = jax.linearize(forces, equations.q_s + q_s, v_s)
+        d = d.reshape(x.slow.shape)
+        return minimal_residuals(lambda dx: dx + self._by_masses(matmul(weights, answer(*sample(dx)))), d).reshape(-1)
 
     def _by_masses(self, rows, tied: Tied | None = None):
         """Slow increments (r, n_s) for given rows (r, n_s)."""
@@ -146,3 +130,25 @@ class SlowEquations(NamedTuple):
         mu = jnp.sum(tied.multipliers * dx, axis=(1, 2))
         return dx - jnp.sum(mu[:, None, None] * tied.responses, axis=0)
 
+
+def minimal_residuals(operator, b):
+    """x with ``operator(x) = b`` to `ENOUGH` of b or after `ITERATIONS`, for an operator close to one.
+
+    By Orthomin(1) (Vinsome 1976): along the residual, made orthogonal to the move before, to where the next one is least.
+    """
+
+    def goes_on(at):
+        i, _, rest, *_ = at
+        return (i < ITERATIONS) & (largest(rest) > ENOUGH * largest(b))
+
+    def move_on(at):
+        i, x, rest, move, change, squared = at
+        change_of_rest = operator(rest)
+        part = jnp.sum(change_of_rest * change) / squared
+        move, change = rest - part * move, change_of_rest - part * change
+        squared = jnp.sum(change**2) + jnp.finfo(float).tiny
+        part = jnp.sum(rest * change) / squared
+        return i + 1, x + part * move, rest - part * change, move, change, squared
+
+    none = jnp.zeros_like(b)
+    return jax.lax.while_loop(goes_on, move_on, (0, none, b, none, none, 1.0))[1]
