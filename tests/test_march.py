@@ -153,10 +153,10 @@ def test_forces_on_slow_variables_cost_few_passes(degree):
 
 def test_minimal_residuals_solve_a_linear_problem():
     """Not symmetric, and close to one."""
-    matrix = jnp.eye(5) + 0.1 * jnp.asarray(np.random.default_rng(0).normal(size=(5, 5)))
+    matrix = jnp.eye(5) + 0.03 * jnp.asarray(np.random.default_rng(0).normal(size=(5, 5)))
     b = jnp.arange(1.0, 6.0)
     x = minimal_residuals(lambda x: matrix @ x, b)
-    assert largest_difference(matrix @ x, b) < 5 * ENOUGH
+    assert largest_difference(matrix @ x, b) < 5 * ENOUGH  # of the largest entry of b
     assert np.array_equal(minimal_residuals(lambda x: matrix @ x, 0 * b), 0 * b)
 
 
