@@ -61,13 +61,7 @@ class Line(NamedTuple):
 
     def next(self, m):
         """The value that is expected in interval m of a macro step."""
-        return self._standing_out(m, 2 * self.last[0] - self.last[1])
-
-    def again(self, m):
-        """The value of the interval before, for what a line would overshoot."""
-        return self._standing_out(m, self.last[0])
-
-    def _standing_out(self, m, value):
+        value = 2 * self.last[0] - self.last[1]
         return value if self.jump is None else value + jnp.where(m == 0, self.jump, 0.0)
 
     def add(self, m, value) -> "Line":

@@ -125,7 +125,7 @@ def march(
         warm: multipliers and bends of the macro step before.
         scale: (num_micro, r, 1) what turns multipliers into unknowns.
         schur: (num_micro, r n_g, r n_g) inverses of ``G K^-1 G^T``. In the first pass there are none: they are computed, and
-            multipliers start from the line through the last two, bends from the last one.
+            multipliers and bends start from the line through the last two.
         linear: the equations are linear with the given matrix, and this is their only pass.
 
     Returns:
@@ -154,7 +154,7 @@ def march(
             mu = scale * multipliers.next(m)
             inc = jnp.zeros_like(straight)
             if bent:
-                inc = straight + h**2 * bends.again(m)
+                inc = straight + h**2 * bends.next(m)
 
         def gradient(inc):
             path = local.path(Unknowns(steps, None, inc[None], None))
