@@ -297,7 +297,8 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
     def with_forces(last: March) -> March:
         part = jnp.where(last.passes == 1, last.missed**2, last.missed)  # the fast unknowns take three passes anyway
         is_hard = part * accepted.over((largest(last.d), 0.0), (largest(last.x.slow), 0.0)) > 1
-        d = jax.lax.cond(is_hard, lambda: outer.with_forces(last.d, last.x), lambda: last.d)
+        wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part
+        d = jax.lax.cond(is_hard, lambda: outer.with_forces(wanted, last.x), lambda: last.d)
         now = moved_by(d, last)
         missed, of = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
         return now._replace(missed=largest(missed) / (largest(of) + numbers.tiny))

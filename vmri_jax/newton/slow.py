@@ -4,6 +4,9 @@ In the first micro interval the constraints give the fast variables the velocity
 them keep it. So a change dx of the slow increments changes the multipliers of the first interval by ``-S G dx``, with S its
 small matrix and G the Jacobian by the slow variables, and those of the others hardly. That is the inertia of what is tied to
 the slow variables; the rest of what the fast ones answer is small.
+
+Where nothing is constrained, what masses leave out is the derivative of the slow forces by the slow path: over a long macro
+step it is as large as they are, and an update can be solved for with it (`SlowEquations.with_forces`).
 """
 
 from collections.abc import Callable
@@ -118,9 +121,12 @@ class SlowEquations(NamedTuple):
             return total
 
         q_s, v_s = sample(x.slow)
-        _, answer = jax.linearize(forces, equations.q_s + q_s, v_s)
-        d = d.reshape(x.slow.shape)
-        return minimal_residuals(lambda dx: dx + self._by_masses(matmul(weights, answer(*sample(dx)))), d).reshape(-1)
+        path = equations.q_s + q_s, v_s
+
+        def operator(dx):
+            return dx + self._by_masses(matmul(weights, jax.jvp(forces, path, sample(dx))[1]))
+
+        return minimal_residuals(operator, d.reshape(x.slow.shape)).reshape(-1)
 
     def _by_masses(self, rows, tied: Tied | None = None):
         """Slow increments (r, n_s) for given rows (r, n_s)."""
@@ -134,7 +140,8 @@ class SlowEquations(NamedTuple):
 def minimal_residuals(operator, b):
     """x with ``operator(x) = b`` to `ENOUGH` of b or after `ITERATIONS`, for an operator close to one.
 
-    By Orthomin(1) (Vinsome 1976): along the residual, made orthogonal to the move before, to where the next one is least.
+    By Orthomin(1) (Vinsome 1976; Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20, 1983): along the residual, with what
+    it has in common with the move before taken out, to where the next residual is least.
     """
 
     def goes_on(at):
