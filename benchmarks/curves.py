@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -121,6 +122,7 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
 
     good = {key: run for key, (run, _) in runs.items() if not programs.failed(results[key])}
     timed = interleaved({str(key): run for key, run in good.items()}, repeats)
+    jax.clear_caches()  # hundreds of programs are more memory maps than a process may have
     samples = {key: [1e6 * s / runs[key][1] for s in timed[str(key)]] for key in good}
     curves = Curves(case, samples)
     for method, n in runs:
