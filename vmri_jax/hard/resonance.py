@@ -1,5 +1,7 @@
 """Cases 1 to 4 and 26: resonances of the macro step, and slow and fast variables exchanged."""
 
+from dataclasses import replace
+
 import numpy as np
 
 import vmri_jax as vm
@@ -10,6 +12,8 @@ from vmri_jax.stability import advise, linear_model, stability_map
 
 FIRST_UNSTABLE = {2: 1.248, 3: 1.089, 5: 1.025, 10: 0.999, 20: 0.993}
 """omega H / pi by num_micro, of an independent prototype."""
+STARTS = 9
+"""Runs of a chaotic motion whose median counts."""
 
 
 def impulse_resonance(full: bool) -> Outcome:
@@ -67,20 +71,24 @@ def combination_resonance(full: bool) -> Outcome:
 
 
 def nonlinear_resonance(full: bool) -> Outcome:
-    """Drift of the energy where omega H is a third and a quarter of a turn."""
+    """Drift of the energy where omega H is a third and a quarter of a turn.
+
+    The motion is chaotic and its energy wanders up and down in a wide band, at random in a single run: the drift is the median of
+    runs whose starts differ by round-off.
+    """
     problem, scheme, steps = cubic_chain(), vm.explicit_slow(10), 100_000
+    starts = [replace(problem, q_s=problem.q_s * (1 + k * 1e-14)) for k in range(STARTS)]
     values, said, fine = {}, [], True
     for name, phase in {"2 pi / 3": 2 * np.pi / 3, "pi / 2": np.pi / 2}.items():
-        trajectory = long_run(problem, scheme, phase / 50.0, steps)
-        change = energy(trajectory, steps, abs(float(trajectory.energy[0])))
-        flagged = not trajectory.success or not advise(problem.system, scheme, problem.state(), phase / 50.0).ok
-        drift = abs(change.drift) / 1e5
-        values |= {f"drift {name}": drift, f"band {name}": change.band}
-        said.append(
-            f"omega H = {name}: {drift:.0e} per step in a band of {change.band:.1e}{', flagged' if flagged else ''}"
-        )
+        runs = [long_run(start, scheme, phase / 50.0, steps) for start in starts]
+        changes = [energy(run, steps, abs(float(run.energy[0]))) for run in runs]
+        failed = not all(run.success for run in runs)
+        flagged = failed or not advise(problem.system, scheme, problem.state(), phase / 50.0).ok
+        drift, band = abs(np.median([c.drift for c in changes])) / 1e5, max(c.band for c in changes)
+        values |= {f"drift {name}": drift, f"band {name}": band}
+        said.append(f"omega H = {name}: {drift:.0e} per step in a band of {band:.1e}{', flagged' if flagged else ''}")
         fine &= drift < 1e-6 or flagged
-    return Outcome(f"relative energy drift at {'; at '.join(said)}", fine, values)
+    return Outcome(f"relative energy drift (median of {STARTS} starts) at {'; at '.join(said)}", fine, values)
 
 
 def swapped_labels(full: bool) -> Outcome:
