@@ -3,11 +3,16 @@
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.algebra import ordered
 
 ORDER = 10
 """Highest order of the polynomials."""
+INFINITE = int(np.float64(np.inf).view(np.int64))
+"""From here on `ordered` numbers are those of a step that failed."""
+FADING = 1 << 50
+"""`ordered` numbers are nearly logarithms: this makes a miss smaller by a sixth with every step."""
 PLACES = 16
 """A power of two, more than there are orders."""
 
@@ -17,28 +22,37 @@ class Differences(NamedTuple):
 
     The polynomial of order k through the last k + 1 values goes on with ``d_0 + ... + d_k``, and d_(k+1) is by how much that
     of the step before missed x_n. Few or rough steps ask for a low order, smooth ones for a high one.
+
+    past (ORDER + 1,): the worst misses before those, `ordered` and fading: one lucky step is not to decide.
     """
 
     values: Any
+    past: Any
 
     @classmethod
     def constant(cls, x) -> "Differences":
         """A past in which nothing changed."""
-        return cls(jnp.zeros((ORDER + 2, x.size)).at[0].set(x))
+        return cls(jnp.zeros((ORDER + 2, x.size)).at[0].set(x), jnp.zeros(ORDER + 1, int))
 
     def next(self, measured: int):
-        """Where the values go on, by the order that missed the first `measured` entries of the last step least."""
-        missed = jnp.max(ordered(self.values[1:, :measured]), axis=1, initial=0)
-        best = jnp.min((missed & -PLACES) + jnp.arange(ORDER + 1)) & (PLACES - 1)  # the last places hold the order
+        """Where the values go on, by the order that has missed the first `measured` entries least."""
+        best = jnp.min((self._missed(measured) & -PLACES) + jnp.arange(ORDER + 1)) & (
+            PLACES - 1
+        )  # the last places hold the order
         taken = jnp.arange(ORDER + 2) <= best
         return jnp.sum(jnp.where(taken[:, None], self.values, 0.0), axis=0)
 
-    def add(self, x) -> "Differences":
+    def add(self, x, measured: int) -> "Differences":
         """With one more step."""
         rows = [x]
         for before in self.values[:-1]:
             rows.append(rows[-1] - before)
-        return Differences(jnp.stack(rows))
+        missed = self._missed(measured)
+        return Differences(jnp.stack(rows), jnp.where(missed < INFINITE, missed - FADING, 0))
+
+    def _missed(self, measured: int):
+        """(ORDER + 1,) by how much each order has missed, `ordered`."""
+        return jnp.maximum(jnp.max(ordered(self.values[1:, :measured]), axis=1, initial=0), self.past)
 
 
 class Line(NamedTuple):

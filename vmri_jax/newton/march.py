@@ -329,7 +329,7 @@ def solve(equations: StepEquations, matrix: IntervalMatrix, warm: Warm, newton, 
         rows, g_slow = done.residual
         done = done._replace(residual=(rows, jnp.maximum(largest(constraints(done)), g_slow)))
     fewest = jnp.where(warm.passes[0] == UNKNOWN, done.passes, jnp.minimum(warm.passes[0], done.passes))
-    slow, passes = warm.slow.add(joined(done.x)), jnp.stack([fewest, done.passes])
+    slow, passes = warm.slow.add(joined(done.x), r * n_s), jnp.stack([fewest, done.passes])
     multiplier = warm.multiplier.after_step(done.x.multiplier / scale)
     bend = warm.bend if done.bends is None else warm.bend.after_step(done.bends)
     return done, Warm(slow, multiplier, bend, done.missed, passes)
