@@ -36,9 +36,8 @@ class Differences(NamedTuple):
 
     def next(self, measured: int):
         """Where the values go on, by the order that has missed the first `measured` entries least."""
-        best = jnp.min((self._missed(measured) & -PLACES) + jnp.arange(ORDER + 1)) & (
-            PLACES - 1
-        )  # the last places hold the order
+        with_order = (self._missed(measured) & -PLACES) + jnp.arange(ORDER + 1)  # the last places hold the order
+        best = jnp.min(with_order) & (PLACES - 1)
         taken = jnp.arange(ORDER + 2) <= best
         return jnp.sum(jnp.where(taken[:, None], self.values, 0.0), axis=0)
 
