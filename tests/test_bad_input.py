@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -52,14 +52,14 @@ def test_float32_data(fpu):
 @pytest.mark.parametrize(
     "call",
     [
-        "vmri_jax.systems.fermi_pasta_ulam().state()",
-        "vmri_jax.simulate(p.system, vmri_jax.fully_implicit(2), None, macro_dt=0.1, num_steps=1)",
+        "vmri_jax.systems.fermi_pasta_ulam()",
+        "vmri_jax.initial_state(None, [1.0], [1.0], [0.0], [0.0])",
+        "vmri_jax.simulate(None, vmri_jax.fully_implicit(2), None, macro_dt=0.1, num_steps=1)",
     ],
 )
 def test_64_bit_mode_off(call):
     program = f"""
 import vmri_jax
-p = vmri_jax.systems.fermi_pasta_ulam()
 try:
     {call}
 except ValueError as error:
@@ -85,6 +85,8 @@ except ValueError as error:
 def test_bad_vectors(fpu, changes, message):
     with pytest.raises(ValueError, match=message):
         start(fpu, **changes)
+    with pytest.raises(ValueError, match=message):
+        replace(fpu, **changes).state()
 
 
 @pytest.mark.parametrize("junk", [None, "one", [1.0, "a"], [[1.0], [2.0, 3.0]], {"a": 1}, object(), 1j, 10**400])

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support import largest_difference
 from tests.user_systems import arms_kinetic, bent_system, double_pendulum
-from vmri_jax import State, System, fully_implicit, initial_state, simulate
+from vmri_jax import ConstantMass, Problem, State, System, fully_implicit, initial_state, simulate
 from vmri_jax.diagnostics import constraint_residual, velocity
 from vmri_jax.state import legendre, project_momentum
 
@@ -19,9 +19,19 @@ def test_momenta_are_mass_times_velocity(fpu):
     assert float(state.t) == 0.0
 
 
-def test_momenta_of_a_mass_matrix(fpu):
-    from vmri_jax import ConstantMass
+def test_a_problem_takes_plain_lists():
+    """Functions of the system get arrays, also where studies call them with the start of a problem."""
+    ring = System(ConstantMass([1.0, 1.0], [1.0]), slow_constraint=lambda q_s, params: jnp.array([q_s @ q_s - 1.0]))
+    problem = Problem(ring, [0.0, 1], [2], [0.5, 0.0], [0])
+    assert {name: getattr(problem, name).dtype for name in ("q_s", "q_f", "v_s", "v_f")} == dict.fromkeys(
+        ("q_s", "q_f", "v_s", "v_f"), np.dtype(float)
+    )
+    assert problem.system.num_constraints(problem.q_s, problem.q_f) == (0, 1)
+    with pytest.raises(TypeError, match=r"Problem: system is int; give a vmri_jax\.System"):
+        Problem(1, [0.0], [1.0], [0.0], [0.0])  # pyright: ignore[reportArgumentType]
 
+
+def test_momenta_of_a_mass_matrix(fpu):
     matrix = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.1], [0.0, 0.1, 3.0]])
     system = fpu.system.replace(kinetic=ConstantMass(matrix, 2 * np.ones(3)))
     v_s, v_f = jnp.array([1.0, 2.0, 3.0]), jnp.ones(3)

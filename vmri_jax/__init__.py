@@ -8,12 +8,20 @@ from vmri_jax.interrupts import Interrupted
 from vmri_jax.newton import Newton
 from vmri_jax.quadrature import macro, micro
 from vmri_jax.results import Method, Result, SimulationError
-from vmri_jax.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, mollified_impulse
+from vmri_jax.scheme import (
+    Scheme,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    galerkin,
+    mollified_impulse,
+    takahashi_imada,
+)
 from vmri_jax.simulate import simulate
-from vmri_jax.state import State, initial_state
+from vmri_jax.state import Problem, State, initial_state
 from vmri_jax.step import StepInfo, macro_step
 from vmri_jax.store import StoredTrajectory, stream
-from vmri_jax.system import ConstantMass, Problem, Rheonomic, System
+from vmri_jax.system import ConstantMass, Rheonomic, System
 from vmri_jax.trajectory import Trajectory
 
 from vmri_jax import systems  # isort: skip  (written with the names above)
@@ -53,4 +61,5 @@ __all__ = [
     "simulate_batch",
     "stream",
     "systems",
+    "takahashi_imada",
 ]

@@ -6,6 +6,7 @@ from functools import lru_cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
 from jax.sharding import PartitionSpec
 
 from vmri_jax.checks import check_params, check_type
@@ -21,11 +22,15 @@ from vmri_jax.state import State, check_constraints
 from vmri_jax.system import System
 from vmri_jax.trajectory import Trajectory
 
-WORKING_SET = 16384
-"""Numbers that the lanes of a chunk may hold together, 128 kB: well within the second-level cache."""
+WORKING_SET = 4096
+"""Numbers that the lanes of a chunk may hold together, 32 kB: the first-level cache."""
 FEWEST, MOST = 64, 1024
 """Lanes of a chunk. Loops over fewer are written out instead of run, which takes twice the time per lane even where 64 do not fit
 into the cache."""
+IN_A_CALL = 16
+"""Chunks that a call computes at most. A call takes as long as a hundred steps of a small system."""
+RESULTS = 4_000_000
+"""Numbers that their results may hold together, 32 MB: with more, loops are no single kernels (`vmri_jax.runtime.configure`)."""
 MATRICES = 10_000_000
 """Numbers that the matrices of a chunk may hold together (80 MB), before the lanes become fewer than that."""
 CACHE = 130_000
@@ -187,16 +192,18 @@ def _unknowns(structure, leaves) -> tuple[int, int]:
 
 def _in_chunks(system, scheme, macro_dt, newton, batch, *, chunk: int, devices: int, **static) -> Trajectory:
     """All lanes, `chunk` per device at a time; the last ones are filled up with copies, so that one program does all."""
-    lanes = batch["state"].q_s.shape[0]
-    together = min(chunk * devices, -(-lanes // devices) * devices)
+    state = batch["state"]
+    lanes, (n_s, n_f) = state.q_s.shape[0], (state.q_s.shape[1], state.q_f.shape[1])
+    width = min(chunk * devices, -(-lanes // devices) * devices)
+    numbers = static["num_saves"] * (2 * (n_s + n_f) + static["save_micro"] * scheme.num_micro * n_f)
+    together = IN_A_CALL if width < lanes and IN_A_CALL * width * numbers < RESULTS else 1
     pieces = []
-    for start in range(0, lanes, together):
-        index = np.minimum(np.arange(start, start + together), lanes - 1)
-        piece = _side_by_side(
-            system, scheme, macro_dt, newton, jax.tree.map(lambda a, i=index: a[i], batch), devices, **static
-        )
-        pieces.append(piece)
-    return pieces[0] if lanes == together else _join(pieces, lanes)
+    for start in range(0, lanes, together * width):
+        index = np.minimum(np.arange(start, start + together * width), lanes - 1).reshape(together, width)
+        count = min(together, -(-(lanes - start) // width))
+        piece = jax.tree.map(lambda a, index=index: a[index], batch)
+        pieces.append(_chunks(system, scheme, macro_dt, newton, piece, count, devices, **static))
+    return pieces[0] if lanes == together * width else _join(pieces, lanes)
 
 
 @partial(jax.jit, static_argnames="lanes")
@@ -205,8 +212,12 @@ def _join(pieces, lanes: int) -> Trajectory:
 
 
 @partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"), compiler_options={**WIDE_VECTORS, **IN_LOOPS})
-def _side_by_side(system, scheme, macro_dt, newton, batch, devices, *, num_saves, save_every, save_micro) -> Trajectory:
-    def together(system, scheme, macro_dt, newton, save_every, batch):
+def _chunks(
+    system, scheme, macro_dt, newton, batch, count, devices, *, num_saves, save_every, save_micro
+) -> Trajectory:
+    """The first `count` chunks of a batch with arrays (chunks, lanes, ...), one after the other; zeros for the others."""
+
+    def side_by_side(system, scheme, macro_dt, newton, save_every, batch):
         def lane(batch):
             state, dt = batch["state"], batch.get("macro_dt", macro_dt)
             own = system.replace(params=batch.get("params", system.params))
@@ -221,5 +232,17 @@ def _side_by_side(system, scheme, macro_dt, newton, batch, devices, *, num_saves
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         shared, spread = PartitionSpec(), PartitionSpec("lanes")
         specs = {"in_specs": (shared,) * 5 + (spread,), "out_specs": spread}
-        together = jax.shard_map(together, mesh=mesh, **specs, check_vma=False)
-    return together(system, scheme, macro_dt, newton, save_every, batch)
+        side_by_side = jax.shard_map(side_by_side, mesh=mesh, **specs, check_vma=False)
+    go = partial(side_by_side, system, scheme, macro_dt, newton, save_every)
+    chunks = batch["state"].t.shape[0]
+    if chunks == 1:
+        return go(jax.tree.map(lambda a: a[0], batch))
+    traced, shape = jax.make_jaxpr(go, return_shape=True)(jax.tree.map(lambda a: a[0], batch))
+    shapes, structure = jax.tree.flatten(shape)
+
+    def chunk(i, results):
+        found = core.jaxpr_as_fun(traced)(*(a[i] for a in jax.tree.leaves(batch)))
+        return [result.at[i].set(one) for result, one in zip(results, found, strict=True)]
+
+    results = jax.lax.fori_loop(0, count, chunk, [jnp.zeros((chunks, *a.shape), a.dtype) for a in shapes])
+    return jax.tree.unflatten(structure, [a.reshape(-1, *a.shape[2:]) for a in results])

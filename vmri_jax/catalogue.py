@@ -70,6 +70,12 @@ SCHEMES = {
     "fully-explicit": NamedScheme(
         vm.fully_explicit, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at the micro nodes"
     ),
+    "takahashi-imada": NamedScheme(
+        vm.takahashi_imada,
+        (),
+        "2, of frequencies 4",
+        "fully-explicit with corrected kicks: a Hessian product beside each gradient",
+    ),
     "galerkin": NamedScheme(
         vm.galerkin, ("degree", "rule"), "2 x degree", "one rule (gauss or lobatto) on every term, any degree"
     ),

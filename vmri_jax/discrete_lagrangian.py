@@ -21,11 +21,11 @@ from vmri_jax.system import ConstantMass, System
 
 @dataclass(frozen=True)
 class Term:
-    """An integrand on its nodes: ``path -> H sum_i w_i integrand(path at theta_i)``.
+    """An integrand on its nodes: ``path -> H^(1 + power) sum_i w_i integrand(path at theta_i)``.
 
     `integrand` takes the arguments it names, e.g. ``("q_s", "q_f")``. Weights at the ends of the macro interval
     are held apart for terms without velocities (None where there is no such node): those are kicks, from averaged
-    positions where `mollified`.
+    positions where `mollified`. `grid` is where its rule was placed.
     """
 
     integrand: Callable
@@ -34,7 +34,13 @@ class Term:
     start: Any = None
     end: Any = None
     sign: float = 1.0
+    grid: str = "micro"
     mollified: bool = False
+    power: int = 0
+
+    def times_step(self, macro_dt):
+        """What the weights are multiplied by."""
+        return macro_dt ** (1 + self.power)
 
     def __call__(self, path: Path):
         return self.at_nodes_inside(path) + self.at_ends(path)
@@ -44,7 +50,7 @@ class Term:
         if not self.inside.groups:
             return jnp.zeros(())
         values = jax.vmap(self.integrand)(*self.inside.sample(path, self.arguments).values())
-        return self.sign * path.macro_dt * jnp.sum(self.inside.weights * values)
+        return self.sign * self.times_step(path.macro_dt) * jnp.sum(self.inside.weights * values)
 
     def at_ends(self, path: Path):
         """The part of the sum at theta = 0 and theta = 1."""
@@ -53,7 +59,7 @@ class Term:
         for weight, k in ((self.start, 0), (self.end, -1)):
             if weight is not None:
                 total += weight * self.integrand(*({"q_s": q_s[k], "q_f": q_f[k]}[a] for a in self.arguments))
-        return self.sign * path.macro_dt * total
+        return self.sign * self.times_step(path.macro_dt) * total
 
     def gradient(self, q_s, q_f):
         """``(d/dq_s, d/dq_f)`` of the signed integrand at one configuration, for kicks."""
@@ -158,7 +164,36 @@ def lagrangian(system: System, scheme: Scheme) -> Sum:
     kinetic = _kinetic(system, scheme)
     slow = _on_position_nodes(system.slow_potential, ("q_s", "q_f"), scheme.slow, scheme, system)
     fast = _on_position_nodes(system.fast_potential, ("q_f",), scheme.fast, scheme, system)
-    return kinetic - slow - fast
+    return kinetic - slow - fast + _corrections(system, scheme)
+
+
+def _corrections(system: System, scheme: Scheme) -> Sum:
+    """The squares of gradients of `vmri_jax.quadrature.corrected`."""
+    if not scheme.slow.corrected and not scheme.fast.corrected:
+        return Sum(())
+    if not isinstance(system.kinetic, ConstantMass):
+        raise ValueError("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
+    slow_potential, fast_potential, mass = system.slow_potential, system.fast_potential, system.kinetic
+    both = scheme.fast.corrected and fast_potential is not None
+
+    def fast(q_f, params):
+        d = jax.grad(fast_potential)(q_f, params)  # pyright: ignore[reportArgumentType]
+        return jnp.sum(d * mass.velocity(jnp.zeros(mass.slow.shape[-1]), d)[1]) / (24 * scheme.num_micro**2)
+
+    def slow(q_s, q_f, params):
+        d = jax.grad(slow_potential, (0, 1))(q_s, q_f, params)  # pyright: ignore[reportArgumentType]
+        v_s, v_f = mass.velocity(*d)
+        total = (jnp.sum(d[0] * v_s) + jnp.sum(d[1] * v_f)) / 24
+        if both:
+            total += jnp.sum(v_f * jax.grad(fast_potential)(q_f, params)) / (12 * scheme.num_micro**2)  # pyright: ignore[reportArgumentType]
+        return total
+
+    terms = Sum(())
+    if scheme.slow.corrected and slow_potential is not None:
+        terms += _on_position_nodes(slow, ("q_s", "q_f"), scheme.slow, scheme, system)
+    if both:
+        terms += _on_position_nodes(fast, ("q_f",), scheme.fast, scheme, system)
+    return Sum(tuple(replace(term, power=2) for term in terms.terms))
 
 
 def _kinetic(system, scheme) -> Sum:
@@ -172,8 +207,10 @@ def _on_position_nodes(function, arguments, placed, scheme, system) -> Sum:
     if function is None:
         return Sum(())
     start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
-    at_node = Term(lambda *q: function(*q, system.params), arguments, inside, start, end, mollified=placed.mollified)
-    return Sum((at_node,))
+    node = Term(
+        lambda *q: function(*q, system.params), arguments, inside, start, end, 1.0, placed.grid, placed.mollified
+    )
+    return Sum((node,))
 
 
 def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:

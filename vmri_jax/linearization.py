@@ -63,7 +63,8 @@ def linearize(equations: StepEquations, x: Unknowns) -> Blocks:
         elif term.inside.groups:
             z = term.inside.sample(path, term.arguments)
             hessian = jax.vmap(jax.jacfwd(jax.grad(_of_dict(term.integrand, term.arguments))))(z)
-            add(term.inside, hessian, term.sign * path.macro_dt * equations.micro_dt * term.inside.weights)
+            factor = term.sign * term.times_step(path.macro_dt) * equations.micro_dt
+            add(term.inside, hessian, factor * term.inside.weights)
 
     if system.force is not None:
         nodes = equations.force_nodes

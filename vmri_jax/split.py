@@ -12,12 +12,11 @@ from vmri_jax.system import ConstantMass, Rheonomic, System
 
 
 class Split(NamedTuple):
-    """A system taken apart: kicks that stay outside, a slow system for one step, a fast one for num_micro steps.
+    """A system taken apart: a slow system for one step, a fast one for num_micro steps; kicks at the macro nodes stay outside.
 
     Each part is a system of fast variables alone on a single micro interval.
     """
 
-    kicks: System
     slow: System
     slow_scheme: Scheme
     fast: System
@@ -33,11 +32,10 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
     if scheme.num_micro == 1 and not n_s:
         return None  # a part already
     slow_potential, fast_potential = system.slow_potential, system.fast_potential
-    kicked = {}
-    if slow_potential is not None and scheme.slow.grid == "macro" and scheme.slow.only_ends:
-        kicked["slow_potential"], slow_potential = slow_potential, None
-    if fast_potential is not None and scheme.fast.grid == "macro" and scheme.fast.only_ends:
-        kicked["fast_potential"], fast_potential = fast_potential, None
+    if scheme.slow.grid == "macro" and scheme.slow.only_ends:
+        slow_potential = None
+    if scheme.fast.grid == "macro" and scheme.fast.only_ends:
+        fast_potential = None
 
     coupled_slow = slow_potential is not None and (
         scheme.slow.grid == "micro" or depends_on(lambda q: slow_potential(q_s, q, params), q_f)[0]
@@ -60,7 +58,6 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
 
     none, drift = jnp.zeros(0), micro(midpoint)
     return Split(
-        kicks=System(system.kinetic, **kicked, params=params),
         slow=System(
             ConstantMass(none, system.kinetic.slow),
             fast_potential=None if slow_potential is None else potential_of_slow,
@@ -76,6 +73,14 @@ def split(system: System, scheme: Scheme, q_s, q_f) -> Split | None:
         ),
         fast_scheme=Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast),
     )
+
+
+def macro_kicks(system: System, scheme: Scheme, parts: Split | None) -> tuple[Term, ...]:
+    """The terms that shift the momenta before and after all else of a macro step; of the others its parts take care."""
+    kicks = lagrangian(system, scheme).kicks
+    if parts is None:
+        return kicks
+    return tuple(term for term in kicks if term.grid == "macro" and not term.inside.groups)
 
 
 def fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:

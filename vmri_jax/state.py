@@ -1,5 +1,6 @@
 """States: positions and momenta on the constraint manifold, and how a run gets its first one."""
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -175,6 +176,36 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
                 "singular at the initial positions, or a function returned NaN there."
             )
     return state
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A system with initial positions and velocities, (n_s,), (n_f,), which are kept as arrays.
+
+    drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
+
+    Raises:
+        TypeError, ValueError: arrays as `initial_state` refuses them.
+    """
+
+    system: System
+    q_s: Any
+    q_f: Any
+    v_s: Any
+    v_f: Any
+    t: Any = 0.0
+    drawing: Any = None
+
+    def __post_init__(self):
+        require_x64()
+        check_type("Problem: system", self.system, System, "a vmri_jax.System")
+        names = "q_s", "q_f", "v_s", "v_f"
+        for name, array in zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True):
+            object.__setattr__(self, name, array)
+
+    def state(self, project: bool = False) -> State:
+        """The consistent initial `State` (see `initial_state`)."""
+        return initial_state(self.system, self.q_s, self.q_f, self.v_s, self.v_f, self.t, project=project)
 
 
 @jax.jit

@@ -27,7 +27,7 @@ from vmri_jax.newton.interval import is_linear
 from vmri_jax.quadrature import is_concrete
 from vmri_jax.results import Method, Result
 from vmri_jax.scheme import Scheme
-from vmri_jax.split import fast_alone, is_drift, is_explicit, split
+from vmri_jax.split import fast_alone, is_drift, is_explicit, macro_kicks, split
 from vmri_jax.state import State, project_momentum
 from vmri_jax.system import ConstantMass, System
 
@@ -115,7 +115,6 @@ def start_memory(
     else:
         velocity = kept = project_momentum(system, state)[2:]
     parts = split(system, scheme, state.q_s, state.q_f)
-    own = system if parts is None else parts.kicks
     memories = None
     if parts is not None:
         slow, fast = _slow_and_fast(state)
@@ -124,7 +123,7 @@ def start_memory(
             start_memory(parts.fast, parts.fast_scheme, fast, macro_dt / scheme.num_micro, newton),
         )
     average = averaging(system, scheme, macro_dt, newton)
-    kicks = _kick_gradients(own, scheme, state.q_s, state.q_f, average)
+    kicks = _kick_gradients(macro_kicks(system, scheme, parts), state.q_s, state.q_f, average)
     matrix = warm = None
     solved = parts is None and not is_explicit(system, scheme) and newton.marches(system, scheme)
     if solved and is_drift(system, scheme):
@@ -205,7 +204,9 @@ def _advance_stages(system, scheme, state, macro_dt, newton, memory: Stages, pro
         memory = _at_same_point(own, last)
         if scheme.scheme.slow.mollified:  # the average depends on the length of the stage
             average = averaging(system, scheme.scheme, c * macro_dt, newton)
-            memory = memory._replace(kicks=_kick_gradients(system, scheme.scheme, state.q_s, state.q_f, average))
+            parts = split(system, scheme.scheme, state.q_s, state.q_f)
+            terms = macro_kicks(system, scheme.scheme, parts)
+            memory = memory._replace(kicks=_kick_gradients(terms, state.q_s, state.q_f, average))
         state, info, memory = advance(system, scheme.scheme, state, c * macro_dt, newton, memory, project)
         return (state, memory), (memory, info)
 
@@ -225,12 +226,11 @@ def _at_same_point(own: Memory, last: Memory) -> Memory:
 
 def _interval(system, scheme, state, macro_dt, newton, memory):
     """Kick, move, kick; momenta are not projected."""
-    parts = split(system, scheme, state.q_s, state.q_f)
-    own = system if parts is None else parts.kicks
-    state = _kick(own, scheme, state, macro_dt, memory.kicks, ("start",))
+    terms = macro_kicks(system, scheme, split(system, scheme, state.q_s, state.q_f))
+    state = _kick(terms, state, macro_dt, memory.kicks, ("start",))
     state, info, memory = _move(system, scheme, state, macro_dt, newton, memory)
-    kicks = _kick_gradients(own, scheme, state.q_s, state.q_f, averaging(system, scheme, macro_dt, newton))
-    state = _kick(own, scheme, state, macro_dt, kicks, ("end",))
+    kicks = _kick_gradients(terms, state.q_s, state.q_f, averaging(system, scheme, macro_dt, newton))
+    state = _kick(terms, state, macro_dt, kicks, ("end",))
     return state, info, memory._replace(kicks=kicks)
 
 
@@ -244,8 +244,8 @@ def _move(system, scheme, state, macro_dt, newton, memory):
     return _move_coupled(system, scheme, state, macro_dt, newton, memory)
 
 
-def _kick_gradients(system, scheme, q_s, q_f, average=None):
-    """``(d/dq_s, d/dq_f)`` of every kicked term, of mollified ones at averaged fast positions."""
+def _kick_gradients(terms, q_s, q_f, average=None):
+    """``(d/dq_s, d/dq_f)`` of every term, of mollified ones at averaged fast positions."""
 
     def gradient(term):
         if average is None or not term.mollified:
@@ -255,7 +255,7 @@ def _kick_gradients(system, scheme, q_s, q_f, average=None):
         more_s, d_f = pull(d_f)
         return d_s + more_s, d_f
 
-    return tuple(gradient(term) for term in lagrangian(system, scheme).kicks)
+    return tuple(map(gradient, terms))
 
 
 def averaging(system: System, scheme: Scheme, macro_dt, newton: Newton):
@@ -284,13 +284,13 @@ def averaging(system: System, scheme: Scheme, macro_dt, newton: Newton):
     return average
 
 
-def _kick(system, scheme, state, macro_dt, gradients, ends: tuple[str, ...]) -> State:
-    """``p + H w dL/dq`` for the weight w that each kicked term has at these ends of the interval."""
+def _kick(terms, state, macro_dt, gradients, ends: tuple[str, ...]) -> State:
+    """``p + H w dL/dq`` for the weight w that each term has at these ends of the interval."""
     p_s, p_f = state.p_s, state.p_f
-    for term, (d_s, d_f) in zip(lagrangian(system, scheme).kicks, gradients, strict=True):
+    for term, (d_s, d_f) in zip(terms, gradients, strict=True):
         weights = [w for w in (getattr(term, end) for end in ends) if w is not None]
         if weights:
-            impulse = macro_dt * sum(weights)
+            impulse = term.times_step(macro_dt) * sum(weights)
             p_s, p_f = p_s + impulse * d_s, p_f + impulse * d_f
     return State(state.t, state.q_s, state.q_f, p_s, p_f)
 
@@ -327,10 +327,12 @@ def _move_parts(parts, num_micro, state, macro_dt, newton, memory):
 def _march_fast(system, scheme, num_micro, fast, micro_dt, newton, memory):
     """num_micro steps of the fast variables; kicks of two steps at the node they share are merged into one."""
 
+    terms = lagrangian(system, scheme).kicks
+
     def micro_step(fast, memory, ends):
         fast, info, memory = _move(system, scheme, fast, micro_dt, newton, memory)
-        kicks = _kick_gradients(system, scheme, fast.q_s, fast.q_f)
-        return _kick(system, scheme, fast, micro_dt, kicks, ends), info, memory, kicks
+        kicks = _kick_gradients(terms, fast.q_s, fast.q_f)
+        return _kick(terms, fast, micro_dt, kicks, ends), info, memory, kicks
 
     large = fast.q_f.size >= LARGE and not is_explicit(system, scheme) and is_linear(system, scheme, fast.q_s, fast.q_f)
     pack, unpack, together = (_packed, _unpacked, TOGETHER) if large else (lambda fast: fast, lambda fast: fast, 1)
@@ -340,7 +342,7 @@ def _march_fast(system, scheme, num_micro, fast, micro_dt, newton, memory):
         fast, info, memory, _ = micro_step(unpack(fast), memory, ("end", "start"))
         return (pack(fast), memory, _worse(worst, _status(info))), (info.q_f_micro[0], info.multiplier[0])
 
-    fast = _kick(system, scheme, fast, micro_dt, memory.kicks, ("start",))
+    fast = _kick(terms, fast, micro_dt, memory.kicks, ("start",))
     memory = memory._replace(kicks=None)  # needed again only at the last node
     start = pack(fast), memory, (jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
     (fast, memory, worst), (q_f, multiplier) = jax.lax.scan(inside, start, length=num_micro - 1, unroll=together)

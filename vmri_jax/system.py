@@ -217,25 +217,3 @@ def _check_hash(name: str, function) -> None:
             f"System: {name} is {function!r}, which has no hash: programs are compiled once per function. Give a plain "
             "function, with what varies in params."
         ) from None
-
-
-@dataclasses.dataclass(frozen=True)
-class Problem:
-    """A system with initial positions and velocities.
-
-    drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
-    """
-
-    system: System
-    q_s: Any
-    q_f: Any
-    v_s: Any
-    v_f: Any
-    t: Any = 0.0
-    drawing: Any = None
-
-    def state(self, project: bool = False):
-        """The consistent initial `State` (see `initial_state`)."""
-        from vmri_jax.state import initial_state
-
-        return initial_state(self.system, self.q_s, self.q_f, self.v_s, self.v_f, self.t, project=project)

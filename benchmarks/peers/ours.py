@@ -18,6 +18,8 @@ COMPOSED = {"kahan-li8": (1, 2, 4), "kahan-li6": (1, 2, 4), "suzuki4": (1, 2, 4,
 """Compositions of `vm.fully_explicit` that are tried, with numbers of micro steps; the finest first."""
 EXPLICIT = (4, 8, 16)
 """Numbers of micro steps of `vm.fully_explicit` on its own."""
+CORRECTED = (1, 2, 4, 8)
+"""Numbers of micro steps of `vm.takahashi_imada`."""
 LOBATTO = (8, 10, 11, 12, 14, 16)
 """Degrees of `vm.galerkin` with one interval to a step, where there are constraints."""
 LOOSE = (1e-2, 1e-4, 1e-6)
@@ -36,13 +38,18 @@ def schemes(case: Case) -> dict[str, vm.Scheme | vm.Composition]:
     }
     if not case.is_chain:
         found |= {f"Lobatto {degree}": vm.galerkin(1, degree, "lobatto") for degree in LOBATTO}
-    return found | {f"explicit {n}": explicit(n) for n in EXPLICIT}
+    return found | {f"explicit {n}": explicit(n) for n in EXPLICIT} | corrected()
+
+
+def corrected() -> dict[str, vm.Scheme]:
+    """Explicit schemes whose frequencies of harmonic vibrations are of order 4."""
+    return {f"Takahashi-Imada {n}": vm.takahashi_imada(n) for n in CORRECTED}
 
 
 def batch_schemes() -> dict[str, vm.Scheme | vm.Composition]:
     """The same for batches and moderate errors."""
     composed = {f"explicit {n}, suzuki4": vm.compose(vm.fully_explicit(n), "suzuki4") for n in (1, 2, 4)}
-    return composed | {f"explicit {n}": vm.fully_explicit(n) for n in (4, 8)}
+    return corrected() | composed | {f"explicit {n}": vm.fully_explicit(n) for n in (4, 8)}
 
 
 def loose(case: Case, scheme: vm.Scheme | vm.Composition) -> tuple[float, ...]:
@@ -109,11 +116,11 @@ def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladd
 
             def run():
                 end = vm.simulate_batch(case.problem.system, scheme, states, **steps, newton=newton)
-                return jnp.concatenate([end.q_s[:, -1], end.q_f[:, -1]], axis=1)
+                return np.concatenate([np.asarray(end.q_s)[:, -1], np.asarray(end.q_f)[:, -1]], axis=1)
 
             return run
 
-        return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end), build)
+        return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end, 8), build)
 
     def tolerances(scheme):
         return {"": MARCH.tolerance} | {f", tolerance {tol:g}": tol for tol in loose(case, scheme)}

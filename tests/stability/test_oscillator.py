@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro
+from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, takahashi_imada
 from vmri_jax.quadrature import midpoint, trapezoidal
 from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
 
@@ -12,6 +12,7 @@ from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
 def test_phases_of_midpoint_and_verlet(x):
     assert phase(fully_implicit(3), x) == pytest.approx(2 * np.arctan(x / 2), rel=1e-14)
     assert phase(fully_explicit(3), x) == pytest.approx(2 * np.arcsin(x / 2), rel=1e-14)
+    assert phase(takahashi_imada(3), x) == pytest.approx(2 * np.arcsin(x / 2 * np.sqrt(1 - x**2 / 12)), rel=1e-13)
     assert phase(explicit_slow(3), x) == phase(fully_implicit(3), x)
 
 
@@ -29,6 +30,8 @@ def test_a_phase_beyond_half_a_turn():
 def test_limits():
     assert fast_limit(fully_explicit(5)) == pytest.approx(2.0, abs=1e-7)
     assert np.isnan(phase(fully_explicit(5), 2.1))
+    limits = fast_limit(takahashi_imada(5)), slow_limit(takahashi_imada(5))
+    assert limits == pytest.approx((np.sqrt(12), np.sqrt(12)), abs=1e-7)
     assert slow_limit(explicit_slow(5, 0.3)) == pytest.approx(2.0, abs=1e-7)
     assert fast_limit(galerkin(3, 2, "lobatto")) == pytest.approx(np.sqrt(8), abs=1e-7)
     assert fast_limit(fully_implicit(5)) == fast_limit(galerkin(3, 3)) == slow_limit(fully_implicit(1)) == np.inf

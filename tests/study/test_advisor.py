@@ -18,7 +18,7 @@ from vmri_jax.study import (
     reference_solution,
     work_precision,
 )
-from vmri_jax.study.advisor import NUM_MICRO, NothingReached
+from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search
 from vmri_jax.study.page import default_t_end
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
@@ -89,6 +89,15 @@ def test_the_command_names_the_setting(found):
     assert f"--steps {found.num_steps}" in command
 
 
+@pytest.mark.parametrize(("digits", "orders"), [(2, [2, 4, 6, 8, 24]), (8, [8, 6, 4, 24, 2])])
+def test_schemes_that_fit_the_error_are_tried_first(reference, digits, orders):
+    one_each = [family for family in families() if "slow" not in family.name and "implicit" not in family.name]
+    search = Search(PROBLEM, 1.0, one_each, reference)
+    error = 10.0**-digits * np.abs(reference.q[1] - reference.q[0]).max()
+    tried = [family.make(family.first).order for family in search.by_promise(error)]
+    assert list(dict.fromkeys(tried)) == orders
+
+
 def test_exhaustive_search_tries_every_num_micro(reference):
     menu = [SHORT_MENU[0]]
     found = recommend(PROBLEM, 1e-3, 1.0, menu=menu, reference=reference, exhaustive=True, verify=False)
@@ -110,7 +119,8 @@ def test_refuses_what_the_reference_cannot_tell(reference):
         recommend(PROBLEM, 1e-6, 1.0, reference=poor)
 
 
-def test_nothing_reached_hands_back_the_runs(reference):
+def test_nothing_reached_hands_back_the_runs(reference, monkeypatch):
+    monkeypatch.setattr("vmri_jax.study.advisor.LONGEST", 0.2)
     wrong = dataclasses.replace(reference, q=reference.q + 1.0)
     with pytest.raises(NothingReached, match=r"no setting reached 0\.0001") as caught:
         recommend(PROBLEM, 1e-4, 1.0, menu=SHORT_MENU[:1], reference=wrong, verify=False)

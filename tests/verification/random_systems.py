@@ -88,6 +88,7 @@ SCHEMES: dict[str, Callable] = {
     "explicit slow": lambda n, degree, alpha: vm.explicit_slow(n, alpha),
     "mollified impulse": lambda n, degree, alpha: vm.mollified_impulse(n, alpha),
     "fully explicit": lambda n, degree, alpha: vm.fully_explicit(n, alpha),
+    "takahashi imada": lambda n, degree, alpha: vm.takahashi_imada(n),
     "gauss": lambda n, degree, alpha: vm.galerkin(n, degree, "gauss"),
     "lobatto": lambda n, degree, alpha: vm.galerkin(n, degree, "lobatto"),
 }

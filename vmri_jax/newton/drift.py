@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from vmri_jax.algebra import inverse, matvec, regularized
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales
-from vmri_jax.newton.interval import ROUNDOFF, SAFETY, constant_mass, inverse_mass
+from vmri_jax.newton.interval import Accepted, constant_mass, inverse_mass
 
 LEAST = 0.1
 """Where two steps of a composition undo each other but for so much, their common multiplier says nothing about the force."""
@@ -61,8 +61,7 @@ class Drift(NamedTuple):
 def solve(equations: StepEquations, warm: Warm, newton):
     """Correct the multipliers until one more correction would change no increment.
 
-    Accepted are changes of ``newton.tolerance / SAFETY`` relative to the motion of the slow and of the fast variables, and
-    round-off of the positions.
+    Accepted are changes relative to the motion of the slow and of the fast variables, and round-off of the positions (`Accepted`).
 
     Returns:
         (state of the iteration, unknowns, (q_f, p_s, p_f) at the end, warm)
@@ -77,7 +76,8 @@ def solve(equations: StepEquations, warm: Warm, newton):
 
     jacobian = jax.jacrev(constraints, argnums=1)(equations.t, q)
     columns = jnp.concatenate([velocity_s(jacobian[:, :n_s]), velocity_f(jacobian[:, n_s:])], axis=1)
-    free = h * jnp.concatenate([velocity_s(equations.p_s), velocity_f(equations.p_f)])
+    straight = h * velocity_s(equations.p_s), h * velocity_f(equations.p_f)
+    free = jnp.concatenate(straight)
 
     n_g, n_gs = system.num_constraints(equations.q_s, equations.q_f)
     scales = multiplier_scales(equations.scheme, h, warm.before)
@@ -86,19 +86,20 @@ def solve(equations: StepEquations, warm: Warm, newton):
     x = free - _combined(mu, columns)
     g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
     schur = inverse(regularized(jax.vmap(push)(columns).T))
-    per = _inverse_of_accepted(q, free, n_s, newton.tolerance / SAFETY)
+    per_slow, per_fast = (1 / size for size in Accepted.of(equations, newton).sizes(tuple(map(_size, straight))))
 
     def at(x, mu, g, iterations) -> Drift:
         dmu = matvec(schur, g)
         dx = _combined(dmu, columns)
-        change = jnp.max(jnp.abs(dx) * per)
+        change = jnp.maximum(per_slow * _size(dx[:n_s]), per_fast * _size(dx[n_s:]))
         return Drift(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
 
     def corrected(last: Drift) -> Drift:
         x = last.x - last.dx
         return at(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
 
-    done = newton.iterate(corrected, at(x, mu, g, 0))
+    first = corrected(at(x, mu, g, 0))  # nearly all steps take one: outside of the loop it is cheaper
+    done = newton.iterate(corrected, first, done=1)
     impulse = _combined(done.mu, jacobian) / h
     x, mu = done.x, done.mu
     end = equations.q_f + x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
@@ -113,11 +114,6 @@ def _combined(mu, rows):
     return jnp.sum(mu[:, None] * rows, axis=0)
 
 
-def _inverse_of_accepted(q, motion, n_s: int, tolerance):
-    """One over the changes of the increments that are accepted, per coordinate."""
-    eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
-    size = tolerance * jnp.abs(motion) + ROUNDOFF * eps * jnp.abs(q)
-    slow, fast = (jnp.max(part, initial=tiny) for part in (size[:n_s], size[n_s:]))
-    least = eps / tolerance * jnp.maximum(slow, fast)  # variables at rest have no size of their own
-    per = (1 / jnp.maximum(part, least) for part in (slow, fast))
-    return jnp.concatenate([jnp.broadcast_to(a, n) for a, n in zip(per, (n_s, q.size - n_s), strict=True)])
+def _size(a):
+    """The largest absolute value."""
+    return jnp.max(jnp.abs(a), initial=0.0)

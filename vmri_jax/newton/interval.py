@@ -38,13 +38,16 @@ class Accepted(NamedTuple):
         floors = (ROUNDOFF * jnp.finfo(float).eps * largest(q) for q in (equations.q_s, equations.q_f))
         return cls(newton.tolerance / SAFETY, *floors)
 
-    def over(self, changes, motions):
-        """Changes (slow, fast) over what is accepted of them with such motions; the larger of the two."""
+    def sizes(self, motions) -> tuple[Any, Any]:
+        """The changes (slow, fast) that are accepted with such motions."""
         numbers = jnp.finfo(float)
         rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny  # variables at rest have no size of their own
-        floors = self.slow, self.fast
-        parts = (c / (self.tolerance * m + floor + rest) for c, m, floor in zip(changes, motions, floors, strict=True))
-        return jnp.maximum(*parts)
+        slow, fast = motions
+        return self.tolerance * slow + self.slow + rest, self.tolerance * fast + self.fast + rest
+
+    def over(self, changes, motions):
+        """Changes (slow, fast) over what is accepted of them with such motions; the larger of the two."""
+        return jnp.maximum(*(c / size for c, size in zip(changes, self.sizes(motions), strict=True)))
 
 
 def expected(moved, before):

@@ -193,7 +193,8 @@ def march(
         increments += jnp.sum((basis[1:] - basis[0])[..., None] * d_steps[:, None], axis=0)
         for term in kicks:  # where two micro intervals meet
             d_s, d_f = term.gradient(equations.q_s + _along(basis[-1], x.slow), q_f)
-            weight = jnp.where(inside, h**2 * sum(w for w in (term.start, term.end) if w is not None), 0.0)
+            weight = h * term.times_step(h) * sum(w for w in (term.start, term.end) if w is not None)
+            weight = jnp.where(inside, weight, 0.0)
             start, p_f = start + weight * d_s, p_f + weight * d_f
             increments += basis[-1][:, None] * (weight * d_s)
 

@@ -19,8 +19,8 @@ from vmri_jax.scene.redundancy import check_constraints
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
 from vmri_jax.scheme import Scheme
-from vmri_jax.state import State, initial_state
-from vmri_jax.system import Problem, System
+from vmri_jax.state import Problem, State, initial_state
+from vmri_jax.system import System
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import vmri_jax as vm
+from vmri_jax.composition import stage_scheme
 from vmri_jax.study.menu import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.solutions import ReferenceSolution, reference_solution
@@ -73,11 +74,13 @@ class Search:
         t_end: simulated time.
         menu: families to choose from.
         reference: what runs are compared with; its number of nodes is that of the runs.
-        newton: how implicit equations are solved.
+        newton: how implicit equations are solved; steps that "auto" would fall back for are given up, for smaller ones take less
+            time, and the fallback takes long to compile.
     """
 
     def __init__(self, problem, t_end: float, menu: Sequence[Family], reference: ReferenceSolution, newton=None):
-        self.problem, self.t_end, self.menu, self.reference, self.newton = problem, t_end, menu, reference, newton
+        self.problem, self.t_end, self.menu, self.reference = problem, t_end, menu, reference
+        self.newton = newton or vm.Newton()
         self.frequency = float(vm.diagnostics.frequencies(problem.system, problem.state())[0])
         self.programs: dict[tuple[str, int], Program] = {}
         self.settings: dict[tuple[str, int, int], Setting] = {}
@@ -87,7 +90,9 @@ class Search:
         key = (family.name, num_micro)
         program = self.programs.pop(key, None)
         if program is None:
-            program = Program(self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton)
+            scheme, saves = family.make(num_micro), self.reference.num_saves
+            newton = self.newton.alone(self.problem.system, stage_scheme(scheme))
+            program = Program(self.problem, scheme, self.t_end, saves, newton)
         self.programs[key] = program  # the last one now
         if len(self.programs) > PROGRAMS:
             self.programs.pop(next(iter(self.programs)))
@@ -129,6 +134,15 @@ class Search:
             n = max(n, too_few + 1)
         return best
 
+    def by_promise(self, error: float) -> list[Family]:
+        """The menu; first the families whose order is about the number of digits asked for.
+
+        Lower orders take many steps, and higher ones long to compile.
+        """
+        motion = float(np.abs(self.reference.q - self.reference.q[0]).max())
+        digits = max(2.0, np.log10(motion / error)) if motion > 0 else 2.0
+        return sorted(self.menu, key=lambda family: abs(np.log(family.make(family.first).order / digits)))
+
     def cheapest(
         self, error: float, progress: Progress = silent, exhaustive: bool = False, budget: float = np.inf
     ) -> list[Setting]:
@@ -154,8 +168,7 @@ class Search:
             return setting
 
         total = len(self.menu) + KEPT
-        slow_ones_last = sorted(self.menu, key=lambda family: -family.make(family.first).order)
-        for i, family in enumerate(slow_ones_last):
+        for i, family in enumerate(self.by_promise(error)):
             for num_micro in NUM_MICRO if exhaustive else (family.first,):
                 attempt(family, num_micro, i, total)
         if not exhaustive:

@@ -42,13 +42,18 @@ def _composed(base: Callable[[int], vm.Scheme], coefficients: str, num_micro: in
     return vm.compose(base(num_micro), coefficients)
 
 
-BASES = {"fully explicit": vm.fully_explicit, "explicit slow": vm.explicit_slow, "fully implicit": vm.fully_implicit}
+BASES = {
+    "fully explicit": vm.fully_explicit,
+    "explicit slow": vm.explicit_slow,
+    "fully implicit": vm.fully_implicit,
+    "takahashi imada": vm.takahashi_imada,
+}
 
 
 def families(
     compositions: tuple[str, ...] = ("suzuki4", "kahan-li6", "kahan-li8"), degrees: tuple[int, ...] = (2, 4, 12)
 ) -> list[Family]:
-    """The second-order schemes, compositions of the first two of them, and Galerkin schemes."""
+    """The schemes of order 2, compositions of the first two of them, and Galerkin schemes."""
     menu = [Family(name, make, f"--scheme {name.replace(' ', '-')}") for name, make in BASES.items()]
     for base in menu[:2]:
         for name in compositions:

@@ -1,6 +1,7 @@
 """One page on what accuracy costs for a system: which scheme to take for which error, and where the time goes."""
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,7 +28,8 @@ PERIODS = 30
 RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 """Errors asked for by default, relative to how far the system moves."""
 BUDGET = 150.0
-"""Seconds of search after which no more schemes are compiled, shared by the errors."""
+"""Seconds of search after which no more schemes are compiled. The first error may take half of them, for all are new to it, the
+next one half of what is then left."""
 SHOWN = 8
 """Schemes in the figure."""
 
@@ -104,9 +106,10 @@ def cost_page(
     if not errors or min(errors) <= 0:
         raise ValueError(f"cost_page: errors are {list(errors)}; give positive numbers, in the unit of the positions.")
     search = Search(problem, t_end, families() if menu is None else menu, reference)
-    answers, page = [], None
+    answers, page, deadline = [], None, time.monotonic() + BUDGET
     for i, error in enumerate(sorted(errors, reverse=True)):
-        found = search.cheapest(error, part(progress, i, len(errors)), budget=BUDGET / len(errors))
+        left = deadline - time.monotonic()
+        found = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
         answers.append(Answer(error, found[0] if found else None, tuple(found)))
         page = _write(search, answers, problem, name, out)
     progress("measuring times", 1, 1)
