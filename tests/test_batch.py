@@ -137,12 +137,13 @@ from vmri_jax import runtime
 runtime.configure(devices=2)
 import jax, jax.numpy as jnp, vmri_jax as vm
 problem = vm.systems.fermi_pasta_ulam()
-states = jax.tree.map(lambda a: jnp.stack([a] * 5), problem.state())
-one, two = (
-    vm.simulate_batch(problem.system, vm.fully_implicit(4), states, macro_dt=0.02, num_steps=5, devices=d) for d in (1, 2)
+states = jax.tree.map(lambda a: a + 1e-3 * jnp.arange(5.0).reshape(5, *[1] * a.ndim), problem.state())
+one, two, chunks = (
+    vm.simulate_batch(problem.system, vm.fully_implicit(4), states, macro_dt=0.02, num_steps=5, **how)
+    for how in ({}, {"devices": 2}, {"devices": 2, "chunk": 1})
 )
 assert jax.device_count() == 2
-assert np.abs(one.q_f - two.q_f).max() < 1e-13
+assert np.abs(one.q_f - two.q_f).max() < 1e-13 and np.abs(one.q_f - chunks.q_f).max() < 1e-13
 try:
     runtime.configure(devices=3)
 except RuntimeError as error:
