@@ -88,8 +88,8 @@ def test_modes_are_eigenvectors(degree, rule):
         return (at.T * weights @ at)[:-1, 1:]
 
     def back(matrix, gamma):
-        (real, imaginary), (re, im) = np.split(modes.of_values, 2, axis=1), gamma
-        return (np.concatenate([re * real - im * imaginary, re * imaginary + im * real], axis=1) @ matrix).T
+        re, im = gamma[:, modes.mode]
+        return ((re * modes.of_values + im * np.asarray(collocation.times_i(modes.of_values))) @ matrix).T
 
     a, b = form(True), form(False)
     one = np.stack([np.ones_like(modes.gamma[0]), np.zeros_like(modes.gamma[0])])

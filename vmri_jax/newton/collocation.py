@@ -40,6 +40,9 @@ from vmri_jax.scheme import Scheme
 from vmri_jax.structure import has_curvature
 from vmri_jax.system import System
 
+FEW_MODES = 4
+"""Parts of no mode are added to more pairs of modes than that, if they are odd: half a vector register costs as much as a full one."""
+
 
 def is_collocation(system: System, scheme: Scheme, q_s, q_f) -> bool:
     """Whether a step is a single interval of degree above one, with a small full matrix of the fast variables.
@@ -53,14 +56,19 @@ def is_collocation(system: System, scheme: Scheme, q_s, q_f) -> bool:
 
 
 class TimeModes(NamedTuple):
-    """Eigenvectors of ``A^-1 B``: real ones, and one of every complex pair. All real parts come before all imaginary ones.
+    """Eigenvectors of ``A^-1 B``, one of every complex pair.
 
-    gamma (2, k): eigenvalues.
-    of_rows, of_values: (r, 2 k) from the rows of the momentum equations (through A^-1) and from values at the nodes to modes.
-    increments, multipliers: (2 k, r) from modes to increments, and (through A) to multipliers.
+    What has one entry per part of a mode has all real parts before all imaginary ones. Two real modes share what a complex one
+    takes, and parts of no mode fill vector registers.
+
+    gamma (2, modes): eigenvalues.
+    mode (k,): which mode it is a part of.
+    of_rows, of_values: (r, k) from the rows of the momentum equations (through A^-1) and from values at the nodes to modes.
+    increments, multipliers: (k, r) from modes to increments, and (through A) to multipliers.
     """
 
     gamma: Any
+    mode: Any
     of_rows: Any
     of_values: Any
     increments: Any
@@ -74,15 +82,24 @@ class TimeModes(NamedTuple):
             for basis, placed in ((lagrange_derivative, scheme.kinetic), (lagrange_basis, scheme.fast))
         )
         gamma, vectors = np.linalg.eig(np.linalg.solve(a, b))
-        kept, twice = np.imag(gamma) >= 0, np.where(np.imag(gamma) > 0, 2.0, 1.0)
-        to = np.linalg.inv(vectors)[kept]
-        back = (twice * vectors.conj())[:, kept].T  # a mode and its conjugate: the real part
+        order = np.argsort(-np.sign(np.imag(gamma)), kind="stable")  # of pairs, real ones, the others of pairs
+        gamma, vectors = gamma[order], vectors[:, order]
+        pairs, distinct = np.sum(np.imag(gamma) > 0), np.sum(np.imag(gamma) >= 0)
+        half = (pairs + distinct + 1) // 2
+        first, second = np.arange(half), np.concatenate([np.arange(pairs), np.arange(half, distinct)])
+        width = half + (half % 2 if half > FEW_MODES else 0)
 
         def parts(z):
-            return np.concatenate([z.real, z.imag])
+            """Of modes (r, m), those of no mode zero."""
+            imaginary = np.where(np.imag(gamma)[:, None] == 0, z.real, z.imag)
+            some = z.real[first], imaginary[second]
+            return np.concatenate([np.pad(a, [(0, width - len(a)), (0, 0)]) for a in some])
 
-        gamma = np.stack([np.real(gamma), np.imag(gamma)])[:, kept]
-        return cls(gamma, parts(to @ np.linalg.inv(a)).T, parts(to).T, parts(back), parts(back @ a.T))
+        to = np.linalg.inv(vectors)
+        back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T  # a mode and its conjugate: the real part
+        mode = np.concatenate([np.pad(a, (0, width - len(a)), mode="edge") for a in (first, second)])
+        eigenvalues = np.stack([np.real(gamma), np.imag(gamma)])[:, :distinct]
+        return cls(eigenvalues, mode, parts(to @ np.linalg.inv(a)).T, parts(to).T, parts(back), parts(back @ a.T))
 
 
 def _form(basis, degree: int, nodes) -> np.ndarray:
@@ -204,10 +221,11 @@ class Interval:
         return (self.times_mass(x @ self.form[:, -1:])[:, 0] + residual.last) / self.h
 
 
-def taken(a, index: np.ndarray):
-    """``a[index]`` of known rows, as slices."""
+def taken(a, index: np.ndarray, axis: int = 0):
+    """Known rows, or what is at an index of another axis, as slices."""
     runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
-    return jnp.concatenate([a[run[0] : run[-1] + 1] if run.size else a[:0] for run in runs])
+    ends = ((int(run[0]), int(run[-1]) + 1) if run.size else (0, 0) for run in runs)
+    return jnp.concatenate([jax.lax.slice_in_dim(a, *end, axis=axis) for end in ends], axis)
 
 
 class Residual(NamedTuple):
@@ -227,12 +245,12 @@ class Saddles(NamedTuple):
     """The saddles of all modes, eliminated: the n variables first (m of them with curvature), then the n_c constraints.
 
     interval: which variables are soft and which are stiff.
-    gamma (2, 2 k): as in `TimeModes`, for real and for imaginary parts of modes, as all that has 2 k.
+    gamma (2, k): eigenvalues, for every part of a mode as in `TimeModes`, as all that has k.
     curvature (m, m): ``w = h^2 M^-1 W''``.
-    denominator (m, m, 2 k): inverses of ``|1 - gamma w|^2``.
+    denominator (m, m, k): inverses of ``|1 - gamma w|^2``.
     push: G by the soft (n_c, n - m) and by the stiff variables (n_c, m).
-    pull_soft (n - m, n_c), pull two of (n_c, m, 2 k): G^T through the inverses of ``M`` and ``M - h^2 gamma W''``.
-    schur two of (n_c, n_c, 2 k): inverse of G times these.
+    pull_soft (n - m, n_c), pull two of (n_c, m, k): G^T through the inverses of ``M`` and ``M - h^2 gamma W''``.
+    schur two of (n_c, n_c, k): inverse of G times these.
     """
 
     interval: Interval
@@ -252,10 +270,9 @@ class Saddles(NamedTuple):
         k, m, n_c = modes.gamma.shape[1], len(w), len(push)
         re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
 
-        def twice(z):
-            """(k, rows, columns) as (columns, rows, 2 k): for real and for imaginary parts."""
-            z = jnp.swapaxes(z, 0, 2)
-            return jnp.concatenate([z, z], axis=-1)
+        def of_parts(z):
+            """(modes, rows, columns) as (columns, rows, k)."""
+            return taken(jnp.swapaxes(z, 0, 2), modes.mode, axis=2)
 
         denominator = inverse(np.eye(m) - 2 * re * w + (re**2 + im**2) * matmul(w, w))
 
@@ -272,12 +289,12 @@ class Saddles(NamedTuple):
         real += matmul(push_soft, pull_soft)
         schur = inverse(regularized(jax.lax.complex(real, imaginary)))
 
-        gamma = jnp.concatenate([modes.gamma] * 2, axis=1)
-        pull, schur = ([twice(a) for a in both] for both in (parts(through), (schur.real, schur.imag)))
-        return cls(interval, gamma, w, twice(denominator), (push_soft, push_stiff), pull_soft, pull, schur)
+        gamma = modes.gamma[:, modes.mode]
+        pull, schur = ([of_parts(a) for a in both] for both in (parts(through), (schur.real, schur.imag)))
+        return cls(interval, gamma, w, of_parts(denominator), (push_soft, push_stiff), pull_soft, pull, schur)
 
     def solve(self, y, g):
-        """x (n, 2 k) and nu (n_c, 2 k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
+        """x (n, k) and nu (n_c, k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
         push_soft, push_stiff = self.push
         x_soft, y = taken(y, self.interval.soft), taken(y, self.interval.stiff)
         bent, (re, im) = matmul(self.curvature, y), self.gamma
@@ -297,7 +314,7 @@ def times_i(z):
 
 
 def product(matrix, z):
-    """Of complex matrices, their real and their imaginary parts (columns, rows, 2 k) twice over, and vectors (columns, 2 k)."""
+    """Of complex matrices, their real and their imaginary parts (columns, rows, k), and vectors (columns, k)."""
     re, im = matrix
     return jnp.sum(re * z[:, None] + im * times_i(z)[:, None], axis=0)
 
