@@ -154,10 +154,12 @@ def line():
 
 
 def test_scan(line):
-    """Levels are reached where no finer setting misses them; a ladder ends when it is fine enough."""
+    """Levels are reached where no finer setting misses them; a ladder ends when it is fine enough, and is finer where it reaches one."""
     errors = {1: np.nan, 2: 1e-5, 4: 1e-3, 8: 1e-6, 16: 1e-10, 32: 1e-12}
-    ladder = Ladder("method", "steps", list(errors), lambda n: lambda: np.array([errors[n]]))
+    between = {5: 1e-3, 6: 2e-6, 11: 1e-6, 13: 1e-9}
+    ladder = Ladder("method", "steps", list(errors), lambda n: lambda: np.array([(errors | between)[n]]))
     points = {p.label: p for p in scan("one", [ladder], line, 1.0)}
+    assert [points[f"method, {n} steps"].settled for n in between] == list(between.values())
     assert [points[f"method, {n} steps"].settled for n in (1, 2, 4, 8, 16)] == [np.inf, 1e-3, 1e-3, 1e-6, 1e-10]
     assert "method, 32 steps" not in points
 
@@ -168,7 +170,7 @@ def test_scan_of_an_integrator_that_gives_up(line):
 
     (point,) = scan("one", [Ladder("method", "tol", [1e-3], lambda tol: run)], line, 1.0)
     assert point.error == np.inf
-    assert point.label == "method, 1e-03"
+    assert point.label == "method, 1.0e-03"
 
 
 def point(error: float, seconds: float) -> Point:

@@ -119,7 +119,12 @@ class Ladder:
 
     def label(self, setting: float) -> str:
         """Method and setting."""
-        return f"{self.method}, {setting:.0e}" if self.kind == "tol" else f"{self.method}, {setting:g} steps"
+        return f"{self.method}, {setting:.1e}" if self.kind == "tol" else f"{self.method}, {setting:g} steps"
+
+    def between(self, a: float, b: float) -> float:
+        """The setting between two, the geometric mean."""
+        middle = float(np.sqrt(a * b))
+        return middle if self.kind == "tol" else round(middle)
 
 
 def tolerances(first: float, last: float, per_decade: int = 2) -> list[float]:

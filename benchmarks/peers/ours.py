@@ -120,7 +120,7 @@ def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladd
 
             return run
 
-        return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end, 8), build)
+        return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end), build)
 
     def tolerances(scheme):
         return {"": MARCH.tolerance} | {f", tolerance {tol:g}": tol for tol in loose(case, scheme)}

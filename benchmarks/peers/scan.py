@@ -16,6 +16,8 @@ CLOSE = 1.5
 """Settings that are at most so many times slower than the cheapest are timed too."""
 MOST = 6
 """Candidates per peer and level."""
+HALVINGS = 2
+"""How often the gap between two settings is halved."""
 ENOUGH = 0.01
 """Seconds that the calls for a rough time take together, at least."""
 
@@ -44,20 +46,63 @@ def scan(
     peer: str, ladders: Sequence[Ladder], case: Case, seconds: float, levels: Sequence[float] = LEVELS
 ) -> list[Point]:
     """Climb every ladder until the error is a tenth of the finest level, a run takes longer than `seconds`, or a setting can no longer
-    be the cheapest one: another ladder has reached the finest level in less time."""
-    found: list[Point] = []
+    be the cheapest one: another ladder has reached the finest level in less time. Where a ladder is among the cheapest at a level,
+    settings between the last one that misses it and the first one that reaches it are tried too."""
+    climbed: list[Climb] = []
     for ladder in ladders:
-        enough = min((p.seconds for p in found if p.settled <= min(levels)), default=np.inf)
-        rungs: list[Point] = []
+        climb = Climb(peer, ladder, case)
+        enough = min((p.seconds for c in climbed for p in c.points() if p.settled <= min(levels)), default=np.inf)
         for setting in ladder.settings:
-            rungs.append(_try(peer, ladder, setting, case, rungs[0].compile if rungs else None))
-            if rungs[-1].error < FINE * min(levels) or rungs[-1].seconds > min(seconds, CLOSE * enough):
+            rung = climb.add(setting)
+            if rung.error < FINE * min(levels) or rung.seconds > min(seconds, CLOSE * enough):
                 break
-        worst = 0.0
-        for rung in reversed(rungs):
-            worst = max(worst, rung.error)
-            found.append(replace(rung, settled=worst))
-    return found
+        climbed.append(climb)
+    for level in levels:
+        first = {i: p.seconds for i, c in enumerate(climbed) if (p := c.first(level)) is not None}
+        for i in sorted(first, key=lambda i: first[i])[:MOST]:
+            if first[i] <= CLOSE * min(first.values()):
+                climbed[i].refine(level)
+    return [p for c in climbed for p in c.points()]
+
+
+class Climb:
+    """The settings of a ladder that were run, from coarse to fine."""
+
+    def __init__(self, peer: str, ladder: Ladder, case: Case):
+        self.peer, self.ladder, self.case = peer, ladder, case
+        self.rungs: dict[float, Point] = {}
+
+    def add(self, setting) -> Point:
+        """Run one more."""
+        compiled = next((p.compile for p in self.rungs.values()), None)
+        self.rungs[setting] = _try(self.peer, self.ladder, setting, self.case, compiled)
+        return self.rungs[setting]
+
+    @property
+    def settings(self) -> list[float]:
+        """What was run, coarse first."""
+        return sorted(self.rungs, reverse=self.ladder.kind == "tol")
+
+    def points(self) -> list[Point]:
+        """The runs, with the largest error of each and of all finer ones."""
+        points = [self.rungs[setting] for setting in self.settings]
+        settled = np.maximum.accumulate([p.error for p in reversed(points)])[::-1]
+        return [replace(p, settled=float(error)) for p, error in zip(points, settled, strict=True)]
+
+    def first(self, level: float) -> Point | None:
+        """The coarsest one that reaches a level."""
+        return next((p for p in self.points() if p.settled <= level), None)
+
+    def refine(self, level: float) -> None:
+        """Halve the gap before it, `HALVINGS` times."""
+        for _ in range(HALVINGS):
+            reached = [p.settled <= level for p in self.points()].index(True)
+            if reached == 0:
+                return
+            middle = self.ladder.between(*self.settings[reached - 1 : reached + 1])
+            if middle in self.rungs:
+                return
+            self.add(middle)
 
 
 def candidates(points: Sequence[Point], level: float) -> list[Point]:

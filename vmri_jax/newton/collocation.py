@@ -84,7 +84,7 @@ class TimeModes(NamedTuple):
         gamma, vectors = np.linalg.eig(np.linalg.solve(a, b))
         order = np.argsort(-np.sign(np.imag(gamma)), kind="stable")  # of pairs, real ones, the others of pairs
         gamma, vectors = gamma[order], vectors[:, order]
-        pairs, distinct = np.sum(np.imag(gamma) > 0), np.sum(np.imag(gamma) >= 0)
+        pairs, distinct = int(np.sum(np.imag(gamma) > 0)), int(np.sum(np.imag(gamma) >= 0))
         half = (pairs + distinct + 1) // 2
         first, second = np.arange(half), np.concatenate([np.arange(pairs), np.arange(half, distinct)])
         width = half + (half % 2 if half > FEW_MODES else 0)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.algebra import inverse, matvec, regularized
+from vmri_jax.algebra import inverse, largest, matvec, regularized
 from vmri_jax.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.newton.interval import Accepted, constant_mass, inverse_mass
 
@@ -86,12 +86,12 @@ def solve(equations: StepEquations, warm: Warm, newton):
     x = free - _combined(mu, columns)
     g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
     schur = inverse(regularized(jax.vmap(push)(columns).T))
-    per_slow, per_fast = (1 / size for size in Accepted.of(equations, newton).sizes(tuple(map(_size, straight))))
+    per_slow, per_fast = (1 / size for size in Accepted.of(equations, newton).sizes(tuple(map(largest, straight))))
 
     def at(x, mu, g, iterations) -> Drift:
         dmu = matvec(schur, g)
         dx = _combined(dmu, columns)
-        change = jnp.maximum(per_slow * _size(dx[:n_s]), per_fast * _size(dx[n_s:]))
+        change = jnp.maximum(per_slow * largest(dx[:n_s]), per_fast * largest(dx[n_s:]))
         return Drift(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
 
     def corrected(last: Drift) -> Drift:
@@ -112,8 +112,3 @@ def solve(equations: StepEquations, warm: Warm, newton):
 def _combined(mu, rows):
     """``sum_j mu_j rows_j``."""
     return jnp.sum(mu[:, None] * rows, axis=0)
-
-
-def _size(a):
-    """The largest absolute value."""
-    return jnp.max(jnp.abs(a), initial=0.0)
