@@ -75,7 +75,7 @@ def start_of(name, request):
 
 
 @pytest.mark.parametrize("rule", ["gauss", "lobatto"])
-@pytest.mark.parametrize("degree", [2, 3, 8])
+@pytest.mark.parametrize("degree", [2, 3, 8, 9, 10])
 def test_modes_are_eigenvectors(degree, rule):
     """``sum_j l_j' y_j`` against ``sum_j l_j y_j``: what the modes diagonalise, from values at the nodes and back."""
     scheme = galerkin(1, degree, rule)
