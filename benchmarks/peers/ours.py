@@ -20,7 +20,7 @@ EXPLICIT = (4, 8, 16)
 """Numbers of micro steps of `vm.fully_explicit` on its own."""
 CORRECTED = (1, 2, 4, 8)
 """Numbers of micro steps of `vm.takahashi_imada`."""
-LOBATTO = (8, 10, 11, 12, 14, 16)
+LOBATTO = (4, 5, 6, 8, 11, 12, 16)
 """Degrees of `vm.galerkin` with one interval to a step, where there are constraints."""
 LOOSE = (1e-2, 1e-4, 1e-6)
 """Newton tolerances for moderate errors, where there are constraints; equations are also solved to round-off."""
