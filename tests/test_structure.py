@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vmri_jax.structure import has_constant_hessian, has_curvature, has_diagonal_hessian
+from vmri_jax.structure import curved_directions, has_constant_hessian, has_diagonal_hessian
 
 Q = jnp.linspace(0.5, 1.5, 4)
 
@@ -43,26 +43,43 @@ def test_constant_hessian_of_several_arguments():
     assert not has_constant_hessian(lambda a, b: jnp.sum(a * b**2), Q, Q)
 
 
+@jax.jit
+def weighed(q):
+    """A distance and a weight, which has no curvature."""
+    return jnp.linalg.norm(q[2:] - q[:2]) + 9.81 * jnp.sum(jnp.arange(4.0) * q)
+
+
 @pytest.mark.parametrize(
-    ("function", "curved"),
+    ("function", "rank", "curved"),
     [
-        (lambda q: jnp.sum(jnp.arange(4.0) * q), [False] * 4),
-        (lambda q: jnp.sum(jnp.arange(4.0) * q**2), [True] * 4),
-        (lambda q: jnp.sum((q[1:3] - q[:2]) ** 2) + q[3], [True, True, True, False]),
-        (lambda q: jnp.linalg.norm(q[::2]) + nested(q[3:]), [True, False, True, True]),
-        (lambda q: jnp.prod(q.reshape(2, 2).T[1]) - 9.81 * q[2], [False, True, False, True]),
-        (lambda q: jnp.sum(jnp.concatenate([q[2:], q[:1]]) ** 2), [True, False, True, True]),
-        (lambda q: jnp.sum(jnp.broadcast_to(q[:1], (3,)) * jnp.stack([q[0], q[0], q[3]])), [True, False, False, True]),
-        (lambda q: jnp.sum(jnp.flip(q)[:2] ** 3), [False, False, True, True]),
+        (lambda q: jnp.sum(jnp.arange(4.0) * q), 0, [False] * 4),
+        (lambda q: jnp.sum(jnp.arange(4.0) * q**2), 4, [True] * 4),
+        (lambda q: jnp.sum((q[1:3] - q[:2]) ** 2) + q[3], 2, [True, True, True, False]),
+        (lambda q: jnp.linalg.norm(q[::2]) + nested(q[3:]), 3, [True, False, True, True]),
+        (lambda q: jnp.prod(q.reshape(2, 2).T[1]) - 9.81 * q[2], 2, [False, True, False, True]),
+        (lambda q: jnp.sum(jnp.concatenate([q[2:], q[:1]]) ** 2), 3, [True, False, True, True]),
+        (
+            lambda q: jnp.sum(jnp.broadcast_to(q[:1], (3,)) * jnp.stack([q[0], q[0], q[3]])),
+            2,
+            [True, False, False, True],
+        ),
+        (lambda q: jnp.sum(jnp.flip(q)[:2] ** 3), 2, [False, False, True, True]),
+        (lambda q: jnp.sum((jnp.roll(q, 1) - q) ** 4), 3, [True] * 4),
+        (lambda q: jnp.cosh(jnp.sum(q[:3])) * nested(q[3:]), 2, [True] * 4),
+        (lambda q: jnp.sum(jax.lax.pad(jnp.diff(q), 0.0, [(-2, 2, 1)]) ** 3), 2, [False, True, True, True]),
+        (lambda q: jax.lax.fori_loop(0, 3, lambda _, x: x * (q[1] - q[0]), 1.0), 1, [True, True, False, False]),
+        (weighed, 2, [True] * 4),
     ],
 )
-def test_curvature(function, curved):
-    """What has a curvature is found; what is said to have none has none."""
-    found = has_curvature(function, Q)
-    bent = np.any(np.asarray(jax.hessian(function)(Q)) != 0, axis=0)
-    assert not np.any(bent & ~found)
-    assert found.tolist() == curved
+def test_curved_directions(function, rank, curved):
+    """They are as few as can be, and the Hessian has nothing beside them."""
+    directions = curved_directions(function, Q)
+    assert directions.shape == (rank, 4)
+    assert directions.any(axis=0).tolist() == curved
+    beside = np.eye(4) - np.linalg.pinv(directions) @ directions
+    hessian = jax.hessian(function)(Q**2)
+    assert np.abs(hessian @ beside).max() <= 1e-14 * np.abs(hessian).max()
 
 
 def test_unknown_operations_bend_everything():
-    assert has_curvature(lambda q: jnp.sum(jnp.sort(q)[:2] ** 2), Q).all()
+    assert curved_directions(lambda q: jnp.sum(jnp.sort(q)[:2] ** 2), Q).shape == (4, 4)

@@ -12,6 +12,8 @@ UNROLLED = 8
 """Largest system whose elimination is written out step by step; larger ones go through a loop, which compiles faster."""
 TOGETHER = 3
 """Steps of that loop that are written out."""
+REGISTER = 4
+"""Numbers in a vector register: rows of so many fill them."""
 ELEMENTWISE = 16
 """Largest system that is eliminated by elementwise operations."""
 
@@ -79,9 +81,9 @@ def inverse(a):
     n = a.shape[-1]
     if n > ELEMENTWISE:
         return jnp.linalg.inv(a)
-    if n > UNROLLED:  # rows of even length fill vector registers
-        even = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, n % 2)])
-        return jax.lax.fori_loop(0, n, _exchanged, even, unroll=TOGETHER)[..., :n]
+    if n > UNROLLED:
+        full = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, -n % REGISTER)])
+        return jax.lax.fori_loop(0, n, _exchanged, full, unroll=TOGETHER)[..., :n]
     for _ in range(n):
         a = _first_exchanged(a)
     return a

@@ -33,10 +33,7 @@ def called(eqn) -> tuple[Any, Any] | None:
 def depends_on(function: Callable, *args) -> tuple[bool, ...]:
     """Whether the outputs of ``function(*args)`` can depend on each argument."""
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
-    needed = {id(v) for v in jaxpr.outvars}
-    for eqn in reversed(jaxpr.eqns):
-        if any(id(v) in needed for v in eqn.outvars):
-            needed.update(id(v) for v in eqn.invars)
+    _, needed = _needed(jaxpr, jaxpr.outvars)
     leaves = [jax.tree.structure(a).num_leaves for a in args]
     stops = np.cumsum(leaves)
     used = [id(v) in needed for v in jaxpr.invars]
@@ -58,67 +55,111 @@ def has_diagonal_hessian(function: Callable, q) -> bool:
     return _classes(closed.jaxpr, [_ELEMENT])[0] <= _ELEMENT
 
 
-def has_curvature(function: Callable, q) -> np.ndarray:
-    """For every element of the vector q whether the gradient of ``function(q) -> ()`` by it can depend on q at all."""
-    closed = jax.make_jaxpr(jax.grad(function))(q)
-    return _seen(closed.jaxpr, [np.ones(q.shape, dtype=bool)])[0]
+def curved_directions(function: Callable, q) -> np.ndarray:
+    """L (d, n) of rank d, with the Hessian of ``function(q) -> ()`` of the form ``L^T w(q) L`` everywhere.
+
+    A potential of the distance of two points is curved along their difference alone. L is found in the product of the Hessian with a
+    vector: combinations of its entries with known coefficients are followed to where anything else is done to them.
+    """
+
+    def product(q, direction):
+        return jax.jvp(jax.grad(function), (q,), (direction,))[1]
+
+    found: list[np.ndarray] = []
+    jaxpr, n = jax.make_jaxpr(product)(q, q).jaxpr, q.size
+    found += _combinations(n, jaxpr, [np.zeros((n, n)), np.eye(n)], jaxpr.outvars, found)
+    rows = [np.zeros((1, n)), *(a.reshape(-1, n) for a in found if a is not None)]
+    return _independent(np.unique(np.concatenate(rows), axis=0))
 
 
-def _seen(jaxpr, seen: list[np.ndarray]) -> list[np.ndarray]:
-    """For every element of each output whether it can depend on those elements of the inputs."""
-    known = dict(zip(map(id, jaxpr.invars), seen, strict=True))
+def _independent(rows: np.ndarray) -> np.ndarray:
+    """As many of the rows (k, n) as are independent, those with few entries first; or single entries where they are as many."""
+    kept = np.zeros((0, rows.shape[1]))
+    for row in sorted(rows, key=np.count_nonzero):
+        if np.linalg.matrix_rank(more := np.concatenate([kept, row[None]])) == len(more):
+            kept = more
+    entries = rows.any(axis=0)
+    return np.eye(rows.shape[1])[entries] if len(kept) == entries.sum() else kept
 
-    def of(v) -> np.ndarray:
-        return known.get(id(v), np.zeros(v.aval.shape, dtype=bool))
 
-    for eqn in jaxpr.eqns:
-        inputs, shapes = [of(v) for v in eqn.invars], [v.aval.shape for v in eqn.outvars]
-        inner = called(eqn)
-        moved = _MOVES.get(eqn.primitive.name)
-        if not any(a.any() for a in inputs):
-            outputs = [np.zeros(shape, dtype=bool) for shape in shapes]
-        elif inner is not None:
-            outputs = _seen(inner[0], inputs)
-        elif eqn.primitive.name in ELEMENTWISE_PRIMITIVES:
-            outputs = [np.broadcast_to(np.any(np.broadcast_arrays(*inputs), axis=0), shapes[0])]
-        elif moved is not None:
-            outputs = moved(shapes[0], *inputs, **eqn.params)
-            outputs = outputs if isinstance(outputs, list) else [outputs]
+def _combinations(n: int, jaxpr, inputs: list, wanted: list, found: list) -> list:
+    """The outputs as coefficients (..., n) of n numbers, None where they are no known combination of them.
+
+    Args:
+        inputs: of the jaxpr, the same.
+        wanted: those of its outputs that are looked at.
+        found: takes the combinations that anything else is done to.
+    """
+    known = dict(zip(map(id, jaxpr.invars), inputs, strict=True))
+    eqns, needed = _needed(jaxpr, wanted)
+    for eqn in eqns:
+        parts = [known.get(id(v), np.zeros((*v.aval.shape, n))) for v in eqn.invars]
+        inner, linear = called(eqn), _LINEAR.get(eqn.primitive.name)
+        if not any(a is None or a.any() for a in parts):
+            continue
+        if inner is not None:
+            looked_at = [v for v, outer in zip(inner[0].outvars, eqn.outvars, strict=True) if id(outer) in needed]
+            outputs = _combinations(n, inner[0], parts, looked_at, found)
+        elif linear is not None and all(a is not None for a in parts):
+            outputs = linear(eqn, *parts)
         else:
-            outputs = [np.ones(shape, dtype=bool) for shape in shapes]
-        known.update(zip(map(id, eqn.outvars), outputs, strict=True))
-    return [of(v) for v in jaxpr.outvars]
+            found += parts
+            outputs = [None] * len(eqn.outvars)
+        known.update(zip(map(id, eqn.outvars), outputs if isinstance(outputs, list) else [outputs], strict=True))
+    return [known.get(id(v), np.zeros((*v.aval.shape, n))) for v in jaxpr.outvars]
 
 
-def _sliced(_, a, /, *, start_indices, limit_indices, strides):
-    strides = strides or (1,) * a.ndim
-    return a[tuple(slice(*at) for at in zip(start_indices, limit_indices, strides, strict=True))]
+def _needed(jaxpr, wanted) -> tuple[list, set[int]]:
+    """The equations of a jaxpr, and its variables by their id, that some of its outputs need."""
+    needed, eqns = {id(v) for v in wanted}, []
+    for eqn in reversed(jaxpr.eqns):
+        if any(id(v) in needed for v in eqn.outvars):
+            needed.update(id(v) for v in eqn.invars)
+            eqns.append(eqn)
+    return eqns[::-1], needed
 
 
-def _padded(shape, a, value, /, *, padding_config):
-    if any(low < 0 or high < 0 for low, high, _ in padding_config):
-        return np.ones(shape, dtype=bool)
-    padded, config = np.full(shape, bool(value)), zip(shape, padding_config, strict=True)
-    padded[tuple(slice(low, size - high, inner + 1) for size, (low, high, inner) in config)] = a
-    return padded
+def _shape(eqn) -> tuple[int, ...]:
+    return eqn.outvars[0].aval.shape
 
 
-def _broadcast(shape, a, /, *, broadcast_dimensions, **_):
-    sizes = dict(zip(broadcast_dimensions, a.shape, strict=True))
-    return np.broadcast_to(a.reshape([sizes.get(i, 1) for i in range(len(shape))]), shape)
+def _sliced(eqn, a):
+    ends = eqn.params["start_indices"], eqn.params["limit_indices"], eqn.params["strides"] or (1,) * len(_shape(eqn))
+    return a[tuple(slice(*at) for at in zip(*ends, strict=True))]
 
 
-_MOVES = {
+def _padded(eqn, a, _):
+    for axis, (size, (low, _, inner)) in enumerate(zip(_shape(eqn), eqn.params["padding_config"], strict=True)):
+        a = np.moveaxis(a, axis, 0)
+        places = low + (inner + 1) * np.arange(len(a))
+        inside = (places >= 0) & (places < size)
+        padded = np.zeros((size, *a.shape[1:]))
+        padded[places[inside]] = a[inside]
+        a = np.moveaxis(padded, 0, axis)
+    return a
+
+
+def _broadcast(eqn, a):
+    sizes = dict(zip(eqn.params["broadcast_dimensions"], a.shape, strict=False))
+    ones = [sizes.get(i, 1) for i in range(len(_shape(eqn)))]
+    return np.broadcast_to(a.reshape(*ones, a.shape[-1]), (*_shape(eqn), a.shape[-1]))
+
+
+_LINEAR = {
+    "neg": lambda _, a: -a,
+    "add": lambda _, a, b: a + b,
+    "add_any": lambda _, a, b: a + b,
+    "sub": lambda _, a, b: a - b,
+    "reduce_sum": lambda eqn, a: a.sum(axis=eqn.params["axes"]),
     "slice": _sliced,
     "pad": _padded,
     "broadcast_in_dim": _broadcast,
-    "reshape": lambda shape, a, /, **_: a.reshape(shape),
-    "squeeze": lambda shape, a, /, **_: a.reshape(shape),
-    "rev": lambda _, a, /, *, dimensions: np.flip(a, dimensions),
-    "split": lambda _, a, /, *, sizes, axis: np.split(a, np.cumsum(sizes)[:-1], axis),
-    "transpose": lambda _, a, /, *, permutation: a.transpose(permutation),
-    "concatenate": lambda _, /, *parts, dimension: np.concatenate(parts, axis=dimension),
-    "reduce_sum": lambda _, a, /, *, axes, **kinds: a.any(axis=axes),
+    "reshape": lambda eqn, a: a.reshape(*_shape(eqn), a.shape[-1]),
+    "squeeze": lambda eqn, a: a.reshape(*_shape(eqn), a.shape[-1]),
+    "rev": lambda eqn, a: np.flip(a, eqn.params["dimensions"]),
+    "split": lambda eqn, a: np.split(a, np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"]),
+    "transpose": lambda eqn, a: a.transpose(*eqn.params["permutation"], a.ndim - 1),
+    "concatenate": lambda eqn, *parts: np.concatenate(parts, axis=eqn.params["dimension"]),
 }
 
 _CONSTANT, _ELEMENT, _MIXED = range(3)

@@ -11,10 +11,11 @@ eigenvectors of A^-1 B, which are known once and for all, it falls apart into on
     [M - h^2 gamma W'',  -G^T;  G,  0],
 
 so that matrices are of the size of the system, whatever the degree (Butcher 1976; Hairer, Wanner, Solving
-Ordinary Differential Equations II, IV.8). The residual is exact, so that all of this decides only how many steps there are.
+Ordinary Differential Equations II, IV.8). Of these only as many rows are solved as there are combinations of variables that the
+potentials are curved along. Forces are exact, so that all of this decides only how many steps there are.
 """
 
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -37,7 +38,7 @@ from vmri_jax.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.quadrature import interpolatory_weights
 from vmri_jax.results import RUNNING
 from vmri_jax.scheme import Scheme
-from vmri_jax.structure import has_curvature
+from vmri_jax.structure import curved_directions
 from vmri_jax.system import System
 
 FEW_MODES = 4
@@ -63,7 +64,8 @@ class TimeModes(NamedTuple):
 
     gamma (2, modes): eigenvalues.
     mode (k,): which mode it is a part of.
-    of_rows, of_values: (r, k) from the rows of the momentum equations (through A^-1) and from values at the nodes to modes.
+    of_rows: (r, r) ``A^-1``, from the rows of the momentum equations to increments.
+    of_values: (r, k) from values at the nodes to modes.
     increments, multipliers: (k, r) from modes to increments, and (through A) to multipliers.
     """
 
@@ -99,7 +101,7 @@ class TimeModes(NamedTuple):
         back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T  # a mode and its conjugate: the real part
         mode = np.concatenate([np.pad(a, (0, width - len(a)), mode="edge") for a in (first, second)])
         eigenvalues = np.stack([np.real(gamma), np.imag(gamma)])[:, :distinct]
-        return cls(eigenvalues, mode, parts(to @ np.linalg.inv(a)).T, parts(to).T, parts(back), parts(back @ a.T))
+        return cls(eigenvalues, mode, np.linalg.inv(a).T, parts(to).T, parts(back), parts(back @ a.T))
 
 
 def _form(basis, degree: int, nodes) -> np.ndarray:
@@ -111,8 +113,9 @@ def _form(basis, degree: int, nodes) -> np.ndarray:
 class Interval:
     """The equations of the step, with the variables joined, q = (q_s, q_f), and nodes as the last axis.
 
-    soft, stiff: variables without curvature in the matrix, which are the slow ones, where there are others, and those that no
-        potential bends; and all others.
+    num_curved: how many variables, the last ones, the Hessian is taken by: the fast ones where there are any.
+    directions, along: (d, n) the combinations of these that the potentials are curved along, and (n, d) changes of the variables
+        that change one of them each.
     """
 
     def __init__(self, equations: StepEquations):
@@ -126,15 +129,14 @@ class Interval:
         self.potentials = [term for term in terms.potentials.terms if term.inside.groups]
         mass = constant_mass(self.system)
         self.velocities = inverse_mass(mass.slow), inverse_mass(mass.fast)
-        self.soft, self.stiff = self._soft_and_stiff(separate=mass.slow.ndim == mass.fast.ndim == 1)
+        self.num_curved = equations.q_f.size or self.q.size
+        self.directions = self._curved_directions()
+        self.along = np.linalg.pinv(self.directions)
         self.at_start = self.jacobian(self.times[0], self.q)
 
-    def _soft_and_stiff(self, separate: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Which variables these are; those that no potential bends are soft where masses are `separate`, not a matrix."""
-        stiff = np.arange(self.q.size) >= (self.n_s if self.q.size > self.n_s else 0)
-        bent = stiff & has_curvature(self.potential, self.q)
-        stiff = bent if separate and bent.any() else stiff
-        return np.flatnonzero(~stiff), np.flatnonzero(stiff)
+    def _curved_directions(self) -> np.ndarray:
+        directions = curved_directions(partial(self.potential_of_curved, self.q), self.q[-self.num_curved :])
+        return np.pad(directions, ((0, 0), (self.q.size - self.num_curved, 0)))
 
     def constraints(self, t, q):
         """All constraints (n_c,) at one point."""
@@ -168,18 +170,19 @@ class Interval:
         """All potentials at one point."""
         return sum((-term.sign * term.integrand(*self.by_name(term, q)) for term in self.potentials), jnp.zeros(()))
 
+    def potential_of_curved(self, q, curved):
+        """The same with the last `num_curved` variables apart."""
+        return self.potential(jnp.concatenate([q[: -self.num_curved], curved]))
+
     def curvature(self, q):
-        """``M^-1`` times the Hessian of the potentials (m, m) by the stiff variables."""
-        soft = taken(q, self.soft)
-        hessian = jax.hessian(lambda stiff: self.potential(self.joined(soft, stiff)))(taken(q, self.stiff))
-        return taken(self.over_mass(self.joined(jnp.zeros((self.soft.size, self.stiff.size)), hessian)), self.stiff)
+        """Hessian of the potentials by these variables times the changes `along` (n, d)."""
+        curved, gradient = q[-self.num_curved :], jax.grad(partial(self.potential_of_curved, q))
+        changes = self.along.T[:, -self.num_curved :]
+        columns = jax.vmap(lambda change: jax.jvp(gradient, (curved,), (change,))[1], out_axes=1)(changes)
+        return jnp.pad(columns, ((self.q.size - self.num_curved, 0), (0, 0)))
 
-    def joined(self, soft, stiff):
-        """All variables from the soft and the stiff ones."""
-        return taken(jnp.concatenate([soft, stiff]), np.argsort(np.concatenate([self.soft, self.stiff])))
-
-    def forces(self, x, mu):
-        """Of potentials and constraints, times h: (n,) at the start of the step and (n, r) at the nodes 1..r, and constraints (n_c, r).
+    def forces(self, x, mu) -> "Forces":
+        """Of potentials and constraints.
 
         Args:
             x, mu: increments (n, r) and multipliers (n_c, r).
@@ -207,18 +210,29 @@ class Interval:
                 d = over_lanes(gradient, k)(self.q[:, None] + x @ basis[:, 1:].T)
                 first += d @ (weights * basis[:, 0])
                 total += d @ (weights[:, None] * basis[:, 1:])
-        return first, total, g
+        inside = jnp.concatenate([(self.h * self.p + first)[:, None], total[:, :-1]], axis=1)
+        return Forces(inside, total[:, -1], g)
 
-    def residual(self, x, mu) -> "Residual":
-        """Of increments (n, r) and multipliers (n_c, r)."""
-        first, later, g = self.forces(x, mu)
-        others = jnp.concatenate([(self.h * self.p + first)[:, None], later[:, :-1]], axis=1)
-        rows = self.times_mass(x @ self.form[:, :-1]) + others
-        return Residual(rows, g, later[:, -1])
+    def residual(self, x, forces: "Forces"):
+        """Of the momentum equations of the nodes 0..r-1, times h, (n, r)."""
+        return self.times_mass(x @ self.form[:, :-1]) + forces.inside
 
-    def momentum(self, x, residual: "Residual"):
+    def momentum(self, x, forces: "Forces"):
         """At the end of the step (n,)."""
-        return (self.times_mass(x @ self.form[:, -1:])[:, 0] + residual.last) / self.h
+        return (self.times_mass(x @ self.form[:, -1:])[:, 0] + forces.last) / self.h
+
+
+class Forces(NamedTuple):
+    """What increments and multipliers make of a step.
+
+    inside (n, r): forces at the nodes 0..r-1, times h, at node 0 with the momentum that arrives.
+    last (n,): forces at the end of the step, times h.
+    g (n_c, r): constraints at the nodes 1..r.
+    """
+
+    inside: Any
+    last: Any
+    g: Any
 
 
 def taken(a, index: np.ndarray, axis: int = 0):
@@ -228,83 +242,81 @@ def taken(a, index: np.ndarray, axis: int = 0):
     return jnp.concatenate([jax.lax.slice_in_dim(a, *end, axis=axis) for end in ends], axis)
 
 
-class Residual(NamedTuple):
-    """Of the equations of a step.
-
-    rows (n, r): momentum equations of the nodes 0..r-1, times h.
-    g (n_c, r): constraints at the nodes 1..r.
-    last (n,): forces at the end of the step, times h.
-    """
-
-    rows: Any
-    g: Any
-    last: Any
-
-
 class Saddles(NamedTuple):
-    """The saddles of all modes, eliminated: the n variables first (m of them with curvature), then the n_c constraints.
+    """The saddles of all modes, eliminated; with z = L x for the d combinations of variables that the potentials are curved along.
 
-    interval: which variables are soft and which are stiff.
-    gamma (2, k): eigenvalues, for every part of a mode as in `TimeModes`, as all that has k.
-    curvature (m, m): ``w = h^2 M^-1 W''``.
-    denominator (m, m, k): inverses of ``|1 - gamma w|^2``.
-    push: G by the soft (n_c, n - m) and by the stiff variables (n_c, m).
-    pull_soft (n - m, n_c), pull two of (n_c, m, k): G^T through the inverses of ``M`` and ``M - h^2 gamma W''``.
-    schur two of (n_c, n_c, k): inverse of G times these.
+    ``M x - gamma L^T w z - G^T nu = M y`` is ``x = y + gamma Q z + M^-1 G^T nu`` and ``(1 - gamma L Q) z = L y + L M^-1 G^T nu``, so
+    that only d rows, and those of the constraints, are solved for each mode.
+
+    modes: as which everything below but `push` and `pull` is.
+    gamma (2, k): eigenvalues, for every part of a mode.
+    push: L and G (d + n_c, n), of the variables.
+    pull: ``Q = M^-1 L^T w`` and ``M^-1 G^T`` (n, d + n_c), with ``w = h^2 W''``.
+    bend: ``L Q`` (d, d).
+    denominator (d, d, k): inverses of ``|1 - gamma L Q|^2``.
+    push_bend: ``G Q`` (n_c, d).
+    pull_bend two of (d, n_c, k): ``(1 - gamma L Q)^-1 L M^-1 G^T``.
+    schur two of (n_c, n_c, k): inverse of G times x for every multiplier.
     """
 
-    interval: Interval
+    modes: TimeModes
     gamma: Any
-    curvature: Any
-    denominator: Any
     push: Any
-    pull_soft: Any
     pull: Any
+    bend: Any
+    denominator: Any
+    push_bend: Any
+    pull_bend: Any
     schur: Any
 
     @classmethod
     def at(cls, interval: Interval, modes: TimeModes, t, q) -> "Saddles":
         """With Hessian and Jacobian at a point."""
-        w, push = interval.h**2 * interval.curvature(q), interval.jacobian(t, q)
-        push_soft, push_stiff = taken(push.T, interval.soft).T, taken(push.T, interval.stiff).T
-        k, m, n_c = modes.gamma.shape[1], len(w), len(push)
+        along, jacobian = interval.directions, interval.jacobian(t, q)
+        bend, pull = interval.over_mass(interval.h**2 * interval.curvature(q)), interval.over_mass(jacobian.T)
+        k, d, n_c = modes.gamma.shape[1], len(along), len(jacobian)
         re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
 
         def of_parts(z):
             """(modes, rows, columns) as (columns, rows, k)."""
             return taken(jnp.swapaxes(z, 0, 2), modes.mode, axis=2)
 
-        denominator = inverse(np.eye(m) - 2 * re * w + (re**2 + im**2) * matmul(w, w))
+        bent = matmul(along, bend)
+        denominator = inverse(np.eye(d) - 2 * re * bent + (re**2 + im**2) * matmul(bent, bent))
 
-        over_mass = interval.over_mass(push.T)
-        pull_soft, straight = taken(over_mass, interval.soft), taken(over_mass, interval.stiff)
-        columns = jnp.concatenate([straight, matmul(w, straight)], axis=1)
-        through = (denominator.reshape(k * m, m) @ columns).reshape(k, m, 2 * n_c)
+        straight = matmul(along, pull)
+        columns = jnp.concatenate([straight, matmul(bent, straight)], axis=1)
+        through = (denominator.reshape(k * d, d) @ columns).reshape(k, d, 2 * n_c)
+        # real and imaginary part of (1 - conj(gamma) L Q) / |1 - gamma L Q|^2 times the columns
+        real, imaginary = through[..., :n_c] - re * through[..., n_c:], im * through[..., n_c:]
 
-        def parts(z):
-            """Real and imaginary part of ``(1 - conj(gamma) w) / |1 - gamma w|^2``, from the columns without and with w."""
-            return z[..., :n_c] - re * z[..., n_c:], im * z[..., n_c:]
+        push_bend = matmul(jacobian, bend)
+        a, b = (matmul(push_bend, z) for z in (re * real - im * imaginary, re * imaginary + im * real))
+        schur = inverse(regularized(jax.lax.complex(a + matmul(jacobian, pull), b)))
 
-        real, imaginary = parts(matmul(push_stiff, through))
-        real += matmul(push_soft, pull_soft)
-        schur = inverse(regularized(jax.lax.complex(real, imaginary)))
-
-        gamma = modes.gamma[:, modes.mode]
-        pull, schur = ([of_parts(a) for a in both] for both in (parts(through), (schur.real, schur.imag)))
-        return cls(interval, gamma, w, of_parts(denominator), (push_soft, push_stiff), pull_soft, pull, schur)
+        push, pull = jnp.concatenate([along, jacobian]), jnp.concatenate([bend, pull], axis=1)
+        pull_bend, schur = ([of_parts(a) for a in both] for both in ((real, imaginary), (schur.real, schur.imag)))
+        return cls(
+            modes, modes.gamma[:, modes.mode], push, pull, bent, of_parts(denominator), push_bend, pull_bend, schur
+        )
 
     def solve(self, y, g):
-        """x (n, k) and nu (n_c, k) with ``(M - h^2 gamma W'') x - G^T nu = M y`` and ``G x = g``."""
-        push_soft, push_stiff = self.push
-        x_soft, y = taken(y, self.interval.soft), taken(y, self.interval.stiff)
-        bent, (re, im) = matmul(self.curvature, y), self.gamma
-        y = y - (re * bent - im * times_i(bent))
-        products = (a * row for a, row in zip(self.denominator, y, strict=True))
-        x = reduce(jnp.add, products)  # written out: within a sum y would be made anew for every row
+        """x (n, r) and mu (n_c, r) with ``M x - h^2 W'' x (A^-1 B)^T - G^T mu A^-T = M y`` and ``G x = g``."""
+        d = len(self.bend)
+        pushed = self.push @ y
+        pushed = jnp.concatenate([pushed[:d], g - pushed[d:]]) @ self.modes.of_values
+        z, g = pushed[:d], pushed[d:]
+        z = z - self._times_gamma(matmul(self.bend, z), -1)
+        products = (a * row for a, row in zip(self.denominator, z, strict=True))
+        z = reduce(jnp.add, products, jnp.zeros_like(z))  # written out: within a sum z would be made anew for every row
+        nu = product(self.schur, g - matmul(self.push_bend, self._times_gamma(z)))
+        z = self._times_gamma(z + product(self.pull_bend, nu))
+        return y + self.pull @ (jnp.concatenate([z, nu]) @ self.modes.increments), nu @ self.modes.multipliers
 
-        nu = product(self.schur, g - matmul(push_soft, x_soft) - matmul(push_stiff, x))
-        x += product(self.pull, nu)
-        return self.interval.joined(x_soft + matmul(self.pull_soft, nu), x), nu
+    def _times_gamma(self, z, sign=1):
+        """Or times the conjugate of gamma."""
+        re, im = self.gamma
+        return re * z + sign * im * times_i(z)
 
 
 def times_i(z):
@@ -320,11 +332,11 @@ def product(matrix, z):
 
 
 class Iterate(NamedTuple):
-    """State of the iteration: increments x (n, r), multipliers mu (n_c, r), their residual, largest corrections, and how it stands."""
+    """State of the iteration: increments x (n, r), multipliers mu (n_c, r), their forces, largest corrections, and how it stands."""
 
     x: Any
     mu: Any
-    residual: Residual
+    forces: Forces
     moved: Any
     iterations: Any
     result: Any
@@ -351,17 +363,19 @@ def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, U
         return largest(x[:n_s]), largest(x[n_s:])
 
     def step(last: Iterate) -> Iterate:
-        rows, g, _ = last.residual
-        dx, nu = saddles.solve(-interval.over_mass(rows) @ modes.of_rows, -g @ modes.of_values)
-        dx, dmu = dx @ modes.increments, nu @ modes.multipliers
+        missing = (
+            last.x + interval.over_mass(last.forces.inside) @ modes.of_rows
+        )  # what these forces do not bring about
+        dx, dmu = saddles.solve(-missing, -last.forces.g)
         x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
         left = map(expected, moved, last.moved)
         result = newton.status(accepted.over(left, slow_and_fast(x)), iterations)
-        return Iterate(x, mu, interval.residual(x, mu), moved, iterations, result)
+        return Iterate(x, mu, interval.forces(x, mu), moved, iterations, result)
 
-    start = Iterate(x, mu, interval.residual(x, mu), (jnp.zeros(()),) * 2, jnp.asarray(0), jnp.asarray(RUNNING))
+    start = Iterate(x, mu, interval.forces(x, mu), (jnp.zeros(()),) * 2, jnp.asarray(0), jnp.asarray(RUNNING))
     done = newton.iterate(step, start)
-    p, (rows, g, _) = interval.momentum(done.x, done.residual), done.residual
+    p, rows = interval.momentum(done.x, done.forces), interval.residual(done.x, done.forces)
     x, mu = done.x.T, done.mu.T
     unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
-    return done, unknowns, (equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]), (largest(rows), largest(g))
+    end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
+    return done, unknowns, end, (largest(rows), largest(done.forces.g))
