@@ -127,13 +127,13 @@ class Ladder:
         return middle if self.kind == "tol" else round(middle)
 
 
-def tolerances(first: float, last: float, per_decade: int = 2) -> list[float]:
-    """Tolerances from `first` down to `last`."""
-    count = round(per_decade * np.log10(first / last)) + 1
+def tolerances(first: float, last: float) -> list[float]:
+    """Tolerances from `first` down to `last`, two per decade."""
+    count = round(2 * np.log10(first / last)) + 1
     return [float(x) for x in np.geomspace(first, last, count)]
 
 
-def step_counts(first: float, last: float, per_octave: int = 4) -> list[int]:
-    """Numbers of steps from `first` up to `last`."""
-    count = round(per_octave * np.log2(last / first)) + 1
+def step_counts(first: float, last: float) -> list[int]:
+    """Numbers of steps from `first` up to `last`, four per octave."""
+    count = round(4 * np.log2(last / first)) + 1
     return sorted({max(1, round(x)) for x in np.geomspace(first, last, count)})

@@ -130,13 +130,10 @@ class Interval:
         mass = constant_mass(self.system)
         self.velocities = inverse_mass(mass.slow), inverse_mass(mass.fast)
         self.num_curved = equations.q_f.size or self.q.size
-        self.directions = self._curved_directions()
+        directions = curved_directions(partial(self.potential_of_curved, self.q), self.q[-self.num_curved :])
+        self.directions = np.pad(directions, ((0, 0), (self.q.size - self.num_curved, 0)))
         self.along = np.linalg.pinv(self.directions)
         self.at_start = self.jacobian(self.times[0], self.q)
-
-    def _curved_directions(self) -> np.ndarray:
-        directions = curved_directions(partial(self.potential_of_curved, self.q), self.q[-self.num_curved :])
-        return np.pad(directions, ((0, 0), (self.q.size - self.num_curved, 0)))
 
     def constraints(self, t, q):
         """All constraints (n_c,) at one point."""
@@ -235,11 +232,10 @@ class Forces(NamedTuple):
     g: Any
 
 
-def taken(a, index: np.ndarray, axis: int = 0):
-    """Known rows, or what is at an index of another axis, as slices."""
+def taken(a, index: np.ndarray):
+    """What is at a known index of the last axis, as slices."""
     runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
-    ends = ((int(run[0]), int(run[-1]) + 1) if run.size else (0, 0) for run in runs)
-    return jnp.concatenate([jax.lax.slice_in_dim(a, *end, axis=axis) for end in ends], axis)
+    return jnp.concatenate([a[..., run[0] : run[-1] + 1] for run in runs], axis=-1)
 
 
 class Saddles(NamedTuple):
@@ -279,7 +275,7 @@ class Saddles(NamedTuple):
 
         def of_parts(z):
             """(modes, rows, columns) as (columns, rows, k)."""
-            return taken(jnp.swapaxes(z, 0, 2), modes.mode, axis=2)
+            return taken(jnp.swapaxes(z, 0, 2), modes.mode)
 
         bent = matmul(along, bend)
         denominator = inverse(np.eye(d) - 2 * re * bent + (re**2 + im**2) * matmul(bent, bent))
