@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vmri_jax import lanes
 from vmri_jax.lanes import over_lanes
 
 LANES = 5
@@ -94,3 +95,23 @@ def test_sums_of_padded_arrays_have_no_pads():
     text = str(jax.make_jaxpr(over_lanes(lambda x: derivative_of_slices(x, 0), LANES))(jnp.ones((4, LANES))))
     assert " pad[" not in text
     assert "concatenate[" in text
+
+
+def test_loops_within_loops_are_read_once(monkeypatch):
+    def nested(depth):
+        if depth == 0:
+            return lambda x, shared: (jnp.sin(x), shared)
+        inner = nested(depth - 1)
+        return lambda x, shared: jax.lax.fori_loop(0, 2, lambda _, at: inner(at[1] * at[0], at[1]), (x, shared))
+
+    def count(depth):
+        count.runs = 0
+        jax.make_jaxpr(over_lanes(lambda x: nested(depth)(x, 2.0), LANES))(jnp.ones((4, LANES)))
+        return count.runs
+
+    def counted(*args, run=lanes._run):
+        count.runs += 1
+        return run(*args)
+
+    monkeypatch.setattr(lanes, "_run", counted)
+    assert count(6) - count(5) == count(3) - count(2)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vmri_jax.structure import curved_directions, has_constant_hessian, has_diagonal_hessian
+from vmri_jax.structure import curved_directions, has_constant_hessian, has_diagonal_hessian, reached
 
 Q = jnp.linspace(0.5, 1.5, 4)
 
@@ -83,3 +83,26 @@ def test_curved_directions(function, rank, curved):
 
 def test_unknown_operations_bend_everything():
     assert curved_directions(lambda q: jnp.sum(jnp.sort(q)[:2] ** 2), Q).shape == (4, 4)
+
+
+def loops(a, b, n, flag):
+    """What each of the results depends on is in its name."""
+    a_n = jax.lax.fori_loop(0, n, lambda _, x: 2 * x, a)
+    both, only_b = jax.lax.fori_loop(0, 3, lambda _, at: (at[0] + at[1], 2 * at[1]), (a, b))
+    (last_of_a,), b_too = jax.lax.scan(lambda at, x: ((at[0] + 1,), at[0] * x), (a,), b * jnp.ones(3))
+    flag_b, flag_too = jax.lax.cond(flag, lambda b: (b, 1.0), lambda b: (-b, 2.0), b)
+    return a_n, both, only_b, last_of_a, b_too, flag_b, flag_too
+
+
+@pytest.mark.parametrize(
+    ("changed", "reaches"),
+    [
+        (0, [True, True, False, True, True, False, False]),
+        (1, [False, True, True, False, True, True, False]),
+        (2, [True, False, False, False, False, False, False]),
+        (3, [False, False, False, False, False, True, True]),
+    ],
+)
+def test_what_an_argument_reaches_through_loops(changed, reaches):
+    jaxpr = jax.make_jaxpr(jax.jit(loops))(1.0, 2.0, 3, True)
+    assert reached(jaxpr.eqns[0], [k == changed for k in range(4)]) == reaches

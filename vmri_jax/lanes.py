@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from vmri_jax.algebra import ELEMENTWISE
-from vmri_jax.structure import ELEMENTWISE_PRIMITIVES, called
+from vmri_jax.structure import ELEMENTWISE_PRIMITIVES, called, reached
 
 
 class _Value(NamedTuple):
@@ -96,7 +96,7 @@ def _run(size: int, jaxpr, consts, values: list[_Value]) -> list[_Value]:
         inputs, name = [read(v) for v in eqn.invars], eqn.primitive.name
         inner = called(eqn)
         if name in _LOOPS:
-            outputs = _LOOPS[name](size, inputs, **eqn.params)
+            outputs = _LOOPS[name](size, inputs, reached(eqn, [x.lanes for x in inputs]), **eqn.params)
         elif inner is not None:
             outputs = _run(size, *inner, inputs)
         elif not any(x.lanes for x in inputs):
@@ -268,27 +268,24 @@ _AXES_NAMED = (
 _RULES |= dict.fromkeys([*_AXES_NAMED.split(), "reduce_or"], _same)
 
 
-def _while(size, inputs, *, cond_jaxpr, body_jaxpr, cond_nconsts, body_nconsts):
+# Equations with jaxprs of their own; `lanes`: which of their outputs differ between lanes, known beforehand.
+
+
+def _while(size, inputs, lanes, *, cond_jaxpr, body_jaxpr, cond_nconsts, body_nconsts):
     cond_consts, body_consts = inputs[:cond_nconsts], inputs[cond_nconsts : cond_nconsts + body_nconsts]
     start = inputs[cond_nconsts + body_nconsts :]
 
-    def test(carry):
-        return _run(size, cond_jaxpr.jaxpr, cond_jaxpr.consts, cond_consts + carry)[0]
-
-    def body(carry):
-        return _run(size, body_jaxpr.jaxpr, body_jaxpr.consts, body_consts + carry)
-
-    lanes = _carried(size, lambda carry: (test(carry), body(carry)), start, own_end=True)
+    def test(arrays):
+        return _run(size, cond_jaxpr.jaxpr, cond_jaxpr.consts, cond_consts + _values(arrays, lanes))[0]
 
     def step(arrays):
-        carry = _values(arrays, lanes)
-        new = _arrays(size, body(carry), lanes)
-        goes_on = test(carry)
+        new = _run(size, body_jaxpr.jaxpr, body_jaxpr.consts, body_consts + _values(arrays, lanes))
+        new, goes_on = _arrays(size, new, lanes), test(arrays)
         if not goes_on.lanes and not np.ndim(goes_on.array):
             return new
         return [a if a is b else _freeze(goes_on, a, b, on) for a, b, on in zip(new, arrays, lanes, strict=True)]
 
-    arrays = lax.while_loop(lambda a: jnp.any(test(_values(a, lanes)).array), step, _arrays(size, start, lanes))
+    arrays = lax.while_loop(lambda a: jnp.any(test(a).array), step, _arrays(size, start, lanes))
     return _values(arrays, lanes)
 
 
@@ -300,48 +297,20 @@ def _freeze(goes_on: _Value, new, old, lanes: bool = True):
     return lax.select(jnp.broadcast_to(flags, new.shape), new, old)
 
 
-def _scan(size, inputs, *, jaxpr, length, reverse, num_consts, num_carry, unroll, **_):
+def _scan(size, inputs, lanes, *, jaxpr, length, reverse, num_consts, num_carry, unroll, **_):
     consts, start, xs = inputs[:num_consts], inputs[num_consts:][:num_carry], inputs[num_consts + num_carry :]
 
-    def body(carry, x):
-        results = _run(size, jaxpr.jaxpr, jaxpr.consts, consts + carry + x)
+    def step(arrays, x_arrays):
+        at = consts + _values(arrays, lanes[:num_carry]) + _values(x_arrays, [x.lanes for x in xs])
+        results = _arrays(size, _run(size, jaxpr.jaxpr, jaxpr.consts, at), lanes)
         return results[:num_carry], results[num_carry:]
 
-    one = [_Value(jax.ShapeDtypeStruct(np.shape(x.array)[1:], jnp.result_type(x.array)), x.lanes) for x in xs]
-    lanes = _carried(size, lambda carry, *x: body(carry, list(x)), start, *one)
-    out_lanes: list[bool] = []
-
-    def step(arrays, x_arrays):
-        carry, ys = body(_values(arrays, lanes), _values(x_arrays, [x.lanes for x in xs]))
-        out_lanes[:] = [y.lanes for y in ys]
-        return _arrays(size, carry, lanes), [y.array for y in ys]
-
-    start = _arrays(size, start, lanes)
+    start = _arrays(size, start, lanes[:num_carry])
     arrays, ys = lax.scan(step, start, [x.array for x in xs], length, reverse=reverse, unroll=unroll)
-    return _values(arrays, lanes) + _values(ys, out_lanes)
+    return _values(arrays + ys, lanes)
 
 
-def _carried(size, body, start: list[_Value], *others, own_end: bool = False) -> list[bool]:
-    """Which parts of a loop's state differ between lanes: those that do at the start, and what they reach."""
-    lanes = [x.lanes for x in start]
-    while True:
-        found: list = []
-
-        def trial(arrays, other_arrays, lanes=lanes, found=found):
-            rest = _values(other_arrays, [x.lanes for x in others])
-            first, second = body(_values(arrays, lanes), *rest)
-            carry = second if own_end else first
-            every = own_end and first.lanes
-            found[:] = [every or a or x.lanes for a, x in zip(lanes, carry, strict=True)]
-            return 0
-
-        jax.eval_shape(trial, _arrays(size, start, lanes), [x.array for x in others])
-        if found == lanes:
-            return lanes
-        lanes = found
-
-
-def _cond(size, inputs, *, branches, **_):
+def _cond(size, inputs, lanes, *, branches, **_):
     index, *operands = inputs
     kept = [x.lanes for x in operands]
 
@@ -357,10 +326,6 @@ def _cond(size, inputs, *, branches, **_):
             out = [_freeze(_Value(which == k, True), new, old) for new, old in zip(result, out, strict=True)]
         return _values(out, [True] * len(out))
 
-    found: list[list[bool]] = []
-    for branch in branches:
-        jax.eval_shape(lambda arrays, b=branch: found.append([x.lanes for x in call(b, arrays)]), arrays)
-    lanes = [any(case) for case in zip(*found, strict=True)]
     calls = [lambda arrays, b=branch: _arrays(size, call(b, arrays), lanes) for branch in branches]
     return _values(lax.switch(index.array, calls, arrays), lanes)
 

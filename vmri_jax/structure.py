@@ -1,4 +1,4 @@
-"""What a function's jaxpr tells about it: which arguments it depends on, and the structure of its Hessian.
+"""What a function's jaxpr tells about it: what depends on what, and the structure of its Hessian.
 
 All answers are structural and conservative: what is called dependent may happen not to be (``0 * x`` counts), what is
 called independent, constant or diagonal is so.
@@ -28,6 +28,55 @@ def called(eqn) -> tuple[Any, Any] | None:
     if eqn.primitive.name not in CALLS or inner is None:
         return None
     return getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+
+
+def reached(eqn, inputs: list[bool]) -> list[bool]:
+    """Which outputs of an equation of a jaxpr some of its inputs can change: those marked."""
+    rule, inner = _LOOPS.get(eqn.primitive.name), called(eqn)
+    if rule is not None:
+        return rule(inputs, **eqn.params)
+    return _outputs_reached(inner[0], inputs) if inner else [any(inputs)] * len(eqn.outvars)
+
+
+def _outputs_reached(jaxpr, inputs: list[bool]) -> list[bool]:
+    known = dict(zip(map(id, jaxpr.invars), inputs, strict=True))
+    for eqn in jaxpr.eqns:
+        outputs = reached(eqn, [known.get(id(v), False) for v in eqn.invars])
+        known.update(zip(map(id, eqn.outvars), outputs, strict=True))
+    return [known.get(id(v), False) for v in jaxpr.outvars]
+
+
+def _by_while(inputs, *, cond_jaxpr, body_jaxpr, cond_nconsts, body_nconsts) -> list[bool]:
+    """Everything where the end of the loop is."""
+    cond_consts, body_consts = inputs[:cond_nconsts], inputs[cond_nconsts : cond_nconsts + body_nconsts]
+
+    def once(carry):
+        end = _outputs_reached(cond_jaxpr.jaxpr, cond_consts + carry)[0]
+        return [end or on for on in _outputs_reached(body_jaxpr.jaxpr, body_consts + carry)]
+
+    return _over_and_over(once, inputs[cond_nconsts + body_nconsts :])
+
+
+def _by_scan(inputs, *, jaxpr, num_consts, num_carry, **_) -> list[bool]:
+    consts, carry, xs = inputs[:num_consts], inputs[num_consts:][:num_carry], inputs[num_consts + num_carry :]
+    carry = _over_and_over(lambda carry: _outputs_reached(jaxpr.jaxpr, consts + carry + xs)[:num_carry], carry)
+    return carry + _outputs_reached(jaxpr.jaxpr, consts + carry + xs)[num_carry:]
+
+
+def _over_and_over(once: Callable, carry: list[bool]) -> list[bool]:
+    """The state of a loop: what is marked at its start, and what that reaches."""
+    found = [a or b for a, b in zip(carry, once(carry), strict=True)]
+    return carry if found == carry else _over_and_over(once, found)
+
+
+def _by_cond(inputs, *, branches, **_) -> list[bool]:
+    """Everything where the choice is."""
+    index, *operands = inputs
+    cases = [_outputs_reached(branch.jaxpr, operands) for branch in branches]
+    return [index or any(case) for case in zip(*cases, strict=True)]
+
+
+_LOOPS = {"while": _by_while, "scan": _by_scan, "cond": _by_cond}
 
 
 def depends_on(function: Callable, *args) -> tuple[bool, ...]:
