@@ -94,6 +94,17 @@ def test_structure_with_constraints(tsp):
     assert float(run.constraint_residual.max()) < 1e-12
 
 
+def test_average_of_a_nonlinear_vibration_by_all_methods(tsp):
+    state = tsp.state()
+    q_f = state.q_f + jnp.array([0, 0, 0, 0, 0, 1e-2])  # the spring is stretched
+    expected, found = (
+        averaging(tsp.system, mollified_impulse(5), 0.02, Newton(method))(state.q_s, q_f)  # pyright: ignore[reportOptionalCall]
+        for method in ("arrowhead", "march")
+    )
+    assert largest_difference(expected, q_f) > 1e-3
+    assert largest_difference(found, expected) < 1e-13
+
+
 def test_composition_averages_over_each_stage(fpu):
     """The average depends on the length of a stage: kicks are not handed from stage to stage."""
     scheme, h, c = mollified_impulse(3), 0.02, (0.7, -0.4, 0.7)

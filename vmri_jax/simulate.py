@@ -124,27 +124,31 @@ class Simulation:
         """Whether there are only numbers, no tracers of a transformation."""
         return is_concrete((self.system, self.scheme, start, self.macro_dt, self.newton))
 
-    def start(self, state: State) -> Checkpoint:
-        """Before the first step."""
-        return Checkpoint(0, state, run_memory(self.system, self.scheme, state, self.macro_dt, self.newton))
+    def newton_for(self, fell_back: bool) -> Newton:
+        """How steps are solved: "auto" is first the march alone (its fallback takes long to compile)."""
+        return self.newton if fell_back else self.newton.alone(self.system, stage_scheme(self.scheme))
+
+    def start(self, state: State, step: int = 0, fell_back: bool = False) -> Checkpoint:
+        """Before the first step, or before any as if it was the first one."""
+        memory = run_memory(self.system, self.scheme, state, self.macro_dt, self.newton_for(fell_back))
+        return Checkpoint(step, state, memory, fell_back)
 
     def advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
         """The next `saves` saved intervals, compiled once per number of them.
 
-        "auto" is first the march alone (its fallback takes long to compile); where that fails the run goes on from the
-        last saved node before with the fallback.
+        Where the march fails the run goes on from the last saved node before with the fallback.
         """
-        alone = self.newton if at.fell_back else self.newton.alone(self.system, stage_scheme(self.scheme))
-        piece, end = self._advance(at, saves, alone)
+        newton = self.newton_for(at.fell_back)
+        piece, end = self._advance(at, saves, newton)
         failed = int(piece.failed_at)
-        if failed < 0 or alone is self.newton:
+        if failed < 0 or newton is self.newton:
             return piece, end
         if int(jnp.max(piece.info.method)) < Method.MARCH:  # explicit or linear: no other method helps
             return piece, end
         kept = (failed - at.step) // self.save_every
         good = [piece.first(kept)] if kept else []
         state = good[0].final_state if kept else at.state
-        at = self.start(state)._replace(step=at.step + kept * self.save_every, fell_back=True)
+        at = self.start(state, at.step + kept * self.save_every, fell_back=True)
         rest, end = self._advance(at, saves - kept, self.newton)
         return join([*good, rest]), end
 
