@@ -5,7 +5,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from vmri_jax import macro_step, simulate, systems
+from vmri_jax import Newton, macro_step, simulate, systems
+from vmri_jax.composition import stage_scheme
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -17,6 +18,11 @@ PROBLEMS = {
 
 compiled_step = jax.jit(macro_step)
 """``(system, scheme, state, macro_dt, newton) -> (state, info)``, compiled once per structure."""
+
+
+def without_fallback(system, scheme) -> Newton:
+    """The default iteration; where it is the nested march, without the exact solve behind it, which takes long to compile."""
+    return Newton().alone(system, stage_scheme(scheme))
 
 
 def relative_difference(value, expected) -> float:

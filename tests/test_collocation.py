@@ -170,16 +170,18 @@ def test_it_solves_the_equations_of_the_step(name, scheme, macro_dt, request):
     assert largest_difference(found, expected) / np.abs(expected).max() < 1e-12  # measured 1e-14
 
 
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-9])
 @pytest.mark.parametrize("name", ["tsp", "general"])
-def test_what_is_accepted_is_within_the_tolerance(name, tolerance, request):
+def test_what_is_accepted_is_within_the_tolerance(name, request):
     system, state = start_of(name, request)
     n = state.q_s.size + state.q_f.size
-    exact, found = (
-        phases(system, galerkin(1, 4), state, newton, 0.05)[0][:, :n]
-        for newton in (Newton("arrowhead"), Newton("march", tolerance))
-    )
-    assert largest_difference(found, exact) < tolerance * np.abs(np.diff(exact, axis=0)).max()
+
+    def positions(newton):
+        return phases(system, galerkin(1, 4), state, newton, 0.05)[0][:, :n]
+
+    exact = positions(Newton("arrowhead"))
+    for tolerance in (1e-3, 1e-9):
+        found = positions(Newton("march", tolerance))
+        assert largest_difference(found, exact) < tolerance * np.abs(np.diff(exact, axis=0)).max()
 
 
 def test_few_iterations_at_high_degree(tsp, sam):

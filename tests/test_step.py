@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.support import compiled_step, largest_difference, relative_difference
+from tests.support import compiled_step, largest_difference, relative_difference, without_fallback
 from tests.user_systems import bent_force, bent_system, double_pendulum, two_oscillators
 from vmri_jax import (
     Newton,
@@ -28,7 +28,7 @@ from vmri_jax.step import LARGE
 
 
 def step(problem, scheme, macro_dt):
-    return compiled_step(problem.system, scheme, problem.state(), macro_dt, Newton())
+    return compiled_step(problem.system, scheme, problem.state(), macro_dt, without_fallback(problem.system, scheme))
 
 
 @pytest.mark.parametrize("name", ["fpu", "tsp", "sam", "arms"])
@@ -75,7 +75,7 @@ def test_split_and_coupled_routes_agree():
     together = problem.system.replace(slow_potential=lambda q_s, q_f, params: only_slow(q_s, q_f, params) + 0 * q_f[0])
     assert split(separate, scheme, problem.q_s, problem.q_f) is not None
     assert split(together, scheme, problem.q_s, problem.q_f) is None
-    a, b = (compiled_step(s, scheme, problem.state(), 0.1, Newton()) for s in (separate, together))
+    a, b = (compiled_step(s, scheme, problem.state(), 0.1, without_fallback(s, scheme)) for s in (separate, together))
     assert largest_difference(a[1].q_f_micro, b[1].q_f_micro) < 1e-14
     for name in ("q_s", "q_f", "p_s", "p_f"):
         assert largest_difference(getattr(a[0], name), getattr(b[0], name)) < 1e-13
