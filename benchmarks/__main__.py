@@ -121,16 +121,19 @@ def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
 
 
 def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, **options) -> None:
-    """Measure, print and write."""
-    name = "full" if full else "quick"
+    """Measure, print and write: after each case what is known by then, so that nothing is lost."""
+    name, report, path = "full" if full else "quick", None, None
     size = module.sizes(name, **options)
-    with progress(title, module.programs_of(size)) as tell:
-        report = module.run(size, name, tell)
-    report.show(module.COLUMNS)
-    if markdown:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / f"{report.name}.md").write_text(report.markdown(module.COLUMNS), encoding="utf-8")
-    console.print(f"written to {report.write(out)}\n")
+    try:
+        with progress(title, module.programs_of(size)) as tell:
+            for report in module.run(size, name, tell):
+                path = report.write(out)
+                if markdown:
+                    path.with_suffix(".md").write_text(report.markdown(module.COLUMNS), encoding="utf-8")
+    finally:
+        if report is not None:
+            report.show(module.COLUMNS)
+            console.print(f"written to {path}\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Batches: time per trajectory and micro step against the batch size, and against one run of the C loop."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -68,8 +68,8 @@ def sizes(name: str, devices: int = 1) -> Size:
     return Size(chosen, (1, 4, 16, 64, 256, 1024), 15, 0.2, devices)
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Report:
-    """Measure all of it."""
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """Measure all of it, a report after each case."""
     rows, claims, notes = [], [], []
     if c_loops.compiler() is None:
         notes.append("No C compiler (cc, gcc or clang) on the PATH: nothing was held against C. Install one for that.")
@@ -81,7 +81,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Report:
             row, claim = _as_accurate(case, case.as_accurate, size, tell)
             rows.append(row)
             claims.append(claim)
-    return Report("batch", name, rows, claims, notes, {"batch": lambda: draw(rows, size.devices)})
+        yield Report("batch", name, rows, claims, notes, {"batch": partial(draw, rows, size.devices)})
 
 
 def programs_of(size: Size) -> int:

@@ -5,7 +5,9 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -42,8 +44,8 @@ def sizes(name: str) -> Size:
     return Size(SYSTEMS, schemes, (100, 1000), 2 if name == "quick" else 7)
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Report:
-    """Start one process after the other, on the cores of this one; the two num_micro take turns."""
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """Start one process after the other, on the cores of this one; the two num_micro take turns; a report after each scheme."""
     rows, claims = [], []
     for system in size.systems:
         for scheme in size.schemes:
@@ -54,7 +56,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Report:
                     found[n].append(_fresh(system, scheme, n))
             rows += [_row(system, scheme, n, found[n]) for n in size.num_micro]
             claims += _claims(f"{system}, {scheme}", found)
-    return Report("compile", name, rows, claims, [], {"compile": lambda: draw(rows)})
+            yield Report("compile", name, rows, claims, [], {"compile": partial(draw, rows)})
 
 
 def programs_of(size: Size) -> int:

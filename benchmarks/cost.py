@@ -1,5 +1,6 @@
 """Cost of accuracy in the fast variables: time per micro step against num_micro, and against the dense solve."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -95,15 +96,24 @@ def sizes(name: str) -> Size:
     )
 
 
-def run(size: Size, name: str, tell=silent) -> Report:
-    """Measure all of it."""
-    parts = {
-        name: [measure(case.affordable(size.most_unknowns), size.repeats, size.seconds, tell) for case in cases]
-        for name, cases in {**size.turning, **size.paper}.items()
-    }
-    once = [measure(case, max(3, size.repeats // 2), size.seconds, tell) for case in size.once]
-    lines = [linear.measure(case, size.repeats, size.seconds, tell) for case in size.linear]
+def run(size: Size, name: str, tell=silent) -> Iterator[Report]:
+    """Measure all of it, a report after each case."""
+    parts: dict[str, list[Curves]] = {}
+    once, lines = [], []
+    for file, cases in {**size.turning, **size.paper}.items():
+        for case in cases:
+            curves = measure(case.affordable(size.most_unknowns), size.repeats, size.seconds, tell)
+            parts.setdefault(file, []).append(curves)
+            yield _report(size, name, parts, once, lines)
+    for case in size.once:
+        once.append(measure(case, max(3, size.repeats // 2), size.seconds, tell))
+        yield _report(size, name, parts, once, lines)
+    for case in size.linear:
+        lines.append(linear.measure(case, size.repeats, size.seconds, tell))
+        yield _report(size, name, parts, once, lines)
 
+
+def _report(size: Size, name: str, parts: Mapping[str, list[Curves]], once: list[Curves], lines: list) -> Report:
     everything = [*(curves for part in parts.values() for curves in part), *once]
     claims = [claim for curves in everything for claim in _claims(curves)]
     claims += [claim for line in lines for claim in line.claims]

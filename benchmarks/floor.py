@@ -1,5 +1,6 @@
 """Single runs against hand-written C on one core, and the implicit schemes against the explicit one."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -70,8 +71,8 @@ def c_loop(system: str, problem: vm.Problem, num_micro: int, micro_dt: float, nu
     return {"TSP": c_loops.tsp, "SAM": c_loops.sam}[system](problem, micro_dt, num_steps * num_micro)
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Report:
-    """Measure all of it; without a compiler only the implicit schemes are held against the explicit one."""
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """Measure all of it, a report after each pair; without a compiler only the implicit schemes are held against the explicit one."""
     rows, claims, notes = [], [], []
     if c_loops.compiler() is None:
         notes.append("No C compiler (cc, gcc or clang) on the PATH: nothing was held against C. Install one for that.")
@@ -79,8 +80,8 @@ def run(size: Size, name: str, tell: Tell = silent) -> Report:
         some_rows, some_claims = _measure(pair, size, tell)
         rows += some_rows
         claims += some_claims
-    figures = {} if notes else {"floor": lambda: draw(rows)}
-    return Report("floor", name, rows, claims, notes, figures)
+        figures = {} if notes else {"floor": partial(draw, rows)}
+        yield Report("floor", name, rows, claims, notes, figures)
 
 
 def programs_of(size: Size) -> int:

@@ -3,6 +3,7 @@
 import multiprocessing
 import shutil
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,7 +42,7 @@ def programs_of(size: Size) -> int:
     return size.count
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Report:
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Kill, look at what is there, resume, kill ..., each completed run compared with one that nobody killed."""
     with TemporaryDirectory() as folder:
         rows, runs = kill_often(size, Path(folder), tell)
@@ -52,7 +53,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Report:
         f"{len(rows)} kills ({counts}), each resumed: {identical} times everything on disk identical to the uninterrupted run.",
         f"{sum(runs)} of {len(runs)} completed runs identical in every array.",
     ]
-    return Report("kills", name, rows, [], notes, {})
+    yield Report("kills", name, rows, [], notes, {})
 
 
 def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict], list[bool]]:

@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -68,12 +68,12 @@ class Part:
 
     COLUMNS: tuple[str, ...]
     programs_of: Callable[[Size], int]
-    run: Callable[..., Report]
+    run: Callable[..., Iterator[Report]]
     sizes: Callable[[str], Size] = sizes
 
 
 # --- absence ---------------------------------------------------------------------------------------------------------
-def absence(size: Size, name: str, tell: Tell = silent) -> Report:
+def absence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Every effect in a small scene, taken out of it, and never mentioned: programs, unknowns and calls."""
     scheme = vm.fully_explicit(5)
     tell("never mentioned")
@@ -111,7 +111,7 @@ def absence(size: Size, name: str, tell: Tell = silent) -> Report:
         f"{sum(row['calls without'] == 0 < row['calls with'] for row in rows)} of {len(rows)}: called with it, never without.",
         *(f"{what}: operations {a[0]}, bytes {a[1]}; by hand {b[0]}, {b[1]}." for what, (a, b) in by_hand.items()),
     ]
-    return Report("scene_absence", name, rows, [], notes, {})
+    yield Report("scene_absence", name, rows, [], notes, {})
 
 
 def _by_hand(scheme: vm.Scheme, tell: Tell) -> dict[str, tuple]:
@@ -158,7 +158,7 @@ def counted(effect: Effect) -> tuple[Effect, list]:
 
 
 # --- presence --------------------------------------------------------------------------------------------------------
-def presence(size: Size, name: str, tell: Tell = silent) -> Report:
+def presence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """The reference systems as scenes and written by hand, in turns; seconds of processor time."""
     rows, claims = [], []
     for system, scene in SCENES.items():
@@ -177,11 +177,11 @@ def presence(size: Size, name: str, tell: Tell = silent) -> Report:
                 rows.append(row | {"bytes": temporary_bytes(program)})
             label = f"{system}, {scheme}: scene over by hand"
             claims.append(Claim(label, ratio(seconds["scene"], seconds["by hand"]), MOST))
-    return Report("scene_presence", name, rows, claims, [], {})
+            yield Report("scene_presence", name, rows, claims, [], {})
 
 
 # --- orders ----------------------------------------------------------------------------------------------------------
-def orders(size: Size, name: str, tell: Tell = silent) -> Report:
+def orders(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Errors and energy balance (change of energy less work of the forces) of bodies under forces, as the step shrinks."""
     rows = []
     for label, scheme, steps in size.orders:
@@ -194,10 +194,12 @@ def orders(size: Size, name: str, tell: Tell = silent) -> Report:
             row = {"effect": effect, "scheme": label, "order": scheme.order, **orders}
             row |= {"finest error": errors[body][-1], "finest balance": balances[body][-1]}
             rows.append(row | {"holds": "yes" if holds else "no"})
-    good = sum(row["holds"] == "yes" for row in rows)
-    error, balance = TOLERANCES.values()
-    notes = [f"{good} of {len(rows)}: error within {error} and energy balance within {balance} of the order expected."]
-    return Report("scene_orders", name, rows, [], notes, {})
+        good = sum(row["holds"] == "yes" for row in rows)
+        error, balance = TOLERANCES.values()
+        notes = [
+            f"{good} of {len(rows)}: error within {error} and energy balance within {balance} of the order expected."
+        ]
+        yield Report("scene_orders", name, rows, [], notes, {})
 
 
 PARTS = {

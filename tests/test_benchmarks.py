@@ -165,6 +165,18 @@ def test_command(name, tmp_path, monkeypatch):
     CHECKS[name](written)
 
 
+def test_what_was_measured_before_a_failure_is_kept(tmp_path, monkeypatch):
+    def run(size, name, tell):
+        yield Report("floor", name, [{"case": "first"}], [], [], {})
+        raise RuntimeError("the second case")
+
+    monkeypatch.setattr(command_line, "prepare", lambda *_, **__: None)
+    monkeypatch.setattr(floor, "run", run)
+    done = CliRunner().invoke(command_line.app, ["floor", "--out", str(tmp_path)])
+    assert str(done.exception) == "the second case"
+    assert json.loads((tmp_path / "floor.json").read_text())["rows"] == [{"case": "first"}]
+
+
 def check_cost(found):
     rows = {(row["case"], row["method"], row["num_micro"]): row for row in found["rows"]}
     assert len(rows) == 3 + 2 + 2 + 2  # turning, once, paper, linear
@@ -209,7 +221,7 @@ CHECKS = {"cost": check_cost, "floor": check_floor, "batch": check_batch, "compi
 
 def test_floor_without_a_compiler(monkeypatch):
     monkeypatch.setattr(c_loops, "compiler", lambda: None)
-    found = floor.run(TINY["floor"][1], "quick")
+    (found,) = floor.run(TINY["floor"][1], "quick")
     assert "No C compiler" in found.notes[0]
     assert [claim.what for claim in found.claims] == ["FPU l=3, num_micro 2: explicit slow over fully explicit"]
     assert found.rows[0]["to C"] is None

@@ -141,7 +141,8 @@ def test_unknown_case():
 def test_without_a_compiler(monkeypatch):
     monkeypatch.setattr(c_loops, "compiler", lambda: None)
     size = compare.Size(SHORT[:1], (), ("C by hand",), 1.0, 1, 1)
-    assert compare.run(size, "quick").notes == [
+    (report,) = compare.run(size, "quick")
+    assert report.notes == [
         "FPU l=3 t=1: C by hand was left out: there is no C compiler (cc, gcc or clang) on the PATH."
     ]
 

@@ -1,7 +1,7 @@
 """Our integrators against what people use instead: the time to reach an error, in one interleaved run per problem."""
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -106,16 +106,21 @@ def load(peer: str):
     return importlib.import_module(f"benchmarks.peers.{PEERS[peer]}")
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Report:
-    """Scan and time all of it."""
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """Scan and time all of it, a report after each case."""
     rows: list[dict] = []
     claims: list[Claim] = []
     notes: list[str] = []
     found: dict[str, list[Point]] = {}
+
+    def report() -> Report:
+        return Report("peers", name, rows, claims, list(dict.fromkeys(notes)), figures.by_family(found, tuple(PEERS)))
+
     for title in size.cases:
         case = cases.case(title)
         ladders = _ladders(title, case, size.peers, notes, partial(_single, case=case))
         found[title] = _one(title, case, ladders, LEVELS, size, tell, rows, claims, notes)
+        yield report()
     for title in size.batches:
         case, starts = batch_case(title.removesuffix(", batch"), size.batch)
         peers = [peer for peer in size.peers if peer in BATCHED]
@@ -123,7 +128,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Report:
             title, case, peers, notes, lambda m, case=case, starts=starts: (m.batch_ladders(case, *starts), None)
         )
         found[title] = _one(title, case, ladders, (BATCH_LEVEL,), size, tell, rows, claims, notes)
-    return Report("peers", name, rows, claims, list(dict.fromkeys(notes)), figures.by_family(found, tuple(PEERS)))
+        yield report()
 
 
 def batch_case(name: str, lanes: int) -> tuple[Case, tuple]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers.cases import Case, Ladder, step_counts, tolerances
 from vmri_jax.composition import stage_scheme
 from vmri_jax.runtime import in_one_kernel
 from vmri_jax.simulate import run, run_memory
@@ -24,7 +24,7 @@ LOBATTO = (4, 5, 6, 8, 11, 12, 16)
 """Degrees of `vm.galerkin` with one interval to a step, where there are constraints."""
 LOOSE = (1e-2, 1e-4, 1e-6)
 """Newton tolerances for moderate errors, where there are constraints; equations are also solved to round-off."""
-LOOSE_HIGH = tuple(10.0**-k for k in range(3, 11))
+LOOSE_HIGH = tuple(tolerances(1e-3, 1e-10))
 """The same for high degrees, whose steps are long: tolerances are relative to the motion."""
 MARCH = vm.Newton("march")
 """As `vm.simulate` starts a run. What it does not solve fails here, and is not solved again in another way."""
@@ -93,7 +93,7 @@ def ladders(case: Case) -> list[Ladder]:
 
             return Ladder(name, "steps", settings, build)
 
-        looser = [ladder(f"{name}, tolerance {tol:g}", tol) for tol in loose(case, scheme)]
+        looser = [ladder(f"{name}, tolerance {tol:.1e}", tol) for tol in loose(case, scheme)]
         return [ladder(name, MARCH.tolerance), *looser]
 
     return [found for name, scheme in schemes(case).items() for found in of_scheme(name, scheme)]
@@ -122,8 +122,8 @@ def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladd
 
         return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end), build)
 
-    def tolerances(scheme):
-        return {"": MARCH.tolerance} | {f", tolerance {tol:g}": tol for tol in loose(case, scheme)}
+    def by_name(scheme):
+        return {"": MARCH.tolerance} | {f", tolerance {tol:.1e}": tol for tol in loose(case, scheme)}
 
     schemes = batch_schemes() if schemes is None else schemes
-    return [ladder(a + b, scheme, tol) for a, scheme in schemes.items() for b, tol in tolerances(scheme).items()]
+    return [ladder(a + b, scheme, tol) for a, scheme in schemes.items() for b, tol in by_name(scheme).items()]

@@ -24,7 +24,8 @@ def one_effect(monkeypatch):
 
 @pytest.mark.usefixtures("one_effect")
 def test_what_is_taken_out_is_the_same_program():
-    (row,) = scenes.absence(TINY, "quick").rows
+    (report,) = scenes.absence(TINY, "quick")
+    (row,) = report.rows
     assert row["effect"] == "damping"
     assert row["same"] == "yes"
     assert row["ops without"] == row["ops never"] < row["ops with"]
@@ -35,7 +36,7 @@ def test_what_is_taken_out_is_the_same_program():
 @pytest.mark.usefixtures("one_effect")
 def test_what_stays_behind_is_seen(monkeypatch):
     monkeypatch.setattr(Scene, "without", lambda scene, _: Scene(scene.bodies, scene.effects))
-    report = scenes.absence(TINY, "quick")
+    (report,) = scenes.absence(TINY, "quick")
     (row,) = report.rows
     assert row["same"] == "no"
     assert report.notes[0].startswith("0 of 1")
@@ -56,7 +57,8 @@ def test_orders_are_held_against_the_scheme(monkeypatch):
         return errors, errors | {"falling": [1e-9, 1e-9]}
 
     monkeypatch.setattr(scenes, "convergence", convergence)
-    found = {row["effect"]: row["holds"] for row in scenes.orders(TINY, "quick").rows}
+    (report,) = scenes.orders(TINY, "quick")
+    found = {row["effect"]: row["holds"] for row in report.rows}
     assert found.pop("quadratic drag") == "no"
     assert set(found.values()) == {"yes"}
 
