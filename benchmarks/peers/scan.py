@@ -14,7 +14,7 @@ FINE = 0.1
 """A ladder ends at the first error below so many times the finest level."""
 CLOSE = 1.5
 """Settings that are at most so many times slower than the cheapest are timed too."""
-MOST = 6
+MOST = 12
 """Candidates per peer and level."""
 HALVINGS = 2
 """How often the gap between two settings is halved."""
