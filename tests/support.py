@@ -6,7 +6,6 @@ import jax
 import numpy as np
 
 from vmri_jax import Newton, macro_step, simulate, systems
-from vmri_jax.composition import stage_scheme
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -22,7 +21,7 @@ compiled_step = jax.jit(macro_step)
 
 def without_fallback(system, scheme) -> Newton:
     """The default iteration; where it is the nested march, without the exact solve behind it, which takes long to compile."""
-    return Newton().alone(system, stage_scheme(scheme))
+    return Newton().alone(system, scheme)
 
 
 def relative_difference(value, expected) -> float:

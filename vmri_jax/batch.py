@@ -109,7 +109,7 @@ def simulate_batch(
     size = _chunk(system, stage_scheme(scheme), first) if chunk is None else chunk
     static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}
     go = partial(_in_chunks, system, scheme, chunk=size, devices=devices, **static)
-    alone = newton.alone(system, stage_scheme(scheme))
+    alone = newton.alone(system, scheme)
     batch = {"state": states}  # what differs between the lanes
     batch |= {} if params is None else {"params": params}
     batch |= {} if dt.ndim == 0 else {"macro_dt": macro_dt}

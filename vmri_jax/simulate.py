@@ -126,7 +126,7 @@ class Simulation:
 
     def newton_for(self, fell_back: bool) -> Newton:
         """How steps are solved: "auto" is first the march alone (its fallback takes long to compile)."""
-        return self.newton if fell_back else self.newton.alone(self.system, stage_scheme(self.scheme))
+        return self.newton if fell_back else self.newton.alone(self.system, self.scheme)
 
     def start(self, state: State, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """Before the first step, or before any as if it was the first one."""
@@ -266,7 +266,7 @@ def _march_first(num_saves: int, save_every: int, save_micro: bool, at) -> Traje
         return _whole(num_saves, save_every, save_micro, (system, scheme, newton, *rest))
 
     system, scheme, newton, *rest = at
-    found = by(newton.alone(system, stage_scheme(scheme)))
+    found = by(newton.alone(system, scheme))
     exact = dataclasses.replace(newton, method="arrowhead")
     return jax.lax.cond(found.failed_at < 0, lambda: found, lambda: by(exact))
 

@@ -277,6 +277,7 @@ def averaging(system: System, scheme: Scheme, macro_dt, newton: Newton):
         micro_dt, none = macro_dt / scheme.num_micro, jnp.zeros(0)
         start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
         memory = start_memory(fast, fast_scheme, start, micro_dt, newton)
+        # One matrix for all micro steps, as in a macro step; `start_memory` leaves it to be filled.
         memory = _renew_matrix(fast, fast_scheme, start, micro_dt, newton, memory)  # pyright: ignore[reportArgumentType]
         _, _, (result, *_), q, _ = _march_fast(fast, fast_scheme, scheme.num_micro, start, micro_dt, newton, memory)
         a = (q_f / 2 + jnp.sum(q[:-1], axis=0) + q[-1] / 2) / scheme.num_micro

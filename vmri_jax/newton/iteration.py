@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.algebra import largest
+from vmri_jax.composition import stage_scheme
 from vmri_jax.equations import StepEquations, Unknowns
 from vmri_jax.linearization import linearize
 from vmri_jax.newton import arrowhead, collocation, drift, full, march
@@ -88,7 +89,7 @@ class Newton(eqx.Module):
 
     def alone(self, system, scheme) -> "Newton":
         """The nested march alone where this method falls back from it (which takes long to compile), else the same."""
-        return replace(self, method="march") if self.falls_back and self.marches(system, scheme) else self
+        return replace(self, method="march") if self.falls_back and self.marches(system, stage_scheme(scheme)) else self
 
     def marches(self, system, scheme) -> bool:
         """Whether the nested march is what this method starts with.

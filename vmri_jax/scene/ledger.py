@@ -191,7 +191,7 @@ def compile_run(system: System, scheme: Scheme | Composition, state, macro_dt, n
 
 
 def _run(system, scheme, state, macro_dt, *, num_steps):
-    newton = Newton().alone(system, stage_scheme(scheme))  # `simulate` compiles the fallback only where a step needs it
+    newton = Newton().alone(system, scheme)  # `simulate` compiles the fallback only where a step needs it
     step = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps}
     return simulate(system, scheme, state, **step, newton=newton, throw=False).final_state
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import vmri_jax as vm
-from vmri_jax.composition import stage_scheme
 from vmri_jax.study.menu import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.solutions import ReferenceSolution, reference_solution
@@ -91,7 +90,7 @@ class Search:
         program = self.programs.pop(key, None)
         if program is None:
             scheme, saves = family.make(num_micro), self.reference.num_saves
-            newton = self.newton.alone(self.problem.system, stage_scheme(scheme))
+            newton = self.newton.alone(self.problem.system, scheme)
             program = Program(self.problem, scheme, self.t_end, saves, newton)
         self.programs[key] = program  # the last one now
         if len(self.programs) > PROGRAMS:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from vmri_jax.composition import Composition, stage_scheme
+from vmri_jax.composition import Composition
 from vmri_jax.runtime import in_one_kernel
 from vmri_jax.simulate import check_run, run
 from vmri_jax.step import start_memory
@@ -66,7 +66,7 @@ class Program:
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
         self.newton, self.state = newton or vm.Newton(), problem.state()
         check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, 1)
-        self._alone = self.newton.alone(problem.system, stage_scheme(scheme))
+        self._alone = self.newton.alone(problem.system, scheme)
         self.compile_seconds = float("nan")
 
     @cached_property
