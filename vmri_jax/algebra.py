@@ -106,8 +106,11 @@ def _first_exchanged(a):
 
 
 def largest(a):
-    """The largest absolute value in a, 0 of nothing, NaN if there is one."""
-    return jax.lax.bitcast_convert_type(jnp.max(ordered(a), initial=0), jnp.float64)
+    """The largest absolute value in a, 0 of nothing, NaN if there is one; axis by axis, so that rows fill vector registers."""
+    order = ordered(a)
+    while order.ndim:
+        order = jnp.max(order, axis=0, initial=0)
+    return jax.lax.bitcast_convert_type(order, jnp.float64)
 
 
 def ordered(a):

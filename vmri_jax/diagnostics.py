@@ -20,7 +20,7 @@ from vmri_jax.system import System
 def energy_parts(system: System, q_s, q_f, p_s, p_f) -> dict:
     """Parts of the Hamiltonian ``p . v - T(q, v) + V + W``: "kinetic", "slow" and "fast"."""
     v_s, v_f = velocity(system, q_s, q_f, p_s, p_f)
-    kinetic = p_s @ v_s + p_f @ v_f - system.kinetic(q_s, q_f, v_s, v_f, system.params)
+    kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - system.kinetic(q_s, q_f, v_s, v_f, system.params)
     zero = jnp.zeros(())
     slow = zero if system.slow_potential is None else system.slow_potential(q_s, q_f, system.params)
     fast = zero if system.fast_potential is None else system.fast_potential(q_f, system.params)

@@ -30,7 +30,7 @@ class ConstantMass(eqx.Module):
         self.slow, self.fast = _mass("slow", slow), _mass("fast", fast)
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
-        return (v_s @ _times(self.slow, v_s) + v_f @ _times(self.fast, v_f)) / 2
+        return (jnp.sum(v_s * _times(self.slow, v_s)) + jnp.sum(v_f * _times(self.fast, v_f))) / 2
 
     def momentum(self, v_s, v_f):
         """``(M_s v_s, M_f v_f)``, over any leading axes."""
