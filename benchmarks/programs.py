@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from vmri_jax.runtime import OPTIONS
 
 SCHEMES: dict[str, Callable[[int], vm.Scheme]] = {
     "fully implicit": vm.fully_implicit,
@@ -50,7 +51,9 @@ def program(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float, newton: vm.
 def short_program(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float):
     """The same compiled once more as a whole, for every number of steps: a call costs nothing besides its steps."""
     whole = jax.jit(
-        lambda num_steps, state: program(problem, scheme, micro_dt)(num_steps, state=state), static_argnums=0
+        lambda num_steps, state: program(problem, scheme, micro_dt)(num_steps, state=state),
+        static_argnums=0,
+        compiler_options=OPTIONS,
     )
     return partial(whole, state=problem.state())
 

@@ -14,7 +14,7 @@ from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.lanes import over_lanes
 from vmri_jax.newton import Newton, is_collocation
 from vmri_jax.quadrature import real_array
-from vmri_jax.runtime import IN_LOOPS, WIDE_VECTORS
+from vmri_jax.runtime import OPTIONS
 from vmri_jax.scheme import Scheme
 from vmri_jax.simulate import check_run, run, run_memory
 from vmri_jax.split import split
@@ -211,7 +211,7 @@ def _join(pieces, lanes: int) -> Trajectory:
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:lanes], *pieces)
 
 
-@partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"), compiler_options={**WIDE_VECTORS, **IN_LOOPS})
+@partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"), compiler_options=OPTIONS)
 def _chunks(
     system, scheme, macro_dt, newton, batch, count, devices, *, num_saves, save_every, save_micro
 ) -> Trajectory:

@@ -22,15 +22,17 @@ from jax.extend import core
 from vmri_jax.structure import called
 
 FAST_LOOPS = (
-    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000,-memdep-block-scan-limit=10000"
+    "--xla_backend_extra_options="
+    "xla_cpu_small_while_loop_byte_threshold=100000000,-memdep-block-scan-limit=10000,-unroll-threshold=200"
 )
-"""An option of XLA and one of LLVM: how far back a load is traced to the store it could be replaced by."""
+"""An option of XLA and two of LLVM: how far back a load is traced to the store it could be replaced by, and how large a loop may be
+to be written out, which is done before what is left of it is turned into vector operations."""
 KNOWN = jax.__version_info__[:2] == (0, 10)
 """Whether this is the version of JAX that options were tried with; others refuse what they do not know."""
 IN_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""} if KNOWN else {}
 """Sums over some thousand numbers stay in their loop; handed to a library, as XLA does, they keep it from being one kernel."""
-WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512} if KNOWN else {}
-"""Vector registers are filled, where the compiler would take half of the widest. For batches."""
+OPTIONS = {**IN_LOOPS, "xla_cpu_prefer_vector_width": 512} if KNOWN else {}
+"""For programs that are a whole run: also, vector registers are filled, where the compiler would take half of the widest."""
 SHORT = 12
 """Most numbers of a reduction that is written out, see `in_one_kernel`."""
 DEVICES = "--xla_force_host_platform_device_count="

@@ -23,11 +23,11 @@ from vmri_jax.interrupts import Interrupted, interrupts_noted
 from vmri_jax.newton import Newton, is_solved
 from vmri_jax.quadrature import is_concrete, real_array
 from vmri_jax.results import CONSTRAINT_TOLERANCE, Method, Result, SimulationError
-from vmri_jax.runtime import WIDE_VECTORS, in_one_kernel
+from vmri_jax.runtime import OPTIONS, in_one_kernel
 from vmri_jax.scheme import Scheme
 from vmri_jax.split import drifts
 from vmri_jax.state import State, check_constraints
-from vmri_jax.step import LARGE, Memory, Stages, advance, projected, start_memory
+from vmri_jax.step import Memory, Stages, advance, projected, start_memory
 from vmri_jax.system import System
 from vmri_jax.trajectory import RunInfo, Trajectory, join
 
@@ -153,8 +153,7 @@ class Simulation:
         return join([*good, rest]), end
 
     def _advance(self, at: Checkpoint, saves: int, newton: Newton) -> tuple[Trajectory, Checkpoint]:
-        run_piece = _run_large if at.state.q_f.size >= LARGE else _run_traced
-        piece, state, memory = run_piece(
+        piece, state, memory = _run_in_one_kernel(
             self.system, self.scheme, newton, self.macro_dt, self.t_start, at.state, at.memory, at.step, saves,
             self.save_every, self.save_micro,
         )  # fmt: skip
@@ -277,6 +276,7 @@ def _of_each_step(num_saves, save_every, save_micro, primals, tangents):
     return jax.jvp(partial(_whole, num_saves, save_every, save_micro), primals, tangents)
 
 
+@partial(jax.jit, static_argnames=("num_saves", "save_micro"), compiler_options=OPTIONS)
 def _run_in_one_kernel(
     system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro
 ):
@@ -288,12 +288,6 @@ def _run_in_one_kernel(
 
     piece, memory = go(macro_dt, t_start, at, memory, first_step)
     return piece, piece.final_state, memory
-
-
-_run_traced, _run_large = (
-    jax.jit(_run_in_one_kernel, static_argnames=("num_saves", "save_micro"), compiler_options=options)
-    for options in (None, WIDE_VECTORS)
-)
 
 
 @jax.jit

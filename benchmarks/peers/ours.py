@@ -11,7 +11,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.peers.cases import Case, Ladder, step_counts, tolerances
 from vmri_jax.composition import stage_scheme
-from vmri_jax.runtime import in_one_kernel
+from vmri_jax.runtime import OPTIONS, in_one_kernel
 from vmri_jax.simulate import run, run_memory
 
 COMPOSED = {"kahan-li8": (1, 2, 4), "kahan-li6": (1, 2, 4), "suzuki4": (1, 2, 4, 8)}
@@ -66,7 +66,7 @@ def program(case: Case, scheme: vm.Scheme | vm.Composition):
     """
     system, newton, n_s, n_f = case.problem.system, MARCH, case.problem.q_s.size, case.problem.q_f.size
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=OPTIONS)
     @in_one_kernel
     def steps(start, t_end, num_steps, tolerance):
         q_s, q_f, p_s, p_f = jnp.split(start, np.cumsum([n_s, n_f, n_s]))

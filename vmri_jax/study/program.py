@@ -1,7 +1,7 @@
 """One problem under one scheme, compiled once for every number of steps: what studies run and time."""
 
 import time
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import numpy as np
 
 import vmri_jax as vm
 from vmri_jax.composition import Composition
-from vmri_jax.runtime import in_one_kernel
+from vmri_jax.runtime import OPTIONS, in_one_kernel
 from vmri_jax.simulate import check_run, run
 from vmri_jax.step import start_memory
 from vmri_jax.trajectory import RunInfo
@@ -26,7 +26,7 @@ def _compiled_for(structure, num_saves: int):
     call cheap. Only the last programs are kept: thousands would exhaust the memory maps that a process may have.
     """
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=OPTIONS)
     @in_one_kernel
     def run_all(leaves, num_steps, save_every):
         system, scheme, newton, state, t_end = jax.tree.unflatten(structure, leaves)
