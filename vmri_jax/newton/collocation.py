@@ -328,14 +328,26 @@ def product(matrix, z):
 
 
 class Iterate(NamedTuple):
-    """State of the iteration: increments x (n, r), multipliers mu (n_c, r), their forces, largest corrections, and how it stands."""
+    """Increments x (n, r), multipliers mu (n_c, r), their largest corrections, how many there were, and what the last one tells."""
 
     x: Any
     mu: Any
-    forces: Forces
     moved: Any
     iterations: Any
     result: Any
+
+
+class Evaluated(NamedTuple):
+    """An iterate, forces of it or of the one before, and RUNNING or, with its own forces, the result."""
+
+    last: Iterate
+    forces: Forces
+    result: Any
+
+
+def only_if(wanted, function, x):
+    """``function(x)``, or x itself. As a loop of at most one pass: of two branches, lanes would always compute both."""
+    return jax.lax.while_loop(lambda a: a[0], lambda a: (jnp.asarray(False), function(a[1])), (wanted, x))[1]
 
 
 def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, Unknowns, Any, Any]:
@@ -358,20 +370,25 @@ def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, U
     def slow_and_fast(x):
         return largest(x[:n_s]), largest(x[n_s:])
 
-    def step(last: Iterate) -> Iterate:
-        missing = (
-            last.x + interval.over_mass(last.forces.inside) @ modes.of_rows
-        )  # what these forces do not bring about
-        dx, dmu = saddles.solve(-missing, -last.forces.g)
+    def corrected(last: Iterate, forces: Forces) -> Iterate:
+        missing = last.x + interval.over_mass(forces.inside) @ modes.of_rows  # what these forces do not bring about
+        dx, dmu = saddles.solve(-missing, -forces.g)
         x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
         left = map(expected, moved, last.moved)
-        result = newton.status(accepted.over(left, slow_and_fast(x)), iterations)
-        return Iterate(x, mu, interval.forces(x, mu), moved, iterations, result)
+        return Iterate(x, mu, moved, iterations, newton.status(accepted.over(left, slow_and_fast(x)), iterations))
 
-    start = Iterate(x, mu, interval.forces(x, mu), (jnp.zeros(()),) * 2, jnp.asarray(0), jnp.asarray(RUNNING))
-    done = newton.iterate(step, start)
-    p, rows = interval.momentum(done.x, done.forces), interval.residual(done.x, done.forces)
-    x, mu = done.x.T, done.mu.T
+    def step(at: Evaluated) -> Evaluated:
+        """Forces first: evaluated in one place, they are compiled once."""
+        last, fixed = at.last, newton.fixed_iterations
+        forces = interval.forces(last.x, last.mu)
+        goes_on = last.result == RUNNING if fixed is None else last.iterations < fixed
+        return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
+
+    running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(interval.q), jnp.zeros_like(mu))
+    start = Iterate(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
+    last, forces, _ = newton.iterate(step, Evaluated(start, none, running), -1)  # forces once more than corrections
+    p, rows = interval.momentum(last.x, forces), interval.residual(last.x, forces)
+    x, mu = last.x.T, last.mu.T
     unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
     end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
-    return done, unknowns, end, (largest(rows), largest(done.forces.g))
+    return last, unknowns, end, (largest(rows), largest(forces.g))
