@@ -14,8 +14,8 @@ import vmri_jax as vm
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
 from vmri_jax import runtime
-from vmri_jax.store.layout import CHECKPOINT
-from vmri_jax.trajectory import STATUS, named_arrays
+from vmri_jax.running.store.layout import CHECKPOINT
+from vmri_jax.running.trajectory import STATUS, named_arrays
 
 COLUMNS = ("kill", "after, s", "chunks", "new", "moment", "identical")
 CHUNKS, PER_CHUNK = 40, 5

@@ -9,8 +9,8 @@ import pytest
 
 import vmri_jax as vm
 from vmri_jax import plots
+from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.study import ConvergenceRow, ConvergenceStudy, CostRow, CostStudy, ReferenceSolution
-from vmri_jax.trajectory import RunInfo
 
 
 def run(num_nodes=21, n_s=2, n_f=3, constrained=False):

@@ -1,14 +1,18 @@
 """Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories."""
 
-from vmri_jax import diagnostics, quadrature, runtime
-from vmri_jax.batch import simulate_batch
-from vmri_jax.composition import Composition, compose
-from vmri_jax.discrete_lagrangian import discrete_lagrangian, discrete_legendre
-from vmri_jax.interrupts import Interrupted
-from vmri_jax.newton import Newton
-from vmri_jax.quadrature import macro, micro
-from vmri_jax.results import Method, Result, SimulationError
-from vmri_jax.scheme import (
+from vmri_jax import diagnostics, runtime
+from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.running.batch import simulate_batch
+from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.simulate import simulate
+from vmri_jax.running.store import StoredTrajectory, stream
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes import quadrature
+from vmri_jax.schemes.composition import Composition, compose
+from vmri_jax.schemes.discrete_lagrangian import discrete_lagrangian, discrete_legendre
+from vmri_jax.schemes.quadrature import macro, micro
+from vmri_jax.schemes.scheme import (
     Scheme,
     explicit_slow,
     fully_explicit,
@@ -17,12 +21,9 @@ from vmri_jax.scheme import (
     mollified_impulse,
     takahashi_imada,
 )
-from vmri_jax.simulate import simulate
-from vmri_jax.state import Problem, State, initial_state
-from vmri_jax.step import StepInfo, macro_step
-from vmri_jax.store import StoredTrajectory, stream
-from vmri_jax.system import ConstantMass, Rheonomic, System
-from vmri_jax.trajectory import Trajectory
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Method, Result, SimulationError
+from vmri_jax.steppers.step import StepInfo, macro_step
 
 from vmri_jax import systems  # isort: skip  (written with the names above)
 

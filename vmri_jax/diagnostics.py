@@ -6,15 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.algebra import largest
-from vmri_jax.composition import Composition
-from vmri_jax.equations import StepEquations
-from vmri_jax.linearization import linearize
-from vmri_jax.newton import Newton, dense
-from vmri_jax.scheme import Scheme
-from vmri_jax.state import State, project_momentum
-from vmri_jax.step import macro_step
-from vmri_jax.system import System
+from vmri_jax.kernels.cpu import largest
+from vmri_jax.mechanics.state import State, project_momentum
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.equations import StepEquations
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton, dense
+from vmri_jax.steppers.newton.linearization import linearize
+from vmri_jax.steppers.step import macro_step
 
 
 def energy_parts(system: System, q_s, q_f, p_s, p_f) -> dict:

@@ -16,7 +16,8 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
-import vmri_jax as vm
+from vmri_jax import diagnostics
+from vmri_jax.running.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from vmri_jax.study import ConvergenceStudy, CostStudy, WorkPrecision
@@ -94,7 +95,7 @@ def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
         figure.savefig(path)
 
 
-def plot_trajectory(trajectory: vm.Trajectory, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+def plot_trajectory(trajectory: Trajectory, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Slow and fast positions, energy error and, where there are constraints, their residual, against time.
 
     Args:
@@ -129,9 +130,7 @@ def plot_trajectory(trajectory: vm.Trajectory, title: str = "", theme: Theme = L
     return figure
 
 
-def plot_oscillatory_energies(
-    trajectory: vm.Trajectory, omega, title: str = "", theme: Theme = LIGHT
-) -> NotebookFigure:
+def plot_oscillatory_energies(trajectory: Trajectory, omega, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of the stiff springs and their sum, the adiabatic invariant.
 
     Args:
@@ -141,7 +140,7 @@ def plot_oscillatory_energies(
         theme: colours.
     """
     t = np.asarray(trajectory.t)
-    energies = np.asarray(vm.diagnostics.oscillatory_energies(omega, trajectory.q_f, trajectory.p_f))
+    energies = np.asarray(diagnostics.oscillatory_energies(omega, trajectory.q_f, trajectory.p_f))
     with style(theme):
         figure = NotebookFigure(figsize=(7.2, 3.4))
         axes = figure.subplots()

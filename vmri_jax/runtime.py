@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from vmri_jax.structure import called
+from vmri_jax.mechanics.structure import called
 
 FAST_LOOPS = (
     "--xla_backend_extra_options="

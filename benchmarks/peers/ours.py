@@ -10,9 +10,9 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.peers.cases import Case, Ladder, step_counts, tolerances
-from vmri_jax.composition import stage_scheme
+from vmri_jax.running.simulate import run, run_memory
 from vmri_jax.runtime import OPTIONS, in_one_kernel
-from vmri_jax.simulate import run, run_memory
+from vmri_jax.schemes.composition import stage_scheme
 
 COMPOSED = {"kahan-li8": (1, 2, 4), "kahan-li6": (1, 2, 4), "suzuki4": (1, 2, 4, 8)}
 """Compositions of `vm.fully_explicit` that are tried, with numbers of micro steps; the finest first."""

@@ -5,7 +5,7 @@ import numpy as np
 
 import vmri_jax as vm
 from tests.support import DATA, PROBLEMS
-from vmri_jax.trajectory import RunInfo
+from vmri_jax.running.trajectory import RunInfo
 
 PENDULUM = {
     "bodies": [

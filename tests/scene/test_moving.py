@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests import test_rheonomic as by_hand
+from tests.steppers import test_rheonomic as by_hand
 from vmri_jax import fully_implicit, simulate
 from vmri_jax.scene import Body, Constraint, Gravity, Guide, MovingPivot, RigidLink, Scene
 

@@ -32,7 +32,7 @@ from vmri_jax.scene import (
     Spring,
     SpringAnchor,
 )
-from vmri_jax.step import macro_step
+from vmri_jax.steppers.step import macro_step
 
 TSP = gallery_scene("triple_spherical_pendulum")
 

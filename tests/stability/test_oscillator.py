@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, takahashi_imada
-from vmri_jax.quadrature import midpoint, trapezoidal
+from vmri_jax.schemes.quadrature import midpoint, trapezoidal
 from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from vmri_jax.results import CONSTRAINT_TOLERANCE
+from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 
 
 def _distance(x):

@@ -16,7 +16,7 @@ from rich.console import Console
 import vmri_jax as vm
 from benchmarks import fuzz
 from tests.verification import random_systems as rs
-from vmri_jax.trajectory import RunInfo
+from vmri_jax.running.trajectory import RunInfo
 
 # Many draws of each run one program; the structures are chosen to be different ways through a step.
 STRUCTURES = {

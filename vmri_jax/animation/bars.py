@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-import vmri_jax as vm
 from vmri_jax.animation.drawing import Anchor, Body, Drawing, check_index, frame
+from vmri_jax.running.trajectory import Trajectory
 
 RADIUS = 0.24
 """Of a ball, in the distance between bars."""
 
 
-def bars(trajectory: vm.Trajectory) -> dict:
+def bars(trajectory: Trajectory) -> dict:
     """A drawing of any run: all coordinates of q_s, and all of q_f, as bars."""
     sizes = {part: np.shape(q)[1] for part, q in (("s", trajectory.q_s), ("f", trajectory.q_f))}
     blocks = [{"name": f"q_{part}", "coordinates": [[part, i] for i in range(n)]} for part, n in sizes.items() if n > 0]

@@ -8,9 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import vmri_jax as vm
+from vmri_jax import diagnostics
 from vmri_jax.animation.bars import with_bars
 from vmri_jax.animation.drawing import Drawing
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.steppers.results import Result
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Motion:
         )
 
 
-def motion(trajectory: vm.Trajectory, drawing: Drawing, system: vm.System | None = None) -> Motion:
+def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = None) -> Motion:
     """The motion of a drawing along a run, up to where it failed.
 
     Velocities at the nodes are those of the momenta if the system is given, else central differences. Where the run kept
@@ -140,12 +143,12 @@ def _differences(t, values) -> np.ndarray:
     return np.gradient(values, t, axis=0, edge_order=2 if len(t) > 2 else 1)
 
 
-def _velocities(system: vm.System, trajectory: vm.Trajectory, count: int) -> np.ndarray:
+def _velocities(system: System, trajectory: Trajectory, count: int) -> np.ndarray:
     """(count, n_s + n_f) velocities of the momenta."""
     phase = [jnp.asarray(a)[:count] for a in (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)]
     try:
-        start = float(vm.diagnostics.energy(system, *(a[0] for a in phase)))
-        v_s, v_f = jax.jit(jax.vmap(partial(vm.diagnostics.velocity, system)))(*phase)
+        start = float(diagnostics.energy(system, *(a[0] for a in phase)))
+        v_s, v_f = jax.jit(jax.vmap(partial(diagnostics.velocity, system)))(*phase)
     except (TypeError, ValueError, IndexError) as error:
         sizes = f"{phase[0].shape[1]} slow and {phase[1].shape[1]} fast coordinates"
         raise ValueError(f"motion: the system does not go with a run of {sizes}: {error}") from error
@@ -158,16 +161,16 @@ def _velocities(system: vm.System, trajectory: vm.Trajectory, count: int) -> np.
     return np.concatenate([v_s, v_f], axis=1)
 
 
-def _ending(trajectory: vm.Trajectory, count: int) -> str:
+def _ending(trajectory: Trajectory, count: int) -> str:
     failed = int(trajectory.failed_at)
     if failed < 0 and count == len(trajectory.t):
         return ""
-    result = vm.Result(int(trajectory.result))
+    result = Result(int(trajectory.result))
     where = f"in macro step {failed}, " if failed >= 0 else ""
     return f"The run failed {where}after t = {float(trajectory.t[count - 1]):.6g} ({result.name}); it is drawn up to there."
 
 
-def _with_micro_nodes(trajectory: vm.Trajectory, t, q, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _with_micro_nodes(trajectory: Trajectory, t, q, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes with the micro nodes between them, if the run kept those of all its macro steps and they are in order.
 
     There the slow positions are those of the cubic between macro nodes, and velocities central differences.

@@ -9,9 +9,9 @@ import jax
 import typer
 
 from vmri_jax import runtime
-from vmri_jax.animation.command import animate
 from vmri_jax.cli import lists, run, scenes, stability, study
-from vmri_jax.hard.command import hard
+from vmri_jax.cli.animate import animate
+from vmri_jax.cli.hard import hard
 
 app = typer.Typer(
     no_args_is_help=True,

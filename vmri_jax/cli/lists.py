@@ -4,9 +4,9 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from vmri_jax.catalogue import SCHEMES, SYSTEMS
+from vmri_jax.cli.catalogue import SCHEMES, SYSTEMS
 from vmri_jax.cli.common import console
-from vmri_jax.composition import COMPOSITIONS
+from vmri_jax.schemes.composition import COMPOSITIONS
 
 app = typer.Typer()
 

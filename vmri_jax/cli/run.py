@@ -13,11 +13,16 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-import vmri_jax as vm
 from vmri_jax import plots
-from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
+from vmri_jax.cli.catalogue import find_problem, find_scheme
 from vmri_jax.cli.common import BadInput, check_target_file, console, print_failure
+from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.simulate import simulate as run_at_once
+from vmri_jax.running.store import StoredTrajectory, stream
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Method, SimulationError
 
 SAVED_NODES = 1000
 """About as many nodes are saved by default."""
@@ -62,7 +67,7 @@ def simulate(
         check_target_file("--plot", plot, (".png", ".svg", ".pdf"))
         problem = find_problem(system)
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-        before = vm.StoredTrajectory(out) if out is not None and resume and out.exists() else None
+        before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
         if save_every is None:
             save_every = default_save_every(steps) if before is None else before.save_every
         arguments = {
@@ -70,20 +75,20 @@ def simulate(
             "micro_dt": micro_dt,
             "num_steps": steps,
             "save_every": save_every,
-            "newton": vm.Newton(method=method),  # pyright: ignore[reportArgumentType]
+            "newton": Newton(method=method),  # pyright: ignore[reportArgumentType]
             "progress": True,
         }
         if streamed:
             arguments |= {"out": out, "resume": resume, "overwrite": overwrite, "drawing": problem.drawing}
         compiling = _compile_clock()
         start = time.perf_counter()
-        trajectory, stopped = _run(vm.stream if streamed else vm.simulate, problem, chosen, arguments)
+        trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
         seconds = time.perf_counter() - start
         saved = [str(out)] if out is not None else []
-        if out is not None and isinstance(trajectory, vm.Trajectory):
+        if out is not None and isinstance(trajectory, Trajectory):
             trajectory.save(out, problem.drawing)
         if plot is not None:
-            nodes = trajectory if isinstance(trajectory, vm.Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
+            nodes = trajectory if isinstance(trajectory, Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
             plots.save(plots.plot_trajectory(nodes, f"{system}, {scheme}, {num_micro} micro steps"), plot)
             saved.append(str(plot))
     except (ValueError, TypeError, FileExistsError, FileNotFoundError) as error:
@@ -93,7 +98,7 @@ def simulate(
         raise typer.Exit(1) from error
     if stopped is not None:
         raise typer.Exit(_print_stop(stopped, saved, streamed))
-    pieces = [trajectory] if isinstance(trajectory, vm.Trajectory) else trajectory.chunks()
+    pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
     now = steps - (0 if before is None else before.step)
     summary = _summary(pieces, steps, chosen.num_micro, now, seconds, sum(compiling), saved)
     if not problem.system.is_constrained:
@@ -105,14 +110,14 @@ def _run(run, problem, scheme, arguments: dict):
     """The trajectory, and what stopped the run before its end, if anything did."""
     try:
         return jax.block_until_ready(run(problem.system, scheme, problem.state(), **arguments)), None
-    except (vm.SimulationError, vm.Interrupted) as stopped:
+    except (SimulationError, Interrupted) as stopped:
         return stopped.trajectory, stopped
 
 
-def _print_stop(stopped: vm.SimulationError | vm.Interrupted, saved: list[str], streamed: bool) -> int:
+def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], streamed: bool) -> int:
     """Say how far a run came, and where that is; returns the exit code."""
     kept = f"\n\nThe trajectory up to there is in {' and '.join(saved)}." if saved else ""
-    if isinstance(stopped, vm.SimulationError):
+    if isinstance(stopped, SimulationError):
         reason = f"Macro step {stopped.step} at t = {stopped.time:.6g}: {stopped.result.message}{kept}"
         print_failure("The run failed", reason)
         return 1
@@ -149,7 +154,7 @@ def _compile_clock() -> list[float]:
 
 
 def _summary(
-    pieces: Iterable[vm.Trajectory],
+    pieces: Iterable[Trajectory],
     steps: int,
     num_micro: int,
     now: int,
@@ -169,7 +174,7 @@ def _summary(
         "simulated time": f"{t_start:g} to {t_end:g}",
         "wall time": f"{seconds:.2f} s, of which {compiling:.2f} s compiling",
         "per micro step": f"{1e6 * max(seconds - compiling, 0.0) / (now * num_micro):.3g} µs" if now else "",
-        "Newton iterations": f"at most {int(iterations)} per step, {vm.Method(int(method)).name.lower()}",
+        "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
         "energy change": f"at most {change:.2e}{'' if absolute else ' of the energy at the start'}",
         "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities",
         "saved": ", ".join(saved) if saved else "nothing; give --out run.npz or --plot run.png",
@@ -184,7 +189,7 @@ def _two_columns(rows: dict[str, str]) -> Table:
     return table
 
 
-def _extremes(piece: vm.Trajectory) -> tuple:
+def _extremes(piece: Trajectory) -> tuple:
     """Start time and energy; end time; least and largest energy; largest residuals, dearest method, most iterations."""
     energy, residual = np.asarray(piece.energy), np.asarray(piece.constraint_residual)
     dearest = int(np.max(piece.info.method)), int(np.max(piece.info.iterations))

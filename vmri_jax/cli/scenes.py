@@ -4,8 +4,8 @@ from typing import Annotated
 
 import typer
 
-from vmri_jax.catalogue import find_scene, find_scheme
 from vmri_jax.cli import options
+from vmri_jax.cli.catalogue import find_scene, find_scheme
 from vmri_jax.cli.common import BadInput, console
 
 app = typer.Typer()

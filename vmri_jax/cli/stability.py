@@ -9,8 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from vmri_jax import plots
-from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
+from vmri_jax.cli.catalogue import find_problem, find_scheme
 from vmri_jax.cli.common import BadInput, check_target_file, console
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map

@@ -7,9 +7,9 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-import vmri_jax as vm
-from vmri_jax.catalogue import find_problem
+from vmri_jax.cli.catalogue import find_problem
 from vmri_jax.cli.common import BadInput, check_target_file, console, print_failure, progress_bar
+from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study import (
     Recommendation,
     WorkPrecision,
@@ -48,7 +48,7 @@ def tune(
         console.print(failure.runs.table())
         print_failure("Nothing reached the error", f"{failure} The best runs are above.")
         raise typer.Exit(1) from failure
-    except vm.SimulationError as failure:
+    except SimulationError as failure:
         print_failure("No reference solution", str(failure))
         raise typer.Exit(1) from failure
     except (ValueError, TypeError) as wrong:
@@ -86,7 +86,7 @@ def cost(
             page = cost_page(problem, system, out, t_end=t_end, errors=error, progress=tell)
     except OSError as wrong:
         raise BadInput(f"--out {out}: {wrong.strerror}; give a folder that can be written.") from wrong
-    except vm.SimulationError as failure:
+    except SimulationError as failure:
         print_failure("No reference solution", str(failure))
         raise typer.Exit(1) from failure
     except (ValueError, TypeError) as wrong:

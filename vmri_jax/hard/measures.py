@@ -7,30 +7,34 @@ from typing import Any
 import jax
 import numpy as np
 
-import vmri_jax as vm
+from vmri_jax import diagnostics
+from vmri_jax.mechanics.state import Problem, State
+from vmri_jax.running.simulate import simulate
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.steppers.results import Result
 
 SAVED = 10_000
 """About as many nodes of a long run are kept."""
 
 
-def run(problem: vm.Problem, scheme, macro_dt, num_steps: int, **options: Any) -> vm.Trajectory:
-    """`vmri_jax.simulate` from the problem's start; a failure is in the trajectory and not raised."""
+def run(problem: Problem, scheme, macro_dt, num_steps: int, **options: Any) -> Trajectory:
+    """`vmri_jax.running.simulate` from the problem's start; a failure is in the trajectory and not raised."""
     state = problem.state()
-    return vm.simulate(problem.system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
+    return simulate(problem.system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
 
 
-def long_run(problem: vm.Problem, scheme, macro_dt, num_steps: int, **options) -> vm.Trajectory:
+def long_run(problem: Problem, scheme, macro_dt, num_steps: int, **options) -> Trajectory:
     """`run` that saves about `SAVED` nodes."""
     return run(problem, scheme, macro_dt, num_steps, save_every=max(1, num_steps // SAVED), **options)
 
 
-def status(trajectory: vm.Trajectory) -> str:
+def status(trajectory: Trajectory) -> str:
     """The status of a run in words."""
-    name = vm.Result(int(trajectory.result)).name
+    name = Result(int(trajectory.result)).name
     return name if trajectory.success else f"{name} at step {int(trajectory.failed_at)}"
 
 
-def iterations(trajectory: vm.Trajectory) -> int:
+def iterations(trajectory: Trajectory) -> int:
     """The most iterations of a step."""
     return int(np.max(np.asarray(trajectory.info.iterations)))
 
@@ -56,7 +60,7 @@ class Energy:
         return not self.share <= 0.5
 
 
-def energy(trajectory: vm.Trajectory, num_steps: int, scale: float = 1.0) -> Energy:
+def energy(trajectory: Trajectory, num_steps: int, scale: float = 1.0) -> Energy:
     """Band, largest jump and drift of the energy over a run of `num_steps` steps, in units of `scale`.
 
     All are infinite where the run failed.
@@ -70,7 +74,7 @@ def energy(trajectory: vm.Trajectory, num_steps: int, scale: float = 1.0) -> Ene
     return Energy(band, float(np.abs(np.diff(e)).max()), change / num_steps * 1e5, share)
 
 
-def smooth_shift(trajectory: vm.Trajectory, num_steps: int, scale: float = 1.0) -> float:
+def smooth_shift(trajectory: Trajectory, num_steps: int, scale: float = 1.0) -> float:
     """Change of the mean energy per 1e5 steps, between the halves of a run, for motion that is quasi-periodic.
 
     The means are weighted by ``exp(-1 / (x (1 - x)))``, x from 0 to 1: they converge faster than any power of the length
@@ -83,15 +87,15 @@ def smooth_shift(trajectory: vm.Trajectory, num_steps: int, scale: float = 1.0) 
     return float(weights @ (e[-half:] - e[:half]) / weights.sum() / (num_steps - num_steps / 2) * 1e5)
 
 
-def energy_scale(problem: vm.Problem, trajectory: vm.Trajectory) -> float:
+def energy_scale(problem: Problem, trajectory: Trajectory) -> float:
     """Size of the energies of a run: the larger of ``|E_0|`` and the largest kinetic energy, at least 1e-300."""
     still = problem.system.replace(slow_potential=None, fast_potential=None)
-    kinetic = jax.vmap(partial(vm.diagnostics.energy, still))
+    kinetic = jax.vmap(partial(diagnostics.energy, still))
     phase = (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)
     return max(float(np.nanmax(kinetic(*phase))), float(abs(trajectory.energy[0])), 1e-300)
 
 
-def constraints(trajectory: vm.Trajectory) -> tuple[float, float]:
+def constraints(trajectory: Trajectory) -> tuple[float, float]:
     """Largest ``|g|`` and ``|G v|`` of a run; infinite where it failed."""
     if not trajectory.success:
         return np.inf, np.inf
@@ -99,7 +103,7 @@ def constraints(trajectory: vm.Trajectory) -> tuple[float, float]:
     return float(position), float(velocity)
 
 
-def nodes(trajectory: vm.Trajectory) -> np.ndarray:
+def nodes(trajectory: Trajectory) -> np.ndarray:
     """(k, n) positions at the saved nodes, slow first."""
     return np.concatenate([trajectory.q_s, trajectory.q_f], axis=1)
 
@@ -109,14 +113,14 @@ def difference(a, b) -> float:
     return float(np.max(np.nan_to_num(np.abs(np.asarray(a) - np.asarray(b)), nan=np.inf), initial=0.0))
 
 
-def reversal(problem: vm.Problem, scheme, macro_dt, num_steps: int) -> float:
+def reversal(problem: Problem, scheme, macro_dt, num_steps: int) -> float:
     """Distance from the start after `num_steps` there and, with momenta turned around, as many back."""
     there = run(problem, scheme, macro_dt, num_steps, save_every=num_steps)
     if not there.success:
         return np.inf
     end = there.final_state
-    turned = vm.State(0.0, end.q_s, end.q_f, -end.p_s, -end.p_f)
-    back = vm.simulate(
+    turned = State(0.0, end.q_s, end.q_f, -end.p_s, -end.p_f)
+    back = simulate(
         problem.system, scheme, turned, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps, throw=False
     )
     return difference(nodes(back)[-1], nodes(there)[0])

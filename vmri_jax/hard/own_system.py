@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import vmri_jax as vm
+from vmri_jax import diagnostics
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.hard.case import Case, Outcome
 from vmri_jax.hard.guards import bad_lane, single_precision
@@ -22,7 +22,11 @@ from vmri_jax.hard.measures import (
     status,
 )
 from vmri_jax.hard.scales import apart_from, midpoint_integrator, rattle
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import ConstantMass
+from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
+from vmri_jax.steppers.newton import Newton
 
 NUM_MICRO = 5
 PHASE = 0.2
@@ -33,8 +37,8 @@ PHASE = 0.2
 class OwnSystem:
     """A problem with a scheme and a step that resolve its fastest vibration; every method is a case."""
 
-    problem: vm.Problem
-    scheme: vm.Scheme
+    problem: Problem
+    scheme: Scheme
     macro_dt: float
     omega: float
 
@@ -80,7 +84,7 @@ class OwnSystem:
     def tolerance(self, full: bool) -> Outcome:
         steps, ends = 1_000 if full else 100, {}
         for tolerance in (1e-4, 1e-8, 1e-12):
-            newton = vm.Newton(tolerance=tolerance)
+            newton = Newton(tolerance=tolerance)
             trajectory = run(self.problem, self.scheme, self.macro_dt, steps, save_every=steps, newton=newton)
             ends[tolerance] = nodes(trajectory)[-1]
         size = np.abs(ends[1e-12]).max()
@@ -110,7 +114,7 @@ class OwnSystem:
     def explicit_limit(self, full: bool) -> Outcome:
         steps = 10_000 if full else 1_000
         below, beyond = (
-            run(self.problem, vm.fully_explicit(1), wh / self.omega, steps, save_every=10) for wh in (1.0, 2.5)
+            run(self.problem, fully_explicit(1), wh / self.omega, steps, save_every=10) for wh in (1.0, 2.5)
         )
         bounded = energy(below, steps, energy_scale(self.problem, below)).band
         finite = all(bool(jnp.isfinite(r.energy).all()) == bool(r.success) for r in (below, beyond))
@@ -124,8 +128,8 @@ class OwnSystem:
         h, steps, values = 0.1 / self.omega, 100 if full else 20, {}
         free = self.problem.system.constraint is self.problem.system.slow_constraint is None
         if free:
-            values["midpoint"] = apart_from(midpoint_integrator, self.problem, vm.fully_implicit(1), h, steps)
-        values["Verlet" if free else "RATTLE"] = apart_from(rattle, self.problem, vm.fully_explicit(1), h, steps)
+            values["midpoint"] = apart_from(midpoint_integrator, self.problem, fully_implicit(1), h, steps)
+        values["Verlet" if free else "RATTLE"] = apart_from(rattle, self.problem, fully_explicit(1), h, steps)
         words = ", ".join(f"{name} {value:.0e}" for name, value in values.items())
         return Outcome(f"from the known method after {steps} steps: {words}", max(values.values()) < 1e-10, values)
 
@@ -137,10 +141,10 @@ class OwnSystem:
         return single_precision(self.problem, self.macro_dt)
 
     def bad_lane(self, full: bool) -> Outcome:
-        return bad_lane(self.problem, self.scheme, self.macro_dt, 20, vm.Newton(), lanes=64 if full else 16)
+        return bad_lane(self.problem, self.scheme, self.macro_dt, 20, Newton(), lanes=64 if full else 16)
 
 
-def own_system(problem: vm.Problem) -> OwnSystem:
+def own_system(problem: Problem) -> OwnSystem:
     """A problem with five micro steps of ``omega h = 0.2`` for its fastest frequency at the start.
 
     Where nothing vibrates, omega is the rate at which velocity or acceleration changes positions by their own size.
@@ -149,21 +153,21 @@ def own_system(problem: vm.Problem) -> OwnSystem:
         ValueError: the problem is refused by `initial_state`.
     """
     state = problem.state()
-    omega = float(vm.diagnostics.frequencies(problem.system, state)[0])
+    omega = float(diagnostics.frequencies(problem.system, state)[0])
     if not omega > 0:
         dt = 1e-3
-        q = nodes(run(problem, vm.fully_implicit(1), dt, 2))
+        q = nodes(run(problem, fully_implicit(1), dt, 2))
         size = max(np.abs(q).max(), 1e-300)
         velocity, acceleration = (np.abs(np.diff(q, k, axis=0)).max() / dt**k for k in (1, 2))
         omega = float(max(velocity / size, np.sqrt(acceleration / size), 1e-3))
-    return OwnSystem(problem, vm.fully_implicit(NUM_MICRO), NUM_MICRO * PHASE / omega, omega)
+    return OwnSystem(problem, fully_implicit(NUM_MICRO), NUM_MICRO * PHASE / omega, omega)
 
 
-def cases_for(problem: vm.Problem) -> tuple[Case, ...]:
+def cases_for(problem: Problem) -> tuple[Case, ...]:
     """The hard cases that a system can be put to: those without sense for it, e.g. constraints it lacks, are left out."""
     own, system = own_system(problem), problem.system
     constrained = not (system.constraint is system.slow_constraint is None)
-    diagonal = isinstance(system.kinetic, vm.ConstantMass) and system.kinetic.slow.ndim == system.kinetic.fast.ndim == 1
+    diagonal = isinstance(system.kinetic, ConstantMass) and system.kinetic.slow.ndim == system.kinetic.fast.ndim == 1
     free = system.force is None
     step = f"fully_implicit, num_micro {NUM_MICRO}, H = {own.macro_dt:.3g}"
     one = f"num_micro 1, omega = {own.omega:.3g}"

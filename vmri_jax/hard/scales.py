@@ -4,18 +4,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import vmri_jax as vm
+from vmri_jax import diagnostics, systems
 from vmri_jax.hard.case import Case, Outcome
 from vmri_jax.hard.measures import difference, nodes, run, status
 from vmri_jax.hard.systems import three_scales
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import ConstantMass
+from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit
 
 
 def three_time_scales(full: bool) -> Outcome:
     """One frequency far above what the micro steps resolve; the actions of the others against a resolved run."""
     problem, omega = three_scales(), np.array([50.0, 70.0, 5000.0])
-    coarse = run(problem, vm.fully_implicit(5), 0.1, 500)  # omega_3 h = 100
-    fine = run(problem, vm.fully_explicit(100), 0.01, 5000, save_every=10)  # omega_3 h = 0.5
-    actions = [np.asarray(vm.diagnostics.oscillatory_energies(omega, r.q_f, r.p_f)) for r in (coarse, fine)]
+    coarse = run(problem, fully_implicit(5), 0.1, 500)  # omega_3 h = 100
+    fine = run(problem, fully_explicit(100), 0.01, 5000, save_every=10)  # omega_3 h = 0.5
+    actions = [np.asarray(diagnostics.oscillatory_energies(omega, r.q_f, r.p_f)) for r in (coarse, fine)]
     at_end = np.abs(actions[0][-1] - actions[1][-1])
     third = actions[0][:, 2].max()
     return Outcome(
@@ -34,11 +37,11 @@ def slow_alone(q_s, q_f, params):
 
 def no_coupling(full: bool) -> Outcome:
     """A slow potential of slow variables alone: the slow motion must not depend on num_micro."""
-    problem = vm.systems.fermi_pasta_ulam()
+    problem = systems.fermi_pasta_ulam()
     system = problem.system.replace(slow_potential=slow_alone)
-    problem = vm.Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f)
+    problem = Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f)
     steps, values = 10_000 if full else 1_000, {}
-    for make in (vm.explicit_slow, vm.fully_explicit):
+    for make in (explicit_slow, fully_explicit):
         runs = [run(problem, make(n), 0.03, steps, save_every=steps) for n in (1, 10)]
         values[make.__name__] = max(difference(runs[1].q_s, runs[0].q_s), difference(runs[1].p_s, runs[0].p_s))
     words = ", ".join(f"{name} {value:.0e}" for name, value in values.items())
@@ -49,18 +52,18 @@ def no_coupling(full: bool) -> Outcome:
 class Flat:
     """A problem with slow and fast variables joined: force, its derivative, constraints and their Jacobian."""
 
-    def __init__(self, problem: vm.Problem):
+    def __init__(self, problem: Problem):
         system, n_s, state = problem.system, problem.q_s.size, problem.state()
         zeros = jnp.zeros_like(state.p_s), jnp.zeros_like(state.p_f)
 
         def potential(q):
-            return vm.diagnostics.energy(system, q[:n_s], q[n_s:], *zeros)
+            return diagnostics.energy(system, q[:n_s], q[n_s:], *zeros)
 
         def rows(q):
             return system.constraints(state.t, q[:n_s], q[n_s:])
 
         kinetic = system.kinetic
-        assert isinstance(kinetic, vm.ConstantMass)
+        assert isinstance(kinetic, ConstantMass)
         self.mass = np.concatenate([kinetic.slow, kinetic.fast])
         self.q = np.concatenate([state.q_s, state.q_f])
         self.p = np.concatenate([state.p_s, state.p_f])
@@ -102,7 +105,7 @@ def rattle(flat: Flat, h: float, q, p):
     return new, p - jacobian.T @ np.linalg.solve(jacobian / flat.mass @ jacobian.T, jacobian @ (p / flat.mass))
 
 
-def apart_from(method, problem: vm.Problem, scheme: vm.Scheme, h: float, steps: int) -> float:
+def apart_from(method, problem: Problem, scheme: Scheme, h: float, steps: int) -> float:
     """Largest difference of a run from a known method, relative to the positions and momenta."""
     flat, trajectory = Flat(problem), run(problem, scheme, h, steps)
     q, p, found, momenta = flat.q, flat.p, nodes(trajectory), np.concatenate([trajectory.p_s, trajectory.p_f], axis=1)
@@ -115,12 +118,12 @@ def apart_from(method, problem: vm.Problem, scheme: vm.Scheme, h: float, steps: 
 
 def reductions(full: bool) -> Outcome:
     """One micro step per macro step gives known integrators."""
-    chain, pendulum = vm.systems.fermi_pasta_ulam(), vm.systems.triple_spherical_pendulum()
+    chain, pendulum = systems.fermi_pasta_ulam(), systems.triple_spherical_pendulum()
     steps = 200 if full else 25
     values = {
-        "midpoint": apart_from(midpoint_integrator, chain, vm.fully_implicit(1), 0.02, steps),
-        "Verlet": apart_from(rattle, chain, vm.fully_explicit(1), 0.02, steps),
-        "RATTLE": apart_from(rattle, pendulum, vm.fully_explicit(1), 0.005, steps),
+        "midpoint": apart_from(midpoint_integrator, chain, fully_implicit(1), 0.02, steps),
+        "Verlet": apart_from(rattle, chain, fully_explicit(1), 0.02, steps),
+        "RATTLE": apart_from(rattle, pendulum, fully_explicit(1), 0.005, steps),
     }
     words = ", ".join(f"{name} {value:.0e}" for name, value in values.items())
     return Outcome(f"from the known method after {steps} steps: {words}", max(values.values()) < 1e-12, values)

@@ -6,7 +6,8 @@ Factories of `Problem`, written as a user would write them: functions at module 
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import ConstantMass, Problem, System
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import ConstantMass, System
 from vmri_jax.systems.fermi_pasta_ulam import fermi_pasta_ulam, soft_springs
 
 

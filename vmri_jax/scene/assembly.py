@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.layout import Place, join
 from vmri_jax.scene.sorting import Placed
@@ -14,7 +15,6 @@ from vmri_jax.scene.terms import (
     SlowPotential,
     TotalForce,
 )
-from vmri_jax.system import ConstantMass, Rheonomic, System
 
 
 def build(bodies: Mapping[str, Body], places: Mapping[str, Place], placed: Sequence[Placed]) -> System:

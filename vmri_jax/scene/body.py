@@ -6,7 +6,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete
 
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3

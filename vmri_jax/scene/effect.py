@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import numpy as np
 
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.layout import Place, Rows
 from vmri_jax.scene.terms import Term, choose

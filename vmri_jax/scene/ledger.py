@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from vmri_jax.composition import Composition, stage_scheme
 from vmri_jax.diagnostics import frequencies
-from vmri_jax.newton import Newton
+from vmri_jax.mechanics.state import initial_state
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.simulate import simulate
 from vmri_jax.scene.assembly import build
-from vmri_jax.scheme import Scheme
-from vmri_jax.simulate import simulate
-from vmri_jax.state import initial_state
-from vmri_jax.system import System
+from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
 
 if TYPE_CHECKING:
     from rich.table import Table

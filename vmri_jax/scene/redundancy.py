@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.layout import Place
 from vmri_jax.scene.sorting import Placed

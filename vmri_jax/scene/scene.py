@@ -7,8 +7,9 @@ from typing import Any
 
 import jax
 
-from vmri_jax.composition import Composition
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.mechanics.system import System
 from vmri_jax.scene import drawing as drawings
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
@@ -18,9 +19,8 @@ from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
-from vmri_jax.scheme import Scheme
-from vmri_jax.state import Problem, State, initial_state
-from vmri_jax.system import System
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
 
 
 @dataclass(frozen=True, eq=False)

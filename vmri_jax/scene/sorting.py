@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Literal, NamedTuple
 
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure

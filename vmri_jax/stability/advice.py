@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vmri_jax import Composition, Scheme, State, System
-from vmri_jax.checks import require_x64
-from vmri_jax.composition import stage_scheme
+from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import ConstantMass, Problem, State, System
 from vmri_jax.diagnostics import velocity
+from vmri_jax.mechanics.state import Problem, State
+from vmri_jax.mechanics.system import ConstantMass, System
 
 QUICK = {"xla_backend_optimization_level": 0}
 """Programs that run for milliseconds: compiled in half the time, at the same speed on matrices this small."""

@@ -9,8 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vmri_jax import Composition, Problem, Scheme, State, System
-from vmri_jax.checks import require_x64
+from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.mechanics.state import Problem, State
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.windows import find_windows

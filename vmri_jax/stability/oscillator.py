@@ -12,9 +12,9 @@ x^2 becomes ``x^2 (1 - x^2 / 12)``: stable for x < 2 sqrt(3).
 
 import numpy as np
 
-from vmri_jax import Scheme
-from vmri_jax.path import lagrange_basis, lagrange_derivative
-from vmri_jax.quadrature import Rule
+from vmri_jax.schemes.path import lagrange_basis, lagrange_derivative
+from vmri_jax.schemes.quadrature import Rule
+from vmri_jax.schemes.scheme import Scheme
 
 RESOLUTION = 0.05
 """Spacing of x over which the phase is followed."""

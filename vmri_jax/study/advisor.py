@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-import vmri_jax as vm
+from vmri_jax import diagnostics
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.steppers.newton import Newton
 from vmri_jax.study.menu import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.solutions import ReferenceSolution, reference_solution
@@ -79,8 +81,8 @@ class Search:
 
     def __init__(self, problem, t_end: float, menu: Sequence[Family], reference: ReferenceSolution, newton=None):
         self.problem, self.t_end, self.menu, self.reference = problem, t_end, menu, reference
-        self.newton = newton or vm.Newton()
-        self.frequency = float(vm.diagnostics.frequencies(problem.system, problem.state())[0])
+        self.newton = newton or Newton()
+        self.frequency = float(diagnostics.frequencies(problem.system, problem.state())[0])
         self.programs: dict[tuple[str, int], Program] = {}
         self.settings: dict[tuple[str, int, int], Setting] = {}
 
@@ -220,7 +222,7 @@ class Verification:
 class Recommendation:
     """The cheapest setting found for an error, and how it was found.
 
-    scheme, macro_dt, num_steps: what to give to `vmri_jax.simulate`.
+    scheme, macro_dt, num_steps: what to give to `vmri_jax.running.simulate`.
     setting: the same with its error and time; others: the runners-up, the fastest first.
     verification: the same setting from another start.
     runs: all runs of the search; ``runs.pareto()`` is their Pareto front.
@@ -248,7 +250,7 @@ class Recommendation:
         return self.setting.num_steps
 
 
-def check_target(error: float, t_end: float, problem: vm.Problem) -> None:
+def check_target(error: float, t_end: float, problem: Problem) -> None:
     """Refuse errors and times that no run can meet."""
     if not (np.isfinite(t_end) and t_end > 0):
         raise ValueError(f"recommend: t_end is {t_end}; it must be a positive number.")
@@ -262,14 +264,14 @@ def check_target(error: float, t_end: float, problem: vm.Problem) -> None:
 
 
 def recommend(
-    problem: vm.Problem,
+    problem: Problem,
     error: float,
     t_end: float,
     *,
     menu: Sequence[Family] | None = None,
     num_saves: int = 1,
     reference: ReferenceSolution | None = None,
-    newton: vm.Newton | None = None,
+    newton: Newton | None = None,
     verify: bool = True,
     exhaustive: bool = False,
     progress: Progress = silent,

@@ -15,9 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import vmri_jax as vm
-from vmri_jax.composition import Composition
+from vmri_jax import diagnostics
 from vmri_jax.diagnostics import OrderFit
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.running.batch import simulate_batch
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.solutions import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Progress, silent, write_csv
@@ -104,7 +110,7 @@ class ConvergenceStudy:
         macro_dt, errors = self.usable(scheme, quantity, case)
         if len(errors) < 2:
             return OrderFit(np.nan, np.nan, len(errors))
-        return vm.diagnostics.fit_order(macro_dt[-points:], errors[-points:])
+        return diagnostics.fit_order(macro_dt[-points:], errors[-points:])
 
     def order(self, scheme: str, quantity: str = "q", points: int = 4, case: str | None = None) -> float:
         """Observed order: that of `fit`."""
@@ -178,8 +184,8 @@ def _order(fit: OrderFit) -> str:
 
 
 def convergence_study(
-    problem: vm.Problem,
-    schemes: Mapping[str, vm.Scheme | Composition],
+    problem: Problem,
+    schemes: Mapping[str, Scheme | Composition],
     macro_dt: Sequence[float],
     t_end: float,
     *,
@@ -187,7 +193,7 @@ def convergence_study(
     params: Mapping[str, Any] | None = None,
     momentum_maps: Sequence[Callable] = (),
     reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
-    newton: vm.Newton | None = None,
+    newton: Newton | None = None,
     progress: Progress = silent,
 ) -> ConvergenceStudy:
     """Run every scheme with every macro step to `t_end` and compare with a reference.
@@ -240,7 +246,7 @@ def convergence_study(
     return ConvergenceStudy(tuple(rows), references)
 
 
-def _runner(problems: Sequence[vm.Problem], scheme, t_end: float, num_saves: int, newton):
+def _runner(problems: Sequence[Problem], scheme, t_end: float, num_saves: int, newton):
     """``run(num_steps)``: a trajectory of each problem."""
     if len(problems) == 1:
         program = Program(problems[0], scheme, t_end, num_saves, newton)
@@ -248,8 +254,8 @@ def _runner(problems: Sequence[vm.Problem], scheme, t_end: float, num_saves: int
     states = jax.tree.map(lambda *a: jnp.stack(a), *(problem.state() for problem in problems))
     params = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *(p.system.params for p in problems))
 
-    def run(num_steps: int) -> list[vm.Trajectory]:
-        batch = vm.simulate_batch(
+    def run(num_steps: int) -> list[Trajectory]:
+        batch = simulate_batch(
             problems[0].system,
             scheme,
             states,
@@ -304,7 +310,7 @@ def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, refer
     energy = np.asarray(trajectory.energy)
     drift, band = _drift_and_band(np.asarray(trajectory.t), energy)
     phase = trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f
-    maps = [np.asarray(jax.vmap(lambda *z, xi=xi: vm.diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
+    maps = [np.asarray(jax.vmap(lambda *z, xi=xi: diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
     return ConvergenceRow(
         scheme=label,
         case=case,
@@ -319,8 +325,8 @@ def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, refer
         momentum_error=float(max((np.abs(m - m[0]).max() for m in maps), default=0.0)),
         constraint_residual=float(np.max(trajectory.constraint_residual)),
         iterations=int(np.max(trajectory.info.iterations)),
-        method=vm.Method(int(np.max(trajectory.info.method))).name,
-        result=vm.Result(int(trajectory.result)).name,
+        method=Method(int(np.max(trajectory.info.method))).name,
+        result=Result(int(trajectory.result)).name,
     )
 
 

@@ -10,7 +10,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-import vmri_jax as vm
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.running.simulate import simulate
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Result
 from vmri_jax.study.table import Progress, silent, write_csv
 
 
@@ -63,8 +68,8 @@ class CostStudy:
 
 
 def cost_study(
-    problem: vm.Problem,
-    scheme: Callable[[int], vm.Scheme],
+    problem: Problem,
+    scheme: Callable[[int], Scheme],
     num_micro: Sequence[int],
     *,
     micro_dt: float,
@@ -109,7 +114,7 @@ def cost_study(
     total = len(num_micro) * len(methods) + repeats
     programs, rows = [], []
     for method in methods:
-        newton = vm.Newton(method=method)  # pyright: ignore[reportArgumentType]
+        newton = Newton(method=method)  # pyright: ignore[reportArgumentType]
         for n in num_micro:
             progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(programs), total)
             scheme_n = scheme(n)
@@ -129,7 +134,7 @@ def cost_study(
                     us_per_micro_step=float("nan"),
                     first_call_seconds=first_call,
                     iterations=int(np.max(trajectory.info.iterations)),
-                    result=vm.Result(int(trajectory.result)).name,
+                    result=Result(int(trajectory.result)).name,
                 )
             )
     times = np.full((repeats, len(programs)), np.nan)
@@ -142,12 +147,12 @@ def cost_study(
     return CostStudy(tuple(_timed(row, np.median(times[:, j]), micro_dt) for j, row in enumerate(rows)))
 
 
-def _program(system, scheme, state, macro_dt, num_steps: int, newton) -> Callable[[], vm.Trajectory]:
+def _program(system, scheme, state, macro_dt, num_steps: int, newton) -> Callable[[], Trajectory]:
     """One compiled run that saves its last node only; the checks of `simulate` happen once, while it is traced."""
 
     @jax.jit
     def run(system, scheme, state, macro_dt, newton):
-        return vm.simulate(
+        return simulate(
             system,
             scheme,
             state,
@@ -167,7 +172,7 @@ def _calls_needed(run, min_seconds: float) -> int:
     return min(20, math.ceil(min_seconds / seconds))
 
 
-def _seconds(run, calls: int = 1) -> tuple[float, vm.Trajectory]:
+def _seconds(run, calls: int = 1) -> tuple[float, Trajectory]:
     """Mean time of so many calls, at least one, and the trajectory."""
     start = time.perf_counter()
     trajectory = jax.block_until_ready(run())

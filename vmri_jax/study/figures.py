@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-import vmri_jax as vm
 from vmri_jax import plots
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.study.convergence import ConvergenceStudy, convergence_study
 from vmri_jax.study.cost import CostStudy, cost_study
 from vmri_jax.study.solutions import ReferenceSolution, reference_solution
@@ -71,8 +72,8 @@ class ConvergenceFigure:
     name: str
     title: str
     paper: str
-    problem: Callable[[], vm.Problem]
-    schemes: Mapping[str, vm.Scheme]
+    problem: Callable[[], Problem]
+    schemes: Mapping[str, Scheme]
     orders: Mapping[str, int]
     source: str
     macro_dt: tuple[float, ...]
@@ -127,9 +128,9 @@ class CostPanel:
     """
 
     title: str
-    dense: Callable[[], vm.Problem]
-    structured: Callable[[], vm.Problem]
-    scheme: Callable[[int], vm.Scheme]
+    dense: Callable[[], Problem]
+    structured: Callable[[], Problem]
+    scheme: Callable[[int], Scheme]
     paper_minimum: int | None
     dense_num_micro: tuple[int, ...]
     num_micro: tuple[int, ...]

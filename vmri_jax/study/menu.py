@@ -6,8 +6,8 @@ from functools import partial
 
 import numpy as np
 
-import vmri_jax as vm
-from vmri_jax.composition import Composition
+from vmri_jax.schemes.composition import Composition, compose
+from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, takahashi_imada
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Family:
     """
 
     name: str
-    make: Callable[[int], vm.Scheme | Composition]
+    make: Callable[[int], Scheme | Composition]
     options: str
     first: int = 5
 
@@ -38,15 +38,15 @@ class Family:
         return max(1, int(frequency * t_end * longest / (num_micro * scheme.degree)))
 
 
-def _composed(base: Callable[[int], vm.Scheme], coefficients: str, num_micro: int) -> Composition:
-    return vm.compose(base(num_micro), coefficients)
+def _composed(base: Callable[[int], Scheme], coefficients: str, num_micro: int) -> Composition:
+    return compose(base(num_micro), coefficients)
 
 
 BASES = {
-    "fully explicit": vm.fully_explicit,
-    "explicit slow": vm.explicit_slow,
-    "fully implicit": vm.fully_implicit,
-    "takahashi imada": vm.takahashi_imada,
+    "fully explicit": fully_explicit,
+    "explicit slow": explicit_slow,
+    "fully implicit": fully_implicit,
+    "takahashi imada": takahashi_imada,
 }
 
 
@@ -60,7 +60,7 @@ def families(
             make = partial(_composed, BASES[base.name], name)
             menu.append(Family(f"{base.name}, {name}", make, f"{base.options} --compose {name}"))
     for degree in degrees:
-        make = partial(vm.galerkin, degree=degree, rule="lobatto")
+        make = partial(galerkin, degree=degree, rule="lobatto")
         first = 1 if degree > 2 else Family.first  # high degrees resolve the fast variables with a single interval
         menu.append(Family(f"galerkin {degree}", make, f"--scheme galerkin --degree {degree} --rule lobatto", first))
     return menu

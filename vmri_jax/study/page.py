@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-import vmri_jax as vm
-from vmri_jax import plots
+from vmri_jax import diagnostics, plots
+from vmri_jax.mechanics.state import Problem
 from vmri_jax.study.advisor import MARGIN, Search, Setting
 from vmri_jax.study.html import embedded, write_page
 from vmri_jax.study.menu import Family, families
@@ -60,9 +60,9 @@ class CostPage:
     shares: dict[str, float]
 
 
-def default_t_end(problem: vm.Problem) -> float:
+def default_t_end(problem: Problem) -> float:
     """PERIODS periods of the fastest vibration, rounded to one digit; 1 if nothing vibrates."""
-    frequency = float(vm.diagnostics.frequencies(problem.system, problem.state())[0])
+    frequency = float(diagnostics.frequencies(problem.system, problem.state())[0])
     if not frequency > 0:
         return 1.0
     t_end = PERIODS * 2 * math.pi / frequency
@@ -70,7 +70,7 @@ def default_t_end(problem: vm.Problem) -> float:
 
 
 def cost_page(
-    problem: vm.Problem,
+    problem: Problem,
     name: str,
     out: str | Path,
     *,
@@ -119,7 +119,7 @@ def cost_page(
     return page  # pyright: ignore[reportReturnType]
 
 
-def _write(search: Search, answers: Sequence[Answer], problem: vm.Problem, name: str, out: Path) -> CostPage:
+def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: str, out: Path) -> CostPage:
     """The page of what is known so far."""
     runs, shares = search.rows(), _shares(problem, answers[len(answers) // 2].setting)
     page = CostPage(out / "cost.html", name, search.t_end, tuple(answers), runs, shares)
@@ -179,7 +179,7 @@ def _multirate(page: CostPage) -> list[tuple[float, str, int, float]]:
     return gains
 
 
-def _shares(problem: vm.Problem, setting: Setting | None) -> dict[str, float]:
+def _shares(problem: Problem, setting: Setting | None) -> dict[str, float]:
     """Parts of the time of a run: gradients of V and of W, constraints with their Jacobian, all the rest."""
     if setting is None:
         return {}

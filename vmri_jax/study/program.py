@@ -7,14 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import vmri_jax as vm
-from vmri_jax.composition import Composition
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.running.simulate import check_run, run
+from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.runtime import OPTIONS, in_one_kernel
-from vmri_jax.simulate import check_run, run
-from vmri_jax.step import start_memory
-from vmri_jax.trajectory import RunInfo
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.step import start_memory
 
-TRAJECTORY = jax.tree.structure(vm.Trajectory(*[0.0] * 7, info=RunInfo(0, 0, 0), result=0, failed_at=0))
+TRAJECTORY = jax.tree.structure(Trajectory(*[0.0] * 7, info=RunInfo(0, 0, 0), result=0, failed_at=0))
 """How a trajectory without micro nodes is made of its arrays."""
 
 
@@ -44,7 +46,7 @@ class Program:
 
     Compiled when first called, once for all problems of the same structure.
 
-    A call costs some ten microseconds besides its steps. As in `vmri_jax.simulate`, "auto" takes the nested march and
+    A call costs some ten microseconds besides its steps. As in `vmri_jax.running.simulate`, "auto" takes the nested march and
     compiles its fallback only when a step needs it. A run that fails is seen in the trajectory; nothing is raised.
 
     Args:
@@ -57,14 +59,14 @@ class Program:
 
     def __init__(
         self,
-        problem: vm.Problem,
-        scheme: vm.Scheme | Composition,
+        problem: Problem,
+        scheme: Scheme | Composition,
         t_end: float,
         num_saves: int = 1,
-        newton: vm.Newton | None = None,
+        newton: Newton | None = None,
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
-        self.newton, self.state = newton or vm.Newton(), problem.state()
+        self.newton, self.state = newton or Newton(), problem.state()
         check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, 1)
         self._alone = self.newton.alone(problem.system, scheme)
         self.compile_seconds = float("nan")
@@ -94,7 +96,7 @@ class Program:
             return self._compiled, arrays
         return self._exact, self._exact(num_steps)
 
-    def __call__(self, num_steps: int) -> vm.Trajectory:
+    def __call__(self, num_steps: int) -> Trajectory:
         """The trajectory with `num_saves` + 1 nodes.
 
         Raises:
@@ -111,7 +113,7 @@ class Program:
         return lambda: chosen(num_steps)[0].block_until_ready()  # the arrays of one program are ready together
 
 
-def joined(trajectory: vm.Trajectory) -> tuple[np.ndarray, np.ndarray]:
+def joined(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """q and p of the saved nodes, slow coordinates first."""
     return (
         np.concatenate([trajectory.q_s, trajectory.q_f], axis=-1),

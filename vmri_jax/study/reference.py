@@ -9,7 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-import vmri_jax as vm
+from vmri_jax import systems
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin
 from vmri_jax.study.figures import ConvergenceFigure, CostFigure, CostPanel
 
 PAPER_STEPS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
@@ -22,9 +24,9 @@ PAPER_MINIMA = {  # cheapest num_micro by scheme: (smallest l, largest l, num_mi
     "fully explicit": ((70, 130, 8), (140, 200, 4)),
 }
 SCHEMES = {
-    "fully implicit": vm.fully_implicit,
-    "explicit slow": partial(vm.explicit_slow, alpha=0.0),
-    "fully explicit": partial(vm.fully_explicit, alpha=0.0),
+    "fully implicit": fully_implicit,
+    "explicit slow": partial(explicit_slow, alpha=0.0),
+    "fully explicit": partial(fully_explicit, alpha=0.0),
 }
 
 
@@ -95,9 +97,9 @@ def reference_figures(size: str = "quick") -> tuple[ConvergenceFigure | CostFigu
 def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
     small = CostPanel(
         title="FPU, l = 3",
-        dense=vm.systems.fermi_pasta_ulam,
-        structured=vm.systems.fermi_pasta_ulam,
-        scheme=vm.fully_implicit,
+        dense=systems.fermi_pasta_ulam,
+        structured=systems.fermi_pasta_ulam,
+        scheme=fully_implicit,
         paper_minimum=60,
         dense_num_micro=size.fpu_num_micro,
         num_micro=size.fpu_num_micro,
@@ -109,8 +111,8 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
     atoms = replace(
         small,
         title="SAM",
-        dense=vm.systems.simple_atomic_model,
-        structured=vm.systems.simple_atomic_model,
+        dense=systems.simple_atomic_model,
+        structured=systems.simple_atomic_model,
         paper_minimum=20,
         dense_num_micro=size.sam_num_micro,
         num_micro=size.sam_num_micro,
@@ -139,7 +141,7 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
 
 def _chain_panel(size: Size, scheme: str, num_springs: int) -> CostPanel:
     minima = [n for low, high, n in PAPER_MINIMA[scheme] if low <= num_springs <= high]
-    chain = partial(vm.systems.fermi_pasta_ulam, num_springs)
+    chain = partial(systems.fermi_pasta_ulam, num_springs)
     feasible = tuple(n for n in size.chain_num_micro if num_springs * (n + 1) <= size.largest_dense)
     return CostPanel(
         title=f"{scheme}, l = {num_springs}",
@@ -161,13 +163,13 @@ def kinetic_energy(q_s, q_f, v_s, v_f, params):
     return (v_s @ v_s + v_f @ v_f) / 2
 
 
-def unstructured_chain(num_springs: int) -> vm.Problem:
+def unstructured_chain(num_springs: int) -> Problem:
     """The FPU chain with T as a plain function: every scheme then solves for all unknowns of a macro step at once."""
-    problem = vm.systems.fermi_pasta_ulam(num_springs)
+    problem = systems.fermi_pasta_ulam(num_springs)
     return replace(problem, system=problem.system.replace(kinetic=kinetic_energy))
 
 
-def _both(scheme, **arguments) -> dict[str, vm.Scheme]:
+def _both(scheme, **arguments) -> dict[str, Scheme]:
     return {f"{n} micro steps": scheme(n, **arguments) for n in (5, 10)}
 
 
@@ -179,31 +181,31 @@ def _convergence_figure(
 
 
 def _fpu_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
-    figure = partial(_convergence_figure, vm.systems.fermi_pasta_ulam, size.fpu_steps)
-    finer = partial(_convergence_figure, vm.systems.fermi_pasta_ulam, DEGREE_STEPS)
+    figure = partial(_convergence_figure, systems.fermi_pasta_ulam, size.fpu_steps)
+    finer = partial(_convergence_figure, systems.fermi_pasta_ulam, DEGREE_STEPS)
     saw = "order {} in positions and momenta, with 5 and with 10 micro steps."
     half = {
         f"{name}, {label}": scheme
-        for name, family in (("explicit slow", vm.explicit_slow), ("fully explicit", vm.fully_explicit))
+        for name, family in (("explicit slow", explicit_slow), ("fully explicit", fully_explicit))
         for label, scheme in _both(family, alpha=0.5).items()
     }
     return (
-        figure("fig6", "FPU, fully explicit", saw.format(1), _both(vm.fully_explicit, alpha=0.0), 1),
-        figure("fig7", "FPU, explicit slow", saw.format(1), _both(vm.explicit_slow, alpha=0.0), 1),
-        figure("fig8", "FPU, fully implicit", saw.format(2), _both(vm.fully_implicit), 2),
+        figure("fig6", "FPU, fully explicit", saw.format(1), _both(fully_explicit, alpha=0.0), 1),
+        figure("fig7", "FPU, explicit slow", saw.format(1), _both(explicit_slow, alpha=0.0), 1),
+        figure("fig8", "FPU, fully implicit", saw.format(2), _both(fully_implicit), 2),
         figure("fpu-half", "FPU, explicit schemes with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
         finer("fpu-degree", "FPU, degree 2 and 3", _NOT_IN_PAPER, *_degrees(size.degree_num_micro), "theory"),
     )
 
 
 def _tsp_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
-    figure = partial(_convergence_figure, vm.systems.triple_spherical_pendulum, size.tsp_steps)
-    finer = partial(_convergence_figure, vm.systems.triple_spherical_pendulum, DEGREE_STEPS)
+    figure = partial(_convergence_figure, systems.triple_spherical_pendulum, size.tsp_steps)
+    finer = partial(_convergence_figure, systems.triple_spherical_pendulum, DEGREE_STEPS)
     tsp = "Triple spherical pendulum"
-    half = _both(vm.fully_explicit, alpha=0.5)
+    half = _both(fully_explicit, alpha=0.5)
     return (
-        figure("fig9", f"{tsp}, fully implicit", "order 2.", _both(vm.fully_implicit), 2),
-        figure("fig10", f"{tsp}, fully explicit", "order 1.", _both(vm.fully_explicit, alpha=0.0), 1),
+        figure("fig9", f"{tsp}, fully implicit", "order 2.", _both(fully_implicit), 2),
+        figure("fig10", f"{tsp}, fully explicit", "order 1.", _both(fully_explicit, alpha=0.0), 1),
         figure("tsp-half", f"{tsp}, fully explicit with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
         finer("tsp-degree", f"{tsp}, degree 2 and 3", _NOT_IN_PAPER, *_degrees(size.degree_num_micro), "theory"),
     )
@@ -212,9 +214,9 @@ def _tsp_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
 _NOT_IN_PAPER = "not in the paper; the theory says order min(2 × degree, order of the quadrature)."
 
 
-def _degrees(num_micro: tuple[int, ...]) -> tuple[dict[str, vm.Scheme], dict[str, int]]:
+def _degrees(num_micro: tuple[int, ...]) -> tuple[dict[str, Scheme], dict[str, int]]:
     """Galerkin schemes of degree 2 and 3 with Gauss quadrature, and their orders 4 and 6."""
     schemes = {
-        f"degree {degree}, {n} micro steps": vm.galerkin(n, degree, "gauss") for degree in (2, 3) for n in num_micro
+        f"degree {degree}, {n} micro steps": galerkin(n, degree, "gauss") for degree in (2, 3) for n in num_micro
     }
     return schemes, {label: scheme.order for label, scheme in schemes.items()}

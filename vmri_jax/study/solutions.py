@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-import vmri_jax as vm
-from vmri_jax.simulate import simulation_error
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.running.simulate import simulation_error
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.scheme import galerkin
 from vmri_jax.study.program import Program, joined
 from vmri_jax.study.table import Progress, silent
 
@@ -32,7 +34,7 @@ class ReferenceSolution:
         """Saved nodes, the start not counted."""
         return len(self.q) - 1
 
-    def errors(self, trajectory: vm.Trajectory) -> tuple[float, float]:
+    def errors(self, trajectory: Trajectory) -> tuple[float, float]:
         """Largest error of q and of p over nodes and coordinates; NaN for a run that failed."""
         q, p = joined(trajectory)
         return float(np.abs(q - self.q).max()), float(np.abs(p - self.p).max())
@@ -60,7 +62,7 @@ class ReferenceSolution:
 
 
 def reference_solution(
-    problem: vm.Problem,
+    problem: Problem,
     t_end: float,
     *,
     num_saves: int = 10,
@@ -85,7 +87,7 @@ def reference_solution(
     Raises:
         SimulationError: runs failed with every number of steps; the last one is in it.
     """
-    program = Program(problem, vm.galerkin(1, degree, "gauss"), t_end, num_saves)
+    program = Program(problem, galerkin(1, degree, "gauss"), t_end, num_saves)
     fixed = num_steps is not None
     n = num_steps if fixed else num_saves * max(1, 32 // num_saves)
     coarse, best, last_error = None, None, np.inf

@@ -7,8 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-import vmri_jax as vm
-from vmri_jax.composition import Composition
+from vmri_jax import diagnostics
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.solutions import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Progress, silent, write_csv
@@ -134,9 +138,9 @@ def work_row(label: str, program: Program, num_steps: int, reference: ReferenceS
     trajectory, scheme = program(num_steps), program.scheme
     error_q, error_p = reference.errors(trajectory)
     cost, passes = scheme.describe(), np.maximum(np.asarray(trajectory.info.iterations), 1)
-    method = vm.Method(int(np.max(trajectory.info.method)))
+    method = Method(int(np.max(trajectory.info.method)))
     solves = 0
-    if method > vm.Method.EXPLICIT:
+    if method > Method.EXPLICIT:
         constrained = max(program.problem.system.num_constraints(program.problem.q_s, program.problem.q_f)) > 0
         solves = num_steps * (cost.constrained_solves if constrained else cost.solves)
     evaluations = num_steps * float(passes.mean())
@@ -158,19 +162,19 @@ def work_row(label: str, program: Program, num_steps: int, reference: ReferenceS
         solves=solves,
         iterations=int(np.max(trajectory.info.iterations)),
         method=method.name,
-        result=vm.Result(int(trajectory.result)).name,
+        result=Result(int(trajectory.result)).name,
     )
 
 
 def work_precision(
-    problem: vm.Problem,
-    schemes: Mapping[str, vm.Scheme | Composition],
+    problem: Problem,
+    schemes: Mapping[str, Scheme | Composition],
     t_end: float,
     *,
     num_steps: Sequence[int] | None = None,
     num_saves: int = 1,
     reference: ReferenceSolution | None = None,
-    newton: vm.Newton | None = None,
+    newton: Newton | None = None,
     repeats: int = 5,
     progress: Progress = silent,
 ) -> WorkPrecision:
@@ -200,7 +204,7 @@ def work_precision(
         raise ValueError(f"work_precision: num_steps is {list(num_steps)}; give multiples of num_saves = {num_saves}.")
     if reference is None:
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
-    frequency = float(vm.diagnostics.frequencies(problem.system, problem.state())[0])
+    frequency = float(diagnostics.frequencies(problem.system, problem.state())[0])
     runs, rows = {}, []
     for i, (label, scheme) in enumerate(schemes.items()):
         program = Program(problem, scheme, t_end, num_saves, newton)

@@ -6,7 +6,8 @@ Hairer, Lubich, Wanner, *Geometric Numerical Integration*, I.5.1.
 
 import jax.numpy as jnp
 
-from vmri_jax import ConstantMass, Problem, System
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import ConstantMass, System
 
 
 def soft_springs(q_s, q_f, params):

@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import ConstantMass, Problem, System
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import ConstantMass, System
 
 TETRAHEDRON = np.sqrt(np.array([1 / 3, 1 / 12, 2 / 3]))  # for unit edges: radius, inradius of a face; height
 

@@ -2,7 +2,8 @@
 
 import jax.numpy as jnp
 
-from vmri_jax import ConstantMass, Problem, System
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import ConstantMass, System
 
 
 def weight(q_s, q_f, params):

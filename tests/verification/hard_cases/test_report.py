@@ -7,8 +7,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from vmri_jax.cli.hard import hard
 from vmri_jax.hard import Case, Outcome, run_cases
-from vmri_jax.hard.command import hard
 
 RAISES = "bad | luck"
 

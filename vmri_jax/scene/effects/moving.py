@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.quadrature import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.effect import Effect, groups
 from vmri_jax.scene.effects.geometry import check_points, squeeze
 from vmri_jax.scene.effects.links import START

@@ -1,0 +1,133 @@
+"""``vmri animate``: what it writes, which drawing it takes, and how it refuses."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from PIL import Image
+from typer.testing import CliRunner
+
+import vmri_jax as vm
+from tests.animation.support import PENDULUM, reference_run, swinging
+from vmri_jax.cli.animate import animate
+from vmri_jax.running.store import stream
+from vmri_jax.running.store.layout import change_attributes
+
+RUN = swinging()
+
+
+@pytest.fixture
+def vmri(tmp_path, monkeypatch):
+    """Runs the command in a folder with runs: (exit code, everything printed with frames and line breaks taken out)."""
+    monkeypatch.chdir(tmp_path)
+    RUN.save("plain.npz")
+    RUN.save("drawn.npz", PENDULUM)
+    (tmp_path / "text.npz").write_text("no run")
+    (tmp_path / "wrong.json").write_text(json.dumps(PENDULUM | {"links": [["bob", "tipp"]]}))
+    (tmp_path / "broken.json").write_text("{")
+    app = typer.Typer()
+    app.command()(animate)
+
+    def run(*arguments):
+        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+        return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
+
+    return run
+
+
+def page(path="run.html") -> dict:
+    with open(path, encoding="utf-8") as file:
+        [text] = re.findall(r'id="data">(.*?)</script>', file.read(), re.DOTALL)
+    return json.loads(text)
+
+
+def names(data: dict) -> list[str]:
+    return [body["name"] for body in data["bodies"]]
+
+
+def test_the_drawing_stored_with_the_run_is_taken(vmri):
+    assert vmri("drawn.npz")[0] == 0
+    assert names(page("drawn.html")) == ["bob", "tip"]
+
+
+def test_without_a_drawing_all_coordinates_are_shown(vmri):
+    code, text = vmri("plain.npz", "--out", "run.html")
+    assert code == 0
+    assert "run.html 0.0" in text
+    assert names(page()) == ["q_s[0]", "q_s[1]", "q_f[0]", "q_f[1]"]
+
+
+def test_a_drawing_of_ones_own_goes_first(vmri):
+    bodies = {"bodies": [{"name": "mine", "coordinates": [["s", 0]]}]}
+    with open("mine.json", "w", encoding="utf-8") as file:
+        json.dump(bodies, file)
+    assert vmri("drawn.npz", "--drawing", "mine.json", "--out", "run.html")[0] == 0
+    assert names(page()) == ["mine"]
+
+
+def test_a_built_in_system_gives_its_drawing_and_its_velocities(vmri):
+    reference_run("tsp_fully_implicit_p1", 0.01).save("tsp.npz")
+    assert vmri("tsp.npz", "--system", "tsp", "--from", 0.1, "--to", 0.3)[0] == 0
+    data = page("tsp.html")
+    assert names(data) == ["heavy bob", "light bob", "last bob"]
+    assert data["speed"] == 0.01
+
+
+def test_a_streamed_run_as_far_as_it_is_on_disk(vmri, fpu):
+    scheme, run = vm.fully_explicit(2), {"macro_dt": 0.01, "num_steps": 12, "chunk": 4}
+    stream(fpu.system, scheme, fpu.state(), out="run.zarr", **run)
+    assert vmri("run.zarr", "--system", "fpu")[0] == 0
+    assert len(names(page())) == 6
+    change_attributes(Path("run.zarr"), drawing={"bodies": [{"name": "first", "coordinates": [["s", 0]]}]})
+    assert vmri("run.zarr")[0] == 0
+    assert names(page()) == ["first"]
+
+
+def test_pictures_by_their_suffix(vmri):
+    assert vmri("drawn.npz", "--out", "run.png", "--frames", 2)[0] == 0
+    assert vmri("drawn.npz", "--out", "dark.png", "--frames", 2, "--dark")[0] == 0
+    assert vmri("drawn.npz", "--out", "run.GIF", "--seconds", 0.2)[0] == 0
+    light, dark = (np.asarray(Image.open(name).convert("L")).mean() for name in ("run.png", "dark.png"))
+    assert light > 200
+    assert dark < 90
+    with Image.open("run.GIF") as image:
+        assert getattr(image, "n_frames", 1) == 4
+
+
+def test_a_failed_run_is_drawn_up_to_there_and_says_so(vmri):
+    broken = np.where(np.arange(41) < 25, 1.0, np.nan)[:, None]
+    fields = {name: getattr(RUN, name) * broken for name in ("q_s", "q_f", "p_s", "p_f")}
+    dataclasses.replace(RUN, **fields, result=4, failed_at=24).save("failed.npz", PENDULUM)
+    code, text = vmri("failed.npz")
+    assert code == 0
+    assert "failed in macro step 24, after t = 2.4" in text
+    assert "macro step 24" in page("failed.html")["ending"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "pieces"),
+    [
+        (["none.npz"], ["none.npz does not exist"]),
+        (["none.zarr"], ["none.zarr"]),
+        (["text.npz"], ["text.npz cannot be read"]),
+        (["plain.npz", "--out", "run.mp4"], ["--out run.mp4", ".html", ".gif"]),
+        (["plain.npz", "--out", "no/run.html"], ["--out no/run.html", "does not exist"]),
+        (["plain.npz", "--system", "tps"], ["no system 'tps'", "Did you mean tsp?"]),
+        (["plain.npz", "--system", "fpu"], ["has 3 slow and 3 fast coordinates, the run 2 and 2"]),
+        (["plain.npz", "--drawing", "none.json"], ["--drawing none.json does not exist"]),
+        (["plain.npz", "--drawing", "broken.json"], ["broken.json is not valid JSON"]),
+        (["plain.npz", "--drawing", "wrong.json"], ["links[0]", "'tipp'", "Did you mean tip?"]),
+        (["plain.npz", "--from", "9"], ["no part of the run, which goes from t = 0 to 4"]),
+        (["plain.npz", "--frames", "0"], ["--frames", "greater than or equal to 1"]),
+    ],
+)
+def test_bad_input_is_refused_in_words(vmri, arguments, pieces):
+    code, text = vmri(*arguments)
+    assert code == 2
+    for piece in pieces:
+        assert piece in text

@@ -1,0 +1,351 @@
+"""The command line: what it prints, what it writes, and how it refuses."""
+
+import dataclasses
+import errno
+import os
+import re
+import signal
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import vmri_jax as vm
+from vmri_jax import cli
+from vmri_jax.cli.catalogue import find_problem
+from vmri_jax.running.simulate import Simulation
+from vmri_jax.study import families, reference, reference_solution
+
+USER_FILE = """
+import jax.numpy as jnp
+import vmri_jax as vm
+
+def soft(q_s, q_f, params):
+    return jnp.sum((q_s - q_f) ** 2) / 2
+
+def stiff(q_f, params):
+    return 200.0 * jnp.sum(q_f**2)
+
+one = jnp.ones(1)
+my_problem = vm.Problem(vm.System(vm.ConstantMass(one, one), soft, stiff), one, 0 * one, one, one)
+
+def make_problem():
+    return my_problem
+
+def needs_more(size):
+    return my_problem
+
+not_a_problem = 3
+"""
+RUN = ["--macro-dt", "0.1", "--steps", "4", "--scheme", "fully-explicit"]
+
+
+@pytest.fixture
+def vmri(tmp_path, monkeypatch):
+    """Runs ``vmri`` in an empty folder: (exit code, everything printed with frames and line breaks taken out)."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "user.py").write_text(USER_FILE)
+    (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "folder.zarr").mkdir()
+
+    def run(*arguments):
+        result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+        return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
+
+    return run
+
+
+def test_systems_lists_all_with_their_parameters(vmri):
+    code, text = vmri("systems")
+    assert code == 0
+    for piece in ("fpu", "tsp", "sam", "omega", "stiffness", "slow", "fast", "constraints"):
+        assert piece in text
+
+
+def test_schemes_lists_all_with_their_options(vmri):
+    code, text = vmri("schemes")
+    assert code == 0
+    for piece in ("fully-implicit", "explicit-slow", "fully-explicit", "galerkin", "--alpha", "--degree --rule"):
+        assert piece in text
+
+
+@pytest.mark.parametrize("command", [["simulate", "--help"], ["reproduce", "-h"]])
+def test_help_shows_examples(vmri, command):
+    code, text = vmri(*command)
+    assert code == 0
+    assert f"Examples: vmri {command[0]}" in text
+
+
+def test_no_arguments_shows_the_commands(vmri):
+    _, text = vmri()
+    for command in ("systems", "schemes", "simulate", "reproduce"):
+        assert command in text
+
+
+def test_simulate_writes_what_it_says(vmri, tmp_path):
+    code, text = vmri("simulate", "fpu", *RUN, "--num-micro", 10, "--out", "run.npz", "--plot", "run.png")
+    assert code == 0
+    assert "macro steps 4, of 10 micro steps each" in text
+    assert "simulated time 0 to 0.4" in text
+    assert "run.npz, run.png" in text
+    assert "constraint residual" not in text
+    problem = vm.systems.fermi_pasta_ulam()
+    expected = vm.simulate(problem.system, vm.fully_explicit(10), problem.state(), macro_dt=0.1, num_steps=4)
+    np.testing.assert_array_equal(vm.Trajectory.load(tmp_path / "run.npz").q_f, expected.q_f)
+    assert (tmp_path / "run.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("name", ["user.py:my_problem", "user.py:make_problem"])
+def test_simulate_runs_a_users_own_problem(vmri, name):
+    code, text = vmri("simulate", name, *RUN, "--alpha", 0.5, "--num-micro", 5)
+    assert code == 0
+    assert "nothing; give --out" in text
+
+
+def test_constraints_are_reported(vmri):
+    arguments = ["--scheme", "fully-explicit", "--macro-dt", "0.01", "--steps", 2, "--num-micro", 1]
+    code, text = vmri("simulate", "tsp", *arguments)
+    assert code == 0
+    assert "constraint residual" in text
+
+
+def test_micro_dt_gives_the_macro_step(vmri):
+    arguments = ["--micro-dt", "0.01", "--steps", "4", "--scheme", "fully-explicit", "--num-micro", "10"]
+    code, text = vmri("simulate", "fpu", *arguments)
+    assert code == 0
+    assert "simulated time 0 to 0.4" in text
+
+
+def test_a_failed_run_keeps_what_was_computed(vmri, tmp_path):
+    code, text = vmri(
+        "simulate", "fpu", "--macro-dt", 1, "--steps", 60, "--scheme", "fully-explicit", "--num-micro", 1,
+        "--out", "run.npz",
+    )  # fmt: skip
+    assert code == 1
+    assert "The run failed" in text
+    assert "Try a smaller macro_dt" in text
+    assert "The trajectory up to there is in run.npz." in text
+    trajectory = vm.Trajectory.load(tmp_path / "run.npz")
+    assert np.isfinite(trajectory.q_s[0]).all()
+    assert np.isnan(trajectory.q_s[-1]).all()
+
+
+STREAM = ["simulate", "fpu", *RUN, "--out", "run.zarr"]
+
+
+def test_simulate_streams_and_resumes(vmri, tmp_path):
+    code, text = vmri(*STREAM)
+    assert code == 0
+    assert "simulated time 0 to 0.4" in text
+    assert "saved run.zarr" in text
+    code, text = vmri(*STREAM)
+    assert code == 2
+    assert "run.zarr holds a run of 4 macro steps, 4 of them done" in text
+    code, text = vmri(*STREAM, "--resume", "--plot", "run.png")
+    assert code == 0
+    assert "per micro step" not in text
+    longer = [{"4": "8"}.get(argument, argument) for argument in STREAM]
+    code, text = vmri(*longer, "--resume")
+    assert code == 0
+    assert "macro steps 8" in text
+    stored = vm.StoredTrajectory(tmp_path / "run.zarr")
+    expected = vm.simulate(
+        (problem := vm.systems.fermi_pasta_ulam()).system,
+        vm.fully_explicit(10),
+        problem.state(),
+        macro_dt=0.1,
+        num_steps=8,
+    )
+    np.testing.assert_array_equal(stored.load().q_f, expected.q_f)
+    assert vmri(*STREAM, "--overwrite")[0] == 0
+    assert vm.StoredTrajectory(tmp_path / "run.zarr").num_steps == 4
+
+
+@pytest.mark.parametrize(("out", "again"), [("run.zarr", True), ("run.npz", False)])
+def test_ctrl_c_says_how_to_go_on(vmri, tmp_path, monkeypatch, out, again):
+    real = Simulation.advance
+
+    def advance(self, at, saves):
+        os.kill(os.getpid(), signal.SIGINT)
+        return real(self, at, saves)
+
+    command = ["simulate", "fpu", *RUN[:2], "--steps", "100", *RUN[4:], "--out", out]
+    monkeypatch.setattr("sys.argv", ["vmri", *command])
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulation, "advance", advance)
+        code, text = vmri(*command)
+    assert code == 130
+    assert f"The trajectory up to there is in {out}." in text
+    assert ("Go on with it: vmri simulate fpu" in text) == again
+    assert ("--out run.zarr --resume" in text) == again
+    assert (tmp_path / out).exists()
+
+
+def test_a_full_disk_is_told(vmri, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("vmri_jax.running.store.layout.commit", full)
+    code, text = vmri(*STREAM)
+    assert code == 1
+    assert "Not written run.zarr cannot be written: No space left on device." in text
+    monkeypatch.setattr("vmri_jax.running.trajectory.replaced", full)
+    code, text = vmri(*STREAM[:-1], "run.npz")
+    assert code == 1
+    assert "No space left on device" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fpu", *RUN, "--out", "run.npz", "--resume"], "--resume is for a run that is written all along; give --out"),
+        (["fpu", *RUN, "--out", "folder.zarr", "--resume"], "folder.zarr is not a stored trajectory"),
+        (["fpu", *RUN, "--out", "nowhere/run.zarr"], "the folder nowhere does not exist; make it first"),
+        (["fpuu", *RUN], "there is no system 'fpuu'. Did you mean fpu? There are fpu, tsp, sam."),
+        (["fpu", *RUN[:4], "--scheme", "fully_explict"], "Did you mean fully-explicit? There are fully-implicit"),
+        (["none.py:x", *RUN], "the file none.py does not exist"),
+        (["user.py", *RUN], "say which problem in that file, e.g. user.py:my_problem"),
+        (["user.py:my_problm", *RUN], "has no name 'my_problm'. Did you mean my_problem? Problems in it: my_problem."),
+        (["user.py:not_a_problem", *RUN], "is int; it must be a vmri_jax.Problem, or a function"),
+        (["user.py:needs_more", *RUN], "needs_more() in user.py failed: TypeError"),
+        (["user.py:my_problem", *RUN, "--out", "run.txt"], "must end in .npz"),
+        (["fpu", *RUN, "--out", "folder.npz"], "--out folder.npz cannot be written"),
+        (["fpu", *RUN, "--plot", "nowhere/run.png"], "the folder nowhere does not exist"),
+        (["fpu", "--steps", 4], "got neither of macro_dt and micro_dt"),
+        (["fpu", *RUN, "--micro-dt", 0.1], "got both of macro_dt and micro_dt"),
+        (["fpu", "--macro-dt", -1, "--steps", 4], "macro_dt is -1.0; it must be a positive number"),
+        (["fpu", "--macro-dt", 1, "--steps", 0], "num_steps is 0; it must be an integer of at least 1"),
+        (["fpu", *RUN, "--save-every", 3], "not a multiple of save_every = 3"),
+        (["fpu", *RUN, "--num-micro", 0], "num_micro is 0; it must be at least 1"),
+        (["fpu", *RUN, "--degree", 2], "the scheme fully-explicit has no degree"),
+        (["fpu", *RUN[:4], "--alpha", 0.5], "use explicit-slow or mollified-impulse or fully-explicit"),
+        (["fpu", *RUN[:4], "--scheme", "galerkin"], "needs the degree"),
+        (["fpu", *RUN[:4], "--scheme", "galerkin", "--degree", 2, "--rule", "simpson"], "must be 'gauss', 'lobatto'"),
+        (["fpu", *RUN, "--method", "sparse"], "it must be one of auto, march, frozen, decoupled, arrowhead, dense"),
+    ],
+)
+def test_bad_input_is_refused_in_one_panel(vmri, arguments, message):
+    code, text = vmri("simulate", *arguments)
+    assert code == 2
+    assert message in text
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("x = 1\nimport not_installed_anywhere", "line 2 of broken.py failed: ModuleNotFoundError"),
+        ("import sys\nsys.exit('no')", "line 2 of broken.py failed: SystemExit: no"),
+        ("def (", "broken.py failed: SyntaxError"),
+    ],
+)
+def test_a_file_that_fails_to_run_says_where(vmri, tmp_path, source, message):
+    (tmp_path / "broken.py").write_text(source)
+    code, text = vmri("simulate", "broken.py:problem", *RUN)
+    assert code == 2
+    assert message in text
+
+
+@pytest.mark.parametrize(("steps", "save_every"), [(1, 1), (1000, 1), (2000, 2), (100_000, 100), (2003, 1), (3001, 1)])
+def test_about_a_thousand_nodes_are_saved(steps, save_every):
+    assert cli.run.default_save_every(steps) == save_every
+
+
+def test_reproduce_one_figure(vmri, tmp_path, monkeypatch):
+    few = dataclasses.replace(reference.SIZES["quick"], fpu_steps=(0.01, 0.005, 0.002, 0.001))
+    monkeypatch.setitem(reference.SIZES, "quick", few)
+    code, text = vmri("reproduce", "--only", "fig6", "--out", "study")
+    assert code == 0
+    assert "fig6 4 of 4" in text
+    assert "Report: study/report.html" in text
+    assert {path.name for path in (tmp_path / "study").iterdir()} == {
+        "report.html",
+        "fig6.csv",
+        "fig6.png",
+        "fig6.svg",
+    }
+
+
+def test_reproduce_refuses_unknown_figures(vmri, tmp_path):
+    code, text = vmri("reproduce", "--only", "fig11")
+    assert code == 2
+    assert "no figure 'fig11'; there are fig4, fig5" in text
+    assert not (tmp_path / "out").exists()
+
+
+def test_reproduce_refuses_a_file_as_its_folder(vmri):
+    code, text = vmri("reproduce", "--only", "fig6", "--out", "user.py")
+    assert code == 2
+    assert "--out user.py: File exists" in text
+
+
+def test_reproduce_keeps_the_other_figures(vmri, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr("vmri_jax.study.figures.convergence_study", fail)
+    code, text = vmri("reproduce", "--only", "fig6", "--out", "study")
+    assert code == 1
+    assert "fig6: RuntimeError: out of luck" in text
+    assert "out of luck" in (tmp_path / "study" / "report.html").read_text()
+
+
+@pytest.fixture
+def short_menu(monkeypatch):
+    """The search chooses among few schemes."""
+    menu = [family for family in families() if family.name in ("fully explicit", "explicit slow")]
+    for module in ("advisor", "page"):
+        monkeypatch.setattr(f"vmri_jax.study.{module}.families", lambda: menu)
+
+
+def test_tune_prints_a_command_that_keeps_its_promise(vmri, short_menu, tmp_path):
+    code, text = vmri("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "1", "--out", "runs.csv")
+    assert code == 0
+    assert "From another start" in text
+    assert (tmp_path / "runs.csv").read_text().startswith("scheme,num_micro,order")
+    command = re.search(r"vmri (simulate user\.py:my_problem .*run\.npz)", text)
+    assert command
+    assert vmri(*command[1].split())[0] == 0
+    run = vm.Trajectory.load(tmp_path / "run.npz")
+    truth = reference_solution(find_problem("user.py:my_problem"), 1.0, num_saves=1)
+    assert abs(run.q_s[-1, 0] - truth.q[-1, 0]) < 1e-3
+    assert float(run.t[-1]) == pytest.approx(1.0)
+
+
+def test_tune_that_reaches_nothing_keeps_the_runs(vmri, short_menu, tmp_path, monkeypatch):
+    monkeypatch.setattr("vmri_jax.study.advisor.MAX_STEPS", 16)
+    code, text = vmri("tune", "user.py:my_problem", "--error", "1e-9", "--t-end", "1", "--out", "runs.json")
+    assert code == 1
+    assert "no setting reached 1e-09" in text
+    assert '"error_q"' in (tmp_path / "runs.json").read_text()
+
+
+def test_cost_writes_its_page(vmri, short_menu, tmp_path):
+    code, text = vmri("cost", "user.py:my_problem", "--t-end", "1", "--error", "1e-3", "--out", "page")
+    assert code == 0
+    assert "page/cost.html" in text
+    assert (tmp_path / "page" / "cost.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("tune", "user.py:my_problem", "--error", "1e-19", "--t-end", "1"), "round-off alone"),
+        (("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "-1"), "t_end is -1.0"),
+        (("tune", "user.py:my_problem", "--error", "1e-3", "--t-end", "1", "--out", "runs.txt"), ".csv or .json"),
+        (("cost", "user.py:my_problem", "--error", "-1"), "round-off alone"),
+        (("cost", "user.py:my_problem", "--t-end", "0"), "t_end is 0.0"),
+        (("simulate", "fpu", *RUN, "--compose", "yoshida5"), "there is no composition"),
+    ],
+)
+def test_what_the_search_refuses(vmri, arguments, message):
+    code, text = vmri(*arguments)
+    assert code == 2
+    assert message in text
+
+
+def test_simulate_composes(vmri):
+    code, text = vmri("simulate", "fpu", *RUN, "--num-micro", "3", "--compose", "suzuki4")
+    assert code == 0
+    assert "15 micro steps" in text

@@ -1,0 +1,186 @@
+"""States: consistent starts, projections, and constraints that no micro grid can keep."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.support import largest_difference
+from tests.user_systems import arms_kinetic, bent_system, double_pendulum
+from vmri_jax import ConstantMass, Problem, State, System, fully_implicit, initial_state, simulate
+from vmri_jax.diagnostics import constraint_residual, velocity
+from vmri_jax.mechanics.state import legendre, project_momentum
+
+
+def test_momenta_are_mass_times_velocity(fpu):
+    state = fpu.state()
+    assert np.array_equal(state.p_s, fpu.v_s)
+    assert np.array_equal(state.q_f, fpu.q_f)
+    assert float(state.t) == 0.0
+
+
+def test_a_problem_takes_plain_lists():
+    """Functions of the system get arrays, also where studies call them with the start of a problem."""
+    ring = System(ConstantMass([1.0, 1.0], [1.0]), slow_constraint=lambda q_s, params: jnp.array([q_s @ q_s - 1.0]))
+    problem = Problem(ring, [0.0, 1], [2], [0.5, 0.0], [0])
+    assert {name: getattr(problem, name).dtype for name in ("q_s", "q_f", "v_s", "v_f")} == dict.fromkeys(
+        ("q_s", "q_f", "v_s", "v_f"), np.dtype(float)
+    )
+    assert problem.system.num_constraints(problem.q_s, problem.q_f) == (0, 1)
+    with pytest.raises(TypeError, match=r"Problem: system is int; give a vmri_jax\.System"):
+        Problem(1, [0.0], [1.0], [0.0], [0.0])  # pyright: ignore[reportArgumentType]
+
+
+def test_momenta_of_a_mass_matrix(fpu):
+    matrix = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.1], [0.0, 0.1, 3.0]])
+    system = fpu.system.replace(kinetic=ConstantMass(matrix, 2 * np.ones(3)))
+    v_s, v_f = jnp.array([1.0, 2.0, 3.0]), jnp.ones(3)
+    state = initial_state(system, fpu.q_s, fpu.q_f, v_s, v_f, t=2.0)
+    assert np.allclose(state.p_s, matrix @ v_s, rtol=1e-15)
+    assert np.allclose(state.p_f, 2 * v_f, rtol=1e-15)
+    assert float(state.t) == 2.0
+    assert largest_difference(system.kinetic.velocity(state.p_s, state.p_f)[0], v_s) < 1e-14
+
+
+def test_legendre_transform_of_a_kinetic_function():
+    problem = double_pendulum()
+    q_s, q_f, v_s, v_f = problem.q_s, problem.q_f, jnp.array([0.7]), jnp.array([-3.0])
+    state = initial_state(problem.system, q_s, q_f, v_s, v_f)
+    (m_1, m_2), (l_1, l_2) = problem.system.params["masses"], problem.system.params["lengths"]
+    coupling = m_2 * l_1 * l_2 * jnp.cos(q_s - q_f)
+    assert largest_difference(state.p_s, (m_1 + m_2) * l_1**2 * v_s + coupling * v_f) < 1e-14
+    assert largest_difference(state.p_f, m_2 * l_2**2 * v_f + coupling * v_s) < 1e-14
+    back = project_momentum(problem.system, state)[2:]
+    assert largest_difference(jnp.concatenate(back), jnp.concatenate([v_s, v_f])) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["tsp", "sam"])
+def test_momenta_are_projected_onto_the_hidden_constraints(name, request):
+    problem = request.getfixturevalue(name)
+    rng = np.random.default_rng(1)
+    v_s, v_f = rng.normal(size=problem.q_s.shape), rng.normal(size=problem.q_f.shape)
+    state = initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f)
+    assert float(constraint_residual(problem.system, state)[1]) < 1e-12  # measured 1.5e-13
+    raw = legendre(problem.system, problem.q_s, problem.q_f, v_s, v_f)
+    residual = constraint_residual(problem.system, State(0.0, problem.q_s, problem.q_f, *raw))
+    assert float(residual[1]) > 0.1
+    # the correction is along the constraint normals: G^T mu
+    jacobian = np.concatenate(
+        jax.jacrev(problem.system.constraints, argnums=(1, 2))(0.0, problem.q_s, problem.q_f), axis=1
+    )
+    correction = np.concatenate([raw[0] - state.p_s, raw[1] - state.p_f])
+    mu = np.linalg.lstsq(jacobian.T, correction, rcond=None)[0]
+    assert np.abs(jacobian.T @ mu - correction).max() < 1e-12
+    again = project_momentum(problem.system, state)
+    assert largest_difference(again[0], state.p_s) < 1e-12
+
+
+def test_inconsistent_positions_are_refused_with_the_violation(tsp):
+    q_f = tsp.q_f.at[1].add(0.1)  # rod of length 2: (2.1^2 - 2^2) / 2 = 0.205
+    with pytest.raises(ValueError, match=r"violate the constraints by 2.050e-01 \(row 0 of 2.*pass project=True"):
+        initial_state(tsp.system, tsp.q_s, q_f, tsp.v_s, tsp.v_f)
+
+
+def test_projection_repairs_positions(tsp):
+    q_f = tsp.q_f.at[1].add(0.1)
+    state = initial_state(tsp.system, tsp.q_s, q_f, tsp.v_s, tsp.v_f, project=True)
+    residual = constraint_residual(tsp.system, state)
+    assert float(jnp.max(residual)) < 1e-13
+    # nearest in the mass metric: masses 1 and 100 at the ends of the rod share 0.1 as 100 : 1 (about)
+    assert float(state.q_f[1] - q_f[1]) == pytest.approx(-0.1 * 100 / 101, rel=0.01)
+    assert float(state.q_s[1]) == pytest.approx(0.1 / 101, rel=0.01)
+
+
+def test_projection_that_fails_says_so(tsp):
+    system = tsp.system.replace(constraint=unsatisfiable)
+    with pytest.raises(ValueError, match="projection did not reach the constraints; start closer"):
+        initial_state(system, tsp.q_s, tsp.q_f, tsp.v_s, tsp.v_f, project=True)
+
+
+def unsatisfiable(q_s, q_f, params):
+    return jnp.sum(q_f**2, keepdims=True) + 1.0
+
+
+def first_rod_as_constraint(q_s, q_f, params):
+    return (jnp.sum(q_s**2, keepdims=True) - params["lengths"][0] ** 2) / 2
+
+
+def both_rods(q_s, q_f, params):
+    rods = jnp.stack([jnp.sum(q_s**2), jnp.sum((q_f[:3] - q_s) ** 2)])
+    return (rods - params["lengths"][:2] ** 2) / 2
+
+
+@pytest.mark.parametrize(
+    ("constraint", "which"),
+    [(first_rod_as_constraint, r"row\(s\) \[0\] of constraint do"), (both_rods, r"row\(s\) \[0\] of constraint")],
+)
+def test_slow_only_constraint_on_the_micro_grid_is_refused(tsp, constraint, which):
+    system = tsp.system.replace(constraint=constraint, slow_constraint=None)
+    message = rf"{which}.* not depend on the fast variables.*rank deficit.*num_micro - 1.*slow_constraint"
+    with pytest.raises(ValueError, match=message):
+        initial_state(system, tsp.q_s, tsp.q_f, tsp.v_s, tsp.v_f)
+    with pytest.raises(ValueError, match=message):
+        simulate(system, fully_implicit(5), tsp.state(), macro_dt=0.01, num_steps=1)
+
+
+def two_constraints(q_s, q_f, params):
+    return jnp.stack([jnp.sum(q_f) - jnp.sum(q_s), jnp.sum(q_f**2) - jnp.sum(q_s**2)])
+
+
+def the_same_twice(q_s, q_f, params):
+    g = jnp.sum((q_f - q_s) ** 2) - 2.0
+    return jnp.stack([g, 2 * g])
+
+
+def two_slow_constraints(q_s, params):
+    return jnp.stack([q_s[0], q_s[0] ** 2])
+
+
+def test_more_constraints_than_variables_are_refused():
+    one = jnp.ones(1)
+    kinetic = double_pendulum().system.params
+    system = System(arms_kinetic, constraint=two_constraints, params=kinetic)
+    with pytest.raises(ValueError, match="constraint returns 2 values for 1 fast variables"):
+        initial_state(system, one, one, one, one)
+    system = System(arms_kinetic, slow_constraint=two_slow_constraints, params=kinetic)
+    with pytest.raises(ValueError, match="slow_constraint returns 2 values for 1 slow variables; at most 1"):
+        initial_state(system, 0 * one, one, one, one)
+
+
+def test_redundant_constraints_are_refused():
+    system = bent_system().replace(constraint=the_same_twice, slow_constraint=None)
+    q_s, q_f = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, 0.0])
+    with pytest.raises(
+        ValueError,
+        match=r"rows \[0, 1\] of constraint depend on each other: 2 rows have rank 1 in the fast variables.*Remove",
+    ):
+        initial_state(system, q_s, q_f, q_s, q_f)
+
+
+def quartic_kinetic(q_s, q_f, v_s, v_f, params):
+    return jnp.sum(v_s**2 / 2 + v_s**4 / 4) + jnp.sum(v_f**2) / 2
+
+
+def relativistic_kinetic(q_s, q_f, v_s, v_f, params):
+    """With the same equations of motion as -sqrt(1 - v^2); infinite slope at v = 1."""
+    return jnp.sum(1 - jnp.sqrt(1 - v_s**2)) + jnp.sum(v_f**2) / 2
+
+
+def soft_and_coupled(q_s, q_f, params):
+    return jnp.sum(q_s**2 + q_s * q_f) / 2
+
+
+@pytest.mark.parametrize(("kinetic", "v"), [(quartic_kinetic, 3.0), (relativistic_kinetic, 0.9)])
+def test_velocity_of_a_kinetic_energy_that_is_not_quadratic(kinetic, v):
+    system = System(kinetic, slow_potential=soft_and_coupled)
+    state = initial_state(system, [0.0], [0.1], [v], [0.5])
+    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    assert float(v_s[0]) == pytest.approx(v, rel=1e-13)
+    assert float(v_f[0]) == pytest.approx(0.5, rel=1e-13)
+
+
+def test_relativistic_run_keeps_its_energy_band():
+    system = System(relativistic_kinetic, slow_potential=soft_and_coupled)
+    state = initial_state(system, [0.0], [0.1], [0.9], [0.0])
+    run = simulate(system, fully_implicit(4), state, macro_dt=0.02, num_steps=500)
+    assert float(jnp.abs(run.energy - run.energy[0]).max()) < 5e-4  # measured 4e-5 with a stiff spring besides

@@ -1,0 +1,108 @@
+"""What is read off jaxprs: dependence, constant Hessians, diagonal Hessians."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vmri_jax.mechanics.structure import curved_directions, has_constant_hessian, has_diagonal_hessian, reached
+
+Q = jnp.linspace(0.5, 1.5, 4)
+
+
+def nested(q):
+    return jax.jit(lambda q: jnp.sum(jnp.where(q > 0, q, q**3) * jnp.cos(q)))(q)
+
+
+@pytest.mark.parametrize(
+    ("function", "diagonal", "constant"),
+    [
+        (lambda q: jnp.sum(q**2), True, True),
+        (lambda q: 3.0 * jnp.sum(jnp.arange(4.0) * q**2 + q), True, True),
+        (lambda q: jnp.sum(q**4) / 4, True, False),
+        (nested, True, False),
+        (lambda q: jnp.sum(q) ** 2, False, True),
+        (lambda q: q[0] * q[1], False, True),
+        (lambda q: jnp.sum((q[1:] - q[:-1]) ** 2), False, True),
+        (lambda q: jnp.linalg.norm(q), False, False),
+        (lambda q: jnp.sum(q**2 * q[0]), False, False),
+    ],
+)
+def test_hessians(function, diagonal, constant):
+    assert has_diagonal_hessian(function, Q) is diagonal
+    assert has_constant_hessian(function, Q) is constant
+    hessian = jax.hessian(function)(Q)
+    if diagonal:
+        assert bool(jnp.all(hessian == jnp.diag(jnp.diag(hessian))))
+    if constant:
+        assert bool(jnp.allclose(hessian, jax.hessian(function)(2 * Q)))
+
+
+def test_constant_hessian_of_several_arguments():
+    assert has_constant_hessian(lambda a, b: jnp.sum(a * b), Q, Q)
+    assert not has_constant_hessian(lambda a, b: jnp.sum(a * b**2), Q, Q)
+
+
+@jax.jit
+def weighed(q):
+    """A distance and a weight, which has no curvature."""
+    return jnp.linalg.norm(q[2:] - q[:2]) + 9.81 * jnp.sum(jnp.arange(4.0) * q)
+
+
+@pytest.mark.parametrize(
+    ("function", "rank", "curved"),
+    [
+        (lambda q: jnp.sum(jnp.arange(4.0) * q), 0, [False] * 4),
+        (lambda q: jnp.sum(jnp.arange(4.0) * q**2), 4, [True] * 4),
+        (lambda q: jnp.sum((q[1:3] - q[:2]) ** 2) + q[3], 2, [True, True, True, False]),
+        (lambda q: jnp.linalg.norm(q[::2]) + nested(q[3:]), 3, [True, False, True, True]),
+        (lambda q: jnp.prod(q.reshape(2, 2).T[1]) - 9.81 * q[2], 2, [False, True, False, True]),
+        (lambda q: jnp.sum(jnp.concatenate([q[2:], q[:1]]) ** 2), 3, [True, False, True, True]),
+        (
+            lambda q: jnp.sum(jnp.broadcast_to(q[:1], (3,)) * jnp.stack([q[0], q[0], q[3]])),
+            2,
+            [True, False, False, True],
+        ),
+        (lambda q: jnp.sum(jnp.flip(q)[:2] ** 3), 2, [False, False, True, True]),
+        (lambda q: jnp.sum((jnp.roll(q, 1) - q) ** 4), 3, [True] * 4),
+        (lambda q: jnp.cosh(jnp.sum(q[:3])) * nested(q[3:]), 2, [True] * 4),
+        (lambda q: jnp.sum(jax.lax.pad(jnp.diff(q), 0.0, [(-2, 2, 1)]) ** 3), 2, [False, True, True, True]),
+        (lambda q: jax.lax.fori_loop(0, 3, lambda _, x: x * (q[1] - q[0]), 1.0), 1, [True, True, False, False]),
+        (weighed, 2, [True] * 4),
+    ],
+)
+def test_curved_directions(function, rank, curved):
+    """They are as few as can be, and the Hessian has nothing beside them."""
+    directions = curved_directions(function, Q)
+    assert directions.shape == (rank, 4)
+    assert directions.any(axis=0).tolist() == curved
+    beside = np.eye(4) - np.linalg.pinv(directions) @ directions
+    hessian = jax.hessian(function)(Q**2)
+    assert np.abs(hessian @ beside).max() <= 1e-14 * np.abs(hessian).max()
+
+
+def test_unknown_operations_bend_everything():
+    assert curved_directions(lambda q: jnp.sum(jnp.sort(q)[:2] ** 2), Q).shape == (4, 4)
+
+
+def loops(a, b, n, flag):
+    """What each of the results depends on is in its name."""
+    a_n = jax.lax.fori_loop(0, n, lambda _, x: 2 * x, a)
+    both, only_b = jax.lax.fori_loop(0, 3, lambda _, at: (at[0] + at[1], 2 * at[1]), (a, b))
+    (last_of_a,), b_too = jax.lax.scan(lambda at, x: ((at[0] + 1,), at[0] * x), (a,), b * jnp.ones(3))
+    flag_b, flag_too = jax.lax.cond(flag, lambda b: (b, 1.0), lambda b: (-b, 2.0), b)
+    return a_n, both, only_b, last_of_a, b_too, flag_b, flag_too
+
+
+@pytest.mark.parametrize(
+    ("changed", "reaches"),
+    [
+        (0, [True, True, False, True, True, False, False]),
+        (1, [False, True, True, False, True, True, False]),
+        (2, [True, False, False, False, False, False, False]),
+        (3, [False, False, False, False, False, True, True]),
+    ],
+)
+def test_what_an_argument_reaches_through_loops(changed, reaches):
+    jaxpr = jax.make_jaxpr(jax.jit(loops))(1.0, 2.0, 3, True)
+    assert reached(jaxpr.eqns[0], [k == changed for k in range(4)]) == reaches

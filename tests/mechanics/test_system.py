@@ -1,0 +1,70 @@
+"""Systems: masses, replacing fields, what depends on what."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax import ConstantMass, System
+from vmri_jax.mechanics.structure import depends_on
+
+
+def test_diagonal_and_matrix_masses_agree():
+    rng = np.random.default_rng(0)
+    slow, fast = rng.uniform(1, 2, size=3), rng.uniform(1, 2, size=2)
+    v_s, v_f = rng.normal(size=(4, 3)), rng.normal(size=(4, 2))
+    a, b = ConstantMass(slow, fast), ConstantMass(np.diag(slow), np.diag(fast))
+    for x, y in zip(a.momentum(v_s, v_f), b.momentum(v_s, v_f), strict=True):
+        assert np.allclose(x, y, rtol=1e-15)
+    for x, y in zip(b.velocity(*b.momentum(v_s, v_f)), (v_s, v_f), strict=True):
+        assert np.allclose(x, y, rtol=1e-13)
+    energy = a(None, None, v_s[0], v_f[0], None)
+    assert np.isclose(energy, (slow @ v_s[0] ** 2 + fast @ v_f[0] ** 2) / 2, rtol=1e-15)
+    assert np.isclose(energy, b(None, None, v_s[0], v_f[0], None), rtol=1e-15)
+
+
+def test_masses_may_be_traced():
+    def kinetic(m):
+        return ConstantMass(m * jnp.ones(2), jnp.ones(1))(None, None, jnp.ones(2), jnp.ones(1), None)
+
+    assert float(jax.jit(jax.grad(kinetic))(3.0)) == 1.0
+
+
+def double_well(q_s, q_f, params):
+    return params["a"] * jnp.sum(q_s**2)
+
+
+def test_replace_changes_one_field_only():
+    system = System(ConstantMass([1.0], [1.0]), slow_potential=double_well, params={"a": jnp.asarray(1.0)})
+    changed = system.replace(params={"a": jnp.asarray(2.0)})
+    assert changed.slow_potential is double_well
+    assert float(changed.params["a"]) == 2.0
+    assert float(system.params["a"]) == 1.0
+    assert jax.tree.structure(system) == jax.tree.structure(changed)
+
+
+def test_constraints_join_coupling_and_slow_ones(sam):
+    values = sam.system.constraints(0.0, sam.q_s + 0.1, sam.q_f)
+    assert values.shape == (4,)
+    assert np.array_equal(values[:3], sam.system.constraint(sam.q_s + 0.1, sam.q_f, sam.system.params))
+    assert np.array_equal(values[3:], sam.system.slow_constraint(sam.q_s + 0.1, sam.system.params))
+    assert sam.system.num_constraints(sam.q_s, sam.q_f) == (3, 1)
+
+
+def test_a_system_without_constraints_has_none(fpu):
+    assert fpu.system.constraints(0.0, fpu.q_s, fpu.q_f).shape == (0,)
+    assert fpu.system.num_constraints(fpu.q_s, fpu.q_f) == (0, 0)
+
+
+def test_dependence_is_read_off_the_function():
+    x, y = jnp.ones(2), jnp.ones(3)
+    assert depends_on(lambda x, y: jnp.sum(x), x, y) == (True, False)
+    assert depends_on(lambda x, y: jnp.sum(x) * y, x, y) == (True, True)
+    assert depends_on(lambda x, y: 3.0 * jnp.sum(jnp.ones(2)), x, y) == (False, False)
+    assert depends_on(lambda x, y: x[0] + 0 * y[0], x, y) == (True, True)  # conservative
+
+    def unused(x, y):
+        return (jnp.sin(y), jnp.cos(x))[1]
+
+    assert depends_on(unused, x, y) == (True, False)
+    inner = jax.jit(lambda x, y: jnp.sin(x))
+    assert depends_on(lambda tree: inner(tree["a"], tree["b"]), {"a": x, "b": x}) == (True,)

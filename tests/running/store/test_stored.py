@@ -1,0 +1,128 @@
+"""Reading a store: parts of it, how far it is, and damage."""
+
+import itertools
+import shutil
+import warnings
+
+import numpy as np
+import pytest
+
+from tests.running.store.conftest import CHUNK, STEPS, assert_identical
+from vmri_jax import State, StoredTrajectory
+from vmri_jax.running.store import layout
+from vmri_jax.running.trajectory import join
+
+
+@pytest.fixture
+def copy(uninterrupted, tmp_path):
+    """Path of a copy that may be damaged."""
+    return shutil.copytree(uninterrupted.path, tmp_path / "copy.zarr")
+
+
+def test_parts_are_those_of_the_whole(uninterrupted):
+    whole = uninterrupted.load()
+    part = uninterrupted[3:9]
+    for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual"):
+        assert np.array_equal(getattr(part, name), getattr(whole, name)[3:9])
+    for name in ("t_micro", "q_f_micro"):
+        assert np.array_equal(getattr(part, name), getattr(whole, name)[3:8])
+    assert np.array_equal(part.info.iterations, whole.info.iterations[3:8])
+    assert_identical(join(list(uninterrupted.chunks())), whole)
+    assert_identical(uninterrupted[:], whole)
+    assert uninterrupted[12:].q_f.shape[0] == 1
+    assert isinstance(uninterrupted.final_state, State)
+    assert np.array_equal(uninterrupted.final_state.q_f, whole.q_f[-1])
+
+
+@pytest.mark.parametrize(("first", "stop", "stride"), [(0, 13, 3), (0, 13, 5), (2, 12, 4), (1, 2, 7)])
+def test_every_nth_node(uninterrupted, first, stop, stride):
+    whole, part = uninterrupted.load(), uninterrupted[first:stop:stride]
+    nodes = list(range(first, stop, stride))
+    assert np.array_equal(part.q_s, whole.q_s[np.array(nodes)])
+    between = list(itertools.pairwise(nodes))
+    residual, iterations = np.asarray(whole.info.residual), np.asarray(whole.info.iterations)
+    assert np.asarray(part.info.residual).tolist() == [residual[a:b].max() for a, b in between]
+    assert np.asarray(part.info.iterations).tolist() == [iterations[a:b].max() for a, b in between]
+    ends = np.array(nodes[1:], dtype=int)
+    assert np.array_equal(part.q_f_micro, whole.q_f_micro[ends - 1])
+    assert np.array_equal(np.asarray(part.q_f_micro)[:, -1], whole.q_f[ends])
+
+
+def test_what_can_not_be_taken(uninterrupted):
+    with pytest.raises(TypeError, match=r"the index is 3; take nodes by a slice"):
+        uninterrupted[3]
+    with pytest.raises(ValueError, match=r"no nodes 13:13:1 .*13 nodes are on disk, of 13"):
+        uninterrupted[20:]
+    with pytest.raises(ValueError, match=r"taken forwards"):
+        uninterrupted[::-1]
+
+
+def test_a_store_that_has_just_begun(run, tmp_path, monkeypatch):
+    def dies(*_):
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(layout.Writer, "append", dies)
+        with pytest.raises(SystemExit):
+            run(tmp_path / "run.zarr")
+    begun = StoredTrajectory(tmp_path / "run.zarr")
+    assert (len(begun), begun.step, begun.complete) == (0, 0, False)
+    assert "0 of 24 macro steps, not complete" in repr(begun)
+    with pytest.raises(ValueError, match=r"0 nodes are on disk"):
+        begun.load()
+
+
+def test_any_zarr_library_reads_it(uninterrupted):
+    import zarr
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        group = zarr.open_group(uninterrupted.path, mode="r")
+        members = dict(group.members(max_depth=None))
+    assert {"t", "q_s", "q_f_micro", "start/q_s", "checkpoint"} <= set(members)
+    assert np.array_equal(np.asarray(group["q_f"]), uninterrupted.load().q_f[1:])
+    assert group.attrs["num_steps"] == STEPS
+    assert len(list((uninterrupted.path / "q_f").glob("c.*"))) == STEPS // 2 // CHUNK
+
+
+def test_no_file_is_left_over(uninterrupted):
+    assert not list(uninterrupted.path.parent.glob("**/*.partial"))
+
+
+def test_missing_store(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere.zarr does not exist; give the folder of a stored trajectory"):
+        StoredTrajectory.open(tmp_path / "nowhere.zarr")
+
+
+def test_folder_of_something_else(tmp_path):
+    with pytest.raises(ValueError, match=r"is not a stored trajectory"):
+        StoredTrajectory(tmp_path)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
+def test_truncated_checkpoint(copy, part):
+    file = copy / layout.CHECKPOINT
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(part * len(whole))])
+    with pytest.raises(ValueError, match=r"copy.zarr: the checkpoint is damaged"):
+        StoredTrajectory(copy)
+
+
+def test_damaged_and_missing_chunks(copy, uninterrupted):
+    first, second = copy / "q_f" / "c.0.0", copy / "q_f" / "c.1.0"
+    data = bytearray(first.read_bytes())
+    data[5] ^= 1
+    first.write_bytes(data)
+    second.unlink()
+    stored = StoredTrajectory(copy)
+    with pytest.raises(ValueError, match=r"q_f cannot be read .*checksum"):
+        stored[:3]
+    with pytest.raises(ValueError, match=r"q_f cannot be read \(chunk 1 is missing\); the store is damaged"):
+        stored[6:8]
+    assert_identical(stored[9:], uninterrupted[9:])
+
+
+def test_truncated_attributes(copy):
+    (copy / "zarr.json").write_text((copy / "zarr.json").read_text()[:100])
+    with pytest.raises(ValueError, match=r"copy.zarr is not a stored trajectory"):
+        StoredTrajectory(copy)

@@ -1,0 +1,334 @@
+"""stream: resumed runs are the uninterrupted one, whatever stopped them, and what is on disk is never lost."""
+
+import errno
+import os
+import signal
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.running.store.conftest import CHUNK, EVERY, STEPS, H, Runs, assert_identical
+from tests.user_systems import two_oscillators
+from vmri_jax import (
+    ConstantMass,
+    Interrupted,
+    Method,
+    Newton,
+    Result,
+    SimulationError,
+    StoredTrajectory,
+    System,
+    fully_explicit,
+    fully_implicit,
+    simulate,
+)
+from vmri_jax.running.simulate import Simulation
+from vmri_jax.running.store import layout
+from vmri_jax.running.trajectory import join
+
+PER_CHUNK = CHUNK * EVERY
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "run.zarr"
+
+
+def stop_after(monkeypatch, chunks: int, where, name: str, error: BaseException) -> None:
+    """The call of a function for the chunk after so many raises instead."""
+    calls, real = [], getattr(where, name)
+
+    def fails(*arguments, **keywords):
+        calls.append(name)
+        if len(calls) > chunks:
+            raise error
+        return real(*arguments, **keywords)
+
+    monkeypatch.setattr(where, name, fails)
+
+
+def dies_after(monkeypatch, chunks: int, run, out, **changes) -> StoredTrajectory:
+    """The store of a run that died with so many chunks."""
+    with monkeypatch.context() as patch:
+        stop_after(patch, chunks, Simulation, "advance", SystemExit())
+        with pytest.raises(SystemExit):
+            run(out, **changes)
+    return StoredTrajectory(out)
+
+
+def test_what_is_streamed_is_what_simulate_returns(run, uninterrupted):
+    expected = simulate(
+        run.problem.system,
+        run.scheme,
+        run.problem.state(),
+        macro_dt=H,
+        num_steps=STEPS,
+        save_every=EVERY,
+        save_micro=True,
+    )
+    assert_identical(uninterrupted.load(), expected)
+    assert uninterrupted.complete
+    assert uninterrupted.success
+    assert (uninterrupted.step, uninterrupted.num_steps, len(uninterrupted)) == (STEPS, STEPS, 13)
+
+
+@pytest.mark.parametrize(
+    ("where", "name"), [(Simulation, "advance"), (layout.Writer, "append"), (layout, "commit"), (layout, "replaced")]
+)
+@pytest.mark.parametrize("chunks", [1, 2])
+def test_a_run_that_died_goes_on_to_the_last_bit(run, uninterrupted, out, monkeypatch, where, name, chunks):
+    """While it computed, wrote a chunk, or was about to commit one (the store itself is committed first)."""
+    with monkeypatch.context() as patch:
+        stop_after(patch, chunks + (where is layout), where, name, SystemExit())
+        with pytest.raises(SystemExit):
+            run(out)
+    died = StoredTrajectory(out)
+    assert died.step == chunks * PER_CHUNK
+    (out / "q_f" / "c.1.0.partial").touch()
+    assert not died.complete
+    assert_identical(died.load(), uninterrupted[: len(died)])
+    assert_identical(run(out, resume=True).load(), uninterrupted.load())
+    assert not list(out.rglob("*.partial"))
+
+
+def test_death_before_there_is_a_store(run, uninterrupted, out, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_after(patch, 0, layout, "commit", SystemExit())
+        with pytest.raises(SystemExit):
+            run(out)
+    assert list(out.parent.iterdir()) == []
+    assert_identical(run(out, resume=True).load(), uninterrupted.load())
+
+
+def test_the_state_alone_would_not_do(run, uninterrupted):
+    """Newton starts from what it learned: without that the run differs in its last digits."""
+    begun = uninterrupted[: CHUNK + 1]
+    arguments = {"macro_dt": H, "num_steps": STEPS - PER_CHUNK, "save_every": EVERY, "save_micro": True}
+    rest = simulate(run.problem.system, run.scheme, begun.final_state, **arguments)
+    whole = join([begun, rest])
+    assert not np.array_equal(whole.q_f, uninterrupted.load().q_f)
+    assert np.allclose(whole.q_f, uninterrupted.load().q_f, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("steps", [PER_CHUNK, 12])
+def test_a_complete_run_is_made_longer(run, uninterrupted, out, steps):
+    """At the end of a chunk, and within one."""
+    short = run(out, num_steps=steps)
+    assert short.complete
+    longer = run(out, resume=True)
+    assert longer.complete
+    assert_identical(longer.load(), uninterrupted.load())
+    with pytest.raises(ValueError, match=r"num_steps is 8, but .* has 24 already; open it"):
+        run(out, num_steps=8, resume=True)
+
+
+def test_a_complete_run_is_returned_at_once(run, uninterrupted, monkeypatch):
+    monkeypatch.setattr(Simulation, "start", None)
+    assert run(uninterrupted.path, resume=True).complete
+
+
+def test_a_run_that_has_fallen_back_goes_on_so(tmp_path, monkeypatch):
+    """At this step the march does not converge, see test_march."""
+    changes = {"scheme": fully_implicit(20), "macro_dt": 40.0, "num_steps": 12, "save_every": 1}
+    run = partial(Runs(two_oscillators(kappa=25.0)), newton=Newton(max_iterations=6), **changes)
+    whole, out = run(tmp_path / "whole.zarr").load(), tmp_path / "run.zarr"
+    assert np.all(np.asarray(whole.info.method) == Method.ARROWHEAD)
+    assert dies_after(monkeypatch, 1, run, out).record.fell_back
+    assert_identical(run(out, resume=True).load(), whole)
+
+
+def test_ctrl_c_finishes_the_chunk(run, uninterrupted, out, monkeypatch):
+    real, calls = Simulation.advance, []
+
+    def advance(self, at, saves):
+        calls.append(saves)
+        if len(calls) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return real(self, at, saves)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulation, "advance", advance)
+        with pytest.raises(Interrupted, match=r"interrupted after 16 of 24 macro steps") as caught:
+            run(out)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert isinstance(caught.value, KeyboardInterrupt)
+    assert_identical(caught.value.trajectory.load(), uninterrupted[:9])
+    assert_identical(run(out, resume=True, progress=True).load(), uninterrupted.load())
+
+
+def test_a_full_disk_keeps_what_was_written(run, uninterrupted, out, monkeypatch):
+    with monkeypatch.context() as patch:
+        full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        stop_after(patch, 1, layout.Writer, "append", full)
+        with pytest.raises(
+            OSError, match=r"No space left on device. The run is kept up to macro step 8: resume it"
+        ) as caught:
+            run(out)
+    assert caught.value.errno == errno.ENOSPC
+    assert_identical(StoredTrajectory(out).load(), uninterrupted[: CHUNK + 1])
+    assert_identical(run(out, resume=True).load(), uninterrupted.load())
+
+
+def test_a_folder_that_cannot_be_written(run, out, monkeypatch):
+    denied = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    stop_after(monkeypatch, 0, layout, "commit", denied)
+    with pytest.raises(PermissionError, match=r"run.zarr cannot be written: Permission denied"):
+        run(out)
+    assert list(out.parent.iterdir()) == []
+
+
+# --- runs that fail --------------------------------------------------------------------------------------------------
+def walled(q_s, q_f, params):
+    """A potential that is not a number beyond a wall."""
+    return -jnp.sum(jnp.sqrt(1.2 - q_s)) + jnp.sum(q_f**2) / 2
+
+
+def test_a_failure_is_kept_with_its_status(run, out):
+    system = run.problem.system.replace(slow_potential=walled)
+    changes = {"system": system, "scheme": fully_explicit(3), "num_steps": 48, "chunk": CHUNK}
+    with pytest.raises(SimulationError, match=r"NON_FINITE.* after 0 Newton iterations") as caught:
+        run(out, **changes)
+    arguments = {"macro_dt": H, "num_steps": 48, "save_every": EVERY, "save_micro": True, "throw": False}
+    expected = simulate(system, fully_explicit(3), run.problem.state(), **arguments)
+    failed = caught.value.trajectory
+    assert isinstance(failed, StoredTrajectory)
+    assert failed.failed_at == caught.value.step == int(expected.failed_at) >= PER_CHUNK
+    assert caught.value.time == pytest.approx(failed.failed_at * H)
+    assert failed.result is Result.NON_FINITE
+    assert not failed.success
+    assert not failed.complete
+    on_disk = failed.load()
+    assert len(failed) < 25
+    for name in ("q_s", "p_f", "energy", "q_f_micro"):
+        array = np.asarray(getattr(on_disk, name))
+        assert np.array_equal(array, getattr(expected, name)[: len(array)], equal_nan=True)
+    assert int(on_disk.failed_at) == failed.failed_at
+    assert failed[:2].success
+    with pytest.raises(SimulationError, match="NON_FINITE"):
+        run(out, resume=True, **changes)
+    assert run(out, resume=True, throw=False, **changes).failed_at == failed.failed_at
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+def steeper(q_s, q_f, params):
+    return 2 * jnp.sum(q_f**2)
+
+
+def of_two(q_s, q_f, params):
+    return q_f[:2]
+
+
+def same_name(power):
+    def steeper(q_f, params):
+        return jnp.sum(q_f**power)
+
+    return steeper
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"macro_dt": 0.03}, r"macro_dt: 0.03 here, 0.02 in the store"),
+        ({"scheme": fully_explicit(3)}, r"scheme.slow.grid: macro here, micro in the store"),
+        ({"newton": Newton(tolerance=1e-10)}, r"newton.tolerance: 1e-10 here, 1e-12 in the store"),
+        ({"save_micro": False}, r"save_micro: False here, True in the store"),
+        ({"chunk": 5}, r"chunk: 5 here, 4 in the store"),
+    ],
+)
+def test_another_run_is_not_resumed(run, uninterrupted, changes, message):
+    with pytest.raises(ValueError, match=rf"uninterrupted.zarr holds another run .*{message}"):
+        run(uninterrupted.path, resume=True, **changes)
+    assert uninterrupted.load().success
+
+
+def test_another_system_is_not_resumed(run, uninterrupted, out):
+    system, params = run.problem.system, run.problem.system.params
+    name = next(iter(params))
+    with pytest.raises(ValueError, match=rf"system.params\['{name}'\]: .* here, .* in the store"):
+        run(uninterrupted.path, resume=True, system=system.replace(params=params | {name: params[name] * 1.5}))
+    with pytest.raises(ValueError, match=r"system.slow_potential: tests.running.store.test_stream.steeper here"):
+        run(uninterrupted.path, resume=True, system=system.replace(slow_potential=steeper))
+    state = run.problem.state()
+    moved = type(state)(state.t, state.q_s + 0.1, state.q_f, state.p_s, state.p_f)
+    with pytest.raises(ValueError, match=r"state.q_s: \[.*\] here, \[.*\] in the store"):
+        run(uninterrupted.path, resume=True, state=moved)
+    run(out, num_steps=PER_CHUNK, system=system.replace(fast_potential=same_name(2)))
+    with pytest.raises(ValueError, match=r"differs: operations of fast_potential: digest \w+ here, digest \w+ in"):
+        run(out, num_steps=PER_CHUNK, resume=True, system=system.replace(fast_potential=same_name(4)))
+
+
+def test_another_version_is_told(run, out, monkeypatch):
+    dies_after(monkeypatch, 1, run, out)
+    layout.change_attributes(out, made_with={**StoredTrajectory(out).attributes["made_with"], "jax": "0.1"})
+    with pytest.warns(UserWarning, match=r"last digits may differ .*jax .* \(0.1 then\)"):
+        run(out, resume=True)
+
+
+def test_a_checkpoint_of_another_version(run, out, monkeypatch):
+    died = dies_after(monkeypatch, 1, run, out)
+    layout.commit(out, died.record._replace(leaves=died.record.leaves[:-1]))
+    with pytest.raises(ValueError, match=r"can be read, but its run cannot go on: .* remember something else"):
+        run(out, resume=True)
+    assert_identical(StoredTrajectory(out).load(), died.load())
+
+
+def test_nothing_is_overwritten_unless_asked(run, uninterrupted, out):
+    run(out, num_steps=PER_CHUNK)
+    with pytest.raises(
+        FileExistsError, match=r"holds a run of 8 macro steps, 8 of them done. Go on with it \(resume\)"
+    ):
+        run(out)
+    with pytest.raises(ValueError, match=r"both resume and overwrite"):
+        run(out, resume=True, overwrite=True)
+    assert_identical(run(out, overwrite=True).load(), uninterrupted.load())
+    assert [path.name for path in out.parent.iterdir()] == ["run.zarr"]
+
+
+@pytest.mark.parametrize("asked", [{}, {"resume": True}, {"overwrite": True}])
+def test_foreign_things_are_left_alone(run, tmp_path, asked):
+    (tmp_path / "file.zarr").write_text("mine")
+    folder = tmp_path / "folder.zarr"
+    folder.mkdir()
+    (folder / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group", "attributes": {}}')
+    for path in (tmp_path / "file.zarr", folder):
+        with pytest.raises(ValueError, match=rf"{path.name} is not a stored trajectory"):
+            run(path, **asked)
+    assert (tmp_path / "file.zarr").read_text() == "mine"
+    assert [path.name for path in folder.iterdir()] == ["zarr.json"]
+
+
+def test_two_processes_do_not_write_at_once(run, uninterrupted):
+    with (
+        layout.locked(uninterrupted.path),
+        pytest.raises(BlockingIOError, match=r"is being written by another process; wait for it or stop it"),
+    ):
+        run(uninterrupted.path, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"chunk": 0}, r"chunk is 0; it must be an integer of at least 1"),
+        ({"chunk": 2.5}, r"chunk is 2.5"),
+        ({"system": System(ConstantMass(np.ones(3), np.ones(3)), of_two)}, r"slow_potential returns shape \(2,\)"),
+        ({"num_steps": 23}, r"not a multiple of save_every"),
+        ({"out": "nowhere/run.zarr"}, r"out is nowhere/run.zarr, but the folder nowhere does not exist; make it first"),
+    ],
+)
+def test_bad_arguments(run, out, changes, message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        run(**({"out": out} | changes))
+    assert not out.exists()
+
+
+def test_no_files_are_written_from_within_a_transformation(run, out):
+    with pytest.raises(ValueError, match=r"tracers; it writes files, call it outside"):
+        jax.jit(lambda dt: run(out, macro_dt=dt).load())(0.1)
+
+
+def test_chunks_of_their_own_size(run, out):
+    """A short run is one chunk."""
+    assert run(out, chunk=None).chunk == STEPS // EVERY

@@ -1,0 +1,203 @@
+"""The discrete Lagrangian against loops written by hand, and where each term is evaluated."""
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.user_systems import bent_system
+from vmri_jax import (
+    discrete_lagrangian,
+    discrete_legendre,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    galerkin,
+    quadrature,
+    simulate,
+)
+from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
+
+N, H = 4, 0.3
+
+
+def control_points(degree, n_s=3, n_f=3):
+    rng = np.random.default_rng(degree)
+    return rng.normal(size=(degree + 1, n_s)), rng.normal(size=(N * degree + 1, n_f))
+
+
+def linear_path_action(system, s, f, potentials):
+    """L_d of the reference schemes: slow linear over the macro step, fast linear between micro nodes."""
+    kinetic = (np.sum((s[1] - s[0]) ** 2) / H + np.sum((f[1:] - f[:-1]) ** 2) * N / H) / 2  # unit masses
+    return kinetic - potentials(system)
+
+
+def fully_implicit_potentials(s, f):
+    def total(system):
+        value = 0.0
+        for m in range(N):
+            theta = (m + 0.5) / N
+            middle = (f[m] + f[m + 1]) / 2
+            value += H / N * system.slow_potential((1 - theta) * s[0] + theta * s[1], middle, system.params)
+            value += H / N * system.fast_potential(middle, system.params)
+        return value
+
+    return total
+
+
+def explicit_slow_potentials(s, f, alpha):
+    def total(system):
+        def V(k):
+            return system.slow_potential(s[k], f[k], system.params)
+
+        value = H * (alpha * V(0) + (1 - alpha) * V(-1))
+        return value + sum(H / N * system.fast_potential((f[m] + f[m + 1]) / 2, system.params) for m in range(N))
+
+    return total
+
+
+def fully_explicit_potentials(s, f, alpha):
+    def total(system):
+        def V(k):
+            return system.slow_potential(s[k], f[k], system.params)
+
+        def W(m):
+            return system.fast_potential(f[m], system.params)
+
+        value = H * (alpha * V(0) + (1 - alpha) * V(-1))
+        return value + sum(H / N * (alpha * W(m) + (1 - alpha) * W(m + 1)) for m in range(N))
+
+    return total
+
+
+@pytest.mark.parametrize(
+    ("scheme", "potentials"),
+    [
+        (fully_implicit(N), fully_implicit_potentials),
+        (explicit_slow(N, 0.3), lambda s, f: explicit_slow_potentials(s, f, 0.3)),
+        (fully_explicit(N, 0.3), lambda s, f: fully_explicit_potentials(s, f, 0.3)),
+    ],
+    ids=["fully implicit", "explicit slow", "fully explicit"],
+)
+def test_reference_schemes_are_the_formulas_of_the_paper(fpu, scheme, potentials):
+    s, f = control_points(1)
+    expected = linear_path_action(fpu.system, s, f, potentials(s, f))
+    assert float(discrete_lagrangian(fpu.system, scheme)(s, f, H)) == pytest.approx(float(expected), rel=1e-14)
+
+
+def galerkin_action(system, s, f, degree, rule):
+    """The Galerkin sum as a double loop over micro intervals and nodes."""
+    value = 0.0
+    for m in range(N):
+        points = f[m * degree : (m + 1) * degree + 1]
+        for c, w in zip(rule.nodes, np.asarray(rule.weights), strict=True):
+            theta = (m + c) / N
+            q_s, v_s = lagrange_basis(degree, theta) @ s, lagrange_derivative(degree, theta) @ s / H
+            q_f, v_f = lagrange_basis(degree, c) @ points, lagrange_derivative(degree, c) @ points * N / H
+            integrand = system.kinetic(q_s, q_f, v_s, v_f, system.params)
+            integrand -= system.slow_potential(q_s, q_f, system.params) + system.fast_potential(q_f, system.params)
+            value += H / N * w * integrand
+    return value
+
+
+@pytest.mark.parametrize("name", ["gauss", "lobatto"])
+def test_degree_two_is_a_sum_over_nodes(fpu, name):
+    rule = quadrature.gauss(2) if name == "gauss" else quadrature.lobatto(3)
+    s, f = control_points(2)
+    for system in (fpu.system, bent_system()):
+        expected = galerkin_action(system, s, f, 2, rule)
+        value = float(discrete_lagrangian(system, galerkin(N, 2, name))(s, f, H))
+        assert value == pytest.approx(float(expected), rel=1e-13)
+
+
+@pytest.mark.parametrize("scheme", [explicit_slow(N, 0.3), galerkin(N, 2)], ids=["explicit slow", "gauss 2"])
+def test_discrete_legendre_transforms_are_slot_derivatives(fpu, scheme):
+    s, f = control_points(scheme.degree)
+    L_d = jax.jit(discrete_lagrangian(fpu.system, scheme))
+    start, end = discrete_legendre(fpu.system, scheme)(s, f, H)
+    eps = 1e-5
+    for (p_s, p_f), k, sign in ((start, 0, -1), (end, -1, 1)):
+        for p, slot in ((p_s, s), (p_f, f)):
+            for i in range(3):
+                shifted = []
+                for step in (eps, -eps):
+                    moved = slot.copy()
+                    moved[k, i] += step
+                    shifted.append(L_d(moved, f, H) if slot is s else L_d(s, moved, H))
+                difference = sign * (shifted[0] - shifted[1]) / (2 * eps)
+                assert float(p[i]) == pytest.approx(float(difference), rel=1e-6, abs=1e-6)  # measured 1e-8
+
+
+def test_straight_motion_has_its_own_momentum(fpu):
+    """Without potentials, the Legendre transforms of a straight path are mass times velocity."""
+    free = fpu.system.replace(slow_potential=None, fast_potential=None)
+    v_s, v_f = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.2, -1.0])
+    for degree in (1, 2, 3):
+        fast_times = np.array([(m + c) / N for m in range(N) for c in control_nodes(degree)[bool(m) :]])
+        transforms = discrete_legendre(free, galerkin(N, degree))(
+            H * control_nodes(degree)[:, None] * v_s, H * fast_times[:, None] * v_f, H
+        )
+        for p_s, p_f in transforms:
+            assert np.allclose(p_s, v_s, rtol=0, atol=1e-13)
+            assert np.allclose(p_f, v_f, rtol=0, atol=1e-13)
+
+
+EVALUATIONS = Counter()
+
+
+def counted(name, function):
+    """The function, counting every evaluation at run time (each lane of a vmap once)."""
+
+    def call(*args):
+        jax.debug.callback(lambda _: EVALUATIONS.update([name]), jnp.sum(args[0]))
+        return function(*args)
+
+    return call
+
+
+@pytest.mark.parametrize("alpha", [0.5, 0.0])
+def test_explicit_chain_evaluates_v_once_and_w_num_micro_times_per_macro_step(fpu, alpha):
+    num_micro = 7
+    system = fpu.system.replace(
+        slow_potential=counted("V", fpu.system.slow_potential), fast_potential=counted("W", fpu.system.fast_potential)
+    )
+    counts = []
+    for num_steps in (10, 25):
+        EVALUATIONS.clear()
+        run = simulate(
+            system,
+            fully_explicit(num_micro, alpha),
+            fpu.state(),
+            macro_dt=0.01,
+            num_steps=num_steps,
+            save_every=num_steps,
+        )
+        run.q_s.block_until_ready()
+        jax.effects_barrier()
+        counts.append(EVALUATIONS.copy())
+    assert counts[1]["V"] - counts[0]["V"] == 15
+    assert counts[1]["W"] - counts[0]["W"] == 15 * num_micro
+    assert int(jnp.max(run.info.iterations)) == 0
+
+
+@pytest.mark.parametrize(
+    ("scheme", "v_nodes", "w_nodes"),
+    [
+        (fully_implicit(N), N, N),
+        (explicit_slow(N), 2, N),
+        (fully_explicit(N), 2, N + 1),
+        (galerkin(N, 2), 2 * N, 2 * N),
+        (galerkin(N, 2, "lobatto"), 2 * N + 1, 2 * N + 1),
+    ],
+    ids=["fully implicit", "explicit slow", "fully explicit", "gauss 2", "lobatto 2"],
+)
+def test_each_term_is_evaluated_at_its_own_nodes_only(fpu, scheme, v_nodes, w_nodes):
+    system = fpu.system.replace(
+        slow_potential=counted("V", fpu.system.slow_potential), fast_potential=counted("W", fpu.system.fast_potential)
+    )
+    EVALUATIONS.clear()
+    jax.block_until_ready(discrete_lagrangian(system, scheme)(*control_points(scheme.degree), H))
+    jax.effects_barrier()
+    assert Counter(V=v_nodes, W=w_nodes) == EVALUATIONS

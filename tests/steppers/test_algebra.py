@@ -1,0 +1,62 @@
+"""Small dense algebra against LAPACK, and its derivative."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vmri_jax.kernels import cpu as algebra
+
+
+def definite(n: int):
+    a = np.random.default_rng(n).normal(size=(n, n))
+    return jnp.asarray(a @ a.T + n * np.eye(n) + 0.1 * a)  # close to symmetric definite
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 5, 12, 16, 20])
+def test_solve_and_inverse(n):
+    a, b = definite(n), jnp.asarray(np.random.default_rng(0).normal(size=(n, 3)))
+    assert float(jnp.abs(a @ algebra.solve(a, b) - b).max()) < 1e-13  # measured 5e-15
+    assert float(jnp.abs(algebra.inverse(a) @ a - jnp.eye(n)).max()) < 1e-13
+
+
+@pytest.mark.parametrize("n", [3, 12, 20])
+def test_inverses_of_several(n):
+    several = jnp.stack([definite(n), 2 * definite(n).T])
+    assert float(jnp.abs(algebra.inverse(several) @ several - jnp.eye(n)).max()) < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [([], 0.0), ([-0.0], 0.0), ([1.0, -3.5, 2.0], 3.5), ([1.0, -np.inf], np.inf), ([np.inf, np.nan, 1.0], np.nan)],
+)
+def test_largest(values, expected):
+    found = (algebra.largest(jnp.asarray(values)), jax.vmap(algebra.largest)(jnp.asarray([values, values]))[1])
+    assert np.array_equal(found, [expected] * 2, equal_nan=True)
+
+
+def test_largest_keeps_a_nan_among_many():
+    values = jnp.ones((300, 300)).at[7, 200].set(jnp.nan)
+    assert np.isnan(jax.jit(algebra.largest)(values))
+
+
+@pytest.mark.parametrize("n", [3, 12])
+def test_solve_is_differentiable_in_reverse(n):
+    a, b = definite(n), jnp.ones((n, 1))
+    ours = jax.grad(lambda a: jnp.sum(algebra.solve(a, b) ** 2))(a)
+    expected = jax.grad(lambda a: jnp.sum(jnp.linalg.solve(a, b) ** 2))(a)
+    assert float(jnp.abs(ours - expected).max()) < 1e-13
+
+
+@pytest.mark.parametrize("n", [2, 30])
+def test_products(n):
+    a, x = definite(n), jnp.arange(1.0, n + 1)
+    assert algebra.matvec(a, x) == pytest.approx(np.asarray(a @ x), rel=1e-13)
+    assert algebra.matmul(a, a) == pytest.approx(np.asarray(a @ a), rel=1e-12, abs=1e-11)
+
+
+def test_no_library_call_below_the_limit():
+    compiled = (
+        jax.jit(lambda a, b: algebra.solve(a, b) + algebra.matmul(a, b)).lower(jnp.eye(12), jnp.ones((12, 2))).compile()
+    )
+    assert "custom-call" not in str(compiled.as_text())

@@ -1,0 +1,242 @@
+"""A single interval of higher degree in modes of time: the matrix is what it says, the step that of the whole equations."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.support import largest_difference
+from tests.user_systems import FULL_MASS, lifted, sphere
+from vmri_jax import (
+    ConstantMass,
+    Method,
+    Newton,
+    Result,
+    Rheonomic,
+    State,
+    System,
+    compose,
+    galerkin,
+    initial_state,
+    simulate,
+    simulate_batch,
+)
+from vmri_jax.schemes.equations import StepEquations
+from vmri_jax.schemes.path import control_nodes
+from vmri_jax.steppers.newton import collocation
+from vmri_jax.steppers.newton.collocation import Interval, Saddles, TimeModes
+
+
+def phases(system, scheme, state, newton=None, macro_dt=0.02, num_steps=10):
+    """(num_steps + 1, 2 n) positions and momenta of a run, and its info."""
+    run = simulate(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, newton=newton)
+    return np.concatenate([run.q_s, run.q_f, run.p_s, run.p_f], axis=1), run.info
+
+
+def soft(q_s, q_f, params):
+    return params * (q_s[1] + q_f[1]) + jnp.sum(q_s**2) * jnp.sum(q_f) / 5
+
+
+def stiff(q_f, params):
+    return 20 * jnp.cosh(q_f[0] - q_f[1]) + 10 * q_f[2] ** 4
+
+
+def general():
+    """Full mass matrices, all kinds of constraints, one of them moved; and a consistent start."""
+    system = System(
+        FULL_MASS, soft, stiff, constraint=Rheonomic(lifted), slow_constraint=sphere, params=jnp.asarray(3.0)
+    )
+    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1])
+
+
+def free():
+    """No constraints."""
+    system = System(FULL_MASS, soft, stiff, params=jnp.asarray(3.0))
+    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1])
+
+
+def slow_only():
+    """A single potential of slow variables alone."""
+    system = System(
+        ConstantMass(jnp.array([1.0, 2.0]), jnp.zeros(0)),
+        lambda q_s, q_f, params: 50 * jnp.cosh(q_s[0] - q_s[1]) + q_s[0],
+        slow_constraint=lambda q_s, params: jnp.sum(q_s**2, keepdims=True) - 1.0,
+    )
+    return system, initial_state(system, [0.6, 0.8], [], [0.4, -0.3], [])
+
+
+def weight_only():
+    """A potential without curvature, so that there is nothing but constraints to solve for."""
+    mass = ConstantMass(jnp.array([1.0, 2.0]), jnp.zeros(0))
+    system = System(mass, lambda q_s, q_f, params: 9.81 * q_s[1], slow_constraint=sphere)
+    return system, initial_state(system, [0.6, 0.8], [], [0.4, -0.3], [])
+
+
+def start_of(name, request):
+    if name in ("tsp", "sam"):
+        problem = request.getfixturevalue(name)
+        return problem.system, problem.state()
+    return {"general": general, "free": free, "slow only": slow_only, "weight only": weight_only}[name]()
+
+
+@pytest.mark.parametrize("rule", ["gauss", "lobatto"])
+@pytest.mark.parametrize("degree", [2, 3, 8, 9, 10])
+def test_modes_are_eigenvectors(degree, rule):
+    """``sum_j l_j' y_j`` against ``sum_j l_j y_j``: what the modes diagonalise, from values at the nodes and back."""
+    scheme = galerkin(1, degree, rule)
+    modes = TimeModes.of(scheme)
+    nodes, weights = np.array(scheme.fast.rule.nodes), np.asarray(scheme.fast.rule.weights)
+
+    def form(derivative):
+        at = [np.polynomial.Polynomial.fit(control_nodes(degree), e, degree, [0, 1]) for e in np.eye(degree + 1)]
+        at = np.stack([(p.deriv() if derivative else p)(nodes) for p in at], axis=1)
+        return (at.T * weights @ at)[:-1, 1:]
+
+    def back(matrix, gamma):
+        re, im = gamma[:, modes.mode]
+        return ((re * modes.of_values + im * np.asarray(collocation.times_i(modes.of_values))) @ matrix).T
+
+    a, b = form(True), form(False)
+    diagonalised = np.linalg.solve(a, b)
+    bound = 100 * np.finfo(float).eps * np.linalg.cond(np.linalg.eig(diagonalised)[1])
+    one = np.stack([np.ones_like(modes.gamma[0]), np.zeros_like(modes.gamma[0])])
+    assert largest_difference(back(modes.increments, one), np.eye(degree)) < bound
+    assert largest_difference(back(modes.increments, modes.gamma), diagonalised) < bound
+    assert largest_difference(back(modes.multipliers, one), a) / np.abs(a).max() < bound
+
+
+@pytest.mark.parametrize("scheme", [galerkin(1, 4, "lobatto"), galerkin(1, 3, "gauss"), galerkin(1, 2, "gauss")])
+def test_potentials_are_taken_at_the_nodes_of_their_rule_alone(scheme):
+    """A potential that is undefined at the end of the step, where none of these rules has a node that is solved for."""
+    mass, n = ConstantMass(jnp.zeros(0), jnp.ones(2)), scheme.degree
+    system = System(mass, fast_potential=lambda q_f, params: jnp.sum(jnp.sqrt(q_f)))
+    none, one = jnp.zeros(0), jnp.ones(2)
+    equations = StepEquations(system, scheme, jnp.zeros(()), none, one, none, one, jnp.asarray(0.1))
+    x = jnp.broadcast_to(-1.05 * control_nodes(n)[1:] ** 8, (2, n))
+    assert not jnp.isfinite(jnp.sqrt(one + x[:, -1])).any()
+    forces = Interval(equations).forces(x, jnp.zeros((0, n)))
+    assert all(jnp.isfinite(a).all() for a in forces)
+
+
+@pytest.mark.parametrize("name", ["general", "free", "slow only", "weight only", "sam"])
+def test_saddles_solve_the_matrix_that_is_written_down(name, request):
+    """``[A x M - h^2 B x W'', -I x G^T; I x G, 0]`` as one dense matrix."""
+    system, state = start_of(name, request)
+    degree, h = 3, 0.3
+    scheme = galerkin(1, degree)
+    equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, jnp.asarray(h))
+    interval, modes = Interval(equations), TimeModes.of(scheme)
+    saddles = Saddles.at(interval, modes, 0.1, interval.q)
+    a, b = (collocation._form(basis, degree, scheme.fast.rule.nodes)[:-1, 1:] for basis in (
+        collocation.lagrange_derivative, collocation.lagrange_basis
+    ))  # fmt: skip
+    n, along = interval.q.size, interval.directions
+    mass, g = interval.times_mass(jnp.eye(n)), interval.jacobian(0.1, interval.q)
+    hessian = interval.curvature(interval.q) @ along
+    assert name != "sam" or np.flatnonzero(along.any(axis=0)).tolist() == list(
+        range(6, 15)
+    )  # nothing bends the last atom
+    first = n - interval.num_curved
+    fast = jax.hessian(interval.potential)(interval.q)[first:, first:]
+    assert largest_difference(hessian, np.pad(fast, ((first, 0), (first, 0)))) <= 1e-10 * np.abs(fast).max()
+    n_c, one = len(g), np.eye(degree)
+    top = np.concatenate([np.kron(a, mass) - h**2 * np.kron(b, hessian), -np.kron(one, g.T)], axis=1)
+    bottom = np.concatenate([np.kron(one, g), np.zeros((degree * n_c, degree * n_c))], axis=1)
+    rows, values = np.random.default_rng(0).normal(size=(n, degree)), np.ones((n_c, degree))
+    found = saddles.solve(interval.over_mass(rows) @ modes.of_rows, values)
+    expected = np.linalg.solve(np.concatenate([top, bottom]), np.concatenate([rows.T.ravel(), values.T.ravel()]))
+    assert largest_difference(np.concatenate([y.T.ravel() for y in found]), expected) < 1e-9 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme", "macro_dt"),
+    [
+        ("tsp", galerkin(1, 3), 0.02),
+        ("tsp", galerkin(1, 4, "lobatto"), 0.02),
+        pytest.param("sam", galerkin(1, 2), 0.01, marks=pytest.mark.full),
+        ("general", galerkin(1, 3), 0.1),
+        ("general", compose(galerkin(1, 2, "lobatto"), [0.5, -0.3, 0.8]), 0.1),
+        ("free", galerkin(1, 5), 0.2),
+        ("slow only", galerkin(1, 4), 0.1),
+        ("weight only", galerkin(1, 3), 0.05),
+    ],
+)
+def test_it_solves_the_equations_of_the_step(name, scheme, macro_dt, request):
+    system, state = start_of(name, request)
+    (found, info), (expected, _) = (
+        phases(system, scheme, state, Newton(method), macro_dt) for method in ("march", "arrowhead")
+    )
+    assert int(info.method.max()) == Method.MARCH
+    assert largest_difference(found, expected) / np.abs(expected).max() < 1e-12  # measured 1e-14
+
+
+@pytest.mark.parametrize("name", ["tsp", "general"])
+def test_what_is_accepted_is_within_the_tolerance(name, request):
+    system, state = start_of(name, request)
+    n = state.q_s.size + state.q_f.size
+
+    def positions(newton):
+        return phases(system, galerkin(1, 4), state, newton, 0.05)[0][:, :n]
+
+    exact = positions(Newton("arrowhead"))
+    for tolerance in (1e-3, 1e-9):
+        found = positions(Newton("march", tolerance))
+        assert largest_difference(found, exact) < tolerance * np.abs(np.diff(exact, axis=0)).max()
+
+
+def test_few_iterations_at_high_degree(tsp, sam):
+    """Steps of about two thirds of a period of the stiff springs; the first of them settles the springs, the others the rotation."""
+    for problem, bound in ((tsp, 8), (sam, 6)):
+        run = simulate(problem.system, galerkin(1, 8), problem.state(), macro_dt=0.04, num_steps=25)
+        assert run.info.iterations.mean() < bound  # measured 6.7 and 5.0
+
+
+def test_where_it_fails_the_whole_equations_are_asked(tsp):
+    start = tsp.state()
+    fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)
+    step = {"macro_dt": 0.2, "num_steps": 1, "throw": False}
+    march, auto = (
+        simulate(tsp.system, galerkin(1, 2), fast, newton=Newton(method), **step) for method in ("march", "auto")
+    )
+    assert not Result(int(march.result)).success
+    assert int(auto.info.method[0]) == Method.ARROWHEAD
+
+
+def test_fixed_iterations(tsp):
+    system, state = tsp.system, tsp.state()
+    free, _ = phases(system, galerkin(1, 3), state)
+    fixed, info = phases(system, galerkin(1, 3), state, Newton(fixed_iterations=8))
+    assert np.all(np.asarray(info.iterations) == 8)
+    assert largest_difference(free, fixed) < 1e-11
+    few = Newton(fixed_iterations=1)
+    run = simulate(system, galerkin(1, 3), state, macro_dt=0.02, num_steps=5, newton=few, throw=False)
+    assert Result(int(run.result)) is Result.STAGNATED
+
+
+def test_lanes_of_a_batch_are_runs(tsp):
+    start, scale = tsp.state(), np.linspace(0.8, 1.2, 3)
+    states = jax.tree.map(lambda a: np.stack([a] * 3), start)
+    states = State(states.t, states.q_s, states.q_f, scale[:, None] * states.p_s, scale[:, None] * states.p_f)
+    batch = simulate_batch(tsp.system, galerkin(1, 3), states, macro_dt=0.02, num_steps=10)
+    for i in range(3):
+        one = simulate(
+            tsp.system, galerkin(1, 3), jax.tree.map(lambda a, i=i: a[i], states), macro_dt=0.02, num_steps=10
+        )
+        assert largest_difference(one.q_f, batch.q_f[i]) < 1e-12
+
+
+@pytest.mark.full
+def test_derivatives_by_parameters():
+    system, state = general()
+
+    def end(weight):
+        run = simulate(system.replace(params=weight), galerkin(1, 3), state, macro_dt=0.1, num_steps=5)
+        return jnp.concatenate([run.q_s[-1], run.q_f[-1]])
+
+    eps = 1e-5
+    expected = (end(jnp.asarray(3 + eps)) - end(jnp.asarray(3 - eps))) / (2 * eps)
+    forward, reverse = jax.jacfwd(end)(jnp.asarray(3.0)), jax.jacrev(end)(jnp.asarray(3.0))
+    assert largest_difference(forward, expected) < 1e-8
+    assert largest_difference(forward, reverse) < 1e-12

@@ -1,0 +1,159 @@
+"""Newton's iteration: how it ends, and how many iterations hard steps take."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from tests.support import compiled_step, largest_difference
+from vmri_jax import ConstantMass, Newton, Result, State, System, fully_implicit, initial_state, simulate
+from vmri_jax.steppers.newton.full import PLAIN_ITERATIONS
+
+EXACT = Newton(method="arrowhead")
+
+
+def step(problem, scheme, macro_dt, newton=EXACT, state=None):
+    state = problem.state() if state is None else state
+    state, info = compiled_step(problem.system, scheme, state, macro_dt, newton)
+    return state, info, Result(int(info.result))
+
+
+def test_a_plain_step_converges(fpu):
+    _, info, result = step(fpu, fully_implicit(5), 0.05)
+    assert result is Result.CONVERGED
+    assert result.success
+    assert 1 <= int(info.iterations) <= 4
+    assert float(info.residual) < 1e-13
+
+
+def test_too_few_iterations_stagnate(fpu):
+    _, info, result = step(fpu, fully_implicit(5), 0.05, Newton("arrowhead", max_iterations=1))
+    assert result is Result.STAGNATED
+    assert not result.success
+    assert int(info.iterations) == 1
+    assert "max_iterations" in result.message
+
+
+def test_nan_is_reported(fpu):
+    start = fpu.state()
+    _, _, result = step(
+        fpu, fully_implicit(5), 0.05, state=State(start.t, start.q_s, start.q_f * jnp.nan, 0.0 * start.p_s, start.p_f)
+    )
+    assert result is Result.NON_FINITE
+
+
+def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
+    _, info, result = step(fpu, fully_implicit(5), 0.05, Newton("arrowhead", tolerance=1e-30))
+    assert result is Result.CONVERGED_AT_ROUNDOFF or result is Result.CONVERGED
+    assert int(info.iterations) < 10
+    assert float(info.residual) < 1e-13
+
+
+@pytest.mark.parametrize(("macro_dt", "most"), [(0.01, 3), (0.05, 4)])
+def test_iterations_of_the_pendulum(tsp, macro_dt, most):
+    run = simulate(tsp.system, fully_implicit(5), tsp.state(), macro_dt=macro_dt, num_steps=100, newton=EXACT)
+    assert int(run.info.iterations.max()) <= most
+
+
+def test_iterations_of_a_large_macro_step(fpu):
+    run = simulate(fpu.system, fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=20, newton=EXACT)
+    assert int(run.info.iterations.max()) <= 8  # measured 6
+
+
+def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(fpu):
+    scheme = fully_implicit(20)
+    exact, info, _ = step(fpu, scheme, 0.5)
+    loose, loose_info, result = step(fpu, scheme, 0.5, Newton("arrowhead", tolerance=1e-4))
+    assert result is Result.CONVERGED
+    assert int(loose_info.iterations) < int(info.iterations)
+    assert 1e-15 < largest_difference(loose.q_s, exact.q_s) < 1e-4
+
+
+def test_solution_does_not_depend_on_the_method(tsp):
+    scheme = fully_implicit(5)
+    ends = [step(tsp, scheme, 0.05, Newton(method=s))[0] for s in ("arrowhead", "dense")]
+    for a, b in zip(jax.tree.leaves(ends[0]), jax.tree.leaves(ends[1]), strict=True):
+        assert largest_difference(a, b) < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"method": "sparse"},
+            "method is 'sparse'; it must be one of auto, march, frozen, decoupled, arrowhead, dense",
+        ),
+        ({"tolerance": 0.0}, "tolerance is 0.0; it must be positive"),
+        ({"max_iterations": 0}, "max_iterations is 0; it must be positive"),
+        ({"fixed_iterations": 0}, "fixed_iterations is 0; it must be positive"),
+    ],
+)
+def test_bad_options_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Newton(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"tolerance": "small"}, "tolerance is 'small'; give a real number"),
+        ({"max_iterations": None}, "max_iterations"),
+        ({"fixed_iterations": 2.5}, "fixed_iterations is 2.5; it must be an integer"),
+    ],
+)
+def test_options_that_are_no_numbers_are_refused(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        Newton(**arguments)
+
+
+def test_every_status_has_a_message():
+    assert all(len(result.message) > 40 and result.message.endswith(".") for result in Result)
+    assert [result.success for result in Result] == [True, True] + [False] * (len(Result) - 2)
+
+
+def test_continuation_finds_the_solution_that_plain_newton_misses(tsp):
+    """At this step of a run with huge steps plain Newton ends at another solution, of 70 times the energy."""
+    run = simulate(tsp.system, fully_implicit(10), tsp.state(), macro_dt=0.2, num_steps=60, newton=EXACT)
+    assert int(run.info.iterations.max()) > PLAIN_ITERATIONS
+    assert float(jnp.abs(run.energy - run.energy[0]).max()) < 200.0  # measured 145, of 12 000 that are exchanged
+    assert float(run.constraint_residual.max()) < 1e-11
+
+
+def on_two_circles(q_s, q_f, params):
+    return jnp.stack([q_f @ q_f - 1.0, q_f @ q_f - 1.2])
+
+
+def hill(q_f, params):
+    return -params / 2 * jnp.sum(q_f**2)
+
+
+def test_contradicting_constraints_are_dependent():
+    system = System(ConstantMass([1.0], [1.0, 1.0]), constraint=on_two_circles)
+    one, zero = jnp.ones(1), jnp.zeros(1)
+    state = State(jnp.zeros(()), zero, jnp.array([1.0, 0.0]), one, jnp.array([0.0, 0.5]))
+    _, info = compiled_step(system, fully_implicit(2), state, 0.1, Newton())
+    assert Result(int(info.result)) is Result.RANK_DEFICIENT
+
+
+def test_a_curvature_that_cancels_the_mass_is_singular():
+    """``m - h^2 k / 4 = 0`` for the midpoint rule on a hill of curvature k."""
+    system = System(ConstantMass([1.0], [1.0]), fast_potential=hill, params=jnp.array(4.0))
+    state = initial_state(system, [0.0], [0.3], [0.0], [0.1])
+    _, info = compiled_step(system, fully_implicit(1), state, 1.0, EXACT)
+    assert Result(int(info.result)) is Result.SINGULAR
+
+
+def pair(q_s, q_f, params):
+    return jnp.sum((q_f - q_s) ** 4) / 2
+
+
+def stiff_pair(q_f, params):
+    return 50 * jnp.sum(q_f**2)
+
+
+def test_slow_variable_that_only_sees_round_off():
+    """A symmetric pair leaves its centre at rest but for round-off: no size of its own to converge relative to."""
+    system = System(ConstantMass([1.0], [1.0, 1.0]), pair, stiff_pair)
+    state = initial_state(system, [0.0], [0.3, -0.3], [0.0], [0.0, 0.0])
+    run = simulate(system, fully_implicit(4), state, macro_dt=0.1, num_steps=200, newton=EXACT)
+    assert int(run.info.iterations.max()) <= 3
+    assert float(jnp.abs(run.q_s).max()) < 1e-15  # measured 1e-17

@@ -1,0 +1,158 @@
+"""One macro step: the route chosen from rules and system, its end, its multipliers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.support import compiled_step, largest_difference, relative_difference, without_fallback
+from tests.user_systems import bent_force, bent_system, double_pendulum, two_oscillators
+from vmri_jax import (
+    Newton,
+    Result,
+    Scheme,
+    discrete_legendre,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    galerkin,
+    initial_state,
+    macro,
+    macro_step,
+    micro,
+    quadrature,
+    systems,
+)
+from vmri_jax.steppers.split import split
+from vmri_jax.steppers.step import LARGE
+
+
+def step(problem, scheme, macro_dt):
+    return compiled_step(problem.system, scheme, problem.state(), macro_dt, without_fallback(problem.system, scheme))
+
+
+@pytest.mark.parametrize("name", ["fpu", "tsp", "sam", "arms"])
+@pytest.mark.parametrize(
+    ("scheme", "splits"),
+    [
+        (fully_implicit(2), ()),
+        (galerkin(2, 2), ()),
+        (explicit_slow(2), ("fpu",)),
+        (fully_explicit(2), ("fpu",)),
+        (
+            Scheme(2, kinetic=micro(quadrature.midpoint), slow=macro(quadrature.midpoint), fast=micro(quadrature.left)),
+            (),
+        ),
+    ],
+)
+def test_route(name, scheme, splits, request):
+    """Only a kicked V, constant masses and no coupling constraint let slow and fast go their own ways."""
+    problem = double_pendulum() if name == "arms" else request.getfixturevalue(name)
+    assert (split(problem.system, scheme, problem.q_s, problem.q_f) is not None) == (name in splits)
+
+
+def test_a_force_couples(fpu):
+    assert split(fpu.system.replace(force=bent_force), explicit_slow(2), fpu.q_s, fpu.q_f) is None
+
+
+def test_explicit_steps_need_no_newton(fpu):
+    _, info = step(fpu, fully_explicit(4), 0.05)
+    assert int(info.iterations) == 0
+    assert Result(int(info.result)) is Result.CONVERGED
+
+
+def only_slow(q_s, q_f, params):
+    return jnp.sum(q_s**4)
+
+
+def test_split_and_coupled_routes_agree():
+    """An implicit V of q_s alone is split off; made to look coupled, the same step is solved at once."""
+    problem = two_oscillators()
+    scheme = Scheme(
+        4, kinetic=micro(quadrature.midpoint), slow=macro(quadrature.midpoint), fast=micro(quadrature.midpoint)
+    )
+    separate = problem.system.replace(slow_potential=only_slow)
+    together = problem.system.replace(slow_potential=lambda q_s, q_f, params: only_slow(q_s, q_f, params) + 0 * q_f[0])
+    assert split(separate, scheme, problem.q_s, problem.q_f) is not None
+    assert split(together, scheme, problem.q_s, problem.q_f) is None
+    a, b = (compiled_step(s, scheme, problem.state(), 0.1, without_fallback(s, scheme)) for s in (separate, together))
+    assert largest_difference(a[1].q_f_micro, b[1].q_f_micro) < 1e-14
+    for name in ("q_s", "q_f", "p_s", "p_f"):
+        assert largest_difference(getattr(a[0], name), getattr(b[0], name)) < 1e-13
+
+
+@pytest.mark.parametrize("scheme", [fully_implicit(3), explicit_slow(3, 0.2), fully_explicit(3, 0.9)])
+def test_the_step_is_the_discrete_legendre_transform(fpu, scheme):
+    """The control points of the step have the start's momenta at one end and the new ones at the other."""
+    start = fpu.state()
+    end, info = step(fpu, scheme, 0.05)
+    slow = jnp.stack([start.q_s, end.q_s])
+    fast = jnp.concatenate([start.q_f[None], info.q_f_micro])
+    (p_s, p_f), (p_s_end, p_f_end) = discrete_legendre(fpu.system, scheme)(slow, fast, 0.05)
+    for a, b in ((p_s, start.p_s), (p_f, start.p_f), (p_s_end, end.p_s), (p_f_end, end.p_f)):
+        assert largest_difference(a, b) < 1e-12  # measured 1e-14
+    assert np.array_equal(info.q_f_micro[-1], end.q_f)
+    assert float(end.t) == 0.05
+
+
+@pytest.mark.parametrize("num_micro", [1, 2, 5, 6])
+def test_linear_micro_steps_some_at_a_time(num_micro, monkeypatch):
+    """Complex numbers of position and momentum, of which nothing is to be seen outside."""
+    problem = systems.fermi_pasta_ulam(LARGE)
+    ends, numbers = [], []
+    for large in (LARGE, LARGE + 1):
+        monkeypatch.setattr("vmri_jax.steppers.step.LARGE", large)
+
+        def end(macro_dt):
+            return macro_step(problem.system, explicit_slow(num_micro), problem.state(), macro_dt)
+
+        numbers.append(str(jax.make_jaxpr(end)(0.05)))
+        ends.append((end(0.05), jax.jacrev(lambda dt: end(dt)[0].p_f)(0.05)))
+    assert ["c128" in jaxpr for jaxpr in numbers] == [True, False]
+    ((state, info), slope), ((other, other_info), other_slope) = ends
+    np.testing.assert_allclose(info.q_f_micro, other_info.q_f_micro, atol=1e-14)
+    np.testing.assert_allclose(state.p_f, other.p_f, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(slope, other_slope, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_constraints_hold_at_every_micro_node(sam, degree):
+    end, info = step(sam, galerkin(3, degree), 0.01)
+    start = sam.state()
+    slow_end = end.q_s
+    if degree == 1:  # the slow path is linear
+        for m in range(3):
+            q_s = start.q_s + (m + 1) / 3 * (slow_end - start.q_s)
+            assert float(jnp.abs(sam.system.constraint(q_s, info.q_f_micro[m], sam.system.params)).max()) < 1e-12
+    assert float(jnp.abs(sam.system.constraints(0.0, end.q_s, end.q_f)).max()) < 1e-12
+    assert info.multiplier.shape == (3, degree, 3)
+    assert info.slow_multiplier.shape == (degree, 1)
+    # hidden constraints: G M^-1 p = 0
+    rates = sam.system.constraint_rates(0.0, end.q_s, end.q_f, *sam.system.kinetic.velocity(end.p_s, end.p_f))
+    assert float(jnp.abs(rates).max()) < 1e-12
+
+
+def test_small_steps_lose_no_digits(fpu):
+    """Relative accuracy of the momenta does not suffer from a tiny step: velocities come from increments."""
+    start = fpu.state()
+    for macro_dt in (1e-6, 1e-9):
+        end, _ = step(fpu, fully_implicit(5), macro_dt)
+        drift = macro_dt * 2500 / 50  # omega^2 f_1, the largest force
+        assert 0.9 * drift < largest_difference(end.p_f, start.p_f) < 1.1 * drift
+        explicit, _ = step(fpu, fully_explicit(5), macro_dt)
+        assert largest_difference(end.p_f, explicit.p_f) < 1e-13 + macro_dt**2 * 2500
+
+
+def test_everything_at_once_makes_a_consistent_step():
+    system = bent_system()
+    rng = np.random.default_rng(0)
+    q_s, q_f, v_s, v_f = 0.6 * np.ones(3), np.array([0.3, 0.4, 1.5]), *rng.normal(size=(2, 3))
+    state = initial_state(system, q_s, q_f, v_s, v_f, project=True)
+    ends = [
+        compiled_step(system, galerkin(2, 2), state, 0.02, Newton(method=solver)) for solver in ("arrowhead", "dense")
+    ]
+    for end, info in ends:
+        assert Result(int(info.result)).success
+        assert float(info.residual) < 1e-12
+        assert float(jnp.abs(system.constraints(0.0, end.q_s, end.q_f)).max()) < 1e-12
+    assert relative_difference(ends[0][0].p_f, np.asarray(ends[1][0].p_f)) < 1e-11

@@ -1,0 +1,127 @@
+"""The command ``vmri animate``: a run as a page, a strip of pictures or a GIF."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+
+from vmri_jax import plots
+from vmri_jax.animation.bars import bars
+from vmri_jax.animation.defaults import built_in
+from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.frames import plot_strip, write_gif
+from vmri_jax.animation.html import write_html
+from vmri_jax.animation.motion import Motion, motion
+from vmri_jax.cli.catalogue import SYSTEMS, find_problem
+from vmri_jax.running.store import StoredTrajectory
+from vmri_jax.running.trajectory import Trajectory
+
+MOST_NODES = 100_000
+"""Read from a store; of longer runs every k-th node is."""
+SUFFIXES = (".html", ".png", ".svg", ".pdf", ".gif")
+
+console = Console()
+
+
+class _BadInput(typer.BadParameter):
+    """Something the user typed: shown in a panel, exit code 2."""
+
+    def format_message(self) -> str:
+        return self.message
+
+
+def animate(
+    run: Annotated[Path, typer.Argument(help="A saved trajectory, run.npz or run.zarr.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Write it here: .html, a strip .png/.svg/.pdf, or .gif. [dim]run.html[/dim]")
+    ] = None,
+    system: Annotated[
+        str | None, typer.Option(help="What was simulated: fpu, tsp, sam, or my_file.py:my_problem.")
+    ] = None,
+    drawing: Annotated[Path | None, typer.Option(help="What to draw, .json, instead of what the run says.")] = None,
+    title: Annotated[str | None, typer.Option(help="Over the picture. [dim]name of the system or file[/dim]")] = None,
+    start: Annotated[float | None, typer.Option("--from", help="Start at this time.")] = None,
+    end: Annotated[float | None, typer.Option("--to", help="Stop at this time.")] = None,
+    frames: Annotated[int, typer.Option(min=1, max=60, help="Pictures in a strip.")] = 5,
+    seconds: Annotated[float, typer.Option(min=0.1, max=60, help="How long a GIF takes.")] = 6.0,
+    dark: Annotated[bool, typer.Option("--dark", help="Dark colours; a page has both.")] = False,
+) -> None:
+    """Show a run: a page to open in a browser, a strip of pictures, or a GIF.
+
+    The drawing is the one stored with the run, else that of --system; without one every coordinate is a bar.
+    """
+    try:
+        out = run.with_suffix(".html") if out is None else out
+        _check_out(out)
+        shown = _motion(run, system, drawing).between(start, end)
+    except (ValueError, TypeError, FileNotFoundError) as error:
+        raise _BadInput(str(error)) from error
+    name = title or (SYSTEMS[system].title if system in SYSTEMS else run.stem)
+    try:
+        _write(shown, out, name, frames, seconds, plots.DARK if dark else plots.LIGHT)
+    except OSError as error:
+        raise _BadInput(f"--out {out}: {error.strerror}; give a file that can be written.") from error
+    if shown.ending:
+        console.print(f"[yellow]{escape(shown.ending)}[/yellow]")
+    console.print(f"[bold]{escape(str(out))}[/bold]  {out.stat().st_size / 1e6:.2g} MB", soft_wrap=True)
+
+
+def _check_out(out: Path) -> None:
+    if out.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"--out {out} must end with {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}.")
+    if out.is_dir() or not out.parent.is_dir():
+        reason = "is a folder" if out.is_dir() else f"the folder {out.parent} does not exist"
+        raise ValueError(f"--out {out}: {reason}; give a file in a folder that exists.")
+
+
+def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
+    """Of a saved run, with the first drawing there is."""
+    (trajectory, description), problem = _load(run), None if system is None else find_problem(system)
+    sizes = [np.shape(a)[-1] for a in (trajectory.q_s, trajectory.q_f)]
+    if problem is not None and sizes != [np.size(problem.q_s), np.size(problem.q_f)]:
+        raise ValueError(
+            f"--system {system} has {np.size(problem.q_s)} slow and {np.size(problem.q_f)} fast coordinates, the run "
+            f"{sizes[0]} and {sizes[1]}; give the system that was simulated."
+        )
+    if drawing is not None:
+        description = _read(drawing)
+    if not description and problem is not None:
+        description = problem.drawing or built_in(system or "", np.size(problem.q_s))
+    found = Drawing.from_dict(description or bars(trajectory))
+    return motion(trajectory, found, None if problem is None else problem.system)
+
+
+def _load(run: Path) -> tuple[Trajectory, str | dict]:
+    """A saved run, of a long store every k-th node, and the drawing stored with it; empty if there is none."""
+    if run.suffix.lower() == ".zarr":
+        stored = StoredTrajectory.open(run)
+        return stored[:: max(1, len(stored) // MOST_NODES)], stored.attributes.get("drawing", "")
+    trajectory = Trajectory.load(run)
+    with np.load(run, allow_pickle=False) as arrays:
+        return trajectory, str(arrays["drawing"]) if "drawing" in arrays else ""
+
+
+def _read(path: Path) -> dict:
+    if not path.is_file():
+        raise ValueError(f"--drawing {path} does not exist.")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"--drawing {path} is not valid JSON ({error}).") from error
+
+
+def _write(shown: Motion, out: Path, title: str, frames: int, seconds: float, theme: plots.Theme) -> None:
+    suffix = out.suffix.lower()
+    if suffix == ".html":
+        write_html(shown, out, title)
+    elif suffix == ".gif":
+        with Progress(console=console, transient=True) as bar:
+            task = bar.add_task("drawing")
+            write_gif(shown, out, seconds, theme, lambda done, total: bar.update(task, completed=done, total=total))
+    else:
+        plots.save(plot_strip(shown, frames, title, theme), out, theme)

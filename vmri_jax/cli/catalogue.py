@@ -1,0 +1,213 @@
+"""Built-in systems and schemes by name, and problems from a user's own file: what the command line accepts."""
+
+import difflib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from vmri_jax import systems
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.scene import Scene
+from vmri_jax.schemes import composition
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import (
+    Scheme,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    galerkin,
+    mollified_impulse,
+    takahashi_imada,
+)
+
+
+@dataclass(frozen=True)
+class NamedSystem:
+    """A built-in system: its factory and what its variables are."""
+
+    factory: Callable[..., Problem]
+    title: str
+    slow: str
+    fast: str
+
+
+@dataclass(frozen=True)
+class NamedScheme:
+    """A built-in scheme: its factory, which options it takes besides num_micro, and its order."""
+
+    factory: Callable[..., Scheme]
+    options: tuple[str, ...]
+    order: str
+    title: str
+
+
+SYSTEMS = {
+    "fpu": NamedSystem(
+        systems.fermi_pasta_ulam,
+        "Fermi-Pasta-Ulam chain",
+        "centres of the stiff springs",
+        "elongations of the stiff springs",
+    ),
+    "tsp": NamedSystem(
+        systems.triple_spherical_pendulum,
+        "triple spherical pendulum",
+        "the heavy bob, on a rod",
+        "two light bobs, on a rod and a stiff spring",
+    ),
+    "sam": NamedSystem(
+        systems.simple_atomic_model,
+        "simple atomic model",
+        "two heavy atoms",
+        "four light atoms with rigid bonds and stiff springs",
+    ),
+}
+
+DEFAULT_NAME = "scene"
+"""What a file alone stands for, if it has one."""
+
+SCHEMES = {
+    "fully-implicit": NamedScheme(fully_implicit, (), "2", "V and W at the micro midpoints"),
+    "explicit-slow": NamedScheme(
+        explicit_slow, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at micro midpoints"
+    ),
+    "mollified-impulse": NamedScheme(
+        mollified_impulse,
+        ("alpha",),
+        "2 at alpha = 1/2, else 1",
+        "explicit-slow with V at averaged fast positions: no impulse resonance",
+    ),
+    "fully-explicit": NamedScheme(
+        fully_explicit, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at the micro nodes"
+    ),
+    "takahashi-imada": NamedScheme(
+        takahashi_imada,
+        (),
+        "2, of frequencies 4",
+        "fully-explicit with corrected kicks: a Hessian product beside each gradient",
+    ),
+    "galerkin": NamedScheme(
+        galerkin, ("degree", "rule"), "2 x degree", "one rule (gauss or lobatto) on every term, any degree"
+    ),
+}
+
+
+def find_problem(name: str) -> Problem:
+    """A built-in problem by name, or one of your own, ``my_file.py:my_problem``.
+
+    In the file it is a `Problem`, a `Scene`, or a function without arguments making one; ``my_file.py`` alone stands for
+    its ``scene``.
+
+    Raises:
+        ValueError: an unknown name; a file that does not exist, fails to run, or has no such name; no Problem there.
+    """
+    if name in SYSTEMS:
+        return SYSTEMS[name].factory()
+    found = _find_own(name)
+    try:
+        return found.problem() if isinstance(found, Scene) else found
+    except Exception as error:
+        raise ValueError(f"{name} is a scene that makes no system: {type(error).__name__}: {error}") from error
+
+
+def find_scene(name: str) -> Scene:
+    """The scene in your own file, ``my_file.py:my_scene``, or ``my_file.py`` for its ``scene``.
+
+    Raises:
+        ValueError: as of `find_problem`; a system that is no scene.
+    """
+    found = SYSTEMS[name] if name in SYSTEMS else _find_own(name)
+    if not isinstance(found, Scene):
+        raise ValueError(
+            f"{name} is a system of functions, not a scene; give a vmri_jax.scene.Scene, my_file.py:my_scene."
+        )
+    return found
+
+
+def _find_own(name: str) -> Problem | Scene:
+    file_name, colon, attribute = name.partition(":")
+    if not colon and not file_name.endswith(".py"):
+        raise ValueError(f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem.")
+    path = Path(file_name)
+    if not path.is_file():
+        raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
+    module = _run_file(path)
+    if not attribute and hasattr(module, DEFAULT_NAME):
+        attribute = DEFAULT_NAME
+    if not attribute:
+        raise ValueError(f"{name}: say which problem in that file, e.g. {file_name}:my_problem.")
+    return _found_in(module, path, attribute)
+
+
+def find_scheme(name: str, num_micro: int, compose: str | None = None, **options) -> Scheme | Composition:
+    """A built-in scheme by name; options that are None keep their defaults.
+
+    Args:
+        compose: name of a composition of it, see `vmri_jax.compose`.
+
+    Raises:
+        ValueError: an unknown name, or an option the scheme does not have.
+        TypeError: an option that is needed.
+    """
+    if name not in SCHEMES:
+        raise ValueError(_unknown("scheme", name, SCHEMES))
+    scheme = SCHEMES[name]
+    given = {key: value for key, value in options.items() if value is not None}
+    for key in given:
+        if key not in scheme.options:
+            takers = [other for other, entry in SCHEMES.items() if key in entry.options]
+            raise ValueError(f"the scheme {name} has no {key}; leave --{key} out or use {' or '.join(takers)}.")
+    if name == "galerkin" and "degree" not in given:
+        raise ValueError("the scheme galerkin needs the degree of its path; give e.g. --degree 2.")
+    made = scheme.factory(num_micro, **given)
+    return made if compose is None else composition.compose(made, compose)
+
+
+def _unknown(kind: str, name: str, known: Iterable[str]) -> str:
+    known = list(known)
+    near = difflib.get_close_matches(name.lower().replace("_", "-"), known, n=1)
+    hint = f" Did you mean {near[0]}?" if near else ""
+    return f"there is no {kind} {name!r}.{hint} There are {', '.join(known)}."
+
+
+def _run_file(path: Path):
+    name = f"vmri_user_{path.stem}"  # not the bare stem, which may be the name of a module
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} is not a Python file; give my_file.py:my_problem.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses and equinox modules look themselves up there
+    sys.path.insert(0, str(path.resolve().parent))
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).name == path.name]
+        where = f"line {lines[-1]} of {path}" if lines else f"{path}"
+        raise ValueError(f"{where} failed: {type(error).__name__}: {error}") from error
+    finally:
+        sys.path.pop(0)
+    return module
+
+
+def _found_in(module, path: Path, attribute: str) -> Problem | Scene:
+    found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
+    if attribute not in found:
+        problems = [name for name, value in found.items() if isinstance(value, Problem | Scene)]
+        near = difflib.get_close_matches(attribute, found, n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        listed = f" Problems in it: {', '.join(problems)}." if problems else ""
+        raise ValueError(f"{path} has no name {attribute!r}.{hint}{listed}")
+    problem = found[attribute]
+    if callable(problem) and not isinstance(problem, Problem | Scene):
+        try:
+            problem = problem()
+        except Exception as error:
+            raise ValueError(f"{attribute}() in {path} failed: {type(error).__name__}: {error}") from error
+    if not isinstance(problem, Problem | Scene):
+        raise ValueError(
+            f"{attribute} in {path} is {type(problem).__name__}; it must be a vmri_jax.Problem, or a function without "
+            "arguments that returns one; a vmri_jax.scene.Scene will do as well."
+        )
+    return problem

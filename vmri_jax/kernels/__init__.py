@@ -1,0 +1,1 @@
+"""Small dense algebra: what is written for speed alone."""

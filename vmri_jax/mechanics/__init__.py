@@ -1,0 +1,1 @@
+"""The physics: systems, masses, constraints, forces, states, and the checks at the door."""

@@ -1,0 +1,132 @@
+"""Checks at the door: bad input is refused before any compute, with what came, what was expected and what to do."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.system import ConstantMass, System, with_time
+
+CONSTRAINT_TOLERANCE = 1e-6
+"""Largest constraint value, in the constraint's own unit, that counts as kept; more where the Newton tolerance is loose."""
+
+
+def require_x64() -> None:
+    """Raise unless JAX's 64-bit mode is on."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError(
+            "vmri_jax needs 64-bit floats: Newton and the constraints are solved to round-off. Switch them on at the start "
+            'of the program with jax.config.update("jax_enable_x64", True), or set JAX_ENABLE_X64=1.'
+        )
+
+
+def check_arrays(**arrays):
+    """Arrays as float64 vectors; slow and fast velocities shaped like their positions; finite where concrete."""
+    out = {}
+    for name, value in arrays.items():
+        if getattr(value, "dtype", None) in (np.float32, np.float16):
+            raise ValueError(f"{name} has dtype {value.dtype}; give float64, e.g. {name}.astype(float).")
+        array = jnp.asarray(real_array(name, value))
+        if array.ndim != 1:
+            raise ValueError(f"{name} has shape {array.shape}; it must be a vector of coordinates, shape (n,).")
+        if is_concrete(array) and not np.isfinite(array).all():
+            raise ValueError(
+                f"{name} has entries that are not finite at {np.flatnonzero(~np.isfinite(array)).tolist()}."
+            )
+        out[name] = array
+    for a, b in (("q_s", "v_s"), ("q_f", "v_f"), ("q_s", "p_s"), ("q_f", "p_f")):
+        if a in out and b in out and out[a].shape != out[b].shape:
+            raise ValueError(f"{b} has shape {out[b].shape}, {a} has {out[a].shape}; they must be equal.")
+    return tuple(out.values())
+
+
+def check_number(name: str, value):
+    """A finite real number, as an array of shape ()."""
+    array = jnp.asarray(real_array(name, value, 0))
+    if is_concrete(array) and not np.isfinite(array):
+        raise ValueError(f"{name} is {value}; it must be finite.")
+    return array
+
+
+def check_flags(**flags) -> None:
+    """Refuse what is neither True nor False: an array or a word would count as one of them."""
+    for name, value in flags.items():
+        if not isinstance(value, bool | np.bool_):
+            raise TypeError(f"{name} is {value!r}; it must be True or False.")
+
+
+def check_type(name: str, value, kind: type, example: str) -> None:
+    """Refuse objects of another class."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} is {type(value).__name__}; give {example}.")
+
+
+def check_params(params) -> None:
+    """Refuse parameters that are no numbers, naming where they are in the pytree."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if is_concrete(leaf) and getattr(leaf, "dtype", np.asarray(leaf).dtype).kind not in "biufc":
+            raise TypeError(
+                f"System: params{jax.tree_util.keystr(path)} is {leaf!r}; give arrays of numbers, which are handed to every "
+                "function. What is no number belongs into the functions themselves."
+            )
+
+
+def check_system(system: System, q_s, q_f) -> None:
+    """Check shapes of masses and of what every user function returns for these positions (without evaluating them)."""
+    n_s, n_f = q_s.shape[0], q_f.shape[0]
+    if isinstance(system.kinetic, ConstantMass):
+        for name, mass, n in (("slow", system.kinetic.slow, n_s), ("fast", system.kinetic.fast, n_f)):
+            if mass.shape[0] != n:
+                raise ValueError(
+                    f"ConstantMass: {name} is for {mass.shape[0]} coordinates, the state has {n} {name} ones."
+                )
+    scalars = {
+        "kinetic": (system.kinetic, (q_s, q_f, q_s, q_f)),
+        "slow_potential": (system.slow_potential, (q_s, q_f)),
+        "fast_potential": (system.fast_potential, (q_f,)),
+    }
+    for name, (function, args) in scalars.items():
+        if function is not None:
+            shape = _shape(name, function, *args, system.params)
+            if getattr(shape, "shape", None) != ():
+                raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a scalar, shape ().")
+            _check_float64(name, shape)
+    for name, args in (("constraint", (q_s, q_f)), ("slow_constraint", (q_s,))):
+        function, args = with_time(getattr(system, name), jnp.zeros(()), *args, system.params)
+        if function is not None:
+            shape = _shape(name, function, *args)
+            if len(getattr(shape, "shape", ())) != 1:
+                raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a vector, shape (n_g,).")
+            _check_float64(name, shape)
+    if system.force is not None:
+        shape = _shape("force", system.force, jnp.zeros(()), q_s, q_f, q_s, q_f, system.params)
+        if not isinstance(shape, tuple) or [getattr(s, "shape", None) for s in shape] != [(n_s,), (n_f,)]:
+            raise ValueError(
+                f"System: force returns {_describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
+            )
+        for part in shape:
+            _check_float64("force", part)
+
+
+def _shape(name: str, function, *args):
+    try:
+        return jax.eval_shape(function, *args)
+    except Exception as error:
+        raise ValueError(
+            f"System: {name} could not be evaluated on arguments of shapes "
+            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and the params: {type(error).__name__}: {error}"
+        ) from error
+
+
+def _check_float64(name: str, value) -> None:
+    if value.dtype != np.float64:
+        raise ValueError(
+            f"System: {name} returns {value.dtype}; it must return float64. Whole numbers become floats as 0.0 instead of 0, "
+            "arrays by .astype(float)."
+        )
+
+
+def _describe(value) -> str:
+    if isinstance(value, tuple):
+        return "(" + ", ".join(_describe(v) for v in value) + ")"
+    return f"shape {value.shape}" if hasattr(value, "shape") else type(value).__name__

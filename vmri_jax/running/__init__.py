@@ -1,0 +1,1 @@
+"""Runs: one engine behind single runs, batches and streams to disk."""

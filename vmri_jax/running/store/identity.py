@@ -1,0 +1,91 @@
+"""Which run a store holds: functions, parameters, scheme, step and start in words, so that two runs can be compared."""
+
+import dataclasses
+import hashlib
+import os
+import platform
+import re
+from collections.abc import Callable
+from importlib.metadata import version
+
+import jax
+import numpy as np
+
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import KineticFunction, System, with_time
+from vmri_jax.running.simulate import Simulation
+
+IN_FULL = 8
+"""Arrays of so many numbers are compared in sight, larger ones by a digest."""
+
+
+def identity(simulation: Simulation, start: State) -> dict[str, str]:
+    """All that decides a run, by name. Functions are known by their name and by the operations they trace to."""
+    found = {}
+    for name in ("system", "scheme", "newton", "macro_dt", "save_every", "save_micro"):
+        found |= describe(name, getattr(simulation, name))
+    found |= describe("state", start)
+    return found | {f"operations of {name}": text for name, text in _operations(simulation.system, start).items()}
+
+
+def environment() -> dict[str, str]:
+    """What the last digits of a run depend on besides."""
+    versions = {name: version(name) for name in ("vmri_jax", "jax", "jaxlib")}
+    flags = os.environ.get("XLA_FLAGS", "")
+    return versions | {"machine": f"{platform.system()} {platform.machine()}", "XLA_FLAGS": flags}
+
+
+def differences(here: dict[str, str], there: dict[str, str], same_jax: bool) -> list[str]:
+    """What differs between two identities, in words; operations are printed differently by another JAX."""
+    names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
+    if not same_jax:
+        names = [name for name in names if not name.startswith("operations of ")]
+    return [f"{name}: {here.get(name, 'none')} here, {there.get(name, 'none')} in the store" for name in names]
+
+
+def describe(name: str, value) -> dict[str, str]:
+    """Everything in a value in words, by the name of its place."""
+    if dataclasses.is_dataclass(value):
+        parts = [describe(f"{name}.{field.name}", getattr(value, field.name)) for field in dataclasses.fields(value)]
+        return {key: text for part in parts for key, text in part.items()}
+    leaves, _ = jax.tree_util.tree_flatten_with_path(value)
+    return {name + jax.tree_util.keystr(path): _words(leaf) for path, leaf in leaves}
+
+
+def _words(leaf) -> str:
+    if callable(leaf):
+        return f"{getattr(leaf, '__module__', '')}.{getattr(leaf, '__qualname__', type(leaf).__name__)}"
+    if isinstance(leaf, str | bool):
+        return str(leaf)
+    array = np.asarray(leaf)
+    if array.size <= IN_FULL:
+        return str(array.tolist())
+    return f"{array.dtype}{array.shape}, digest {_digest(array.tobytes())}"
+
+
+def _operations(system: System, start: State) -> dict[str, str]:
+    """Digests of what the user's functions do: a changed body under the same name is another run."""
+    q_s, q_f, params = start.q_s, start.q_f, system.params
+    functions = {
+        "slow_potential": (system.slow_potential, (q_s, q_f, params)),
+        "fast_potential": (system.fast_potential, (q_f, params)),
+        "constraint": with_time(system.constraint, start.t, q_s, q_f, params),
+        "slow_constraint": with_time(system.slow_constraint, start.t, q_s, params),
+        "force": (system.force, (start.t, q_s, q_f, q_s, q_f, params)),
+    }
+    if isinstance(system.kinetic, KineticFunction):
+        functions["kinetic"] = system.kinetic.function, (q_s, q_f, q_s, q_f, params)
+    return {name: _traced(function, args) for name, (function, args) in functions.items() if function is not None}
+
+
+def _traced(function: Callable, arguments) -> str:
+    closed = jax.make_jaxpr(function)(*arguments)
+    text = re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr))  # addresses in memory
+    return f"digest {_digest(text.encode(), *(np.asarray(c).tobytes() for c in closed.consts))}"
+
+
+def _digest(*parts: bytes) -> str:
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(part)
+    return total.hexdigest()[:16]

@@ -1,0 +1,150 @@
+"""Reading a store: how far its run is, and any part of its trajectory."""
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.mechanics.state import State
+from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
+from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, from_named_arrays
+from vmri_jax.steppers.results import Result, SimulationError
+
+MICRO = ("t_micro", "q_f_micro")
+
+
+class StoredTrajectory:
+    """A trajectory on disk, written by `stream`; only what is asked for is read.
+
+    ``len(stored)`` is the number of saved nodes, the start among them (0 before the first chunk is complete);
+    ``stored[a:b]`` and ``stored[a:b:n]`` are a `Trajectory` of these nodes, ``stored.load()`` is all of them. What it says
+    is what was on disk when it was opened; open it again to follow a run at work.
+
+    Args:
+        path: folder of the store.
+
+    Raises:
+        FileNotFoundError: nothing there.
+        ValueError: something else than a store, or a damaged one.
+    """
+
+    def __init__(self, path):
+        self.path = Path(path)
+        self.attributes: dict[str, Any] = read_attributes(self.path)
+        self.record: Record = read_record(self.path)
+
+    @classmethod
+    def open(cls, path) -> "StoredTrajectory":
+        """The store at `path`."""
+        return cls(path)
+
+    def __repr__(self) -> str:
+        state = "complete" if self.complete else "failed" if not self.success else "not complete"
+        return f"StoredTrajectory({str(self.path)!r}: {self.step} of {self.num_steps} macro steps, {state})"
+
+    @property
+    def num_steps(self) -> int:
+        """Macro steps that the run was to make."""
+        return self.attributes["num_steps"]
+
+    @property
+    def save_every(self) -> int:
+        """Macro steps from one saved node to the next."""
+        return self.attributes["save_every"]
+
+    @property
+    def chunk(self) -> int:
+        """Saved intervals that are written together."""
+        return self.attributes["chunk"]
+
+    @property
+    def step(self) -> int:
+        """Macro steps on disk."""
+        return self.record.step
+
+    @property
+    def result(self) -> Result:
+        """Status up to there, the first that was no success."""
+        return Result(self.record.result)
+
+    @property
+    def failed_at(self) -> int:
+        """Index of the macro step that failed, -1 if none did."""
+        return self.record.failed_at
+
+    @property
+    def success(self) -> bool:
+        """Whether no step has failed."""
+        return self.result.success
+
+    @property
+    def complete(self) -> bool:
+        """Whether all steps were made."""
+        return self.success and self.step == self.num_steps
+
+    @cached_property
+    def final_state(self) -> State:
+        """`State` at the last saved node."""
+        return self[len(self) - 1 :].final_state
+
+    def load(self) -> Trajectory:
+        """All saved nodes.
+
+        Raises:
+            ValueError: no chunk is complete yet, or a file is damaged.
+        """
+        return self[:]
+
+    def __len__(self) -> int:
+        return self.record.saved + 1 if self.record.saved else 0
+
+    def __getitem__(self, nodes: slice) -> Trajectory:
+        if not isinstance(nodes, slice):
+            raise TypeError(f"StoredTrajectory: the index is {nodes!r}; take nodes by a slice, e.g. stored[:100].")
+        require_x64()
+        first, stop, stride = nodes.indices(len(self))
+        if stride < 1 or first >= stop:
+            raise ValueError(
+                f"StoredTrajectory: no nodes {first}:{stop}:{stride} in {self.path}; {len(self)} nodes are on disk, of "
+                f"{self.num_steps // self.save_every + 1}, and they are taken forwards."
+            )
+        last = first + (stop - 1 - first) // stride * stride
+        arrays = {name: self._nodes(name, first, last, stride) for name in NODES}
+        for name in RunInfo._fields:  # the most of all intervals between two nodes
+            rows = self._rows(name, slice(first, last))
+            arrays[name] = np.maximum.reduceat(rows, range(0, len(rows), stride)) if len(rows) else rows
+        if self.attributes["save_micro"]:
+            arrays |= {name: self._rows(name, slice(first + stride - 1, last, stride)) for name in MICRO}
+        arrays |= {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
+        if self.failed_at < last * self.save_every:
+            arrays |= {"result": np.asarray(int(self.result)), "failed_at": np.asarray(self.failed_at)}
+        return from_named_arrays({name: jnp.asarray(array) for name, array in arrays.items()})
+
+    def chunks(self):
+        """The trajectory piece by piece, each of a chunk and starting where the one before ends."""
+        for first in range(0, len(self) - 1, self.chunk):
+            yield self[first : first + self.chunk + 1]
+
+    def raise_failure(self) -> None:
+        """Raise the `SimulationError` of a run that failed; its trajectory is this one."""
+        if self.success:
+            return
+        interval = self.failed_at // self.save_every
+        before = self[interval : interval + 2]
+        within = self.failed_at - interval * self.save_every
+        time = float(before.t[0] + (before.t[1] - before.t[0]) * within / self.save_every)
+        iterations, residual = int(before.info.iterations[0]), float(before.info.residual[0])
+        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self)
+
+    def _nodes(self, name: str, first: int, last: int, stride: int) -> np.ndarray:
+        """Values at nodes; the start is stored apart, row k is node k + 1."""
+        if first > 0:
+            return self._rows(name, slice(first - 1, last, stride))
+        start = read_rows(self.path / "start", name, slice(0, 1), 1)
+        return np.concatenate([start, self._rows(name, slice(stride - 1, last, stride))])
+
+    def _rows(self, name: str, rows: slice) -> np.ndarray:
+        return read_rows(self.path, name, rows, self.chunk)

@@ -1,0 +1,216 @@
+"""Runs that are written to disk while they are computed, and go on where they were."""
+
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from vmri_jax.mechanics.checks import check_system
+from vmri_jax.mechanics.state import State, check_constraints
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.interrupts import Interrupted, interrupts_noted
+from vmri_jax.running.simulate import Simulation, prepare
+from vmri_jax.running.store import layout
+from vmri_jax.running.store.identity import differences, environment, identity
+from vmri_jax.running.store.layout import Record
+from vmri_jax.running.store.stored import StoredTrajectory
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+
+PARTS = 100
+"""A run is written in so many chunks, if they are neither too short nor too large:"""
+LEAST_MICRO_STEPS = 1_000_000
+"""what takes a second or less is not worth a chunk,"""
+MOST_BYTES = 2**26
+"""and a chunk has to fit well into memory."""
+
+
+def stream(
+    system: System,
+    scheme: Scheme | Composition,
+    state: State,
+    *,
+    out: str | os.PathLike,
+    macro_dt=None,
+    micro_dt=None,
+    num_steps: int,
+    save_every: int = 1,
+    save_micro: bool = False,
+    newton: Newton | None = None,
+    chunk: int | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    throw: bool = True,
+    progress: bool = False,
+    drawing: dict | None = None,
+) -> StoredTrajectory:
+    """`simulate` that writes the trajectory to disk chunk by chunk: a long run survives a kill, and goes on with `resume`.
+
+    A chunk counts when all of it is on disk, together with a checkpoint of everything that the next steps depend on (the
+    state, and what Newton's iteration learned): on the same machine with the same versions, a resumed run is identical
+    to the uninterrupted one to the last bit. The memory needed is that of one chunk.
+
+    Args:
+        system, scheme, state, macro_dt, micro_dt, save_every, save_micro, newton: as in `simulate`.
+        out: folder of the store, a zarr group; conventionally named .zarr.
+        num_steps: macro steps. A resumed run may be given more of them than before: then it is made longer.
+        chunk: saved intervals that are computed and written together, kept by the store; None for a hundredth of the run,
+            within limits.
+        resume: go on with the run that is in `out`, which must be the same one; start it if there is none. A run that is
+            complete is returned at once.
+        overwrite: replace a store that is in `out`.
+        throw: raise `SimulationError` if a step fails; else return the store. What was computed is on disk either way.
+        progress: show a progress bar.
+        drawing: what the system looks like, plain data kept with the run (see `Trajectory.save`).
+
+    Returns:
+        The `StoredTrajectory`. After a failure it ends with the chunk of the failure, NaN from the failing step on.
+
+    Raises:
+        ValueError, TypeError: bad arguments, or a store of another run, before anything is computed.
+        FileExistsError: there is something in `out` and neither `resume` nor `overwrite` is asked for.
+        OSError: `out` cannot be written; of a full disk the chunks before are kept.
+        SimulationError: a step failed; the store is its trajectory.
+        Interrupted: Ctrl-C; the chunk at work was finished first (a second Ctrl-C does not wait for it).
+    """
+    path = Path(out)
+    simulation, start = prepare(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    if not simulation.is_concrete(start):
+        raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
+    check_system(system, start.q_s, start.q_f)
+    check_constraints(system, start, "stream: the state")
+    _check_place(path, resume, overwrite)
+    attributes = {
+        "num_steps": num_steps,
+        "save_every": save_every,
+        "save_micro": save_micro,
+        "chunk": _chunk(simulation, start, num_steps) if chunk is None else _given(chunk),
+        "identity": identity(simulation, start),
+        "made_with": environment(),
+    }
+    attributes |= {} if drawing is None else {"drawing": drawing}
+    with interrupts_noted() as interrupted:
+        if overwrite or not path.exists():
+            with _explained(path, 0):
+                layout.create(path, attributes, Record.of(simulation.start(start)))
+        with layout.locked(path):
+            stored = StoredTrajectory(path)
+            _check_same_run(stored, attributes, chunk)
+            _lengthen(stored, num_steps)
+            layout.clear(path)
+            for step in _go_on(StoredTrajectory(path), simulation, start, progress):
+                if interrupted():
+                    raise Interrupted(StoredTrajectory(path), step, num_steps)
+    stored = StoredTrajectory(path)
+    if throw:
+        stored.raise_failure()
+    return stored
+
+
+def _go_on(stored: StoredTrajectory, simulation: Simulation, start: State, progress: bool) -> Iterator[int]:
+    """Compute and write what is not there yet; yields the number of macro steps done after every chunk."""
+    path, chunk, record = stored.path, stored.chunk, stored.record
+    rows = stored.num_steps // simulation.save_every
+    if record.saved == rows or not stored.success:
+        return
+    try:
+        at = record.checkpoint(like=jax.eval_shape(simulation.start, start))
+    except ValueError as error:
+        raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
+    writer = layout.Writer(path, rows, chunk)
+    ends = [*range((record.saved // chunk + 1) * chunk, rows, chunk), rows]
+    sizes = [end - begin for begin, end in pairwise([record.saved, *ends])]
+    for size in _shown(sizes, -(-rows // chunk)) if progress else sizes:
+        piece, at = simulation.advance(at, size)
+        with _explained(path, at.step - size * simulation.save_every):
+            writer.append(piece, record.saved)
+            result = max(record.result, int(piece.result))  # failures are larger
+            record = Record.of(at, record.saved + size, result, int(piece.failed_at))
+            layout.commit(path, record)
+        yield at.step
+        if record.failed_at >= 0:
+            return
+
+
+def _shown(sizes: list[int], chunks: int):
+    from rich.progress import track
+
+    return track(sizes, "simulating", total=chunks, completed=chunks - len(sizes), transient=True)
+
+
+@contextmanager
+def _explained(path: Path, step: int) -> Iterator[None]:
+    """Errors of the file system say what is kept and what to do."""
+    try:
+        yield
+    except OSError as error:
+        kept = (
+            f"The run is kept up to macro step {step}: resume it when there is room." if step else "Give another place."
+        )
+        raise OSError(error.errno, f"{path} cannot be written: {error.strerror or error}. {kept}") from error
+
+
+def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
+    """Refuse what is in the way, and a place that does not exist."""
+    if resume and overwrite:
+        raise ValueError("stream: both resume and overwrite are asked for; choose one of them.")
+    if not path.resolve().parent.is_dir():
+        raise FileNotFoundError(f"stream: out is {path}, but the folder {path.parent} does not exist; make it first.")
+    if not path.exists():
+        return
+    found = StoredTrajectory(path)  # or it is something else
+    if not (resume or overwrite):
+        raise FileExistsError(
+            f"{path} holds a run of {found.num_steps} macro steps, {found.step} of them done. Go on with it (resume), replace "
+            "it (overwrite), or give another name."
+        )
+
+
+def _check_same_run(stored: StoredTrajectory, attributes: dict[str, Any], chunk: int | None) -> None:
+    there, here = stored.attributes["made_with"], attributes["made_with"]
+    found = differences(attributes["identity"], stored.attributes["identity"], there["jax"] == here["jax"])
+    if chunk not in (None, stored.chunk):
+        found.append(f"chunk: {chunk} here, {stored.chunk} in the store")
+    if found:
+        raise ValueError(
+            f"{stored.path} holds another run and cannot go on with this one. What differs: {'; '.join(found)}. Give the "
+            "arguments it was started with, or another name."
+        )
+    changed = [f"{name} {value} ({there.get(name)} then)" for name, value in here.items() if value != there.get(name)]
+    if changed and not stored.complete:
+        warnings.warn(
+            f"{stored.path} was started under other conditions; its last digits may differ from those of an uninterrupted "
+            f"run. Now: {', '.join(changed)}.",
+            stacklevel=3,
+        )
+
+
+def _lengthen(stored: StoredTrajectory, num_steps: int) -> None:
+    if num_steps < stored.step:
+        raise ValueError(f"stream: num_steps is {num_steps}, but {stored.path} has {stored.step} already; open it.")
+    if num_steps != stored.num_steps:
+        with _explained(stored.path, stored.step):
+            layout.change_attributes(stored.path, num_steps=num_steps)
+
+
+def _chunk(simulation: Simulation, start: State, num_steps: int) -> int:
+    """Saved intervals per chunk where none are given."""
+    num_micro, save_every = simulation.scheme.num_micro, simulation.save_every
+    n_s, n_f = start.q_s.shape[0], start.q_f.shape[0]
+    numbers = 2 * (n_s + n_f) + 8 + (num_micro * (n_f + 1) if simulation.save_micro else 0)
+    saves = num_steps // save_every
+    wanted = max(saves // PARTS, LEAST_MICRO_STEPS // (num_micro * save_every))
+    return max(1, min(wanted, saves, MOST_BYTES // (8 * numbers)))
+
+
+def _given(chunk) -> int:
+    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1:
+        raise ValueError(f"stream: chunk is {chunk!r}; it must be an integer of at least 1, or None.")
+    return int(chunk)

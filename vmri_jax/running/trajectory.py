@@ -1,0 +1,179 @@
+"""What a run returns: saved nodes, what the solver did, conserved quantities, and where it stopped."""
+
+import dataclasses
+import json
+from pathlib import Path as FilePath
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.running.files import replaced
+from vmri_jax.steppers.results import Result
+
+FORMAT = "vmri_jax trajectory 2"
+NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
+"""Fields with one entry per saved node; all others but `STATUS` have one per saved interval."""
+STATUS = ("result", "failed_at")
+
+
+class RunInfo(NamedTuple):
+    """What the solver did between saved nodes: most expensive method, most iterations and largest residual of a step.
+
+    As in `StepInfo`; `Method` names the codes of the methods.
+    """
+
+    method: Any
+    iterations: Any
+    residual: Any
+
+
+class Trajectory(eqx.Module):
+    """Trajectory at the saved macro nodes; every leading axis is the saved node, the first one the start.
+
+    Attributes:
+        t: (k,) times.
+        q_s, q_f, p_s, p_f: (k, n) positions and momenta; NaN after a failure.
+        energy: (k,) Hamiltonian.
+        constraint_residual: (k, 2) largest |g| and largest |G v|.
+        info: `RunInfo`, the most Newton iterations and the largest residual of a step since the node before, (k - 1,).
+        t_micro, q_f_micro: (k - 1, num_micro) and (k - 1, num_micro, n_f), the micro nodes of the macro step that ends
+            at each saved node (its start excluded); None unless asked for.
+        result: status of the run, a `Result`; the first that was no success.
+        failed_at: index of the macro step that failed, -1 if none did.
+    """
+
+    t: Any
+    q_s: Any
+    q_f: Any
+    p_s: Any
+    p_f: Any
+    energy: Any
+    constraint_residual: Any
+    info: RunInfo
+    result: Any
+    failed_at: Any
+    t_micro: Any = None
+    q_f_micro: Any = None
+
+    @property
+    def success(self):
+        return self.result <= Result.CONVERGED_AT_ROUNDOFF
+
+    @property
+    def final_state(self):
+        """`State` at the last saved node (of every run, in a batch)."""
+        from vmri_jax.mechanics.state import State
+
+        return State(self.t[..., -1], *(x[..., -1, :] for x in (self.q_s, self.q_f, self.p_s, self.p_f)))
+
+    def first(self, count: int) -> "Trajectory":
+        """The first `count` saved intervals of a run that had not failed by then."""
+        stops = dict.fromkeys(NODES, count + 1)
+        flat = {
+            name: a if a is None or name in STATUS else a[: stops.get(name, count)]
+            for name, a in named_arrays(self).items()
+        }
+        return from_named_arrays(flat | {"result": jnp.asarray(int(Result.CONVERGED)), "failed_at": jnp.asarray(-1)})
+
+    def save(self, path, drawing: dict | None = None) -> None:
+        """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
+
+        Args:
+            path: of the file.
+            drawing: plain data of a `vmri_jax.animation.Drawing`, kept next to the arrays.
+        """
+        arrays = {name: np.asarray(value) for name, value in named_arrays(self).items() if value is not None}
+        if drawing is not None:
+            arrays["drawing"] = np.array(json.dumps(drawing))
+        with replaced(path) as file:
+            np.savez_compressed(file, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
+
+    @classmethod
+    def load(cls, path) -> "Trajectory":
+        """Read a trajectory written by `save`.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: a file that is damaged or not a trajectory.
+        """
+        require_x64()
+        path = FilePath(path)
+        if not path.exists():
+            raise FileNotFoundError(f"{path} does not exist; give the .npz file of a saved trajectory.")
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+                arrays = dict(data)
+        except Exception as error:
+            raise ValueError(
+                f"{path} cannot be read as a .npz file ({error}); it is damaged or something else."
+            ) from error
+        if str(arrays.pop("format", "")) != FORMAT:
+            raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
+        arrays.pop("drawing", None)
+        fields = {field.name for field in dataclasses.fields(cls)} - {"info"} | set(RunInfo._fields)
+        missing = fields - set(arrays) - {"t_micro", "q_f_micro"}
+        if missing or set(arrays) - fields:
+            raise ValueError(
+                f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
+            )
+        return from_named_arrays({name: jnp.asarray(value) for name, value in arrays.items()})
+
+    def to_xarray(self):
+        """The trajectory as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``)."""
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError("to_xarray needs xarray; install it with pip install 'vmri_jax[xarray]'.") from error
+        t = np.asarray(self.t)
+        data = {
+            "q_s": (("t", "slow"), self.q_s),
+            "q_f": (("t", "fast"), self.q_f),
+            "p_s": (("t", "slow"), self.p_s),
+            "p_f": (("t", "fast"), self.p_f),
+            "energy": ("t", self.energy),
+            "constraint_residual": (("t", "level"), self.constraint_residual),
+            "method": ("t_end", self.info.method),
+            "iterations": ("t_end", self.info.iterations),
+            "residual": ("t_end", self.info.residual),
+        }
+        if self.q_f_micro is not None:
+            data["t_micro"] = (("t_end", "micro"), self.t_micro)
+            data["q_f_micro"] = (("t_end", "micro", "fast"), self.q_f_micro)
+        data = {k: (dims, np.asarray(v)) for k, (dims, v) in data.items()}
+        coords = {"t": t, "t_end": t[1:], "level": ["position", "velocity"]}
+        attributes = {"result": Result(int(self.result)).name, "failed_at": int(self.failed_at)}
+        return xarray.Dataset(data, coords=coords, attrs=attributes)
+
+
+def join(pieces: list[Trajectory]) -> Trajectory:
+    """Consecutive trajectories, each starting where the one before ends, as one."""
+    if len(pieces) == 1:
+        return pieces[0]
+    flat = [named_arrays(piece) for piece in pieces]
+    worst = max(flat, key=lambda f: int(f["result"]))
+    status = next((f for f in flat if int(f["failed_at"]) >= 0), worst)
+
+    def joined(name, first):
+        if first is None:
+            return None
+        if name in STATUS:
+            return jnp.asarray(status[name])
+        skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
+        return jnp.concatenate([first] + [f[name][skip:] for f in flat[1:]])
+
+    return from_named_arrays({name: joined(name, first) for name, first in flat[0].items()})
+
+
+def named_arrays(trajectory: Trajectory) -> dict:
+    """All arrays of a trajectory by name, those of `info` among them; None for what was not asked for."""
+    fields = dict(vars(trajectory))
+    return fields | fields.pop("info")._asdict()
+
+
+def from_named_arrays(arrays: dict) -> Trajectory:
+    """The inverse of `named_arrays`; those that may be None may be absent."""
+    info = RunInfo(**{name: arrays.pop(name) for name in RunInfo._fields})
+    return Trajectory(**arrays, info=info)

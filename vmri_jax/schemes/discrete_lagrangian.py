@@ -1,0 +1,256 @@
+"""The discrete Lagrangian: a weighted sum of the user's functions at quadrature nodes of the path.
+
+    L_d(S, F) = sum over terms, over nodes i of the term's rule:  H w_i term(q(theta_i), qdot(theta_i))
+
+`lagrangian` builds it by combinators, ``kinetic - slow - fast``, each term placed on its own nodes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.kernels.cpu import matmul
+from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.schemes.path import Nodes, Path, lagrange_derivative, position_nodes, velocity_nodes
+from vmri_jax.schemes.scheme import Scheme
+
+
+@dataclass(frozen=True)
+class Term:
+    """An integrand on its nodes: ``path -> H^(1 + power) sum_i w_i integrand(path at theta_i)``.
+
+    `integrand` takes the arguments it names, e.g. ``("q_s", "q_f")``. Weights at the ends of the macro interval
+    are held apart for terms without velocities (None where there is no such node): those are kicks, from averaged
+    positions where `mollified`. `grid` is where its rule was placed.
+    """
+
+    integrand: Callable
+    arguments: tuple[str, ...]
+    inside: Nodes
+    start: Any = None
+    end: Any = None
+    sign: float = 1.0
+    grid: str = "micro"
+    mollified: bool = False
+    power: int = 0
+
+    def times_step(self, macro_dt):
+        """What the weights are multiplied by."""
+        return macro_dt ** (1 + self.power)
+
+    def __call__(self, path: Path):
+        return self.at_nodes_inside(path) + self.at_ends(path)
+
+    def at_nodes_inside(self, path: Path):
+        """The part of the sum that the unknowns of a step enter."""
+        if not self.inside.groups:
+            return jnp.zeros(())
+        values = jax.vmap(self.integrand)(*self.inside.sample(path, self.arguments).values())
+        return self.sign * self.times_step(path.macro_dt) * jnp.sum(self.inside.weights * values)
+
+    def at_ends(self, path: Path):
+        """The part of the sum at theta = 0 and theta = 1."""
+        q_s, q_f = path.slow_control_points(), path.control_points()[1]
+        total = jnp.zeros(())
+        for weight, k in ((self.start, 0), (self.end, -1)):
+            if weight is not None:
+                total += weight * self.integrand(*({"q_s": q_s[k], "q_f": q_f[k]}[a] for a in self.arguments))
+        return self.sign * self.times_step(path.macro_dt) * total
+
+    def gradient(self, q_s, q_f):
+        """``(d/dq_s, d/dq_f)`` of the signed integrand at one configuration, for kicks."""
+        q = {"q_s": q_s, "q_f": q_f}
+        grads = jax.grad(self.integrand, argnums=tuple(range(len(self.arguments))))(*(q[a] for a in self.arguments))
+        q |= {a: jnp.zeros_like(x) for a, x in q.items()}
+        q |= {a: self.sign * g for a, g in zip(self.arguments, grads, strict=True)}
+        return q["q_s"], q["q_f"]
+
+    def __neg__(self):
+        return replace(self, sign=-self.sign)
+
+    def __add__(self, other):
+        return Sum((self,)) + other
+
+    def __sub__(self, other):
+        return Sum((self,)) - other
+
+
+@dataclass(frozen=True)
+class QuadraticKinetic:
+    """Kinetic energy of constant masses: a quadratic form in the increments, assembled once.
+
+    ``sum_ij k_ij Delta_i^T M Delta_j / (2 dt)`` per interval, with ``k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)`` for the
+    slow increments over the macro interval and for the fast ones over each micro interval.
+    """
+
+    mass: ConstantMass
+    nodes: Nodes
+    start = end = None
+
+    @property
+    def slow_form(self):
+        """(r + 1, r + 1) matrix k of the macro interval."""
+        theta = np.concatenate([self.nodes.theta(g) for g in self.nodes.groups])
+        return self._form(theta, self.nodes.weights)
+
+    @property
+    def fast_form(self):
+        """(r + 1, r + 1) matrix k of a micro interval."""
+        groups = self.nodes.groups
+        return self._form(
+            np.array([g.c for g in groups]), jnp.stack([g.weights[0] for g in groups]) * self.nodes.num_micro
+        )
+
+    def _form(self, at, weights):
+        slopes = lagrange_derivative(self.nodes.degree, at)
+        return jnp.einsum("n,ni,nj->ij", weights, slopes, slopes)
+
+    def rows(self, slow, fast):
+        """Derivative by the slow increments (r, n_s) times H, and by the fast ones (..., r, n_f) times h."""
+        slow, fast = self.mass.momentum(slow, fast)
+        return matmul(self.slow_form[1:, 1:], slow), matmul(self.fast_form[1:, 1:], fast)
+
+    def __call__(self, path: Path):
+        slow, fast = self.rows(path.slow, path.fast)
+        return (jnp.sum(path.slow * slow) + self.nodes.num_micro * jnp.sum(path.fast * fast)) / (2 * path.macro_dt)
+
+    at_nodes_inside = __call__
+
+
+@dataclass(frozen=True)
+class Sum:
+    """A sum of terms, itself a function of the path."""
+
+    terms: tuple[Any, ...]  # of Term and QuadraticKinetic
+
+    def __call__(self, path: Path):
+        return sum((term(path) for term in self.terms), jnp.zeros(()))
+
+    def at_nodes_inside(self, path: Path):
+        """The sum without the nodes at the ends of the macro interval."""
+        return sum((term.at_nodes_inside(path) for term in self.terms), jnp.zeros(()))
+
+    @property
+    def kinetic(self) -> QuadraticKinetic:
+        """The kinetic energy of constant masses."""
+        return next(term for term in self.terms if isinstance(term, QuadraticKinetic))
+
+    @property
+    def potentials(self) -> "Sum":
+        """The terms without the kinetic energy of constant masses."""
+        return Sum(tuple(term for term in self.terms if not isinstance(term, QuadraticKinetic)))
+
+    @property
+    def kicks(self) -> tuple[Term, ...]:
+        """The terms that have nodes at the ends of the macro interval."""
+        return tuple(term for term in self.terms if term.start is not None or term.end is not None)
+
+    def __neg__(self):
+        return Sum(tuple(-term for term in self.terms))
+
+    def __add__(self, other):
+        return Sum(self.terms + (other.terms if isinstance(other, Sum) else (other,)))
+
+    def __sub__(self, other):
+        return self + (-other)
+
+
+def lagrangian(system: System, scheme: Scheme) -> Sum:
+    """``T - V - W`` of a system, each term on the nodes the scheme gives it."""
+    kinetic = _kinetic(system, scheme)
+    slow = _on_position_nodes(system.slow_potential, ("q_s", "q_f"), scheme.slow, scheme, system)
+    fast = _on_position_nodes(system.fast_potential, ("q_f",), scheme.fast, scheme, system)
+    return kinetic - slow - fast + _corrections(system, scheme)
+
+
+def _corrections(system: System, scheme: Scheme) -> Sum:
+    """The squares of gradients of `vmri_jax.schemes.quadrature.corrected`."""
+    if not scheme.slow.corrected and not scheme.fast.corrected:
+        return Sum(())
+    if not isinstance(system.kinetic, ConstantMass):
+        raise ValueError("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
+    slow_potential, fast_potential, mass = system.slow_potential, system.fast_potential, system.kinetic
+    both = scheme.fast.corrected and fast_potential is not None
+
+    def fast(q_f, params):
+        d = jax.grad(fast_potential)(q_f, params)  # pyright: ignore[reportArgumentType]
+        return jnp.sum(d * mass.velocity(jnp.zeros(mass.slow.shape[-1]), d)[1]) / (24 * scheme.num_micro**2)
+
+    def slow(q_s, q_f, params):
+        d = jax.grad(slow_potential, (0, 1))(q_s, q_f, params)  # pyright: ignore[reportArgumentType]
+        v_s, v_f = mass.velocity(*d)
+        total = (jnp.sum(d[0] * v_s) + jnp.sum(d[1] * v_f)) / 24
+        if both:
+            total += jnp.sum(v_f * jax.grad(fast_potential)(q_f, params)) / (12 * scheme.num_micro**2)  # pyright: ignore[reportArgumentType]
+        return total
+
+    terms = Sum(())
+    if scheme.slow.corrected and slow_potential is not None:
+        terms += _on_position_nodes(slow, ("q_s", "q_f"), scheme.slow, scheme, system)
+    if both:
+        terms += _on_position_nodes(fast, ("q_f",), scheme.fast, scheme, system)
+    return Sum(tuple(replace(term, power=2) for term in terms.terms))
+
+
+def _kinetic(system, scheme) -> Sum:
+    nodes = velocity_nodes(scheme.kinetic, scheme.num_micro, scheme.degree)
+    if isinstance(system.kinetic, ConstantMass):
+        return Sum((QuadraticKinetic(system.kinetic, nodes),))
+    return Sum((Term(lambda *z: system.kinetic(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes),))
+
+
+def _on_position_nodes(function, arguments, placed, scheme, system) -> Sum:
+    if function is None:
+        return Sum(())
+    start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
+    node = Term(
+        lambda *q: function(*q, system.params), arguments, inside, start, end, 1.0, placed.grid, placed.mollified
+    )
+    return Sum((node,))
+
+
+def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
+    """The discrete Lagrangian ``L_d(slow, fast, macro_dt, t=0) -> ()`` as a function of absolute control points.
+
+    Args:
+        slow: (r + 1, n_s) slow control points of the macro interval.
+        fast: (num_micro r + 1, n_f) fast control points, shared ones once.
+        macro_dt: length H of the macro interval.
+
+    Its slot derivatives are ``jax.grad(L_d, argnums=(0, 1))``; the discrete Legendre transforms are the first and
+    last of them, see `discrete_legendre`.
+    """
+    if scheme.slow.mollified:
+        raise ValueError(
+            "discrete_lagrangian: a mollified potential depends on more than the control points of a step."
+        )
+    terms = lagrangian(system, scheme)
+
+    def L_d(slow, fast, macro_dt):
+        expected = (scheme.degree + 1, scheme.num_micro * scheme.degree + 1)
+        if (slow.shape[0], fast.shape[0]) != expected:
+            raise ValueError(
+                f"L_d: got {slow.shape[0]} slow and {fast.shape[0]} fast control points; this scheme has {expected[0]} "
+                f"and {expected[1]}."
+            )
+        return terms(Path.from_control_points(slow, fast, 0.0, macro_dt))
+
+    return L_d
+
+
+def discrete_legendre(system: System, scheme: Scheme) -> Callable:
+    """Discrete Legendre transforms ``(slow, fast, macro_dt) -> ((p_s, p_f) at the start, (p_s, p_f) at the end)``.
+
+    ``p = -D_first L_d`` and ``p+ = D_last L_d`` (without constraint forces).
+    """
+    slots = jax.grad(discrete_lagrangian(system, scheme), argnums=(0, 1))
+
+    def transforms(slow, fast, macro_dt):
+        d_slow, d_fast = slots(slow, fast, macro_dt)
+        return (-d_slow[0], -d_fast[0]), (d_slow[-1], d_fast[-1])
+
+    return transforms

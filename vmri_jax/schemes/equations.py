@@ -1,0 +1,165 @@
+"""The equations of one macro step: stationarity of the augmented discrete action in momentum form.
+
+    A = L_d - sum_j H w_j lambda_j . g(q at node j) - sum_i H w_i nu_i . g_s(S_i)
+
+    p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)           g_s(S_i) = 0  (i = 1..r)
+    p_f + D_{F_0} A = 0      D_{F_j} A = 0  (all but the last)    g = 0 at every micro control node but the first
+
+Everything is multiplied by the micro step h, and the multipliers absorb their weights: the unknowns are
+``mu_j = h H w_j lambda_j`` and ``num_micro h H w_i nu_i``, so that rows and columns stay of the size of the mass
+matrix and the constraint Jacobian for every step size.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.discrete_lagrangian import Sum, lagrangian
+from vmri_jax.schemes.path import Nodes, Path, control_nodes, lagrange_basis, velocity_nodes
+from vmri_jax.schemes.scheme import Scheme
+
+
+class Unknowns(NamedTuple):
+    """Unknowns of a macro step, and with the same shapes its residual.
+
+    | field | unknown | residual |
+    |---|---|---|
+    | slow (r, n_s) | increments of S_1..S_r | slow equations at S_0..S_{r-1} |
+    | slow_multiplier (r, n_gs) | scaled, at S_0..S_{r-1} | g_s at S_1..S_r |
+    | fast (num_micro, r, n_f) | increments in each micro interval | fast equations at its nodes 0..r-1 |
+    | multiplier (num_micro, r, n_g) | scaled, at its nodes 0..r-1 | g at its nodes 1..r |
+    """
+
+    slow: Any
+    slow_multiplier: Any
+    fast: Any
+    multiplier: Any
+
+
+class StepEquations(eqx.Module):
+    """The nonlinear equations of one macro step from given positions and (kicked) momenta."""
+
+    system: System
+    scheme: Scheme
+    t: Any
+    q_s: Any
+    q_f: Any
+    p_s: Any
+    p_f: Any
+    macro_dt: Any
+
+    @property
+    def micro_dt(self):
+        return self.macro_dt / self.scheme.num_micro
+
+    @property
+    def force_nodes(self) -> Nodes:
+        return velocity_nodes(self.scheme.force, self.scheme.num_micro, self.scheme.degree)
+
+    def path(self, x: Unknowns) -> Path:
+        """The path of the unknowns: fast starts are running sums of the increments over whole intervals."""
+        return Path(self.t, self.macro_dt, self.q_s, x.slow, self.q_f + sum_before(x.fast[:, -1]), x.fast)
+
+    def action(self, path: Path, at: Path, x: Unknowns):
+        """Augmented action times h; forces act on the virtual displacement of `path`, evaluated along `at`."""
+        return self.unconstrained(path, at) - self.constraint_work(path, x)
+
+    def unconstrained(self, path: Path, at: Path):
+        """The action times h without constraints."""
+        return self._action(lagrangian(self.system, self.scheme), path, at)
+
+    def without_kinetic(self, path: Path, at: Path):
+        """The same without the kinetic energy of constant masses."""
+        return self._action(lagrangian(self.system, self.scheme).potentials, path, at)
+
+    def _action(self, terms: Sum, path: Path, at: Path):
+        return self.micro_dt * (terms.at_nodes_inside(path) + self.virtual_work(path, at))
+
+    def virtual_work(self, path: Path, at: Path):
+        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, with the forces along `at`."""
+        if self.system.force is None:
+            return 0.0
+        nodes = self.force_nodes
+        f_s, f_f = jax.vmap(self.system.forces)(*nodes.sample(at, ("t", "q_s", "q_f", "v_s", "v_f")).values())
+        q_s, q_f = nodes.sample(path, ("q_s", "q_f")).values()
+        return self.macro_dt * jnp.sum(nodes.weights * (jnp.sum(f_s * q_s, axis=1) + jnp.sum(f_f * q_f, axis=1)))
+
+    def constraint_work(self, path: Path, x: Unknowns):
+        """``sum mu . g + sum nu . g_s / num_micro`` at all control nodes but the last."""
+        q_s, q_f = path.control_points()
+        g = jax.vmap(self.system.g)(path.control_times()[:-1], q_s[:-1], q_f[:-1])
+        g_slow = jax.vmap(self.system.g_slow)(path.slow_control_times()[:-1], path.slow_control_points()[:-1])
+        return jnp.sum(x.multiplier.reshape(g.shape) * g) + jnp.sum(x.slow_multiplier * g_slow) / self.scheme.num_micro
+
+    def slots(self, x: Unknowns):
+        """``h D_{S_i} A`` (r + 1, n_s) and, per micro interval, ``h D_{F_j} A`` (num_micro, r + 1, n_f)."""
+        path = self.path(x)
+        d = jax.grad(self.action)(path, path, x)
+        slow = jnp.concatenate([(d.slow_start - d.slow.sum(0))[None], d.slow])
+        fast = jnp.concatenate([(d.fast_start - d.fast.sum(1))[:, None], d.fast], axis=1)
+        return slow, fast
+
+    def evaluate(self, x: Unknowns):
+        """Residual of the equations (times h in the momentum rows), and momenta ``D_last A`` at the end of the step."""
+        slow, fast = self.slots(x)
+        path = self.path(x)
+        q_s, q_f = path.control_points()
+        incoming = jnp.concatenate([self.micro_dt * self.p_f[None], fast[:-1, -1]])
+        residual = Unknowns(
+            slow=slow[:-1].at[0].add(self.micro_dt * self.p_s),
+            slow_multiplier=jax.vmap(self.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:]),
+            fast=fast[:, :-1].at[:, 0].add(incoming),
+            multiplier=jax.vmap(self.system.g)(path.control_times()[1:], q_s[1:], q_f[1:]).reshape(x.multiplier.shape),
+        )
+        return residual, (slow[-1] / self.micro_dt, fast[-1, -1] / self.micro_dt)
+
+    def residual(self, x: Unknowns) -> Unknowns:
+        """Left-hand sides of the equations at x."""
+        return self.evaluate(x)[0]
+
+    def guess(self, v_s, v_f, multiplier, slow_multiplier) -> Unknowns:
+        """Straight motion at the given velocities, with the given (physical) multipliers throughout."""
+        n, c = self.scheme.num_micro, control_nodes(self.scheme.degree)[1:, None]
+        scale, slow_scale = multiplier_scales(self.scheme, self.macro_dt)
+        return Unknowns(
+            slow=c * (self.macro_dt * v_s),
+            slow_multiplier=slow_scale * slow_multiplier,
+            fast=jnp.broadcast_to(c * (self.micro_dt * v_f), (n, len(c), v_f.shape[0])),
+            multiplier=scale * multiplier,
+        )
+
+
+def sum_before(increments):
+    """Running sum of increments over the intervals before each one."""
+    return jnp.concatenate([jnp.zeros_like(increments[:1]), jnp.cumsum(increments[:-1], axis=0)])
+
+
+def multiplier_scales(scheme: Scheme, macro_dt, before=0.0):
+    """What turns multipliers into unknowns: ``h H w_j`` (num_micro, r, 1) and ``num_micro h H w_i`` (r, 1).
+
+    Args:
+        before: length of the macro step before, if the momenta have not been projected since: the multipliers of the node that
+            the two steps share are then those of both.
+    """
+    n, h = scheme.num_micro, macro_dt / scheme.num_micro
+    w, w_slow = (jnp.asarray(placed.rule.weights) for placed in (scheme.constraint, scheme.slow_constraint))
+    starts, first = np.eye(1, w.size - 1), np.eye(n, 1)
+    shared = w[:-1] + (1 + first * (before / macro_dt - 1)) * starts * w[-1]
+    slow_shared = w_slow[:-1] + before / macro_dt * np.eye(1, w_slow.size - 1)[0] * w_slow[-1]
+    return h**2 * shared[..., None], macro_dt**2 * slow_shared[:, None]
+
+
+def physical_multipliers(scheme: Scheme, macro_dt, multiplier, slow_multiplier):
+    """Multipliers lambda (num_micro, r, n_g) and nu (r, n_gs) of ``g`` and ``g_s`` from the scaled unknowns."""
+    scale, slow_scale = multiplier_scales(scheme, macro_dt)
+    return multiplier / scale, slow_multiplier / slow_scale
+
+
+def slow_basis_at_control_nodes(num_micro: int, degree: int) -> np.ndarray:
+    """``l_i(theta_{m,j})`` of the slow path at every micro control node, shape (num_micro, r + 1, r + 1)."""
+    theta = (np.arange(num_micro)[:, None] + control_nodes(degree)[None]) / num_micro
+    return lagrange_basis(degree, theta)

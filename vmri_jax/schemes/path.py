@@ -1,0 +1,217 @@
+"""The path of one macro step: piecewise polynomials in time, and where quadrature nodes fall on them.
+
+Slow variables follow one polynomial of degree r over the macro interval, fast variables one per
+micro interval. Each is given by its start and the *increments* of its control points from there,
+``X(c) = X_0 + sum_j l_j(c) Delta_j`` on the r + 1 Gauss-Lobatto points (l_j: Lagrange basis), so that
+velocities ``sum_j l_j'(c) Delta_j / dt`` come from increments directly, never from the difference of
+two nearly equal positions: momenta keep full relative precision however small the step.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.kernels.cpu import matmul
+from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, Rule, lobatto
+
+
+def control_nodes(degree: int) -> np.ndarray:
+    """The degree + 1 Gauss-Lobatto points on [0, 1]: 0 = c_0 < ... < c_r = 1."""
+    return np.array(lobatto(degree + 1).nodes)
+
+
+def lagrange_basis(degree: int, at) -> np.ndarray:
+    """Values ``l_j(x)`` of the Lagrange polynomials of the control nodes, shape (..., degree + 1).
+
+    By the product formula, which is exactly 0 or 1 at the control nodes.
+    """
+    c, x = control_nodes(degree), np.asarray(at, dtype=float)[..., None]
+    others = [np.delete(c, j) for j in range(degree + 1)]
+    return np.stack([np.prod((x - o) / (c[j] - o), axis=-1) for j, o in enumerate(others)], axis=-1)
+
+
+def lagrange_derivative(degree: int, at) -> np.ndarray:
+    """Derivatives ``l_j'(x)`` of the Lagrange polynomials of the control nodes, shape (..., degree + 1)."""
+    c, x = control_nodes(degree), np.asarray(at, dtype=float)[..., None]
+    columns = []
+    for j in range(degree + 1):
+        o = np.delete(c, j)
+        products = [
+            np.prod((x - np.delete(o, k)) / (c[j] - np.delete(o, k)), axis=-1) / (c[j] - o[k]) for k in range(degree)
+        ]
+        columns.append(sum(products))
+    return np.stack(columns, axis=-1)
+
+
+class Path(eqx.Module):
+    """Piecewise polynomial path over one macro interval of length ``macro_dt`` that starts at time ``t``.
+
+    Args:
+        t, macro_dt: start and length of the interval.
+        slow_start: (n_s,) slow position at the start.
+        slow: (r, n_s) increments of the slow control points 1..r from the start.
+        fast_start: (num_micro, n_f) fast position at the start of each micro interval.
+        fast: (num_micro, r, n_f) increments of the fast control points from the start of their interval.
+    """
+
+    t: Any
+    macro_dt: Any
+    slow_start: Any
+    slow: Any
+    fast_start: Any
+    fast: Any
+
+    @classmethod
+    def from_control_points(cls, slow, fast, t, macro_dt) -> "Path":
+        """Path through slow control points (r + 1, n_s) and fast ones (num_micro r + 1, n_f)."""
+        degree = slow.shape[0] - 1
+        starts = fast[:-1:degree]
+        ends = fast[1:].reshape(starts.shape[0], degree, fast.shape[1])
+        return cls(t, macro_dt, slow[0], slow[1:] - slow[0], starts, ends - starts[:, None])
+
+    @property
+    def degree(self) -> int:
+        return self.slow.shape[0]
+
+    @property
+    def num_micro(self) -> int:
+        return self.fast.shape[0]
+
+    def control_points(self):
+        """Slow and fast positions at the num_micro r + 1 micro control nodes, first to last."""
+        n, r = self.num_micro, self.degree
+        theta = (np.arange(n)[:, None] + control_nodes(r)[None, 1:]).reshape(-1) / n
+        slow = self.slow_start + matmul(lagrange_basis(r, np.concatenate([[0.0], theta]))[:, 1:], self.slow)
+        fast = (self.fast_start[:, None] + self.fast).reshape(n * r, -1)
+        return slow, jnp.concatenate([self.fast_start[:1], fast])
+
+    def control_times(self):
+        """Times of the num_micro r + 1 micro control nodes."""
+        theta = (np.arange(self.num_micro)[:, None] + control_nodes(self.degree)[None, :-1]).reshape(-1)
+        return self.t + self.macro_dt * np.append(theta / self.num_micro, 1.0)
+
+    def slow_control_times(self):
+        """Times of the r + 1 macro control nodes."""
+        return self.t + self.macro_dt * control_nodes(self.degree)
+
+    def slow_control_points(self):
+        """Slow positions at the r + 1 macro control nodes."""
+        return jnp.concatenate([self.slow_start[None], self.slow_start + self.slow])
+
+
+@dataclass(frozen=True)
+class NodeGroup:
+    """Nodes at one local coordinate ``c`` of the micro intervals ``first <= m < stop``."""
+
+    c: float
+    first: int
+    stop: int
+    weights: Any
+
+    @property
+    def size(self) -> int:
+        return self.stop - self.first
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Quadrature nodes of one term on the macro interval, sorted into groups of equal local coordinate.
+
+    The grouping keeps everything regular: a group is a slice of the micro intervals, so sampling and
+    pulling back are slices and pads whose cost is linear in num_micro, without gather or scatter.
+    """
+
+    groups: tuple[NodeGroup, ...]
+    num_micro: int
+    degree: int
+
+    @cached_property
+    def weights(self):
+        return jnp.concatenate([jnp.asarray(g.weights) for g in self.groups])
+
+    def theta(self, group: NodeGroup) -> np.ndarray:
+        """Positions of a group's nodes on the macro interval."""
+        return (np.arange(group.first, group.stop) + group.c) / self.num_micro
+
+    def sample(self, path: Path, names: Iterable[str]) -> dict:
+        """By name, of the path at all nodes, group after group: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
+        together = [tuple(groups) for _, groups in groupby(self.groups, key=lambda g: (g.first, g.stop))]
+        return {name: jnp.concatenate([self._at(groups, path, name) for groups in together]) for name in names}
+
+    def _at(self, groups: tuple[NodeGroup, ...], path: Path, name: str):
+        """One of them at groups on the same micro intervals."""
+        theta, c = np.concatenate([self.theta(g) for g in groups]), np.array([g.c for g in groups])
+        if name == "t":
+            return path.t + path.macro_dt * theta
+        velocity = name[0] == "v"
+        basis = lagrange_derivative if velocity else lagrange_basis
+        if name[2] == "s":
+            moved = matmul(basis(self.degree, theta)[:, 1:], path.slow)
+            return moved / path.macro_dt if velocity else path.slow_start + moved
+        inside = slice(groups[0].first, groups[0].stop)
+        moved = jnp.swapaxes(matmul(basis(self.degree, c)[:, 1:], path.fast[inside]), 0, 1)
+        q_f = moved / (path.macro_dt / self.num_micro) if velocity else path.fast_start[inside] + moved
+        return q_f.reshape(len(theta), path.fast.shape[-1])
+
+
+def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
+    """Nodes of a term that depends on velocities, which may jump where micro intervals meet.
+
+    Raises:
+        ValueError: a macro rule with a node on the border of two micro intervals.
+    """
+    if placed.grid == "micro":
+        groups = tuple(_on_every_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
+    else:
+        groups = tuple(_on_one_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
+        for g in groups:
+            if g.c == 0.0 and g.first > 0:
+                raise ValueError(
+                    f"macro rule: node {g.first / num_micro} falls on the border of two of the {num_micro} micro intervals, "
+                    "where the velocity is not defined; place this term with micro(...) or choose another rule."
+                )
+    return Nodes(groups, num_micro, degree)
+
+
+def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any, Nodes, Any]:
+    """Nodes of a term that depends on positions only: (weight at 0, nodes inside, weight at 1).
+
+    Nodes at the ends of the macro interval are kicks: they act on given or final momenta and never
+    enter an equation to be solved. Their weight is None where the rule has no such node. Where micro
+    intervals meet, the right node of one and the left node of the next are one node.
+    """
+    rule, size = placed.rule, num_micro if placed.grid == "micro" else 1
+    has_start, has_end = rule.nodes[0] <= NODE_TOLERANCE, rule.nodes[-1] >= 1 - NODE_TOLERANCE
+    start = rule.weights[0] / size if has_start else None
+    end = rule.weights[-1] / size if has_end else None
+    inside = range(has_start, len(rule.nodes) - has_end)
+    if placed.grid == "macro":
+        groups = [_on_one_interval(rule, i, num_micro) for i in inside]
+    else:
+        groups = [_on_every_interval(rule, i, num_micro) for i in inside]
+        if num_micro > 1 and (has_start or has_end):
+            meeting = sum(w for w in (start, end) if w is not None)
+            groups.insert(0, NodeGroup(0.0, 1, num_micro, jnp.full(num_micro - 1, meeting)))
+    return start, Nodes(tuple(groups), num_micro, degree), end
+
+
+def _on_every_interval(rule: Rule, i: int, num_micro: int) -> NodeGroup:
+    return NodeGroup(rule.nodes[i], 0, num_micro, jnp.full(num_micro, rule.weights[i] / num_micro))
+
+
+def _on_one_interval(rule: Rule, i: int, num_micro: int) -> NodeGroup:
+    m = min(int(np.floor(rule.nodes[i] * num_micro + NODE_TOLERANCE)), num_micro - 1)
+    c = rule.nodes[i] * num_micro - m
+    return NodeGroup(0.0 if abs(c) <= NODE_TOLERANCE else c, m, m + 1, rule.weights[i : i + 1])
+
+
+def control_node_groups(num_micro: int, degree: int) -> Nodes:
+    """All micro control nodes but the last as a group each (weights 1): where constraint forces act."""
+    ones = np.ones(num_micro)
+    return Nodes(tuple(NodeGroup(float(c), 0, num_micro, ones) for c in control_nodes(degree)[:-1]), num_micro, degree)

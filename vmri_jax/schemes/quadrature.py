@@ -1,0 +1,251 @@
+"""Quadrature rules on [0, 1] as values: add them, scale them, repeat them, place them on a grid.
+
+A rule is a list of nodes and weights; the integral of ``f`` over an interval of length ``T`` is
+approximated by ``T * sum_i w_i f(theta_i T)``. Rules form a vector space, and nodes that coincide
+merge, so that a sum of rules never evaluates an integrand twice at one place:
+
+    trapezoidal = (left + right) / 2
+    simpson     = (left + 4 * midpoint + right) / 6
+
+Nodes are static (they decide which equations exist), weights are arrays and may be traced.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.polynomial import legendre
+
+from vmri_jax.mechanics.arrays import is_concrete, real_array
+
+NODE_TOLERANCE = 1e-12
+"""Nodes closer than this are the same node."""
+
+
+class Rule(eqx.Module):
+    """Quadrature rule ``sum_i w_i f(theta_i)`` on [0, 1].
+
+    Args:
+        nodes: increasing numbers in [0, 1].
+        weights: as many weights; any array, possibly traced.
+
+    Raises:
+        ValueError: nodes outside [0, 1], not increasing, or not as many as weights.
+    """
+
+    nodes: tuple[float, ...] = eqx.field(static=True)
+    weights: Any
+    __array_ufunc__ = None  # so that numpy scalars leave `alpha * rule` to __rmul__
+
+    def __init__(self, nodes, weights):
+        self.nodes = tuple(real_array("Rule: nodes", nodes, 1).tolist())
+        self.weights = real_array("Rule: weights", weights)
+        if self.weights.shape != (len(self.nodes),):
+            raise ValueError(
+                f"Rule: got {len(self.nodes)} nodes and weights of shape {self.weights.shape}; give one weight per node."
+            )
+        if any(not -NODE_TOLERANCE <= node <= 1 + NODE_TOLERANCE for node in self.nodes):
+            raise ValueError(f"Rule: nodes {self.nodes} must lie in [0, 1], the unit interval.")
+        if any(b - a <= NODE_TOLERANCE for a, b in zip(self.nodes, self.nodes[1:], strict=False)):
+            raise ValueError(f"Rule: nodes {self.nodes} must increase strictly; add two rules to merge their nodes.")
+
+    def __add__(self, other: "Rule") -> "Rule":
+        if not isinstance(other, Rule):
+            return NotImplemented
+        return _merge(self.nodes + other.nodes, [self.weights, other.weights])
+
+    def __mul__(self, factor) -> "Rule":
+        if isinstance(factor, Rule):
+            return NotImplemented
+        return Rule(self.nodes, factor * self.weights)
+
+    __rmul__ = __mul__
+
+    def __neg__(self) -> "Rule":
+        return self * -1.0
+
+    def __sub__(self, other: "Rule") -> "Rule":
+        return self + (-other)
+
+    def __truediv__(self, divisor) -> "Rule":
+        return self * (1 / divisor)
+
+    def __call__(self, function: Callable) -> Any:
+        """Approximate the integral of ``function`` over [0, 1]."""
+        return sum(w * function(node) for node, w in zip(self.nodes, self.weights, strict=True))
+
+    def repeat(self, count: int) -> "Rule":
+        """Composite rule: this one on each of ``count`` equal subintervals, shared end nodes merged."""
+        _check_count("repeat", count, 1, "count")
+        nodes = tuple((m + node) / count for m in range(count) for node in self.nodes)
+        return _merge(nodes, [self.weights / count] * count)
+
+    @property
+    def order(self) -> int:
+        """Number of moments ``sum_i w_i theta_i^k = 1 / (k + 1)``, k = 0, 1, ..., that hold.
+
+        A rule of order p integrates polynomials of degree p - 1 exactly; its error on a smooth
+        function over an interval of length h is O(h^(p+1)).
+        """
+        if not is_concrete(self.weights):
+            raise ValueError("Rule.order needs concrete weights; ask for it outside jit, vmap and grad.")
+        x, w = 2 * np.array(self.nodes) - 1, np.asarray(self.weights)
+        for k in range(2 * len(x) + 1):  # in Legendre polynomials, whose moments are well scaled
+            moment = w @ legendre.legval(x, np.eye(k + 1)[k])
+            if abs(moment - (k == 0)) > 1e-11:
+                return k
+        return 2 * len(x)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether the rule is its own mirror image, ``theta -> 1 - theta``; needs concrete weights."""
+        x, w = np.array(self.nodes), np.asarray(self.weights)
+        return bool(np.allclose(x, 1 - x[::-1], rtol=0, atol=1e-12) and np.allclose(w, w[::-1], rtol=0, atol=1e-12))
+
+
+def _merge(nodes: tuple[float, ...], weights: list) -> Rule:
+    """Rule of all the nodes, equal ones merged and their weights summed in order."""
+    order = np.argsort(nodes, kind="stable")
+    sorted_nodes = np.asarray(nodes)[order]
+    first = np.concatenate([[True], np.diff(sorted_nodes) > NODE_TOLERANCE])
+    target = np.empty(len(nodes), dtype=int)
+    target[order] = np.cumsum(first) - 1
+    xp = jnp if any(isinstance(w, jax.Array) for w in weights) else np
+    merged = xp.concatenate(weights)
+    if not first.all():
+        merged = jax.ops.segment_sum(merged, target, first.sum()) if xp is jnp else np.bincount(target, merged)
+    else:
+        merged = merged[order]
+    return Rule(tuple(sorted_nodes[first]), merged)
+
+
+def interpolatory(nodes) -> Rule:
+    """Rule on the given n nodes that is exact for polynomials of degree n - 1."""
+    return Rule(nodes, interpolatory_weights(nodes))
+
+
+def interpolatory_weights(nodes) -> np.ndarray:
+    """The weights of `interpolatory`."""
+    x = 2 * np.asarray(nodes, dtype=float) - 1
+    moments = np.zeros(len(x))
+    moments[0] = 1.0
+    return np.linalg.solve(legendre.legvander(x, len(x) - 1).T, moments)
+
+
+def _roots(series) -> np.ndarray:
+    """Roots of a Legendre series in [-1, 1], polished by one Newton step."""
+    x = np.sort(legendre.legroots(series).real)
+    return x - legendre.legval(x, series) / legendre.legval(x, legendre.legder(series))
+
+
+def gauss(n: int) -> Rule:
+    """Gauss-Legendre rule: n interior nodes, order 2n."""
+    _check_count("gauss", n, 1)
+    return interpolatory((_roots(np.eye(n + 1)[n]) + 1) / 2)
+
+
+def lobatto(n: int) -> Rule:
+    """Gauss-Lobatto rule: n >= 2 nodes including both ends, order 2n - 2."""
+    _check_count("lobatto", n, 2)
+    interior = _roots(legendre.legder(np.eye(n)[n - 1])) if n > 2 else np.zeros(0)
+    return interpolatory((np.concatenate([[-1.0], interior, [1.0]]) + 1) / 2)
+
+
+def radau(n: int, end: Literal["left", "right"] = "right") -> Rule:
+    """Gauss-Radau rule: n nodes including one end, order 2n - 1."""
+    _check_count("radau", n, 1)
+    if end not in ("left", "right"):
+        raise ValueError(f"radau: end is {end!r}; it must be 'left' or 'right'.")
+    interior = np.zeros(0)
+    if n > 1:  # roots of (P_{n-1} + P_n) / (1 + x): the other nodes of the rule that includes x = -1
+        quotient, _ = legendre.legdiv(np.eye(n + 1)[n] + np.eye(n + 1)[n - 1], [1.0, 1.0])
+        interior = _roots(quotient)
+    x = np.concatenate([[-1.0], interior])
+    nodes = (x + 1) / 2 if end == "left" else np.sort((1 - x) / 2)
+    return interpolatory(nodes)
+
+
+def affine(alpha) -> Rule:
+    """``alpha * left + (1 - alpha) * right``; order 2 for alpha = 1/2, else 1. alpha may be traced."""
+    real_array("affine: alpha", alpha, 0)
+    return alpha * left + (1 - alpha) * right
+
+
+def _check_count(name: str, n: int, least: int, what: str = "number of nodes") -> None:
+    if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < least:
+        raise ValueError(f"{name}: the {what} is {n!r}; it must be an integer of at least {least}.")
+
+
+left = Rule((0.0,), (1.0,))
+right = Rule((1.0,), (1.0,))
+midpoint = Rule((0.5,), (1.0,))
+trapezoidal = (left + right) / 2
+simpson = (left + 4 * midpoint + right) / 6
+
+
+class PlacedRule(eqx.Module):
+    """A rule and the grid it lives on: once per macro interval, or once per micro interval.
+
+    mollified: whether its term is taken at averaged fast positions, see `mollified`.
+    corrected: whether its term is less a square of its gradient, see `corrected`.
+    """
+
+    rule: Rule
+    grid: Literal["macro", "micro"] = eqx.field(static=True)
+    mollified: bool = eqx.field(static=True, default=False)
+    corrected: bool = eqx.field(static=True, default=False)
+
+    def composite(self, num_micro: int) -> Rule:
+        """The rule on the macro interval [0, 1] that this placement amounts to."""
+        return self.rule if self.grid == "macro" else self.rule.repeat(num_micro)
+
+    @property
+    def only_ends(self) -> bool:
+        """Whether every node is an end of the interval the rule is placed on."""
+        return all(min(node, 1 - node) <= NODE_TOLERANCE for node in self.rule.nodes)
+
+
+def macro(rule: Rule) -> PlacedRule:
+    """Place a rule on the macro interval: its nodes are visited once per macro step."""
+    return _placed(rule, "macro")
+
+
+def micro(rule: Rule) -> PlacedRule:
+    """Place a rule on every micro interval: ``rule.repeat(num_micro)`` of the macro interval."""
+    return _placed(rule, "micro")
+
+
+def _placed(rule: Rule, grid: Literal["macro", "micro"]) -> PlacedRule:
+    if not isinstance(rule, Rule):
+        raise TypeError(f"{grid}: rule is {rule!r}; give a Rule, e.g. midpoint or gauss(2).")
+    return PlacedRule(rule, grid)
+
+
+def mollified(placed: PlacedRule) -> PlacedRule:
+    """The same nodes, with the slow potential at averaged fast positions: ``V(q_s, a(q_s, q_f))``.
+
+    The average is that of the fast motion from rest over the macro step (`vmri_jax.steppers.step.averaging`). Kicks by V then
+    act through ``a'(q)^T grad V``, which filters out the vibrations that they would excite where a macro step is a
+    multiple of half their period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
+    differential equations* (1998), the mollified impulse method with LongAverage.
+    """
+    if not isinstance(placed, PlacedRule) or placed.grid != "macro" or not placed.only_ends:
+        raise ValueError(f"mollified: got {placed!r}; give kicks at the macro nodes, e.g. macro(trapezoidal).")
+    return PlacedRule(placed.rule, placed.grid, mollified=True)
+
+
+def corrected(placed: PlacedRule) -> PlacedRule:
+    """The same nodes, with a square of the gradient taken off the potential.
+
+    Fast kicks act through ``W - h^2/24 grad W . M^-1 grad W``, slow ones through
+    ``V - H^2/24 grad V . M^-1 grad V - h^2/12 grad V . M^-1 grad W``, the last term where W is corrected too. With
+    velocity Verlet in between this is the method of Takahashi and Imada, J. Phys. Soc. Jpn. 53 (1984), and Rowlands,
+    J. Comput. Phys. 97 (1991): errors of order 2 are a change of coordinates, of the start and of the result, in which the motion
+    is of order 4. So are, as they are, the frequencies of harmonic vibrations, which no change of the start alters.
+    """
+    if not isinstance(placed, PlacedRule) or not placed.only_ends or placed.mollified:
+        raise ValueError(f"corrected: got {placed!r}; give kicks at the nodes of a grid, e.g. micro(trapezoidal).")
+    return PlacedRule(placed.rule, placed.grid, corrected=True)

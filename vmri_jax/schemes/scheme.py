@@ -1,0 +1,277 @@
+"""Schemes: which quadrature rule carries which term of the Lagrangian.
+
+A scheme is data. The reference schemes and the Galerkin family are points in one space:
+
+| scheme | V | W | explicit | order |
+|---|---|---|---|---|
+| `fully_implicit(num_micro)` | micro(midpoint) | micro(midpoint) | no | 2 |
+| `explicit_slow(num_micro, alpha)` | macro(affine(alpha)) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
+| `mollified_impulse(num_micro, alpha)` | mollified(macro(affine(alpha))) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
+| `fully_explicit(num_micro, alpha)` | macro(affine(alpha)) | micro(affine(alpha)) | yes | 2 at alpha = 1/2, else 1 |
+| `takahashi_imada(num_micro)` | corrected(macro(trapezoidal)) | corrected(micro(trapezoidal)) | yes | 2, frequencies 4 |
+| `galerkin(num_micro, degree, rule)` | micro(rule) | micro(rule) | no | min(2 degree, rule order) |
+"""
+
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.schemes.path import control_nodes, lagrange_derivative
+from vmri_jax.schemes.quadrature import (
+    NODE_TOLERANCE,
+    PlacedRule,
+    Rule,
+    affine,
+    corrected,
+    gauss,
+    lobatto,
+    macro,
+    micro,
+    midpoint,
+    mollified,
+    trapezoidal,
+)
+
+
+class Scheme(eqx.Module):
+    """Variational multirate scheme: the degree of the path and the rule of every term.
+
+    Every scheme is symplectic, conserves the momentum maps its discrete Lagrangian inherits, and has order
+    ``min(2 degree, order of its rules)`` (Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991). It is
+    symmetric (time-reversible) exactly when all its rules are.
+
+    Args:
+        num_micro: micro intervals per macro interval.
+        degree: polynomial degree r of the path, on r + 1 Gauss-Lobatto control points.
+        kinetic, slow, fast, force: placed rules (``macro(...)`` or ``micro(...)``) of T, V, W and the forces;
+            `kinetic` must be placed with micro, `force` defaults to the rule of `kinetic`.
+        constraint: where g holds: micro(rule) whose nodes are the control nodes; default micro(lobatto(degree + 1)).
+        slow_constraint: where g_s holds: macro(rule) on the same nodes; default macro(lobatto(degree + 1)).
+
+    Raises:
+        TypeError: num_micro or degree not an integer, or a rule that was not placed with macro or micro.
+        ValueError: num_micro or degree below 1, weights that do not sum to 1, or constraint nodes that are not the
+            control nodes.
+    """
+
+    num_micro: int = eqx.field(static=True)
+    degree: int = eqx.field(static=True)
+    kinetic: PlacedRule
+    slow: PlacedRule
+    fast: PlacedRule
+    constraint: PlacedRule
+    slow_constraint: PlacedRule
+    force: PlacedRule
+
+    def __init__(self, num_micro, degree=1, *, kinetic, slow, fast, constraint=None, slow_constraint=None, force=None):
+        self.num_micro = _positive_integer("num_micro", num_micro)
+        self.degree = _positive_integer("degree", degree)
+        self.kinetic, self.slow, self.fast = kinetic, slow, fast
+        self.force = kinetic if force is None else force
+        self.constraint = micro(lobatto(degree + 1)) if constraint is None else constraint
+        self.slow_constraint = macro(lobatto(degree + 1)) if slow_constraint is None else slow_constraint
+        for name in ("kinetic", "slow", "fast", "force", "constraint", "slow_constraint"):
+            _check_placed(name, getattr(self, name))
+        if self.kinetic.grid != "micro":
+            raise ValueError(
+                "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
+            )
+        _check_kinetic(self.kinetic.rule, self.degree)
+        filtered = [name for name in ("kinetic", "fast", "force", "constraint") if getattr(self, name).mollified]
+        if filtered or (self.slow.mollified and self.fast.grid != "micro"):
+            raise ValueError(
+                f"Scheme: {filtered or 'slow'} is mollified; only kicks of the slow potential can be, along fast motion on the "
+                "micro grid: slow=mollified(macro(...)) with fast=micro(...)."
+            )
+        grids = {"slow": "macro", "fast": "micro"}
+        for name in ("kinetic", "slow", "fast", "force", "constraint"):
+            placed = getattr(self, name)
+            if placed.corrected and (placed.grid != grids.get(name) or self.degree > 1):
+                raise ValueError(
+                    f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of a path of degree 1 "
+                    "can be: slow=corrected(macro(...)), fast=corrected(micro(...))."
+                )
+        for name, grid in (("constraint", "micro"), ("slow_constraint", "macro")):
+            placed = getattr(self, name)
+            nodes, needed = np.array(placed.rule.nodes), control_nodes(self.degree)
+            if placed.grid != grid or nodes.shape != needed.shape or np.abs(nodes - needed).max() > NODE_TOLERANCE:
+                raise ValueError(
+                    f"Scheme: {name} must be held at the control nodes {needed.tolist()} of degree {degree}; "
+                    f"give {grid}(lobatto({degree + 1})), got {placed.grid} rule with nodes {nodes.tolist()}."
+                )
+            if is_concrete(placed) and np.any(np.asarray(placed.rule.weights) == 0):
+                raise ValueError(f"Scheme: a weight of the {name} rule is zero; its multiplier would be undefined.")
+
+    @property
+    def order(self) -> int:
+        """Order of convergence, ``min(2 degree, order of the rules of T, V and W)``; needs concrete weights."""
+        return min(2 * self.degree, *(placed.rule.order for placed in (self.kinetic, self.slow, self.fast)))
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether a step forward and a step back with -H lead back to the start; needs concrete weights."""
+        return all(placed.rule.is_symmetric for placed in (self.kinetic, self.slow, self.fast, self.force))
+
+    @property
+    def micro_times(self) -> np.ndarray:
+        """(num_micro,) ends of the micro steps in units of the macro step."""
+        return np.arange(1, self.num_micro + 1) / self.num_micro
+
+    def describe(self) -> "Description":
+        """Order, symmetry, evaluations and solves per macro step; prints as a table."""
+        drifts = self.degree == 1 and self.fast.only_ends and self.fast.grid == "micro"
+        kicked = self.degree == 1 and self.slow.only_ends and self.slow.grid == "macro"
+        free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
+        slow, fast = (
+            _evaluations(placed, self.num_micro) * (1 + placed.corrected) for placed in (self.slow, self.fast)
+        )
+        fast *= 1 + self.slow.mollified  # along the motion that is averaged
+        fast += self.slow.corrected and self.fast.corrected  # in the term of both
+        return Description(self.order, self.is_symmetric, 1, self.num_micro, self.degree, slow, fast, free, 1)
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a scheme promises and what a macro step costs. Evaluations are per pass where equations are solved.
+
+    order, symmetric: of convergence; whether time-reversible.
+    stages, num_micro, degree: steps of the scheme per macro step, micro steps per macro step, degree of the path.
+    slow_evaluations, fast_evaluations: gradients of V and of W, and products of their Hessians with a vector, which cost about
+        as much; at a node that two macro steps share, once.
+    solves: systems of equations with constant masses and no constraint or force: none for explicit schemes, one per
+        micro step (of the fast variables of one micro step) where V only kicks, else one per stage.
+    constrained_solves: the same with constraints on slow and fast variables together.
+    """
+
+    order: int
+    symmetric: bool
+    stages: int
+    num_micro: int
+    degree: int
+    slow_evaluations: int
+    fast_evaluations: int
+    solves: int
+    constrained_solves: int
+
+    def repeated(self, stages: int, order: int, symmetric: bool) -> "Description":
+        """Of a composition of so many stages."""
+        counts = ("num_micro", "slow_evaluations", "fast_evaluations", "solves", "constrained_solves")
+        more = {name: stages * getattr(self, name) for name in counts}
+        return replace(self, order=order, symmetric=symmetric, stages=stages, **more)
+
+    def __str__(self) -> str:
+        per = "per macro step"
+        rows = {
+            "order": f"{self.order}, {'symmetric' if self.symmetric else 'not symmetric'}",
+            "path": f"{self.num_micro} micro steps of degree {self.degree} {per}"
+            + (f", in {self.stages} stages" if self.stages > 1 else ""),
+            "gradients of V": f"{self.slow_evaluations} {per}",
+            "gradients of W": f"{self.fast_evaluations} {per}",
+            "solves": f"{self.solves or 'none'} {per}; with constraints {self.constrained_solves}",
+        }
+        return "\n".join(f"{name:<16}{value}" for name, value in rows.items())
+
+
+def _evaluations(placed: PlacedRule, num_micro: int) -> int:
+    nodes = placed.composite(num_micro).nodes
+    shared = nodes[0] <= NODE_TOLERANCE and nodes[-1] >= 1 - NODE_TOLERANCE
+    return len(nodes) - shared
+
+
+def _positive_integer(name: str, value) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"Scheme: {name} is {value!r}; it must be an integer of at least 1.")
+    if value < 1:
+        raise ValueError(f"Scheme: {name} is {value}; it must be at least 1.")
+    return int(value)
+
+
+def _check_kinetic(rule: Rule, degree: int) -> None:
+    """Refuse rules that leave an increment of the path without mass, ``sum_i w_i l_j'(c_i) l_k'(c_i)`` singular."""
+    slopes = lagrange_derivative(degree, np.array(rule.nodes))[:, 1:]
+    weights = np.asarray(rule.weights) if is_concrete(rule) else np.ones(len(rule.nodes))
+    if np.linalg.eigvalsh(slopes.T @ (weights[:, None] * slopes)).min() <= 1e-9:
+        raise ValueError(
+            f"Scheme: the kinetic rule with nodes {list(rule.nodes)} does not see every velocity of a path of degree {degree}; "
+            f"give one that does, e.g. micro(gauss({degree}))."
+        )
+
+
+def _check_placed(name: str, placed) -> None:
+    if isinstance(placed, Rule):
+        raise TypeError(f"Scheme: {name} is a bare rule; say on which grid it lives, macro(rule) or micro(rule).")
+    if not isinstance(placed, PlacedRule):
+        raise TypeError(f"Scheme: {name} is {placed!r}; give macro(rule) or micro(rule).")
+    if is_concrete(placed):
+        total = float(placed.rule.weights.sum())
+        if not abs(total - 1) < 1e-10:
+            raise ValueError(f"Scheme: the weights of the {name} rule sum to {total:.15g}; they must sum to 1.")
+
+
+def fully_implicit(num_micro: int) -> Scheme:
+    """V and W at the midpoint of every micro interval. Order 2, symmetric, implicit.
+
+    Evaluations per macro step and Newton iteration: V num_micro, W num_micro.
+    """
+    return Scheme(num_micro, kinetic=micro(midpoint), slow=micro(midpoint), fast=micro(midpoint))
+
+
+def explicit_slow(num_micro: int, alpha=0.5) -> Scheme:
+    """V as a kick at the macro nodes, W at the micro midpoints. Order 2 and symmetric at alpha = 1/2, else order 1.
+
+    Evaluations per macro step: V once (the right node of a step is the left node of the next), W num_micro per
+    Newton iteration. Unstable near the impulse resonances omega H = k pi.
+    """
+    return Scheme(num_micro, kinetic=micro(midpoint), slow=macro(affine(alpha)), fast=micro(midpoint))
+
+
+def mollified_impulse(num_micro: int, alpha=0.5) -> Scheme:
+    """`explicit_slow` with V at averaged fast positions, ``V(q_s, a(q_s, q_f))``: stable at the impulse resonances.
+
+    Order 2 and symmetric at alpha = 1/2, else order 1. Evaluations per macro step: V once; W num_micro per Newton
+    iteration as before, and as many again for the average, with their derivative: cheap where W is quadratic, else an
+    exact solve per micro step. See `vmri_jax.schemes.quadrature.mollified`.
+    """
+    return Scheme(num_micro, kinetic=micro(midpoint), slow=mollified(macro(affine(alpha))), fast=micro(midpoint))
+
+
+def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
+    """V as a kick at the macro nodes, W as kicks at the micro nodes (impulse method, r-RESPA at alpha = 1/2).
+
+    Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints: V once and
+    W num_micro times per macro step, no Newton. Stable only for omega h < 2.
+    """
+    return Scheme(num_micro, kinetic=micro(midpoint), slow=macro(affine(alpha)), fast=micro(affine(alpha)))
+
+
+def takahashi_imada(num_micro: int) -> Scheme:
+    """`fully_explicit` with corrected kicks. Order 2, symmetric; frequencies of harmonic vibrations are of order 4.
+
+    What is left at order 2 is a change of coordinates, see `vmri_jax.schemes.quadrature.corrected`: phases of vibrations stay accurate;
+    where a period depends on the amplitude, it is that of a start which is moved by order 2. With constraints, whose forces the
+    correction leaves out, frequencies are of order 2. Explicit for constant masses, which it needs, without constraints, and stable
+    for ``omega h < 2 sqrt(3)``. Evaluations per macro step: V once and W num_micro times, each with a product of its Hessian, and one
+    such product of W more.
+    """
+    return Scheme(
+        num_micro, kinetic=micro(midpoint), slow=corrected(macro(trapezoidal)), fast=corrected(micro(trapezoidal))
+    )
+
+
+def galerkin(num_micro: int, degree: int, rule: Rule | str = "gauss") -> Scheme:
+    """One rule on every term of a degree-r path: order 2r with ``"gauss"`` (r nodes) or ``"lobatto"`` (r + 1 nodes).
+
+    Symmetric for symmetric rules, implicit, also with constraints. Evaluations of V and W per macro step and Newton
+    iteration: num_micro times the number of nodes (lobatto shares the nodes where micro intervals meet).
+
+    On small constrained systems the cheapest way to small errors is a single interval of high degree, e.g.
+    ``galerkin(1, 12, "lobatto")`` with five or six nodes to a period of the fastest vibration: steps of two periods.
+    """
+    degree = _positive_integer("degree", degree)
+    if isinstance(rule, str):
+        if rule not in ("gauss", "lobatto"):
+            raise ValueError(f"galerkin: rule is {rule!r}; it must be 'gauss', 'lobatto' or a Rule.")
+        rule = gauss(degree) if rule == "gauss" else lobatto(degree + 1)
+    return Scheme(num_micro, degree, kinetic=micro(rule), slow=micro(rule), fast=micro(rule))

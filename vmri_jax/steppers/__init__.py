@@ -1,0 +1,1 @@
+"""How a macro step is taken."""

@@ -1,0 +1,394 @@
+"""One interval with a path of degree r > 1: all variables at once, by simplified Newton steps in modes of time.
+
+With the Hessian of the potentials by the fast variables and the Jacobian of the constraints taken at one point, in the middle of
+the step, the Newton matrix is
+
+    [A x M - h^2 B x W'',  -I x G^T;  I x G,  0]
+
+with A, B (r, r) the stiffness and the mass matrix of the polynomials in time, rows of the nodes 0..r-1, columns of 1..r. In the
+eigenvectors of A^-1 B, which are known once and for all, it falls apart into one complex saddle per pair of eigenvalues gamma,
+
+    [M - h^2 gamma W'',  -G^T;  G,  0],
+
+so that matrices are of the size of the system, whatever the degree (Butcher 1976; Hairer, Wanner, Solving
+Ordinary Differential Equations II, IV.8). Of these only as many rows are solved as there are combinations of variables that the
+potentials are curved along. Forces are exact, so that all of this decides only how many steps there are.
+"""
+
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.kernels.cpu import ELEMENTWISE, inverse, largest, matmul, regularized
+from vmri_jax.mechanics.structure import curved_directions
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
+from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
+from vmri_jax.schemes.quadrature import interpolatory_weights
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.lanes import over_lanes
+from vmri_jax.steppers.newton.interval import (
+    Accepted,
+    constant_mass,
+    expected,
+    inverse_mass,
+    is_linear,
+    is_per_coordinate,
+)
+from vmri_jax.steppers.results import RUNNING
+
+FEW_MODES = 4
+"""Parts of no mode are added to more pairs of modes than that, if they are odd: half a vector register costs as much as a full one."""
+
+
+def is_collocation(system: System, scheme: Scheme, q_s, q_f) -> bool:
+    """Whether a step is a single interval of degree above one, with a small full matrix of the fast variables.
+
+    A large one is better kept for many steps, which the march does.
+    """
+    small = (q_f.size or q_s.size) <= ELEMENTWISE
+    if scheme.num_micro > 1 or scheme.degree == 1 or system.force is not None or not small:
+        return False
+    return not is_per_coordinate(system, scheme, q_f) and not is_linear(system, scheme, q_s, q_f)
+
+
+class TimeModes(NamedTuple):
+    """Eigenvectors of ``A^-1 B``, one of every complex pair.
+
+    What has one entry per part of a mode has all real parts before all imaginary ones. Two real modes share what a complex one
+    takes, and parts of no mode fill vector registers.
+
+    gamma (2, modes): eigenvalues.
+    mode (k,): which mode it is a part of.
+    of_rows: (r, r) ``A^-1``, from the rows of the momentum equations to increments.
+    of_values: (r, k) from values at the nodes to modes.
+    increments, multipliers: (k, r) from modes to increments, and (through A) to multipliers.
+    """
+
+    gamma: Any
+    mode: Any
+    of_rows: Any
+    of_values: Any
+    increments: Any
+    multipliers: Any
+
+    @classmethod
+    def of(cls, scheme: Scheme) -> "TimeModes":
+        """Of the polynomials and the nodes of the rules for T and W."""
+        a, b = (
+            _form(basis, scheme.degree, placed.rule.nodes)[:-1, 1:]
+            for basis, placed in ((lagrange_derivative, scheme.kinetic), (lagrange_basis, scheme.fast))
+        )
+        gamma, vectors = np.linalg.eig(np.linalg.solve(a, b))
+        order = np.argsort(-np.sign(np.imag(gamma)), kind="stable")  # of pairs, real ones, the others of pairs
+        gamma, vectors = gamma[order], vectors[:, order]
+        pairs, distinct = int(np.sum(np.imag(gamma) > 0)), int(np.sum(np.imag(gamma) >= 0))
+        half = (pairs + distinct + 1) // 2
+        first, second = np.arange(half), np.concatenate([np.arange(pairs), np.arange(half, distinct)])
+        width = half + (half % 2 if half > FEW_MODES else 0)
+
+        def parts(z):
+            """Of modes (r, m), those of no mode zero."""
+            imaginary = np.where(np.imag(gamma)[:, None] == 0, z.real, z.imag)
+            some = z.real[first], imaginary[second]
+            return np.concatenate([np.pad(a, [(0, width - len(a)), (0, 0)]) for a in some])
+
+        to = np.linalg.inv(vectors)
+        back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T  # a mode and its conjugate: the real part
+        mode = np.concatenate([np.pad(a, (0, width - len(a)), mode="edge") for a in (first, second)])
+        eigenvalues = np.stack([np.real(gamma), np.imag(gamma)])[:, :distinct]
+        return cls(eigenvalues, mode, np.linalg.inv(a).T, parts(to).T, parts(back), parts(back @ a.T))
+
+
+def _form(basis, degree: int, nodes) -> np.ndarray:
+    """``sum_n w_n l_i(c_n) l_j(c_n)`` (r + 1, r + 1) of the interpolatory rule on these nodes."""
+    at = basis(degree, np.array(nodes))
+    return at.T @ (interpolatory_weights(nodes)[:, None] * at)
+
+
+class Interval:
+    """The equations of the step, with the variables joined, q = (q_s, q_f), and nodes as the last axis.
+
+    num_curved: how many variables, the last ones, the Hessian is taken by: the fast ones where there are any.
+    directions, along: (d, n) the combinations of these that the potentials are curved along, and (n, d) changes of the variables
+        that change one of them each.
+    """
+
+    def __init__(self, equations: StepEquations):
+        self.system, self.h = equations.system, equations.macro_dt
+        self.n_s, self.r = equations.q_s.size, equations.scheme.degree
+        self.q = jnp.concatenate([equations.q_s, equations.q_f])
+        self.p = jnp.concatenate([equations.p_s, equations.p_f])
+        self.times = equations.t + self.h * control_nodes(self.r)
+        terms = lagrangian(self.system, equations.scheme)
+        self.form = terms.kinetic.fast_form[1:]
+        self.potentials = [term for term in terms.potentials.terms if term.inside.groups]
+        mass = constant_mass(self.system)
+        self.velocities = inverse_mass(mass.slow), inverse_mass(mass.fast)
+        self.num_curved = equations.q_f.size or self.q.size
+        directions = curved_directions(partial(self.potential_of_curved, self.q), self.q[-self.num_curved :])
+        self.directions = np.pad(directions, ((0, 0), (self.q.size - self.num_curved, 0)))
+        self.along = np.linalg.pinv(self.directions)
+        self.at_start = self.jacobian(self.times[0], self.q)
+
+    def constraints(self, t, q):
+        """All constraints (n_c,) at one point."""
+        return self.system.constraints(t, q[: self.n_s], q[self.n_s :])
+
+    def jacobian(self, t, q):
+        """Their Jacobian G (n_c, n)."""
+        return jax.jacrev(self.constraints, argnums=1)(t, q)
+
+    def times_mass(self, x):
+        """``M x`` for (n, m)."""
+        mass, parts = constant_mass(self.system), (x[: self.n_s], x[self.n_s :])
+        return jnp.concatenate(
+            [
+                m[:, None] * a if m.ndim == 1 else matmul(m, a)
+                for m, a in zip((mass.slow, mass.fast), parts, strict=True)
+            ]
+        )
+
+    def over_mass(self, x):
+        """``M^-1 x`` for (n, m)."""
+        parts = x[: self.n_s], x[self.n_s :]
+        return jnp.concatenate([velocity(a.T).T for velocity, a in zip(self.velocities, parts, strict=True)])
+
+    def by_name(self, term: Term, q) -> tuple:
+        """What a term takes of (n, ...) joined variables."""
+        at = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
+        return tuple(at[name] for name in term.arguments)
+
+    def potential(self, q):
+        """All potentials at one point."""
+        return sum((-term.sign * term.integrand(*self.by_name(term, q)) for term in self.potentials), jnp.zeros(()))
+
+    def potential_of_curved(self, q, curved):
+        """The same with the last `num_curved` variables apart."""
+        return self.potential(jnp.concatenate([q[: -self.num_curved], curved]))
+
+    def curvature(self, q):
+        """Hessian of the potentials by these variables times the changes `along` (n, d)."""
+        curved, gradient = q[-self.num_curved :], jax.grad(partial(self.potential_of_curved, q))
+        changes = self.along.T[:, -self.num_curved :]
+        columns = jax.vmap(lambda change: jax.jvp(gradient, (curved,), (change,))[1], out_axes=1)(changes)
+        return jnp.pad(columns, ((self.q.size - self.num_curved, 0), (0, 0)))
+
+    def forces(self, x, mu) -> "Forces":
+        """Of potentials and constraints.
+
+        Args:
+            x, mu: increments (n, r) and multipliers (n_c, r).
+        """
+        q = self.q[:, None] + x  # at the nodes 1..r
+
+        def at_node(at):
+            t, q, mu = at
+            g, pull = jax.vjp(lambda q: self.constraints(t, q), q)
+            return g, -pull(mu)[0]
+
+        later = jnp.concatenate([mu[:, 1:], jnp.zeros_like(mu[:, :1])], axis=1)
+        g, total = over_lanes(at_node, self.r)((self.times[1:], q, later))
+        first = -jnp.sum(mu[:, :1] * self.at_start, axis=0)
+        for term in self.potentials:
+            theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
+            basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
+            gradient = jax.grad(lambda q, term=term: term.sign * term.integrand(*self.by_name(term, q)))
+            before, k = int(np.argmax(basis[0, 1:])), len(theta)
+            consecutive = np.eye(self.r + 1)[before + 1 : before + 1 + k]
+            if np.array_equal(basis, consecutive):  # nodes of the path: nothing to interpolate
+                d = over_lanes(gradient, k)(q[:, before : before + k])
+                total += jnp.pad(weights * d, ((0, 0), (before, self.r - before - k)))
+            else:
+                d = over_lanes(gradient, k)(self.q[:, None] + x @ basis[:, 1:].T)
+                first += d @ (weights * basis[:, 0])
+                total += d @ (weights[:, None] * basis[:, 1:])
+        inside = jnp.concatenate([(self.h * self.p + first)[:, None], total[:, :-1]], axis=1)
+        return Forces(inside, total[:, -1], g)
+
+    def residual(self, x, forces: "Forces"):
+        """Of the momentum equations of the nodes 0..r-1, times h, (n, r)."""
+        return self.times_mass(x @ self.form[:, :-1]) + forces.inside
+
+    def momentum(self, x, forces: "Forces"):
+        """At the end of the step (n,)."""
+        return (self.times_mass(x @ self.form[:, -1:])[:, 0] + forces.last) / self.h
+
+
+class Forces(NamedTuple):
+    """What increments and multipliers make of a step.
+
+    inside (n, r): forces at the nodes 0..r-1, times h, at node 0 with the momentum that arrives.
+    last (n,): forces at the end of the step, times h.
+    g (n_c, r): constraints at the nodes 1..r.
+    """
+
+    inside: Any
+    last: Any
+    g: Any
+
+
+def taken(a, index: np.ndarray):
+    """What is at a known index of the last axis, as slices."""
+    runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
+    return jnp.concatenate([a[..., run[0] : run[-1] + 1] for run in runs], axis=-1)
+
+
+class Saddles(NamedTuple):
+    """The saddles of all modes, eliminated; with z = L x for the d combinations of variables that the potentials are curved along.
+
+    ``M x - gamma L^T w z - G^T nu = M y`` is ``x = y + gamma Q z + M^-1 G^T nu`` and ``(1 - gamma L Q) z = L y + L M^-1 G^T nu``, so
+    that only d rows, and those of the constraints, are solved for each mode.
+
+    modes: as which everything below but `push` and `pull` is.
+    gamma (2, k): eigenvalues, for every part of a mode.
+    push: L and G (d + n_c, n), of the variables.
+    pull: ``Q = M^-1 L^T w`` and ``M^-1 G^T`` (n, d + n_c), with ``w = h^2 W''``.
+    bend: ``L Q`` (d, d).
+    denominator (d, d, k): inverses of ``|1 - gamma L Q|^2``.
+    push_bend: ``G Q`` (n_c, d).
+    pull_bend two of (d, n_c, k): ``(1 - gamma L Q)^-1 L M^-1 G^T``.
+    schur two of (n_c, n_c, k): inverse of G times x for every multiplier.
+    """
+
+    modes: TimeModes
+    gamma: Any
+    push: Any
+    pull: Any
+    bend: Any
+    denominator: Any
+    push_bend: Any
+    pull_bend: Any
+    schur: Any
+
+    @classmethod
+    def at(cls, interval: Interval, modes: TimeModes, t, q) -> "Saddles":
+        """With Hessian and Jacobian at a point."""
+        along, jacobian = interval.directions, interval.jacobian(t, q)
+        bend, pull = interval.over_mass(interval.h**2 * interval.curvature(q)), interval.over_mass(jacobian.T)
+        k, d, n_c = modes.gamma.shape[1], len(along), len(jacobian)
+        re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
+
+        def of_parts(z):
+            """(modes, rows, columns) as (columns, rows, k)."""
+            return taken(jnp.swapaxes(z, 0, 2), modes.mode)
+
+        bent = matmul(along, bend)
+        denominator = inverse(np.eye(d) - 2 * re * bent + (re**2 + im**2) * matmul(bent, bent))
+
+        straight = matmul(along, pull)
+        columns = jnp.concatenate([straight, matmul(bent, straight)], axis=1)
+        through = (denominator.reshape(k * d, d) @ columns).reshape(k, d, 2 * n_c)
+        # real and imaginary part of (1 - conj(gamma) L Q) / |1 - gamma L Q|^2 times the columns
+        real, imaginary = through[..., :n_c] - re * through[..., n_c:], im * through[..., n_c:]
+
+        push_bend = matmul(jacobian, bend)
+        a, b = (matmul(push_bend, z) for z in (re * real - im * imaginary, re * imaginary + im * real))
+        schur = inverse(regularized(jax.lax.complex(a + matmul(jacobian, pull), b)))
+
+        push, pull = jnp.concatenate([along, jacobian]), jnp.concatenate([bend, pull], axis=1)
+        pull_bend, schur = ([of_parts(a) for a in both] for both in ((real, imaginary), (schur.real, schur.imag)))
+        return cls(
+            modes, modes.gamma[:, modes.mode], push, pull, bent, of_parts(denominator), push_bend, pull_bend, schur
+        )
+
+    def solve(self, y, g):
+        """x (n, r) and mu (n_c, r) with ``M x - h^2 W'' x (A^-1 B)^T - G^T mu A^-T = M y`` and ``G x = g``."""
+        d = len(self.bend)
+        pushed = self.push @ y
+        pushed = jnp.concatenate([pushed[:d], g - pushed[d:]]) @ self.modes.of_values
+        z, g = pushed[:d], pushed[d:]
+        z = z - self._times_gamma(matmul(self.bend, z), -1)
+        products = (a * row for a, row in zip(self.denominator, z, strict=True))
+        z = reduce(jnp.add, products, jnp.zeros_like(z))  # written out: within a sum z would be made anew for every row
+        nu = product(self.schur, g - matmul(self.push_bend, self._times_gamma(z)))
+        z = self._times_gamma(z + product(self.pull_bend, nu))
+        return y + self.pull @ (jnp.concatenate([z, nu]) @ self.modes.increments), nu @ self.modes.multipliers
+
+    def _times_gamma(self, z, sign=1):
+        """Or times the conjugate of gamma."""
+        re, im = self.gamma
+        return re * z + sign * im * times_i(z)
+
+
+def times_i(z):
+    """Complex numbers, all real parts before all imaginary ones."""
+    re, im = jnp.split(z, 2, axis=-1)
+    return jnp.concatenate([-im, re], axis=-1)
+
+
+def product(matrix, z):
+    """Of complex matrices, their real and their imaginary parts (columns, rows, k), and vectors (columns, k)."""
+    re, im = matrix
+    return jnp.sum(re * z[:, None] + im * times_i(z)[:, None], axis=0)
+
+
+class Iterate(NamedTuple):
+    """Increments x (n, r), multipliers mu (n_c, r), their largest corrections, how many there were, and what the last one tells."""
+
+    x: Any
+    mu: Any
+    moved: Any
+    iterations: Any
+    result: Any
+
+
+class Evaluated(NamedTuple):
+    """An iterate, forces of it or of the one before, and RUNNING or, with its own forces, the result."""
+
+    last: Iterate
+    forces: Forces
+    result: Any
+
+
+def only_if(wanted, function, x):
+    """``function(x)``, or x itself. As a loop of at most one pass: of two branches, lanes would always compute both."""
+    return jax.lax.while_loop(lambda a: a[0], lambda a: (jnp.asarray(False), function(a[1])), (wanted, x))[1]
+
+
+def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, Unknowns, Any, Any]:
+    """Newton steps until one more would change no increment.
+
+    What it would change them by is known from how the corrections shrink. Accepted are changes of ``newton.tolerance``
+    relative to the motion over the step, and round-off of the positions.
+
+    Returns:
+        (state of the iteration, unknowns, (q_f, p_s, p_f) at the end of the step, largest row of the momentum equations (times h)
+        and largest value of a constraint)
+    """
+    interval, modes = Interval(equations), TimeModes.of(equations.scheme)
+    n_s, (n_g, _) = interval.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
+    x = jnp.concatenate([guess.slow, guess.fast[0]], axis=1).T
+    mu = jnp.concatenate([guess.multiplier[0], guess.slow_multiplier], axis=1).T
+    saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
+    accepted = Accepted.of(equations, newton)
+
+    def slow_and_fast(x):
+        return largest(x[:n_s]), largest(x[n_s:])
+
+    def corrected(last: Iterate, forces: Forces) -> Iterate:
+        missing = last.x + interval.over_mass(forces.inside) @ modes.of_rows  # what these forces do not bring about
+        dx, dmu = saddles.solve(-missing, -forces.g)
+        x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
+        left = map(expected, moved, last.moved)
+        return Iterate(x, mu, moved, iterations, newton.status(accepted.over(left, slow_and_fast(x)), iterations))
+
+    def step(at: Evaluated) -> Evaluated:
+        """Forces first: evaluated in one place, they are compiled once."""
+        last, fixed = at.last, newton.fixed_iterations
+        forces = interval.forces(last.x, last.mu)
+        goes_on = last.result == RUNNING if fixed is None else last.iterations < fixed
+        return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
+
+    running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(interval.q), jnp.zeros_like(mu))
+    start = Iterate(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
+    last, forces, _ = newton.iterate(step, Evaluated(start, none, running), -1)  # forces once more than corrections
+    p, rows = interval.momentum(last.x, forces), interval.residual(last.x, forces)
+    x, mu = last.x.T, last.mu.T
+    unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
+    end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
+    return last, unknowns, end, (largest(rows), largest(forces.g))

@@ -1,0 +1,226 @@
+"""One micro interval as a problem of its own, and the Newton matrix its fast increments are corrected with."""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.kernels.cpu import inverse, largest, matmul, matvec, regularized, solve
+from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian
+from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
+from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.path import control_nodes, lagrange_basis
+from vmri_jax.schemes.quadrature import micro, midpoint
+from vmri_jax.schemes.scheme import Scheme
+
+ROUNDOFF = 4.0
+"""Changes of the positions below so many units of round-off are accepted."""
+SAFETY = 10.0
+"""Of the tolerance, and of how corrections shrink from one iteration to the next."""
+
+
+class Accepted(NamedTuple):
+    """Changes of the increments that are accepted: relative to the motion over the step, and round-off of the positions.
+
+    tolerance: of Newton, over `SAFETY`, since what is left of every step adds up.
+    slow, fast: round-off.
+    """
+
+    tolerance: Any
+    slow: Any
+    fast: Any
+
+    @classmethod
+    def of(cls, equations: StepEquations, newton) -> "Accepted":
+        floors = (ROUNDOFF * jnp.finfo(float).eps * largest(q) for q in (equations.q_s, equations.q_f))
+        return cls(newton.tolerance / SAFETY, *floors)
+
+    def sizes(self, motions) -> tuple[Any, Any]:
+        """The changes (slow, fast) that are accepted with such motions."""
+        numbers = jnp.finfo(float)
+        rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny  # variables at rest have no size of their own
+        slow, fast = motions
+        return self.tolerance * slow + self.slow + rest, self.tolerance * fast + self.fast + rest
+
+    def over(self, changes, motions):
+        """Changes (slow, fast) over what is accepted of them with such motions; the larger of the two."""
+        return jnp.maximum(*(c / size for c, size in zip(changes, self.sizes(motions), strict=True)))
+
+
+def expected(moved, before):
+    """The next correction, with a margin, after this one and the one before."""
+    return jnp.minimum(SAFETY * moved / (before + jnp.finfo(float).tiny), 1.0) * moved
+
+
+def can_be_cut(system: System, scheme: Scheme) -> bool:
+    """Whether every term lives on single micro intervals or is a kick at the macro nodes, with constant masses."""
+    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
+    local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
+    force = system.force is None or scheme.force.grid == "micro"
+    return isinstance(system.kinetic, ConstantMass) and local and force
+
+
+def has_kicks(system: System, scheme: Scheme) -> bool:
+    """Whether a potential acts at the macro nodes."""
+    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
+    return any(f is not None and placed.grid == "macro" for f, placed in potentials)
+
+
+def constant_mass(system: System) -> ConstantMass:
+    """The masses of a system that can be cut."""
+    assert isinstance(system.kinetic, ConstantMass)
+    return system.kinetic
+
+
+def inverse_mass(mass):
+    """``p -> M^-1 p``, with the inverse computed once."""
+    if mass.ndim == 1:
+        inverse_diagonal = 1 / mass
+        return lambda p: inverse_diagonal * p
+    matrix = inverse(mass)
+    return lambda p: matmul(jnp.atleast_2d(p), matrix).reshape(p.shape)
+
+
+def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
+    """System and scheme of one micro interval: without the kicks at the macro nodes and the slow constraint."""
+    changes: dict[str, Any] = {"slow_constraint": None}
+    rules = {"slow": scheme.slow, "fast": scheme.fast, "force": scheme.force}
+    for name, placed in rules.items():
+        if placed.grid == "macro":
+            rules[name] = micro(midpoint)
+            changes |= {} if name == "force" else {f"{name}_potential": None}
+    local = Scheme(1, scheme.degree, kinetic=scheme.kinetic, constraint=scheme.constraint, **rules)
+    return system.replace(**changes), local
+
+
+def implicit_terms(system: System, scheme: Scheme) -> list[Term]:
+    """The potentials that the fast unknowns of a micro interval enter."""
+    terms = lagrangian(*interval_problem(system, scheme)).terms
+    return [term for term in terms if isinstance(term, Term) and term.inside.groups]
+
+
+def is_explicit_given_multipliers(system: System, scheme: Scheme) -> bool:
+    """Whether the fast increment of a micro interval is the momentum that arrives plus the constraint force."""
+    return scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
+
+
+class IntervalMatrix(NamedTuple):
+    """K, the derivative of the fast equations of a micro interval by its increments, without constraints.
+
+    inverse: of the rows of slots 0..r-1, (r, r, n_f) for every coordinate alone, or (r n_f, r n_f).
+    last: the row of slot r, which is the momentum handed on, (r, n_f) or (n_f, r n_f).
+    """
+
+    inverse: Any
+    last: Any
+
+    @classmethod
+    def none(cls, system: System, scheme: Scheme, q_f) -> "IntervalMatrix":
+        """Where it comes with every macro step: the shapes, all zero."""
+        r, n_f = scheme.degree, q_f.shape[0]
+        if is_per_coordinate(system, scheme, q_f):
+            return cls(jnp.zeros((r, r, n_f)), jnp.zeros((r, n_f)))
+        return cls(jnp.zeros((r * n_f, r * n_f)), jnp.zeros((n_f, r * n_f)))
+
+    def solve(self, rows):
+        """The increments (r, n_f) for given rows (r, n_f)."""
+        if self.inverse.ndim == 3:
+            return jnp.sum(self.inverse * rows[None], axis=1)
+        return matvec(self.inverse, rows.reshape(-1)).reshape(rows.shape)
+
+    def outgoing(self, increments):
+        """Change (n_f,) of the last slot with the increments."""
+        if self.inverse.ndim == 3:
+            return jnp.sum(self.last * increments, axis=0)
+        return matvec(self.last, increments.reshape(-1))
+
+
+def is_per_coordinate(system: System, scheme: Scheme, q_f) -> bool:
+    """Whether K is taken for every fast coordinate alone: explicit fast equations, or W a sum over the coordinates.
+
+    V is then left out: it is the soft potential, and h^2 times its curvature is small beside the mass.
+    """
+    if constant_mass(system).fast.ndim == 2:
+        return False
+    terms = implicit_terms(system, scheme)
+    fast = [term for term in terms if term.arguments == ("q_f",)]
+    return not terms or (bool(fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in fast))
+
+
+def is_constant(system: System, scheme: Scheme, q_s, q_f) -> bool:
+    """Whether K is the same for a whole run."""
+    q = {"q_s": q_s, "q_f": q_f}
+    terms = implicit_terms(system, scheme)
+    if is_per_coordinate(system, scheme, q_f):
+        terms = [term for term in terms if term.arguments == ("q_f",)]
+    elif system.force is not None or (scheme.degree > 1 and system.constraint is not None):
+        return False
+    return all(has_constant_hessian(term.integrand, *(q[a] for a in term.arguments)) for term in terms)
+
+
+def is_linear(system: System, scheme: Scheme, q_s, q_f) -> bool:
+    """Whether there are only fast equations, linear ones with matrix K: one pass solves them."""
+    alone = not system.is_constrained and system.force is None and not q_s.shape[0]
+    complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
+    return alone and (complete or not is_per_coordinate(system, scheme, q_f)) and is_constant(system, scheme, q_s, q_f)
+
+
+def interval_matrix(equations: StepEquations) -> IntervalMatrix:
+    """K on the first micro interval of a macro step, on the straight path from its start."""
+    q_s, q_f, p_s, p_f, h = equations.q_s, equations.q_f, equations.p_s, equations.p_f, equations.micro_dt
+    system, scheme = interval_problem(equations.system, equations.scheme)
+    local = StepEquations(system, scheme, equations.t, q_s, q_f, p_s, p_f, h)
+    r, n_f = scheme.degree, q_f.shape[0]
+    slow, fast = (h * control_nodes(r)[1:, None] * v for v in constant_mass(system).velocity(p_s, p_f))
+    path = local.path(Unknowns(slow, None, fast[None], None))
+    if not is_per_coordinate(equations.system, equations.scheme, q_f):
+        kinetic = lagrangian(system, scheme).kinetic
+
+        def slots(increments):
+            at = replace(path, fast=increments[None])
+            d = jax.grad(local.without_kinetic)(at, at)
+            d_fast = d.fast[0] + kinetic.rows(slow, increments)[1]
+            return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast])
+
+        block = jax.jacfwd(slots)(fast)
+        return IntervalMatrix(inverse(block[:-1].reshape(r * n_f, r * n_f)), block[-1].reshape(n_f, r * n_f))
+
+    block = jnp.zeros((r + 1, r, n_f))
+    for term in lagrangian(system, scheme).terms:
+        if isinstance(term, QuadraticKinetic):
+            block += term.fast_form[:, 1:, None] * term.mass.fast
+        elif term.inside.groups and term.arguments == ("q_f",):
+            q = term.inside.sample(path, ("q_f",))["q_f"]
+            gradient = jax.vmap(jax.grad(term.integrand))
+            curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]  # the diagonal of each Hessian
+            basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))
+            weights = term.sign * h**2 * term.inside.weights
+            block += jnp.einsum("k,ki,kj,ka->ija", weights, basis, basis[:, 1:], curvature)
+    if r == 1:
+        return IntervalMatrix(1 / block[:1], block[-1])
+    return IntervalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block[:-1]), 0, -1), block[-1])
+
+
+def solve_saddle(solve_k, jacobian, push, rows, g):
+    """(dx, dmu) with ``K dx - G_0^T dmu = -rows`` and ``G_1 dx = -g``, by the Schur complement ``G_1 K^-1 G_0^T``.
+
+    Args:
+        solve_k: K^-1, (r, n) rows to (r, n) increments.
+        jacobian: (r, n_g, n) G_0, at the control nodes 0..r-1, where the multipliers act.
+        push: G_1 as a function, changes (r, n) of the control points 1..r to changes (r, n_g) of the constraints.
+        rows, g: (r, n), or None if they are zero, and (r, n_g).
+    """
+    r, n_g = g.shape
+    dx = jnp.zeros((r, jacobian.shape[-1])) if rows is None else -solve_k(rows)
+    if n_g == 0:
+        return dx, g
+    columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
+    response = jax.vmap(solve_k)(columns.reshape(r * n_g, r, -1))
+    schur = regularized(jax.vmap(push)(response).reshape(r * n_g, r * n_g))
+    if rows is not None:
+        g = g + push(dx)
+    dmu = -solve(schur.T, g.reshape(r * n_g, 1))
+    return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)

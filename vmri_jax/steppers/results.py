@@ -1,0 +1,105 @@
+"""Outcome of a step: a status code whose message tells the user what happened and what to change."""
+
+from enum import IntEnum
+
+
+class Result(IntEnum):
+    """Status of a macro step. `CONVERGED` and `CONVERGED_AT_ROUNDOFF` are successes."""
+
+    CONVERGED = 0
+    CONVERGED_AT_ROUNDOFF = 1
+    STAGNATED = 2
+    DIVERGED = 3
+    NON_FINITE = 4
+    SINGULAR = 5
+    RANK_DEFICIENT = 6
+    CONSTRAINT_VIOLATED = 7
+
+    @property
+    def success(self) -> bool:
+        return self <= Result.CONVERGED_AT_ROUNDOFF
+
+    @property
+    def message(self) -> str:
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Result.CONVERGED: "the step converged to the Newton tolerance.",
+    Result.CONVERGED_AT_ROUNDOFF: (
+        "the step converged to the round-off floor of its own numbers, which lies above the Newton tolerance."
+    ),
+    Result.STAGNATED: (
+        "Newton's iteration used up its iterations while still improving slowly, and so did shorter parts of the step. Likely "
+        "causes: the step is too large for the fast forces, or the constraints are nearly dependent. Try a smaller macro_dt "
+        "or a larger num_micro, or raise Newton(max_iterations=...)."
+    ),
+    Result.DIVERGED: (
+        "Newton's iteration moved away from a solution, and following the solution of shorter steps ended before the whole "
+        "step: there may be none. Likely causes: the step is too large for the curvature of the potentials or constraints, "
+        "or the run is unstable and its energy has grown. Try a smaller macro_dt, and look at the energy before the failure."
+    ),
+    Result.NON_FINITE: (
+        "a NaN or infinity appeared. Likely causes: an explicit scheme beyond its stability limit (omega h < 2), a function "
+        "evaluated outside its domain (a norm at zero, a logarithm or root of a negative number). Try a smaller macro_dt, or look at the "
+        "state just before the failure."
+    ),
+    Result.SINGULAR: (
+        "the Newton matrix is singular although the functions are finite. Likely causes: a kinetic energy that does not see "
+        "every velocity (a mass that is or becomes zero), or a potential whose curvature cancels the mass at this step. Look "
+        "at the mass matrix at the last state, or change macro_dt."
+    ),
+    Result.RANK_DEFICIENT: (
+        "the constraints have become dependent: the rank of their Jacobian in the fast variables (of slow_constraint: in the "
+        "slow ones) is less than their number. Likely causes: redundant rows that contradict each other, a singular "
+        "configuration (links in line, a closed loop folded flat), or a constraint whose fast variables no longer enter. "
+        "Remove rows, make the variables they need fast, or start elsewhere."
+    ),
+    Result.CONSTRAINT_VIOLATED: (
+        "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or rows of "
+        "very different size (scale them to order one)."
+    ),
+}
+
+
+RUNNING = -1
+"""Status of an iteration that goes on."""
+
+
+class Method(IntEnum):
+    """How the equations of a step were solved, in order of cost; of several the most expensive one is reported.
+
+    EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. The others are methods of `Newton`.
+    """
+
+    EXPLICIT = 0
+    LINEAR = 1
+    MARCH = 2
+    DECOUPLED = 3
+    FROZEN = 4
+    ARROWHEAD = 5
+    DENSE = 6
+
+
+class SimulationError(RuntimeError):
+    """A run failed at some macro step; what was computed before is in `.trajectory`.
+
+    Attributes:
+        result: the `Result` of the failing step.
+        step: index of the failing macro step (0 = the first).
+        time: time at the start of that step.
+        iterations, residual: the most Newton iterations and the largest residual of a step from the saved node before to it.
+        trajectory: the `Trajectory` up to the failure (NaN after it).
+    """
+
+    def __init__(self, result: Result, step: int, time: float, iterations: int, residual: float, trajectory):
+        self.result, self.step, self.time = result, step, time
+        self.iterations, self.residual, self.trajectory = iterations, residual, trajectory
+        super().__init__(
+            f"macro step {step} at t = {time:.6g} failed ({result.name}) after {iterations} Newton iterations with residual "
+            f"{residual:.2e}: {result.message} The trajectory up to there is in this exception's .trajectory; "
+            "throw=False returns it instead of raising."
+        )
+
+    def __reduce__(self):
+        return type(self), (self.result, self.step, self.time, self.iterations, self.residual, self.trajectory)
