@@ -23,7 +23,8 @@ from vmri_jax.schemes.scheme import (
 )
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result, SimulationError
-from vmri_jax.steppers.step import StepInfo, macro_step
+from vmri_jax.steppers.stepper import StepInfo
+from vmri_jax.running.simulate import macro_step
 
 from vmri_jax import systems  # isort: skip  (written with the names above)
 

@@ -6,15 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels.cpu import largest
+from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.state import State, project_momentum
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton, dense
-from vmri_jax.steppers.newton.linearization import linearize
-from vmri_jax.steppers.step import macro_step
+from vmri_jax.running.simulate import macro_step
 
 
 def energy_parts(system: System, q_s, q_f, p_s, p_f) -> dict:
@@ -40,7 +39,7 @@ def oscillatory_energies(omega, q_f, p_f):
 
 def constraint_residual(system: System, state: State):
     """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,)."""
-    return jax.vmap(largest)(jnp.stack(all_constraints(system, state)))
+    return jax.vmap(max_abs)(jnp.stack(all_constraints(system, state)))
 
 
 def all_constraints(system: System, state: State):
@@ -158,7 +157,7 @@ def _newton_matrix(system, scheme, state, macro_dt):
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     x = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
-    return dense.assemble(linearize(equations, x), x)
+    return dense.matrix(equations, x)
 
 
 class OrderFit(NamedTuple):

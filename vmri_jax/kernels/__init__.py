@@ -1,1 +1,25 @@
-"""Small dense algebra: what is written for speed alone."""
+"""Small dense algebra: the one place for what is written for speed alone.
+
+Two modules have the same names: `plain`, what a reader expects, and `cpu`, the tuned form. The environment variable
+VMRI_KERNELS (``plain`` or ``cpu``, the default) chooses one when the package is imported.
+"""
+
+import os
+
+from vmri_jax.kernels import cpu, plain
+from vmri_jax.kernels.saddle import REGULARIZATION, regularized, saddle
+
+CHOICES = {"plain": plain, "cpu": cpu}
+
+_name = os.environ.get("VMRI_KERNELS", "cpu")
+if _name not in CHOICES:
+    raise ValueError(f"VMRI_KERNELS is {_name!r}; it must be one of {', '.join(CHOICES)}.")
+_chosen = CHOICES[_name]
+
+inverse = _chosen.inverse
+matmul = _chosen.matmul
+matvec = _chosen.matvec
+max_abs = _chosen.max_abs
+solve = _chosen.solve
+
+__all__ = ["REGULARIZATION", "inverse", "matmul", "matvec", "max_abs", "regularized", "saddle", "solve"]

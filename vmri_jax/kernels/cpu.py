@@ -1,4 +1,4 @@
-"""Small dense algebra as elementwise operations.
+"""Small dense algebra as elementwise operations: the names of `plain`, tuned for small systems on CPUs.
 
 XLA compiles a loop without library calls into one kernel; a LAPACK call or a matrix product inside it costs about a
 microsecond each. Up to `ELEMENTWISE` rows systems are therefore eliminated by elementwise operations, beyond by LAPACK.
@@ -6,7 +6,6 @@ microsecond each. Up to `ELEMENTWISE` rows systems are therefore eliminated by e
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 UNROLLED = 8
 """Largest system whose elimination is written out step by step; larger ones go through a loop, which compiles faster."""
@@ -16,26 +15,6 @@ REGISTER = 4
 """Numbers in a vector register: rows of so many fill them."""
 ELEMENTWISE = 16
 """Largest system that is eliminated by elementwise operations."""
-
-REGULARIZATION = 2e-15
-"""Part of its diagonal that is added to ``G M^-1 G^T``, see `regularized`."""
-
-
-def regularized(a):
-    """``G M^-1 G^T`` (..., n, n), kept invertible where rows of G become dependent.
-
-    Multipliers are then nearly those of least norm. Residuals are exact, so that it decides on convergence alone, not
-    on solutions: errors shrink by REGULARIZATION times the condition number, instead of at once.
-    """
-    return a * (1 + REGULARIZATION * np.eye(a.shape[-1]))
-
-
-def saddle(a, b, c):
-    """``[[a, b], [c, 0]]`` over any leading axes, `regularized`: 0 becomes a small part of the diagonal of ``-c a^-1 b``."""
-    diagonal = jnp.diagonal(a, axis1=-2, axis2=-1)[..., None]
-    scale = jnp.sum(jnp.swapaxes(c, -1, -2) * b / jnp.where(diagonal == 0, 1.0, diagonal), axis=-2)
-    corner = -REGULARIZATION * scale[..., None] * np.eye(b.shape[-1])
-    return jnp.concatenate([jnp.concatenate([a, b], axis=-1), jnp.concatenate([c, corner], axis=-1)], axis=-2)
 
 
 def matmul(a, b):
@@ -105,18 +84,14 @@ def _first_exchanged(a):
     return moved - column * row
 
 
-def largest(a):
-    """The largest absolute value in a, 0 of nothing, NaN if there is one; axis by axis, so that rows fill vector registers."""
-    order = ordered(a)
+def max_abs(a):
+    """The largest absolute value in a, 0 of nothing, not finite if an entry is not.
+
+    As integers with the order of ``|a|``, those of the same bits: a maximum of integers may be taken in any order, so that it
+    fills vector registers; one of floats is taken number by number, and XLA loses NaN in some of them. Axis by axis, so
+    that rows fill the registers.
+    """
+    order = jax.lax.bitcast_convert_type(jnp.abs(a), jnp.int64)
     while order.ndim:
         order = jnp.max(order, axis=0, initial=0)
     return jax.lax.bitcast_convert_type(order, jnp.float64)
-
-
-def ordered(a):
-    """Integers with the order of ``|a|``, NaN above all: those of the same bits.
-
-    A maximum of integers may be taken in any order, so that it fills vector registers; one of floats is taken number by number,
-    and XLA loses NaN in some of them.
-    """
-    return jax.lax.bitcast_convert_type(jnp.abs(a), jnp.int64)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels import cpu as algebra
+from vmri_jax import kernels
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import (
     CONSTRAINT_TOLERANCE,
@@ -64,7 +64,7 @@ def project_momentum(system: System, state: State, guess=None):
             rates = push(*velocity(p_s, p_f))
             if system.is_rheonomic:
                 rates = rates + _own_rates(system, t, q_s, q_f)
-            mu = algebra.solve(algebra.regularized(matrix), rates[:, None])[:, 0]
+            mu = kernels.solve(kernels.regularized(matrix), rates[:, None])[:, 0]
             pull_s, pull_f = pull(mu)
             p_s, p_f = p_s - pull_s, p_f - pull_f
         return p_s, p_f, *velocity(p_s, p_f)
@@ -95,16 +95,16 @@ def _velocity(system: System, q_s, q_f, jacobian, own, p, guess, max_iterations:
     def direction(at, v):
         system, q_s, q_f, jacobian, own, p = at
         hessian, gradient = (d(lambda v: kinetic(system, q_s, q_f, v))(v) for d in (jax.hessian, jax.grad))
-        matrix = algebra.saddle(hessian, jacobian.T, jacobian)
+        matrix = kernels.saddle(hessian, jacobian.T, jacobian)
         return jnp.linalg.solve(matrix, jnp.concatenate([p - gradient, -(jacobian @ v + own)]))[: v.size]
 
     def search(carry):
         v, k, _ = carry
         system, q_s, q_f, jacobian, own, p = fixed
         d = direction(fixed, v)
-        small = algebra.largest(d) <= 1e-9 * algebra.largest(v)  # the two steps at the end do the rest
+        small = kernels.max_abs(d) <= 1e-9 * kernels.max_abs(v)  # the two steps at the end do the rest
         merit = jax.vmap(lambda v: kinetic(system, q_s, q_f, v) - p @ v)(v + fractions[:, None] * d)
-        on_constraints = algebra.largest(jacobian @ v + own) <= 1e-9 * algebra.largest(v)
+        on_constraints = kernels.max_abs(jacobian @ v + own) <= 1e-9 * kernels.max_abs(v)
         better = jnp.isfinite(merit) & ((merit < merit[-1]) | ~on_constraints)
         stop = small | ~jnp.any(better)
         return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
@@ -117,7 +117,7 @@ def _velocity(system: System, q_s, q_f, jacobian, own, p, guess, max_iterations:
     for _ in range(2):  # Newton's map is flat at its fixed point: these two carry first and second derivatives
         d = direction(at, v)
         v = v + d
-    return jnp.where(algebra.largest(d) <= 1e-6 * algebra.largest(v) + 1e-300, v, jnp.nan)
+    return jnp.where(kernels.max_abs(d) <= 1e-6 * kernels.max_abs(v) + 1e-300, v, jnp.nan)
 
 
 def project_positions(system: System, t, q_s, q_f, iterations: int = 20):

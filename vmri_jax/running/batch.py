@@ -13,14 +13,12 @@ from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.checks import check_params, check_type
 from vmri_jax.mechanics.state import State, check_constraints
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.simulate import check_run, run, run_memory
+from vmri_jax.running.simulate import _alone, check_run, run, run_memory
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.runtime import OPTIONS
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.lanes import over_lanes
-from vmri_jax.steppers.newton import Newton, is_collocation
-from vmri_jax.steppers.split import split
+from vmri_jax.steppers.newton import Newton
 
 WORKING_SET = 4096
 """Numbers that the lanes of a chunk may hold together, 32 kB: the first-level cache."""
@@ -109,7 +107,7 @@ def simulate_batch(
     size = _chunk(system, stage_scheme(scheme), first) if chunk is None else chunk
     static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}
     go = partial(_in_chunks, system, scheme, chunk=size, devices=devices, **static)
-    alone = newton.alone(system, scheme)
+    alone = _alone(newton, system, scheme)
     batch = {"state": states}  # what differs between the lanes
     batch |= {} if params is None else {"params": params}
     batch |= {} if dt.ndim == 0 else {"macro_dt": macro_dt}

@@ -27,10 +27,10 @@ from vmri_jax.running.trajectory import RunInfo, Trajectory, join
 from vmri_jax.runtime import OPTIONS, in_one_kernel
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton, is_solved
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.plan import has_fallback, plan
+from vmri_jax.steppers.plan import projects_rarely as _projects_rarely
 from vmri_jax.steppers.results import Method, Result, SimulationError
-from vmri_jax.steppers.split import drifts
-from vmri_jax.steppers.step import Memory, Stages, advance, projected, start_memory
 
 
 def simulate(
@@ -105,7 +105,7 @@ class Checkpoint(NamedTuple):
 
     step: int
     state: State
-    memory: Memory | Stages
+    memory: Any
     fell_back: bool = False
 
 
@@ -127,7 +127,7 @@ class Simulation:
 
     def newton_for(self, fell_back: bool) -> Newton:
         """How steps are solved: "auto" is first the march alone (its fallback takes long to compile)."""
-        return self.newton if fell_back else self.newton.alone(self.system, self.scheme)
+        return self.newton if fell_back or not self.newton.falls_back else _alone(self.newton, self.system, self.scheme)
 
     def start(self, state: State, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """Before the first step, or before any as if it was the first one."""
@@ -144,7 +144,7 @@ class Simulation:
         failed = int(piece.failed_at)
         if failed < 0 or newton is self.newton:
             return piece, end
-        if int(jnp.max(piece.info.method)) < Method.MARCH:  # explicit or linear: no other method helps
+        if int(jnp.max(piece.info.method)) < Method.RATTLE:  # explicit or linear: no other method helps
             return piece, end
         kept = (failed - at.step) // self.save_every
         good = [piece.first(kept)] if kept else []
@@ -165,31 +165,28 @@ class Simulation:
         check_system(self.system, state.q_s, state.q_f)
         at = self.system, self.scheme, self.newton, self.macro_dt, self.t_start, state
         rules = stage_scheme(self.scheme)
-        falls_back = self.newton.alone(self.system, rules) is not self.newton
-        iterates = is_solved(self.system, rules, state.q_s, state.q_f)
+        falls_back = iterates = has_fallback(plan(self.system, rules, self.newton, state))
         whole = _march_first if falls_back and iterates else _whole
         return whole(saves, self.save_every, self.save_micro, at)
 
 
-def projects_rarely(system: System, scheme: Scheme | Composition, state: State, newton: Newton) -> bool:
-    """Whether a run may project its momenta only where they are looked at.
+def _alone(newton, system, scheme):
+    """Temporary."""
+    from vmri_jax.steppers.plan import _can_be_nested
 
-    A projection is a shift by ``G^T mu``, which the multipliers of the next step take back.
-    """
-    scheme = stage_scheme(scheme)
-    held = system.is_constrained and newton.marches(system, scheme)
-    return held and drifts(system, scheme, state.q_s, state.q_f)
+    return newton.without_fallback() if _can_be_nested(system, stage_scheme(scheme)) else newton
 
 
 def run(
     system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro
-) -> tuple[Trajectory, Memory | Stages]:
+) -> tuple[Trajectory, Any]:
     """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one."""
-    n, rarely = scheme.num_micro, projects_rarely(system, scheme, state, newton)
+    stepper = plan(system, scheme, newton, state)
+    n, rarely = scheme.num_micro, _projects_rarely(stepper)
 
     def step(_, carry):
         state, memory, k, (result, failed_at), worst, _ = carry
-        state, info, memory = advance(system, scheme, state, macro_dt, newton, memory, project=not rarely)
+        state, info, memory = stepper.step(state, memory, macro_dt)
         alive = failed_at < 0  # until the step before
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
         now = (info.method, info.iterations, info.residual)
@@ -208,7 +205,7 @@ def run(
         carry = (state, memory, k, status, worst, micro)
         state, memory, k, status, worst, micro = jax.lax.fori_loop(0, save_every, step, carry)
         if rarely:
-            state, memory = projected(system, state, memory)
+            state, memory = stepper.project(state, memory)
         return (state, memory, k, status), (state, worst, micro)
 
     status = (jnp.asarray(int(Result.CONVERGED)), jnp.asarray(-1))
@@ -266,7 +263,7 @@ def _march_first(num_saves: int, save_every: int, save_micro: bool, at) -> Traje
         return _whole(num_saves, save_every, save_micro, (system, scheme, newton, *rest))
 
     system, scheme, newton, *rest = at
-    found = by(newton.alone(system, scheme))
+    found = by(_alone(newton, system, scheme))
     exact = dataclasses.replace(newton, method="arrowhead")
     return jax.lax.cond(found.failed_at < 0, lambda: found, lambda: by(exact))
 
@@ -295,7 +292,7 @@ def _run_in_one_kernel(
 def run_memory(system, scheme, state, macro_dt, newton):
     """`start_memory`; what the user's functions return is checked while tracing."""
     check_system(system, state.q_s, state.q_f)
-    return start_memory(system, scheme, state, macro_dt, newton)
+    return plan(system, scheme, newton, state).init(state, macro_dt)
 
 
 def _sizes(num_saves: int, progress: bool):
@@ -370,3 +367,10 @@ def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> Simul
         float(trajectory.info.residual[interval]),
         trajectory,
     )
+
+
+def macro_step(system, scheme, state, macro_dt, newton=None):
+    """One macro step."""
+    stepper = plan(system, scheme, newton or Newton(), state)
+    state, info, own = stepper.step(state, stepper.init(state, macro_dt), macro_dt)
+    return (stepper.project(state, own)[0] if _projects_rarely(stepper) else state), info

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels.cpu import matmul
+from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.system import ConstantMass, System
 from vmri_jax.schemes.path import Nodes, Path, lagrange_derivative, position_nodes, velocity_nodes
 from vmri_jax.schemes.scheme import Scheme
@@ -25,7 +25,7 @@ class Term:
 
     `integrand` takes the arguments it names, e.g. ``("q_s", "q_f")``. Weights at the ends of the macro interval
     are held apart for terms without velocities (None where there is no such node): those are kicks, from averaged
-    positions where `mollified`. `grid` is where its rule was placed.
+    positions where `mollified`. `grid` is where its rule was placed; `name` is for people.
     """
 
     integrand: Callable
@@ -37,6 +37,7 @@ class Term:
     grid: str = "micro"
     mollified: bool = False
     power: int = 0
+    name: str = ""
 
     def times_step(self, macro_dt):
         """What the weights are multiplied by."""
@@ -162,8 +163,8 @@ class Sum:
 def lagrangian(system: System, scheme: Scheme) -> Sum:
     """``T - V - W`` of a system, each term on the nodes the scheme gives it."""
     kinetic = _kinetic(system, scheme)
-    slow = _on_position_nodes(system.slow_potential, ("q_s", "q_f"), scheme.slow, scheme, system)
-    fast = _on_position_nodes(system.fast_potential, ("q_f",), scheme.fast, scheme, system)
+    slow = _on_position_nodes(system.slow_potential, ("q_s", "q_f"), scheme.slow, scheme, system, "V")
+    fast = _on_position_nodes(system.fast_potential, ("q_f",), scheme.fast, scheme, system, "W")
     return kinetic - slow - fast + _corrections(system, scheme)
 
 
@@ -190,9 +191,9 @@ def _corrections(system: System, scheme: Scheme) -> Sum:
 
     terms = Sum(())
     if scheme.slow.corrected and slow_potential is not None:
-        terms += _on_position_nodes(slow, ("q_s", "q_f"), scheme.slow, scheme, system)
+        terms += _on_position_nodes(slow, ("q_s", "q_f"), scheme.slow, scheme, system, "the correction of V")
     if both:
-        terms += _on_position_nodes(fast, ("q_f",), scheme.fast, scheme, system)
+        terms += _on_position_nodes(fast, ("q_f",), scheme.fast, scheme, system, "the correction of W")
     return Sum(tuple(replace(term, power=2) for term in terms.terms))
 
 
@@ -203,14 +204,12 @@ def _kinetic(system, scheme) -> Sum:
     return Sum((Term(lambda *z: system.kinetic(*z, system.params), ("q_s", "q_f", "v_s", "v_f"), nodes),))
 
 
-def _on_position_nodes(function, arguments, placed, scheme, system) -> Sum:
+def _on_position_nodes(function, arguments, placed, scheme, system, name: str) -> Sum:
     if function is None:
         return Sum(())
     start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
-    node = Term(
-        lambda *q: function(*q, system.params), arguments, inside, start, end, 1.0, placed.grid, placed.mollified
-    )
-    return Sum((node,))
+    ends = {"start": start, "end": end, "grid": placed.grid, "mollified": placed.mollified, "name": name}
+    return Sum((Term(lambda *q: function(*q, system.params), arguments, inside, **ends),))
 
 
 def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:

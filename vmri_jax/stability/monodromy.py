@@ -17,7 +17,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import QUICK
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
-from vmri_jax.steppers.step import macro_step
+from vmri_jax.running.simulate import macro_step
 
 
 @dataclass(frozen=True)

@@ -1,45 +1,256 @@
-"""How a macro step of a system under a scheme is taken: decided once, from structure alone."""
+"""The plan: how a macro step of a system under a scheme is taken, decided once, from structure alone.
 
-from dataclasses import dataclass
+The cheapest stepper that the rules and the system allow is found from outside to inside:
+
+* *composed*: a composition runs its stage over parts of the step;
+* *kicked*: potentials at the ends of the interval only shift momenta, before and after everything else;
+* *decoupled*: where, kicks aside, the slow equations do not see the fast unknowns, the slow variables make one step over the
+  macro interval and the fast ones num_micro steps over the micro intervals, each a problem of the same kind;
+* *free flight*: nothing but kinetic energy of constant masses is left;
+* *linear*: what is left is linear, in fast variables alone;
+* else equations are solved: for the multipliers of a drift (*Rattle*), for one interval of high degree (*collocation*), for the
+  micro intervals in order (*nested*), or for all unknowns at once (*coupled*), also where one of the others fails (*fallback*).
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
 
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.structure import depends_on
+from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
+from vmri_jax.schemes.quadrature import PlacedRule, micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.collocation import Collocation
+from vmri_jax.steppers.composed import Composed, Projected
+from vmri_jax.steppers.coupled import Coupled
+from vmri_jax.steppers.decoupled import Decoupled
+from vmri_jax.steppers.free_flight import FreeFlight
+from vmri_jax.steppers.interval import Interval, implicit_terms
+from vmri_jax.steppers.kicked import Kicked, average_over_fast_motion
+from vmri_jax.steppers.linear import Linear
+from vmri_jax.steppers.nested import SMALL, Nested
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.split import drifts
-from vmri_jax.steppers.step import StepInfo, advance, projected, start_memory
-
-
-@dataclass(frozen=True)
-class Stepper:
-    """Takes macro steps: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)`` again and again.
-
-    Attributes:
-        projects_rarely: whether momenta need the projection only where they are looked at; else `project` follows every step.
-    """
-
-    system: System
-    scheme: Scheme | Composition
-    newton: Newton
-    projects_rarely: bool
-
-    def init(self, state: State, macro_dt):
-        """What the first step starts from besides the state."""
-        return start_memory(self.system, self.scheme, state, macro_dt, self.newton)
-
-    def step(self, state: State, own, macro_dt) -> tuple[State, StepInfo, object]:
-        """One macro step, momenta not projected."""
-        return advance(self.system, self.scheme, state, macro_dt, self.newton, own, project=False)
-
-    def project(self, state: State, own) -> tuple[State, object]:
-        """Momenta onto the hidden constraints."""
-        return projected(self.system, state, own)
+from vmri_jax.steppers.rattle import Rattle
+from vmri_jax.steppers.solved import Fallback, Solved, Solver
+from vmri_jax.steppers.stepper import Stepper
 
 
 def plan(system: System, scheme: Scheme | Composition, newton: Newton, state: State) -> Stepper:
-    """The stepper for states of this shape."""
+    """The stepper for a system and a scheme; ``print`` shows it in words.
+
+    Args:
+        system, scheme: what moves, and how.
+        newton: how implicit equations are solved.
+        state: any state of the system; only the shapes of its arrays matter.
+
+    Raises:
+        ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
+    """
     stage = stage_scheme(scheme)
-    held = system.is_constrained and newton.marches(system, stage)
-    rarely = held and drifts(system, stage, state.q_s, state.q_f)
-    return Stepper(system, scheme, newton, rarely)
+    stepper: Stepper = _whole_step(system, stage, newton, state.q_s, state.q_f)
+    needs_projection = system.is_constrained or not isinstance(system.kinetic, ConstantMass)
+    if needs_projection and not projects_rarely(stepper):
+        stepper = Projected(stepper)
+    return Composed(scheme.coefficients, stepper) if isinstance(scheme, Composition) else stepper
+
+
+def projects_rarely(stepper: Stepper) -> bool:
+    """Whether momenta have to be projected only where they are looked at.
+
+    A projection is a shift by ``G^T mu``, which the multipliers of the next step take back where nothing but a drift moves along
+    the constraints.
+    """
+    if isinstance(stepper, Composed):
+        return projects_rarely(stepper.stage)
+    if isinstance(stepper, Kicked):
+        return projects_rarely(stepper.inner)
+    if isinstance(stepper, Decoupled):
+        parts = [part.inner for part in (stepper.slow, stepper.fast)]
+        return any(map(projects_rarely, parts)) and all(
+            projects_rarely(part) for part in parts if isinstance(part, Solved) and part.system.is_constrained
+        )
+    return isinstance(stepper, Solved) and isinstance(_first(stepper.solver), Rattle)
+
+
+def has_fallback(stepper: Stepper) -> bool:
+    """Whether a solver inside may give way to another one."""
+    inner = [getattr(stepper, name) for name in ("inner", "stage", "slow", "fast") if hasattr(stepper, name)]
+    return any(map(has_fallback, inner)) or (isinstance(stepper, Solved) and isinstance(stepper.solver, Fallback))
+
+
+def _first(solver: Solver) -> Solver:
+    return solver.first if isinstance(solver, Fallback) else solver
+
+
+def _whole_step(system: System, scheme: Scheme, newton: Newton, q_s, q_f) -> Kicked:
+    """Kicks, and what happens between them."""
+    kicks = lagrangian(system, scheme).kicks
+    average = _average(system, scheme, newton)
+    if is_decoupled(system, scheme, q_s, q_f):
+        between = _decoupled(system, scheme, newton, q_s, q_f)
+        kicks = tuple(term for term in kicks if term.grid == "macro" and not term.inside.groups)
+        return Kicked(kicks, between, average)
+    return Kicked(kicks, _between_kicks(system, scheme, newton, q_s, q_f), average)
+
+
+def _between_kicks(system: System, scheme: Scheme, newton: Newton, q_s, q_f) -> Stepper:
+    can_be_nested = _can_be_nested(system, scheme)
+    if newton.method == "nested" and not can_be_nested:
+        raise ValueError(
+            "Newton: method 'nested' needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the "
+            "macro nodes; a term of this scheme has nodes inside the macro interval. Take 'auto' or 'arrowhead'."
+        )
+    if _is_drift(system, scheme) and not system.is_constrained:
+        return FreeFlight(system)
+    if not can_be_nested or newton.method not in ("auto", "nested"):
+        linear_solver = "dense" if newton.method == "dense" else "arrowhead"
+        return Solved(system, scheme, Coupled(newton, linear_solver))
+    interval = Interval.of(system, scheme, q_s, q_f)
+    if _is_linear(system, scheme, interval, q_s):
+        return Linear(system, scheme, interval)
+    solver = _first_choice(system, scheme, newton, interval, q_s, q_f)
+    if newton.falls_back:
+        solver = Fallback(solver, Coupled(newton, "arrowhead"))
+    return Solved(system, scheme, solver)
+
+
+def _first_choice(system: System, scheme: Scheme, newton: Newton, interval: Interval, q_s, q_f) -> Solver:
+    if _is_drift(system, scheme):
+        return Rattle(newton)
+    single = scheme.num_micro == 1 and scheme.degree > 1
+    small = (q_f.size or q_s.size) <= SMALL  # a large matrix is better kept for many steps, which the march does
+    if single and small and system.force is None and not interval.is_diagonal:
+        return Collocation(newton)
+    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
+    has_kicks = any(f is not None and placed.grid == "macro" for f, placed in potentials)
+    return Nested(newton, interval, has_kicks)
+
+
+def _can_be_nested(system: System, scheme: Scheme) -> bool:
+    """Whether every term lives on single micro intervals or is a kick at the macro nodes, with constant masses."""
+    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
+    local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
+    force = system.force is None or scheme.force.grid == "micro"
+    return isinstance(system.kinetic, ConstantMass) and local and force
+
+
+def _is_drift(system: System, scheme: Scheme) -> bool:
+    """Whether on a single micro interval, kicks aside, only kinetic energy of constant masses and constraints are left."""
+    terms = lagrangian(system, scheme).terms
+    return (
+        scheme.num_micro == scheme.degree == 1
+        and isinstance(system.kinetic, ConstantMass)
+        and system.force is None
+        and not any(term.inside.groups for term in terms if isinstance(term, Term))
+    )
+
+
+def _is_linear(system: System, scheme: Scheme, interval: Interval, q_s) -> bool:
+    """Whether there are only fast equations on one interval, linear ones with the matrix K."""
+    alone = not system.is_constrained and system.force is None and not q_s.shape[0] and scheme.num_micro == 1
+    complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
+    return alone and interval.is_constant and (complete or not interval.is_diagonal)
+
+
+def is_decoupled(system: System, scheme: Scheme, q_s, q_f) -> bool:
+    """Whether, kicks aside, the slow equations do not see the fast unknowns."""
+    params = system.params
+    if scheme.degree > 1 or system.force is not None or not isinstance(system.kinetic, ConstantMass):
+        return False
+    if scheme.num_micro == 1 and not q_s.shape[0]:
+        return False  # a part already
+    slow_potential, fast_potential = _inside_potentials(system, scheme)
+    if slow_potential is not None:
+        coupled = depends_on(lambda q: slow_potential(q_s, q, params), q_f)[0]
+        if coupled or scheme.slow.grid == "micro":
+            return False
+    if fast_potential is not None and scheme.fast.grid == "macro":
+        return False
+    return not depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
+
+
+def _inside_potentials(system: System, scheme: Scheme) -> tuple[Callable | None, Callable | None]:
+    """V and W, None where they only kick at the macro nodes."""
+    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
+    slow, fast = (None if placed.grid == "macro" and placed.only_ends else f for f, placed in potentials)
+    return slow, fast
+
+
+def _decoupled(system: System, scheme: Scheme, newton: Newton, q_s, q_f) -> Decoupled:
+    """Two systems of fast variables alone, each on a single interval."""
+    assert isinstance(system.kinetic, ConstantMass)
+    n_s, n_f, params = q_s.shape[0], q_f.shape[0], system.params
+    slow_potential, fast_potential = _inside_potentials(system, scheme)
+
+    def potential_of_slow(q, params):
+        return slow_potential(q, jnp.zeros(n_f), params)  # pyright: ignore[reportOptionalCall]
+
+    @Rheonomic
+    def constraint_of_slow(t, _, q, params):
+        return system.replace(params=params).g_slow(t, q)
+
+    @Rheonomic
+    def constraint_of_fast(t, _, q, params):
+        return system.replace(params=params).g(t, jnp.zeros(n_s), q)
+
+    none, drift = jnp.zeros(0), micro(midpoint)
+    slow = System(
+        ConstantMass(none, system.kinetic.slow),
+        fast_potential=None if slow_potential is None else potential_of_slow,
+        constraint=None if system.slow_constraint is None else constraint_of_slow,
+        params=params,
+    )
+    fast = System(
+        ConstantMass(none, system.kinetic.fast),
+        fast_potential=fast_potential,
+        constraint=None if system.constraint is None else constraint_of_fast,
+        params=params,
+    )
+    slow_scheme = Scheme(1, kinetic=drift, slow=drift, fast=PlacedRule(scheme.slow.rule, scheme.slow.grid))
+    fast_scheme = Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast)
+    return Decoupled(
+        _whole_step(slow, slow_scheme, newton, none, q_s),
+        _whole_step(fast, fast_scheme, newton, none, q_f),
+        scheme.num_micro,
+    )
+
+
+def _average(system: System, scheme: Scheme, newton: Newton) -> Callable | None:
+    """The filter of a mollified slow potential, if that is what the scheme has."""
+    if not scheme.slow.mollified:
+        return None
+    if not isinstance(system.kinetic, ConstantMass) or system.is_rheonomic:
+        raise ValueError(
+            "Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass, without Rheonomic constraints."
+        )
+
+    def stepper_of(q_s) -> Kicked:
+        alone, rules = _fast_alone(system, scheme, q_s)
+        q_f = jnp.zeros(alone.kinetic.fast.shape[0])
+        return _whole_step(alone, rules, newton, jnp.zeros(0), q_f)
+
+    return average_over_fast_motion(stepper_of, scheme.num_micro)
+
+
+def _fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
+    """The fast variables under W and g with the slow ones at rest in q_s, and the scheme of one micro interval of them."""
+    assert isinstance(system.kinetic, ConstantMass)
+    fast_potential = system.fast_potential
+
+    def potential(q, at):
+        return fast_potential(q, at[0])  # pyright: ignore[reportOptionalCall]
+
+    def constraint_at_rest(_, q, at):
+        return system.replace(params=at[0]).g(jnp.zeros(()), at[1], q)
+
+    alone = System(
+        ConstantMass(jnp.zeros(0), system.kinetic.fast),
+        fast_potential=None if fast_potential is None else potential,
+        constraint=None if system.constraint is None else constraint_at_rest,
+        params=(system.params, q_s),
+    )
+    rule = micro(scheme.kinetic.rule)
+    return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)

@@ -67,16 +67,18 @@ RUNNING = -1
 
 
 class Method(IntEnum):
-    """How the equations of a step were solved, in order of cost; of several the most expensive one is reported.
+    """Which stepper took a step, in order of cost; of several the most expensive one is reported.
 
-    EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. The others are methods of `Newton`.
+    EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. RATTLE: the multipliers of a drift along the
+    constraints. NESTED: the slow path outside, micro intervals in order inside. COLLOCATION: one interval of high degree,
+    in modes of time. ARROWHEAD, DENSE: Newton's iteration on all unknowns of the macro step.
     """
 
     EXPLICIT = 0
     LINEAR = 1
-    MARCH = 2
-    DECOUPLED = 3
-    FROZEN = 4
+    RATTLE = 2
+    NESTED = 3
+    COLLOCATION = 4
     ARROWHEAD = 5
     DENSE = 6
 

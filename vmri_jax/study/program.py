@@ -14,7 +14,8 @@ from vmri_jax.runtime import OPTIONS, in_one_kernel
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.step import start_memory
+from vmri_jax.steppers.plan import plan
+from vmri_jax.running.simulate import _alone
 
 TRAJECTORY = jax.tree.structure(Trajectory(*[0.0] * 7, info=RunInfo(0, 0, 0), result=0, failed_at=0))
 """How a trajectory without micro nodes is made of its arrays."""
@@ -33,7 +34,7 @@ def _compiled_for(structure, num_saves: int):
     def run_all(leaves, num_steps, save_every):
         system, scheme, newton, state, t_end = jax.tree.unflatten(structure, leaves)
         macro_dt = t_end / num_steps
-        memory = start_memory(system, scheme, state, macro_dt, newton)
+        memory = plan(system, scheme, newton, state).init(state, macro_dt)
         saves = 0, num_saves, save_every, False
         trajectory, _ = run(system, scheme, newton, macro_dt, state.t, state, memory, *saves)
         return jax.tree.leaves(trajectory)
@@ -68,7 +69,7 @@ class Program:
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
         self.newton, self.state = newton or Newton(), problem.state()
         check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, 1)
-        self._alone = self.newton.alone(problem.system, scheme)
+        self._alone = _alone(self.newton, problem.system, scheme)
         self.compile_seconds = float("nan")
 
     @cached_property

@@ -1,18 +1,5 @@
-"""Newton's iteration for the equations of a macro step: methods, linear solvers, derivative."""
+"""Newton's iteration over all unknowns of a macro step: options, linear solvers, derivative of the solution."""
 
-from vmri_jax.steppers.newton import drift, march
-from vmri_jax.steppers.newton.collocation import is_collocation
-from vmri_jax.steppers.newton.interval import IntervalMatrix, interval_matrix, is_constant
-from vmri_jax.steppers.newton.iteration import Newton, is_solved, solve
+from vmri_jax.steppers.newton.options import Newton
 
-__all__ = [
-    "IntervalMatrix",
-    "Newton",
-    "drift",
-    "interval_matrix",
-    "is_collocation",
-    "is_constant",
-    "is_solved",
-    "march",
-    "solve",
-]
+__all__ = ["Newton"]

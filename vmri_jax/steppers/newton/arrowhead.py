@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.kernels.cpu import saddle
-from vmri_jax.schemes.equations import Unknowns
-from vmri_jax.steppers.newton.linearization import Blocks
+from vmri_jax.kernels import saddle
+from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.steppers.newton.linearization import Blocks, linearize
 
 
 class Factors(NamedTuple):
@@ -31,13 +31,11 @@ class Factors(NamedTuple):
     border: Any
 
 
-def factor(blocks: Blocks, like: Unknowns, coupled: bool = True) -> Factors:
-    """Eliminate the chain; `like` gives the shapes of the unknowns.
-
-    With ``coupled=False`` the response of slow and fast variables to each other is left out: cheaper, not exact.
-    """
-    n, r, n_f = like.fast.shape
-    n_s, n_gs, n_g = like.slow.shape[1], like.slow_multiplier.shape[1], like.multiplier.shape[2]
+def factor(equations: StepEquations, x: Unknowns) -> Factors:
+    """Eliminate the chain of the matrix at x."""
+    blocks = linearize(equations, x)
+    n, r, n_f = x.fast.shape
+    n_s, n_gs, n_g = x.slow.shape[1], x.slow_multiplier.shape[1], x.multiplier.shape[2]
     border = r * n_s
     nodes = jnp.eye(r)
 
@@ -46,13 +44,9 @@ def factor(blocks: Blocks, like: Unknowns, coupled: bool = True) -> Factors:
     top_left = blocks.ff[:, :-1, :, 1:].reshape(n, r * n_f, r * n_f)
     chain = jnp.linalg.inv(saddle(top_left, top_right, bottom_left))
 
-    if coupled:
-        slots = blocks.fs.reshape(n, r + 1, n_f, border)
-        g = jnp.einsum("mji,mjgb->mjgib", blocks.basis[:, 1:, 1:], blocks.g_s[:, 1:]).reshape(n, r, n_g, border)
-        response, slow_rows = _march(blocks, chain, slots, g)
-    else:
-        response, slow_rows = jnp.zeros((n, r * (n_f + n_g), border)), jnp.zeros((r, n_s, border))
-        blocks = blocks._replace(sf=jnp.zeros_like(blocks.sf))
+    slots = blocks.fs.reshape(n, r + 1, n_f, border)
+    g = jnp.einsum("mji,mjgb->mjgib", blocks.basis[:, 1:, 1:], blocks.g_s[:, 1:]).reshape(n, r, n_g, border)
+    response, slow_rows = _march(blocks, chain, slots, g)
 
     force = -jnp.einsum("iga,ij->iajg", blocks.g_slow[:-1], nodes).reshape(border, r * n_gs) / n
     jacobian = jnp.einsum("iga,ij->igja", blocks.g_slow[1:], nodes).reshape(r * n_gs, border)

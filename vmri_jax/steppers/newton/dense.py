@@ -1,25 +1,23 @@
 """Newton direction by one dense factorisation over all unknowns of the macro step: O(num_micro^3).
 
-The way of the reference paper; kept as baseline and oracle.
+The way of the reference paper; kept as baseline and oracle. The matrix is the derivative of the whole residual.
 """
 
 import jax
-import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from vmri_jax.schemes.equations import Unknowns
-from vmri_jax.steppers.newton.linearization import Blocks, apply
+from vmri_jax.schemes.equations import StepEquations, Unknowns
 
 
-def assemble(blocks: Blocks, like: Unknowns):
-    """The matrix over all unknowns in a row; `like` gives their shapes."""
-    flat, unravel = ravel_pytree(like)
-    return jax.vmap(lambda e: ravel_pytree(apply(blocks, unravel(e)))[0])(jnp.eye(flat.size)).T
+def matrix(equations: StepEquations, x: Unknowns):
+    """``dR/dx`` over all unknowns in a row."""
+    flat, unravel = ravel_pytree(x)
+    return jax.jacfwd(lambda z: ravel_pytree(equations.residual(unravel(z)))[0])(flat)
 
 
-def factor(blocks: Blocks, like: Unknowns):
-    """LU factors of the assembled matrix."""
-    return jax.scipy.linalg.lu_factor(assemble(blocks, like))
+def factor(equations: StepEquations, x: Unknowns):
+    """LU factors of the matrix at x."""
+    return jax.scipy.linalg.lu_factor(matrix(equations, x))
 
 
 def solve(factors, residual: Unknowns) -> Unknowns:

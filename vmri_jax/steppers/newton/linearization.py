@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
-from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes, sum_before
+from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import NodeGroup, Nodes, control_node_groups, lagrange_basis, lagrange_derivative
 
 
@@ -152,28 +152,3 @@ def _dependence(nodes: Nodes, group: NodeGroup, name: str, macro_dt):
     if not velocity:
         return jnp.asarray(lagrange_basis(nodes.degree, at))
     return jnp.asarray(lagrange_derivative(nodes.degree, at)) / (macro_dt if slow else macro_dt / nodes.num_micro)
-
-
-def apply(blocks: Blocks, x: Unknowns) -> Unknowns:
-    """The Newton matrix times a vector, from the blocks."""
-    n = x.fast.shape[0]
-    start = sum_before(x.fast[:, -1])
-    fast = jnp.concatenate([start[:, None], x.fast], axis=1)  # [start, increments] of each micro interval
-    slow_at = jnp.einsum("mji,ia->mja", blocks.basis[..., 1:], x.slow)  # slow change at each control node
-    fast_at = jnp.concatenate([start[:, None], start[:, None] + x.fast], axis=1)
-
-    fast_slots = jnp.einsum("miajb,mjb->mia", blocks.ff, fast) + jnp.einsum("miajb,jb->mia", blocks.fs, x.slow)
-    fast_slots -= jnp.pad(jnp.einsum("mjga,mjg->mja", blocks.g_f[:, :-1], x.multiplier), [(0, 0), (0, 1), (0, 0)])
-    incoming = jnp.concatenate([jnp.zeros_like(fast_slots[:1, -1]), fast_slots[:-1, -1]])
-
-    slow_slots = jnp.einsum("miajb,mjb->ia", blocks.sf, fast) + jnp.einsum("iajb,jb->ia", blocks.ss, x.slow)
-    slow_slots -= jnp.einsum("mji,mjga,mjg->ia", blocks.basis[:, :-1], blocks.g_s[:, :-1], x.multiplier)
-    slow_slots -= jnp.pad(jnp.einsum("iga,ig->ia", blocks.g_slow[:-1], x.slow_multiplier) / n, [(0, 1), (0, 0)])
-
-    return Unknowns(
-        slow=slow_slots[:-1],
-        slow_multiplier=jnp.einsum("iga,ia->ig", blocks.g_slow[1:], x.slow),
-        fast=fast_slots[:, :-1].at[:, 0].add(incoming),
-        multiplier=jnp.einsum("mjga,mja->mjg", blocks.g_f[:, 1:], fast_at[:, 1:])
-        + jnp.einsum("mjga,mja->mjg", blocks.g_s[:, 1:], slow_at[:, 1:]),
-    )

@@ -15,6 +15,7 @@ Ordinary Differential Equations II, IV.8). Of these only as many rows are solved
 potentials are curved along. Forces are exact, so that all of this decides only how many steps there are.
 """
 
+from dataclasses import dataclass
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -22,38 +23,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels.cpu import ELEMENTWISE, inverse, largest, matmul, regularized
+from vmri_jax.kernels import inverse, matmul, max_abs, regularized
 from vmri_jax.mechanics.structure import curved_directions
-from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import interpolatory_weights
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.lanes import over_lanes
-from vmri_jax.steppers.newton.interval import (
-    Accepted,
-    constant_mass,
-    expected,
-    inverse_mass,
-    is_linear,
-    is_per_coordinate,
-)
-from vmri_jax.steppers.results import RUNNING
+from vmri_jax.steppers.interval import Accepted, constant_mass, expected, inverse_mass
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import RUNNING, Method
+from vmri_jax.steppers.solved import Solution, Solver, status_of
 
 FEW_MODES = 4
 """Parts of no mode are added to more pairs of modes than that, if they are odd: half a vector register costs as much as a full one."""
-
-
-def is_collocation(system: System, scheme: Scheme, q_s, q_f) -> bool:
-    """Whether a step is a single interval of degree above one, with a small full matrix of the fast variables.
-
-    A large one is better kept for many steps, which the march does.
-    """
-    small = (q_f.size or q_s.size) <= ELEMENTWISE
-    if scheme.num_micro > 1 or scheme.degree == 1 or system.force is not None or not small:
-        return False
-    return not is_per_coordinate(system, scheme, q_f) and not is_linear(system, scheme, q_s, q_f)
 
 
 class TimeModes(NamedTuple):
@@ -110,7 +93,7 @@ def _form(basis, degree: int, nodes) -> np.ndarray:
     return at.T @ (interpolatory_weights(nodes)[:, None] * at)
 
 
-class Interval:
+class CollocatedInterval:
     """The equations of the step, with the variables joined, q = (q_s, q_f), and nodes as the last axis.
 
     num_curved: how many variables, the last ones, the Hessian is taken by: the fast ones where there are any.
@@ -192,7 +175,7 @@ class Interval:
             return g, -pull(mu)[0]
 
         later = jnp.concatenate([mu[:, 1:], jnp.zeros_like(mu[:, :1])], axis=1)
-        g, total = over_lanes(at_node, self.r)((self.times[1:], q, later))
+        g, total = at_nodes(at_node)((self.times[1:], q, later))
         first = -jnp.sum(mu[:, :1] * self.at_start, axis=0)
         for term in self.potentials:
             theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
@@ -201,10 +184,10 @@ class Interval:
             before, k = int(np.argmax(basis[0, 1:])), len(theta)
             consecutive = np.eye(self.r + 1)[before + 1 : before + 1 + k]
             if np.array_equal(basis, consecutive):  # nodes of the path: nothing to interpolate
-                d = over_lanes(gradient, k)(q[:, before : before + k])
+                d = at_nodes(gradient)(q[:, before : before + k])
                 total += jnp.pad(weights * d, ((0, 0), (before, self.r - before - k)))
             else:
-                d = over_lanes(gradient, k)(self.q[:, None] + x @ basis[:, 1:].T)
+                d = at_nodes(gradient)(self.q[:, None] + x @ basis[:, 1:].T)
                 first += d @ (weights * basis[:, 0])
                 total += d @ (weights[:, None] * basis[:, 1:])
         inside = jnp.concatenate([(self.h * self.p + first)[:, None], total[:, :-1]], axis=1)
@@ -266,7 +249,7 @@ class Saddles(NamedTuple):
     schur: Any
 
     @classmethod
-    def at(cls, interval: Interval, modes: TimeModes, t, q) -> "Saddles":
+    def at(cls, interval: CollocatedInterval, modes: TimeModes, t, q) -> "Saddles":
         """With Hessian and Jacobian at a point."""
         along, jacobian = interval.directions, interval.jacobian(t, q)
         bend, pull = interval.over_mass(interval.h**2 * interval.curvature(q)), interval.over_mass(jacobian.T)
@@ -345,50 +328,70 @@ class Evaluated(NamedTuple):
     result: Any
 
 
+def at_nodes(function):
+    """`function` at all nodes, which are the last axis."""
+    return jax.vmap(function, in_axes=-1, out_axes=-1)
+
+
 def only_if(wanted, function, x):
     """``function(x)``, or x itself. As a loop of at most one pass: of two branches, lanes would always compute both."""
     return jax.lax.while_loop(lambda a: a[0], lambda a: (jnp.asarray(False), function(a[1])), (wanted, x))[1]
 
 
-def solve(equations: StepEquations, guess: Unknowns, newton) -> tuple[Iterate, Unknowns, Any, Any]:
+@dataclass(frozen=True)
+class Collocation(Solver):
     """Newton steps until one more would change no increment.
 
     What it would change them by is known from how the corrections shrink. Accepted are changes of ``newton.tolerance``
     relative to the motion over the step, and round-off of the positions.
-
-    Returns:
-        (state of the iteration, unknowns, (q_f, p_s, p_f) at the end of the step, largest row of the momentum equations (times h)
-        and largest value of a constraint)
     """
-    interval, modes = Interval(equations), TimeModes.of(equations.scheme)
-    n_s, (n_g, _) = interval.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
-    x = jnp.concatenate([guess.slow, guess.fast[0]], axis=1).T
-    mu = jnp.concatenate([guess.multiplier[0], guess.slow_multiplier], axis=1).T
-    saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
-    accepted = Accepted.of(equations, newton)
 
-    def slow_and_fast(x):
-        return largest(x[:n_s]), largest(x[n_s:])
+    newton: Newton
 
-    def corrected(last: Iterate, forces: Forces) -> Iterate:
-        missing = last.x + interval.over_mass(forces.inside) @ modes.of_rows  # what these forces do not bring about
-        dx, dmu = saddles.solve(-missing, -forces.g)
-        x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
-        left = map(expected, moved, last.moved)
-        return Iterate(x, mu, moved, iterations, newton.status(accepted.over(left, slow_and_fast(x)), iterations))
+    def solve(self, equations: StepEquations, guess: Unknowns, own: tuple) -> tuple[Solution, tuple]:
+        newton = self.newton
+        interval, modes = CollocatedInterval(equations), TimeModes.of(equations.scheme)
+        n_s, (n_g, _) = interval.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
+        x = jnp.concatenate([guess.slow, guess.fast[0]], axis=1).T
+        mu = jnp.concatenate([guess.multiplier[0], guess.slow_multiplier], axis=1).T
+        saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
+        accepted = Accepted.of(equations, newton)
 
-    def step(at: Evaluated) -> Evaluated:
-        """Forces first: evaluated in one place, they are compiled once."""
-        last, fixed = at.last, newton.fixed_iterations
-        forces = interval.forces(last.x, last.mu)
-        goes_on = last.result == RUNNING if fixed is None else last.iterations < fixed
-        return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
+        def slow_and_fast(x):
+            return max_abs(x[:n_s]), max_abs(x[n_s:])
 
-    running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(interval.q), jnp.zeros_like(mu))
-    start = Iterate(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
-    last, forces, _ = newton.iterate(step, Evaluated(start, none, running), -1)  # forces once more than corrections
-    p, rows = interval.momentum(last.x, forces), interval.residual(last.x, forces)
-    x, mu = last.x.T, last.mu.T
-    unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
-    end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
-    return last, unknowns, end, (largest(rows), largest(forces.g))
+        def corrected(last: Iterate, forces: Forces) -> Iterate:
+            missing = last.x + interval.over_mass(forces.inside) @ modes.of_rows  # what these forces do not bring about
+            dx, dmu = saddles.solve(-missing, -forces.g)
+            x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
+            left = map(expected, moved, last.moved)
+            return Iterate(x, mu, moved, iterations, newton.status(accepted.over(left, slow_and_fast(x)), iterations))
+
+        def step(at: Evaluated) -> Evaluated:
+            """Forces first: evaluated in one place, they are compiled once."""
+            last, fixed = at.last, newton.fixed_iterations
+            forces = interval.forces(last.x, last.mu)
+            goes_on = last.result == RUNNING if fixed is None else last.iterations < fixed
+            return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
+
+        running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(interval.q), jnp.zeros_like(mu))
+        start = Iterate(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
+        last, forces, _ = newton.iterate(step, Evaluated(start, none, running), -1)  # forces once more than corrections
+
+        p, rows = interval.momentum(last.x, forces), interval.residual(last.x, forces)
+        x, mu = last.x.T, last.mu.T
+        unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
+        end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
+        status = status_of(
+            equations,
+            last.result,
+            Method.COLLOCATION,
+            last.iterations,
+            max_abs(rows),
+            max_abs(forces.g),
+            newton.tolerance,
+        )
+        return Solution(unknowns, end, status), own
+
+    def lines(self) -> list[str]:
+        return ["one interval of high degree: all variables at once, in modes of time"]

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels.cpu import inverse, largest, matmul, solve
+from vmri_jax.kernels import inverse, matmul, max_abs, solve
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import gauss
-from vmri_jax.steppers.newton.interval import constant_mass, interval_problem, inverse_mass, solve_saddle
+from vmri_jax.steppers.interval import constant_mass, interval_problem, inverse_mass, solve_saddle
 
 NODES = 4
 """Gauss nodes of a macro step at which the slow forces are linearised."""
@@ -146,7 +146,7 @@ def minimal_residuals(operator, b):
 
     def goes_on(at):
         i, _, rest, *_ = at
-        return (i < ITERATIONS) & (largest(rest) > ENOUGH * largest(b))
+        return (i < ITERATIONS) & (max_abs(rest) > ENOUGH * max_abs(b))
 
     def move_on(at):
         i, x, rest, move, change, squared = at

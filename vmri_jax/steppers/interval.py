@@ -1,18 +1,18 @@
 """One micro interval as a problem of its own, and the Newton matrix its fast increments are corrected with."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels.cpu import inverse, largest, matmul, matvec, regularized, solve
+from vmri_jax.kernels import inverse, matmul, matvec, max_abs, regularized, solve
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian
 from vmri_jax.mechanics.system import ConstantMass, System
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.schemes.path import control_nodes, lagrange_basis
+from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
 from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
@@ -35,7 +35,7 @@ class Accepted(NamedTuple):
 
     @classmethod
     def of(cls, equations: StepEquations, newton) -> "Accepted":
-        floors = (ROUNDOFF * jnp.finfo(float).eps * largest(q) for q in (equations.q_s, equations.q_f))
+        floors = (ROUNDOFF * jnp.finfo(float).eps * max_abs(q) for q in (equations.q_s, equations.q_f))
         return cls(newton.tolerance / SAFETY, *floors)
 
     def sizes(self, motions) -> tuple[Any, Any]:
@@ -53,20 +53,6 @@ class Accepted(NamedTuple):
 def expected(moved, before):
     """The next correction, with a margin, after this one and the one before."""
     return jnp.minimum(SAFETY * moved / (before + jnp.finfo(float).tiny), 1.0) * moved
-
-
-def can_be_cut(system: System, scheme: Scheme) -> bool:
-    """Whether every term lives on single micro intervals or is a kick at the macro nodes, with constant masses."""
-    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
-    local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
-    force = system.force is None or scheme.force.grid == "micro"
-    return isinstance(system.kinetic, ConstantMass) and local and force
-
-
-def has_kicks(system: System, scheme: Scheme) -> bool:
-    """Whether a potential acts at the macro nodes."""
-    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
-    return any(f is not None and placed.grid == "macro" for f, placed in potentials)
 
 
 def constant_mass(system: System) -> ConstantMass:
@@ -102,94 +88,109 @@ def implicit_terms(system: System, scheme: Scheme) -> list[Term]:
     return [term for term in terms if isinstance(term, Term) and term.inside.groups]
 
 
-def is_explicit_given_multipliers(system: System, scheme: Scheme) -> bool:
-    """Whether the fast increment of a micro interval is the momentum that arrives plus the constraint force."""
-    return scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
+class DiagonalMatrix(NamedTuple):
+    """K of a micro interval for every coordinate alone.
 
-
-class IntervalMatrix(NamedTuple):
-    """K, the derivative of the fast equations of a micro interval by its increments, without constraints.
-
-    inverse: of the rows of slots 0..r-1, (r, r, n_f) for every coordinate alone, or (r n_f, r n_f).
-    last: the row of slot r, which is the momentum handed on, (r, n_f) or (n_f, r n_f).
+    inverse: (r, r, n_f) of the rows of slots 0..r-1. last: (r, n_f) the row of slot r, which is the momentum handed on.
     """
 
     inverse: Any
     last: Any
 
-    @classmethod
-    def none(cls, system: System, scheme: Scheme, q_f) -> "IntervalMatrix":
-        """Where it comes with every macro step: the shapes, all zero."""
-        r, n_f = scheme.degree, q_f.shape[0]
-        if is_per_coordinate(system, scheme, q_f):
-            return cls(jnp.zeros((r, r, n_f)), jnp.zeros((r, n_f)))
-        return cls(jnp.zeros((r * n_f, r * n_f)), jnp.zeros((n_f, r * n_f)))
+    def solve(self, rows):
+        """The increments (r, n_f) for given rows (r, n_f)."""
+        return jnp.sum(self.inverse * rows[None], axis=1)
+
+    def outgoing(self, increments):
+        """Change (n_f,) of the last slot with the increments."""
+        return jnp.sum(self.last * increments, axis=0)
+
+
+class FullMatrix(NamedTuple):
+    """K of a micro interval: inverse (r n_f, r n_f) and last (n_f, r n_f), as in `DiagonalMatrix`."""
+
+    inverse: Any
+    last: Any
 
     def solve(self, rows):
         """The increments (r, n_f) for given rows (r, n_f)."""
-        if self.inverse.ndim == 3:
-            return jnp.sum(self.inverse * rows[None], axis=1)
         return matvec(self.inverse, rows.reshape(-1)).reshape(rows.shape)
 
     def outgoing(self, increments):
         """Change (n_f,) of the last slot with the increments."""
-        if self.inverse.ndim == 3:
-            return jnp.sum(self.last * increments, axis=0)
         return matvec(self.last, increments.reshape(-1))
 
 
-def is_per_coordinate(system: System, scheme: Scheme, q_f) -> bool:
-    """Whether K is taken for every fast coordinate alone: explicit fast equations, or W a sum over the coordinates.
+@dataclass(frozen=True)
+class Interval:
+    """What one micro interval is like, decided from structure.
 
-    V is then left out: it is the soft potential, and h^2 times its curvature is small beside the mass.
+    is_explicit: its fast increment is the momentum that arrives plus the constraint force.
+    is_diagonal: its matrix K, the derivative of its fast equations by its increments without constraints, is taken for every
+        fast coordinate alone: fast equations are explicit, or W is a sum over the coordinates. V is then left out: it is the
+        soft potential, and h^2 times its curvature is small beside the mass.
+    is_constant: K is the same for a whole run.
     """
-    if constant_mass(system).fast.ndim == 2:
-        return False
-    terms = implicit_terms(system, scheme)
-    fast = [term for term in terms if term.arguments == ("q_f",)]
-    return not terms or (bool(fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in fast))
+
+    is_explicit: bool
+    is_diagonal: bool
+    is_constant: bool
+
+    @classmethod
+    def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "Interval":
+        """For positions of these shapes."""
+        terms = implicit_terms(system, scheme)
+        of_fast = [term for term in terms if term.arguments == ("q_f",)]
+        sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
+        is_diagonal = constant_mass(system).fast.ndim == 1 and (not terms or sums)
+        is_constant = True
+        if is_diagonal:
+            terms = of_fast
+        elif system.force is not None or (scheme.degree > 1 and system.constraint is not None):
+            is_constant = False
+        q = {"q_s": q_s, "q_f": q_f}
+        is_constant = is_constant and all(
+            has_constant_hessian(term.integrand, *(q[a] for a in term.arguments)) for term in terms
+        )
+        is_explicit = scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
+        return cls(is_explicit, is_diagonal, is_constant)
+
+    def no_matrix(self, equations: StepEquations) -> DiagonalMatrix | FullMatrix:
+        """The shapes of K, all zero."""
+        r, n_f = equations.scheme.degree, equations.q_f.shape[0]
+        if self.is_diagonal:
+            return DiagonalMatrix(jnp.zeros((r, r, n_f)), jnp.zeros((r, n_f)))
+        return FullMatrix(jnp.zeros((r * n_f, r * n_f)), jnp.zeros((n_f, r * n_f)))
+
+    def matrix(self, equations: StepEquations) -> DiagonalMatrix | FullMatrix:
+        """K on the first micro interval of a macro step, on the straight path from its start."""
+        system, scheme = interval_problem(equations.system, equations.scheme)
+        start = equations.q_s, equations.q_f, equations.p_s, equations.p_f
+        local = StepEquations(system, scheme, equations.t, *start, equations.micro_dt)
+        velocities = constant_mass(system).velocity(equations.p_s, equations.p_f)
+        slow, fast = (local.macro_dt * control_nodes(scheme.degree)[1:, None] * v for v in velocities)
+        path = local.path(Unknowns(slow, None, fast[None], None))
+        return _diagonal_matrix(local, path) if self.is_diagonal else _full_matrix(local, path)
 
 
-def is_constant(system: System, scheme: Scheme, q_s, q_f) -> bool:
-    """Whether K is the same for a whole run."""
-    q = {"q_s": q_s, "q_f": q_f}
-    terms = implicit_terms(system, scheme)
-    if is_per_coordinate(system, scheme, q_f):
-        terms = [term for term in terms if term.arguments == ("q_f",)]
-    elif system.force is not None or (scheme.degree > 1 and system.constraint is not None):
-        return False
-    return all(has_constant_hessian(term.integrand, *(q[a] for a in term.arguments)) for term in terms)
+def _full_matrix(local: StepEquations, path: Path) -> FullMatrix:
+    kinetic = lagrangian(local.system, local.scheme).kinetic
+    _, r, n_f = path.fast.shape
+
+    def slots(increments):
+        at = replace(path, fast=increments[None])
+        d = jax.grad(local.without_kinetic)(at, at)
+        d_fast = d.fast[0] + kinetic.rows(path.slow, increments)[1]
+        return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast])
+
+    block = jax.jacfwd(slots)(path.fast[0])
+    return FullMatrix(inverse(block[:-1].reshape(r * n_f, r * n_f)), block[-1].reshape(n_f, r * n_f))
 
 
-def is_linear(system: System, scheme: Scheme, q_s, q_f) -> bool:
-    """Whether there are only fast equations, linear ones with matrix K: one pass solves them."""
-    alone = not system.is_constrained and system.force is None and not q_s.shape[0]
-    complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
-    return alone and (complete or not is_per_coordinate(system, scheme, q_f)) and is_constant(system, scheme, q_s, q_f)
-
-
-def interval_matrix(equations: StepEquations) -> IntervalMatrix:
-    """K on the first micro interval of a macro step, on the straight path from its start."""
-    q_s, q_f, p_s, p_f, h = equations.q_s, equations.q_f, equations.p_s, equations.p_f, equations.micro_dt
-    system, scheme = interval_problem(equations.system, equations.scheme)
-    local = StepEquations(system, scheme, equations.t, q_s, q_f, p_s, p_f, h)
-    r, n_f = scheme.degree, q_f.shape[0]
-    slow, fast = (h * control_nodes(r)[1:, None] * v for v in constant_mass(system).velocity(p_s, p_f))
-    path = local.path(Unknowns(slow, None, fast[None], None))
-    if not is_per_coordinate(equations.system, equations.scheme, q_f):
-        kinetic = lagrangian(system, scheme).kinetic
-
-        def slots(increments):
-            at = replace(path, fast=increments[None])
-            d = jax.grad(local.without_kinetic)(at, at)
-            d_fast = d.fast[0] + kinetic.rows(slow, increments)[1]
-            return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast])
-
-        block = jax.jacfwd(slots)(fast)
-        return IntervalMatrix(inverse(block[:-1].reshape(r * n_f, r * n_f)), block[-1].reshape(n_f, r * n_f))
-
+def _diagonal_matrix(local: StepEquations, path: Path) -> DiagonalMatrix:
+    _, r, n_f = path.fast.shape
     block = jnp.zeros((r + 1, r, n_f))
-    for term in lagrangian(system, scheme).terms:
+    for term in lagrangian(local.system, local.scheme).terms:
         if isinstance(term, QuadraticKinetic):
             block += term.fast_form[:, 1:, None] * term.mass.fast
         elif term.inside.groups and term.arguments == ("q_f",):
@@ -197,11 +198,11 @@ def interval_matrix(equations: StepEquations) -> IntervalMatrix:
             gradient = jax.vmap(jax.grad(term.integrand))
             curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]  # the diagonal of each Hessian
             basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))
-            weights = term.sign * h**2 * term.inside.weights
+            weights = term.sign * local.macro_dt**2 * term.inside.weights
             block += jnp.einsum("k,ki,kj,ka->ija", weights, basis, basis[:, 1:], curvature)
     if r == 1:
-        return IntervalMatrix(1 / block[:1], block[-1])
-    return IntervalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block[:-1]), 0, -1), block[-1])
+        return DiagonalMatrix(1 / block[:1], block[-1])
+    return DiagonalMatrix(jnp.moveaxis(jax.vmap(inverse, in_axes=-1)(block[:-1]), 0, -1), block[-1])
 
 
 def solve_saddle(solve_k, jacobian, push, rows, g):

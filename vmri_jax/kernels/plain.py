@@ -1,0 +1,29 @@
+"""Small dense algebra as a reader expects it: NumPy's names and LAPACK. What `cpu` is held against."""
+
+import jax.numpy as jnp
+
+
+def matmul(a, b):
+    """``a @ b`` of (..., i, k) and (..., k, j)."""
+    return a @ b
+
+
+def matvec(a, x):
+    """``a @ x`` of (..., i, k) and (..., k)."""
+    return jnp.matvec(a, x)
+
+
+def solve(a, b):
+    """The x with ``a x = b`` for a (n, n), b (n, m)."""
+    return jnp.linalg.solve(a, b)
+
+
+def inverse(a):
+    """The inverses of a (..., n, n), real or complex."""
+    return jnp.linalg.inv(a)
+
+
+def max_abs(a):
+    """The largest absolute value in a, 0 of nothing, not finite if an entry is not."""
+    largest = jnp.max(jnp.abs(a), initial=0.0)
+    return jnp.where(jnp.all(jnp.isfinite(a)), largest, jnp.inf)

@@ -1,0 +1,80 @@
+"""A composition: its stages one after the other, each over its part of the macro step, some of them backwards."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.state import State
+from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
+
+
+class ComposedState(NamedTuple):
+    """last: what the last stage hands on. own: what every stage carries to its next turn, stacked."""
+
+    last: Any
+    own: Any
+
+
+@dataclass(frozen=True)
+class Composed(Stepper):
+    """``Psi_H = Phi_{c_s H} o ... o Phi_{c_1 H}``.
+
+    coefficients: (s,) parts c_i of the macro step.
+    stage: the stepper Phi.
+    """
+
+    coefficients: Any
+    stage: Stepper
+
+    def init(self, state: State, macro_dt) -> ComposedState:
+        own = jax.vmap(lambda c: self.stage.init(state, c * macro_dt))(jnp.asarray(self.coefficients))
+        return ComposedState(jax.tree.map(lambda a: a[0], own), own)
+
+    def move(self, state: State, own: ComposedState, macro_dt) -> tuple[State, StepInfo, ComposedState]:
+        def stage(carry, at):
+            (state, last), (c, own) = carry, at
+            own = self.stage.continued(own, last, state, c * macro_dt)
+            state, info, own = self.stage.step(state, own, c * macro_dt)
+            return (state, own), (own, info)
+
+        stages = jnp.asarray(self.coefficients), own.own
+        (state, last), (own_stages, infos) = jax.lax.scan(stage, (state, own.last), stages)
+        worst = jax.tree.map(jnp.max, infos.status)
+        along = map(jnp.concatenate, (infos.q_f_micro, infos.multiplier, infos.slow_multiplier))
+        return state, StepInfo(*worst, *along), ComposedState(last, own_stages)
+
+    def project(self, state: State, own: ComposedState) -> tuple[State, ComposedState]:
+        state, last = self.stage.project(state, own.last)
+        return state, own._replace(last=last)
+
+    def lines(self) -> list[str]:
+        return [f"composition of {len(self.coefficients)} stages, each:", *indented(self.stage.lines())]
+
+
+@dataclass(frozen=True)
+class Projected(Stepper):
+    """A stepper whose momenta are projected onto the hidden constraints at the end of every step."""
+
+    inner: Stepper
+
+    def init(self, state: State, macro_dt):
+        return self.inner.init(state, macro_dt)
+
+    def renew(self, state: State, own, macro_dt):
+        return self.inner.renew(state, own, macro_dt)
+
+    def move(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
+        state, info, own = self.inner.move(state, own, macro_dt)
+        state, own = self.inner.project(state, own)
+        return state, info, own
+
+    def project(self, state: State, own) -> tuple[State, Any]:
+        return state, own
+
+    def continued(self, own, last, state: State, macro_dt):
+        return self.inner.continued(own, last, state, macro_dt)
+
+    def lines(self) -> list[str]:
+        return [*self.inner.lines(), "momenta projected onto the hidden constraints"]

@@ -1,0 +1,135 @@
+"""Kicks: potentials at the ends of an interval, which only shift momenta before and after everything else."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.state import State
+from vmri_jax.schemes.discrete_lagrangian import Term
+from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
+
+
+class KickedState(NamedTuple):
+    """gradients: of every kick, ``(dL/dq_s, dL/dq_f)`` at the node that two steps share. inner: of the inner stepper."""
+
+    gradients: Any
+    inner: Any
+
+
+@dataclass(frozen=True)
+class Kicked(Stepper):
+    """``p + H w dL/dq`` before and after an inner step, with the weight w that a term has at that end of the interval.
+
+    A mollified kick is taken at averaged fast positions.
+
+    kicks: the terms that have nodes at the ends, maybe none.
+    inner: what happens between the kicks.
+    average: the filter of mollified kicks, ``average(macro_dt)(q_s, q_f) -> q_f``; None if there is no such kick.
+    """
+
+    kicks: tuple[Term, ...]
+    inner: Stepper
+    average: Callable | None = None
+
+    def init(self, state: State, macro_dt) -> KickedState:
+        return KickedState(self._gradients(state, macro_dt), self.inner.init(state, macro_dt))
+
+    def renew(self, state: State, own: KickedState, macro_dt) -> KickedState:
+        return own._replace(inner=self.inner.renew(state, own.inner, macro_dt))
+
+    def move(self, state: State, own: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
+        state = self._kick(state, macro_dt, own.gradients, ("start",))
+        state, info, inner = self.inner.move(state, own.inner, macro_dt)
+        gradients = self._gradients(state, macro_dt)
+        return self._kick(state, macro_dt, gradients, ("end",)), info, KickedState(gradients, inner)
+
+    def move_many(self, state: State, own: KickedState, macro_dt, count: int) -> tuple[State, StepInfo, KickedState]:
+        """`count` steps; the kicks of two steps at the node they share are merged into one."""
+
+        def move(state, inner, ends):
+            state, info, inner = self.inner.move(state, inner, macro_dt)
+            gradients = self._gradients(state, macro_dt)
+            return self._kick(state, macro_dt, gradients, ends), info, KickedState(gradients, inner)
+
+        def between(carry, _):
+            state, inner, worst = carry
+            state, info, own = move(state, inner, ("end", "start"))
+            along = info.q_f_micro[0], info.multiplier[0]
+            return (state, own.inner, worst.worse(info.status)), along
+
+        state = self._kick(state, macro_dt, own.gradients, ("start",))
+        none = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
+        (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, own.inner, none), length=count - 1)
+        state, last, own = move(state, inner, ("end",))
+        status = last.status if is_concrete(last.status) else worst.worse(last.status)  # known ones are all alike
+        q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
+        return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), own
+
+    def project(self, state: State, own: KickedState) -> tuple[State, KickedState]:
+        state, inner = self.inner.project(state, own.inner)
+        return state, own._replace(inner=inner)
+
+    def continued(self, own: KickedState, last: KickedState, state: State, macro_dt) -> KickedState:
+        gradients = last.gradients if self.average is None else self._gradients(state, macro_dt)
+        return KickedState(gradients, self.inner.continued(own.inner, last.inner, state, macro_dt))
+
+    def _gradients(self, state: State, macro_dt):
+        q_s, q_f = state.q_s, state.q_f
+
+        def gradient(term: Term):
+            if self.average is None or not term.mollified:
+                return term.gradient(q_s, q_f)
+            averaged, pull = jax.vjp(self.average(macro_dt), q_s, q_f)
+            d_s, d_f = term.gradient(q_s, averaged)
+            more_s, d_f = pull(d_f)
+            return d_s + more_s, d_f
+
+        return tuple(map(gradient, self.kicks))
+
+    def _kick(self, state: State, macro_dt, gradients, ends: tuple[str, ...]) -> State:
+        p_s, p_f = state.p_s, state.p_f
+        for term, (d_s, d_f) in zip(self.kicks, gradients, strict=True):
+            weights = [w for w in (getattr(term, end) for end in ends) if w is not None]
+            if weights:
+                impulse = term.times_step(macro_dt) * sum(weights)
+                p_s, p_f = p_s + impulse * d_s, p_f + impulse * d_f
+        return State(state.t, state.q_s, state.q_f, p_s, p_f)
+
+    def lines(self) -> list[str]:
+        if not self.kicks:
+            return self.inner.lines()
+        names = ", ".join(term.name for term in self.kicks)
+        averaged = ", at averaged fast positions" if self.average is not None else ""
+        return [f"kicks of {names} at both ends{averaged}", *indented(self.inner.lines())]
+
+
+def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
+    """The filter of a mollified slow potential, ``average(macro_dt)(q_s, q_f) -> a``.
+
+    ``a = (x_0 / 2 + x_1 + ... + x_{n - 1} + x_n / 2) / n`` over the n = num_micro micro nodes of the fast motion from rest at
+    q_f, slow variables at rest: the trapezoidal rule on the micro grid. A fast vibration whose phase advances by k pi over
+    the macro step, as the scheme resolves it, has the average zero, so that V cannot excite it.
+
+    Args:
+        stepper_of: ``q_s -> Kicked``, the stepper of one micro interval of the fast variables with the slow ones at rest.
+        num_micro: micro steps per macro step.
+    """
+
+    def average(macro_dt):
+        def averaged(q_s, q_f):
+            stepper, micro_dt, none = stepper_of(q_s), macro_dt / num_micro, jnp.zeros(0)
+            start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
+            own = stepper.renew(start, stepper.init(start, micro_dt), micro_dt)
+            _, info, _ = stepper.move_many(start, own, micro_dt, num_micro)
+            x = info.q_f_micro
+            a = (q_f / 2 + jnp.sum(x[:-1], axis=0) + x[-1] / 2) / num_micro
+            return jnp.where(info.result <= Result.CONVERGED_AT_ROUNDOFF, a, jnp.nan)
+
+        return averaged
+
+    return average

@@ -1,0 +1,51 @@
+"""Linear equations of fast variables alone on one interval: one product with a matrix that is computed once per run."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.interval import DiagonalMatrix, FullMatrix, Interval
+from vmri_jax.steppers.results import Method
+from vmri_jax.steppers.stepper import Status, StepInfo, Stepper
+
+
+@dataclass(frozen=True)
+class Linear(Stepper):
+    """``x = -K^-1 r(0)`` with the residual r of no motion at all; K is what it carries."""
+
+    system: System
+    scheme: Scheme
+    interval: Interval
+
+    def init(self, state: State, macro_dt) -> DiagonalMatrix | FullMatrix:
+        return self.interval.matrix(self._equations(state, macro_dt))
+
+    def move(
+        self, state: State, own: DiagonalMatrix | FullMatrix, macro_dt
+    ) -> tuple[State, StepInfo, DiagonalMatrix | FullMatrix]:
+        equations = self._equations(state, macro_dt)
+        h, rest = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
+        path = equations.path(Unknowns(jnp.zeros((self.scheme.degree, 0)), None, rest[None], None))
+        d = jax.grad(equations.without_kinetic)(path, path)
+        rows = jnp.concatenate([d.fast_start - d.fast[0].sum(0) + h * state.p_f, d.fast[0, :-1]])
+        increments = -own.solve(rows)
+
+        p_f = (d.fast[0, -1] + own.outgoing(increments)) / h
+        q_f = state.q_f + increments[-1]
+        none = jnp.zeros((1, self.scheme.degree, 0)), jnp.zeros((self.scheme.degree, 0))
+        info = StepInfo(*Status.direct(Method.LINEAR), q_f[None], *none)
+        return State(state.t + macro_dt, state.q_s, q_f, state.p_s, p_f), info, own
+
+    def continued(self, own, last, state: State, macro_dt):
+        return own  # the matrix of a stage belongs to its length
+
+    def _equations(self, state: State, macro_dt) -> StepEquations:
+        return StepEquations(self.system, self.scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
+
+    def lines(self) -> list[str]:
+        return ["linear equations: one product with a matrix computed once"]

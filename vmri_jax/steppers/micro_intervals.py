@@ -1,0 +1,226 @@
+"""One pass over the micro intervals of a macro step: each corrected once, in order, for a given slow path."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.kernels import inverse, matvec, max_abs, regularized
+from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
+from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
+from vmri_jax.schemes.path import control_nodes
+from vmri_jax.steppers.interval import DiagonalMatrix, FullMatrix, constant_mass, interval_problem, inverse_mass
+from vmri_jax.steppers.predictors import LinearPredictor
+
+
+class Left(NamedTuple):
+    """What a pass leaves, or what arrives at a micro interval in it.
+
+    q_f, p_f: position and momentum times h at the end of the last interval.
+    start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path,
+        without their kinetic energy.
+    moved: largest correction of an increment.
+    """
+
+    q_f: Any
+    p_f: Any
+    start: Any
+    increments: Any
+    moved: Any
+
+
+class Lines(NamedTuple):
+    """Where the unknowns of the micro intervals go on.
+
+    multiplier: (r, n_g) multipliers lambda.
+    bend: (r, n_f) by how much fast increments leave the straight line, over h^2; (r, 0) where increments follow from the multipliers.
+    """
+
+    multiplier: LinearPredictor
+    bend: LinearPredictor
+
+
+class Fast(NamedTuple):
+    """Unknowns of the micro intervals and what is kept of them, with the intervals as first axis.
+
+    increments (n, r, n_f), multiplier (n, r, n_g): the unknowns, multipliers scaled.
+    nodes: (n, r, n_f) positions at the nodes 1..r.
+    bends: (n, r, n_f) or (n, r, 0), see `Lines`.
+    schur: (n, r n_g, r n_g) inverses of ``G K^-1 G^T`` from the first pass.
+    """
+
+    increments: Any
+    multiplier: Any
+    nodes: Any
+    bends: Any
+    schur: Any
+
+
+class March(NamedTuple):
+    """What is the same in all passes of a macro step.
+
+    equations: of the macro step.
+    is_explicit: whether fast increments follow from the multipliers, see `Interval`.
+    matrix: K of the micro intervals.
+    scale: (num_micro, r, 1) what turns multipliers into unknowns.
+    """
+
+    equations: StepEquations
+    is_explicit: bool
+    matrix: DiagonalMatrix | FullMatrix
+    scale: Any
+
+    def first_pass(self, slow, lines: Lines) -> tuple[Fast, Left]:
+        """With fast unknowns from where the intervals before lead to, for slow increments (r, n_s)."""
+        r = self.equations.scheme.degree
+        velocity = inverse_mass(constant_mass(self.equations.system).fast)
+
+        def interval(carry, at):
+            (arriving, lines), (m, basis, scale) = carry, at
+            straight = control_nodes(r)[1:, None] * velocity(arriving.p_f)
+            mu, increments = scale * lines.multiplier.next(m), straight
+            if not self.is_explicit:
+                increments = straight + self.equations.micro_dt**2 * lines.bend.next(m)
+            done, left = self._corrected(slow, arriving, m, basis, increments, mu)
+            bend = jnp.zeros((r, 0))
+            if not self.is_explicit:
+                bend = (done.increments - straight) / self.equations.micro_dt**2
+            lines = Lines(lines.multiplier.add(m, done.multiplier / scale), lines.bend.add(m, bend))
+            return (left, lines), done._replace(bends=bend)
+
+        (left, _), fast = jax.lax.scan(interval, (self._start(slow), lines), (*self._intervals(), self.scale))
+        return fast, left
+
+    def next_pass(self, slow, fast: Fast) -> tuple[Fast, Left]:
+        """With fast unknowns and small matrices of the pass before."""
+
+        def interval(arriving, at):
+            m, basis, before = at
+            known = before.increments, before.multiplier, before.schur
+            done, left = self._corrected(slow, arriving, m, basis, *known)
+            straight = control_nodes(len(slow))[1:, None] * velocity(arriving.p_f)
+            bend = before.bends
+            if not self.is_explicit:
+                bend = (done.increments - straight) / self.equations.micro_dt**2
+            return left, done._replace(bends=bend)
+
+        velocity = inverse_mass(constant_mass(self.equations.system).fast)
+        left, fast = jax.lax.scan(interval, self._start(slow), (*self._intervals(), fast))
+        return fast, left
+
+    def _intervals(self):
+        """Numbers of the intervals, and (n, r + 1, r) the slow positions at their nodes by slow increments."""
+        n, r = self.equations.scheme.num_micro, self.equations.scheme.degree
+        return jnp.arange(n), jnp.asarray(slow_basis_at_control_nodes(n, r)[..., 1:])
+
+    def _start(self, slow) -> Left:
+        equations = self.equations
+        zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(slow), jnp.zeros(())
+        return Left(equations.q_f, equations.micro_dt * equations.p_f, *zero)
+
+    def _corrected(self, slow, arriving: Left, m, basis, increments, mu, schur=None) -> tuple[Fast, Left]:
+        """Interval m, corrected once by a Newton step on its exact residual, and what it leaves."""
+        equations, h, n = self.equations, self.equations.micro_dt, self.equations.scheme.num_micro
+        q_s, steps = equations.q_s + along(basis[0], slow), along(basis[1:] - basis[0], slow)
+        system, scheme = interval_problem(equations.system, equations.scheme)
+        at_rest = jnp.zeros_like(q_s), jnp.zeros_like(arriving.q_f)
+        local = StepEquations(system, scheme, equations.t + m * h, q_s, arriving.q_f, *at_rest, h)
+        done = correct(local, steps, arriving.p_f, increments, mu, self.matrix, schur, self.is_explicit)
+
+        start = arriving.start + done.start
+        rows = arriving.increments + basis[0][:, None] * done.start
+        rows += jnp.sum((basis[1:] - basis[0])[..., None] * done.steps[:, None], axis=0)
+        q_f, p_f = arriving.q_f + done.increments[-1], done.p_f
+        for term in lagrangian(system, scheme).kicks if n > 1 else ():  # where two micro intervals meet
+            weight = jnp.where(m < n - 1, h * kick_weight(term, h), 0.0)
+            d_s, d_f = term.gradient(equations.q_s + along(basis[-1], slow), q_f)
+            start, p_f = start + weight * d_s, p_f + weight * d_f
+            rows += basis[-1][:, None] * (weight * d_s)
+
+        left = Left(q_f, p_f, start, rows, jnp.maximum(arriving.moved, done.moved))
+        nodes = arriving.q_f + done.increments
+        return Fast(done.increments, done.multiplier, nodes, None, done.schur), left
+
+
+def kick_weight(term: Term, h):
+    """Of a kick where one interval ends and the next one starts, times its power of h."""
+    return term.times_step(h) * sum(w for w in (term.start, term.end) if w is not None)
+
+
+class Corrected(NamedTuple):
+    """A micro interval after its correction.
+
+    increments (r, n_f), multiplier (r, n_g): its unknowns.
+    p_f: momentum times h that it hands on.
+    start, steps: gradient (n_s,), (r, n_s) of h times its action by the start and the increments of its slow path.
+    moved: largest correction of an increment.
+    schur: inverse of ``G K^-1 G^T``.
+    """
+
+    increments: Any
+    multiplier: Any
+    p_f: Any
+    start: Any
+    steps: Any
+    moved: Any
+    schur: Any
+
+
+def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_explicit: bool) -> Corrected:
+    """One Newton step ``[K, -G_0^T; G_1, 0]`` on the equations of one micro interval.
+
+    Args:
+        local: its problem, from the positions at its start.
+        steps: (r, n_s) increments of its slow path.
+        p_f: momentum times h that arrives.
+        increments, mu: (r, n_f), (r, n_g) its unknowns so far; explicit increments follow from mu.
+        matrix: K.
+        schur: inverse of ``G_1 K^-1 G_0^T``; None to compute it here.
+    """
+    system, (r, n_g) = local.system, mu.shape
+    times = local.t + local.macro_dt * control_nodes(r)
+    slow_nodes = jnp.concatenate([local.q_s[None], local.q_s + steps])
+    fast_nodes = jnp.concatenate([local.q_f[None], local.q_f + increments[:-1]])
+    pull = jax.vjp(partial(jax.vmap(system.g), times[:-1]), slow_nodes[:-1], fast_nodes)[1]  # G_0^T
+    pull_s, pull_f = pull(mu)
+    if is_explicit:
+        increments = -matrix.solve(p_f - pull_f)
+
+    def gradient(increments):
+        path = local.path(Unknowns(steps, None, increments[None], None))
+        return jax.grad(local.without_kinetic)(path, path)
+
+    d, change = jax.linearize(gradient, increments)
+    d_fast = d.fast[0] + lagrangian(system, local.scheme).kinetic.rows(steps, increments)[1]
+    g, push = jax.linearize(lambda x: jax.vmap(system.g)(times[1:], slow_nodes[1:], local.q_f + x), increments)
+    dx, g_then = jnp.zeros_like(increments), g
+    if not is_explicit:
+        rows = jnp.concatenate([(d.fast_start - d_fast.sum(0)) + p_f, d_fast[:-1]])
+        dx = -matrix.solve(rows - pull_f)
+        g_then = g + push(dx)
+    if schur is None:
+        units = jnp.eye(r * n_g).reshape(r * n_g, r, n_g)
+        columns = jax.vmap(lambda unit: push(matrix.solve(pull(unit)[1])))(units)
+        schur = inverse(regularized(columns.reshape(r * n_g, r * n_g))).T
+    dmu = -matvec(schur, g_then.reshape(-1)).reshape(r, n_g)
+    more_s, more_f = pull(dmu)
+    if n_g:
+        dx += matrix.solve(more_f)
+
+    coupling, impulse = change(dx), -(pull_s + more_s)
+    later = jnp.concatenate([impulse[1:], jnp.zeros_like(impulse[:1])])
+    return Corrected(
+        increments + dx,
+        mu + dmu,
+        p_f=d_fast[-1] + matrix.outgoing(dx),
+        start=d.slow_start + coupling.slow_start + impulse.sum(0),
+        steps=d.slow + coupling.slow + later,
+        moved=max_abs(dx),
+        schur=schur,
+    )
+
+
+def along(weights, increments):
+    """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
+    return jnp.sum(weights[..., None] * increments, axis=-2)

@@ -1,0 +1,255 @@
+"""Nested march: the slow path outside, the micro intervals in order inside, each solving only its own small system.
+
+A pass takes the slow path as known. It marches over the micro intervals; each corrects its fast increments and
+multipliers once, by a Newton step on its exact residual, and adds its impulse to the slow equations. Then the slow
+increments and slow multipliers are corrected from what is left of their equations. The matrices are cheap ones:
+
+* micro interval: ``[K, -G^T; G, 0]`` with K from the start of the macro step, or of one before it while that costs no passes
+  (the mass alone where the fast equations are explicit, so that only the multipliers are solved for), and
+  ``G K^-1 G^T`` from the first pass;
+* slow equations: masses, with those that constraints tie to the slow ones, and slow constraint (`SlowEquations`). What they
+  miss is learned from steps with many passes where there are constraints (`Pairs`); elsewhere it is the derivative of the slow
+  forces, which is taken where updates by the masses alone would cost a pass (`SlowEquations.with_forces`).
+
+The slow unknowns start from what the steps before extrapolate to (`PolynomialPredictor`), the fast ones from the micro intervals
+before (`LinearPredictor`). The residual is exact, so all of this decides only how many passes there are: two where the slow
+motion is smooth. A pass costs one gradient of each term at each of its nodes; nothing is stored but the path and those small matrices.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.kernels import max_abs
+from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
+from vmri_jax.schemes.path import control_nodes
+from vmri_jax.steppers.interval import (
+    Accepted,
+    DiagonalMatrix,
+    FullMatrix,
+    Interval,
+    constant_mass,
+    expected,
+    inverse_mass,
+)
+from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March, along
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor
+from vmri_jax.steppers.results import Method
+from vmri_jax.steppers.secant import SIZE, Pairs
+from vmri_jax.steppers.slow_equations import SlowEquations
+from vmri_jax.steppers.solved import Solution, Solver, status_of
+
+SMALL = 16
+"""Matrices of micro intervals up to this size are renewed with every macro step."""
+NOISE = 3e2
+"""Secant pairs shorter than so many units of round-off of the positions are not kept."""
+MORE = 1
+"""A matrix is renewed after a step with more than so many passes above the fewest with it."""
+EASY = 2
+"""Steps with so few passes do without secant pairs."""
+UNKNOWN = -1
+
+
+class NestedState(NamedTuple):
+    """What a macro step hands to the next one.
+
+    matrix: K of the micro intervals.
+    slow: slow unknowns (r n_s + r n_gs,) of the last steps.
+    lines: multipliers and bends of the last micro intervals.
+    missed: what the cheap matrix of the slow equations misses: secant pairs with constraints, else the part of an update
+        that it leaves to the next one.
+    passes: (2,) fewest of a step with this matrix (UNKNOWN before one), and those of the last step.
+    """
+
+    matrix: DiagonalMatrix | FullMatrix
+    slow: PolynomialPredictor
+    lines: Lines
+    missed: Any
+    passes: Any
+
+
+class Pass(NamedTuple):
+    """Unknowns of a pass, what it left, and how the iteration stands.
+
+    d: the update of the slow unknowns by the cheap matrix.
+    tied: masses that constraints tie to the slow variables, from the first pass.
+    impulse: on the slow variables over the step, times h.
+    residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
+    """
+
+    slow: Any
+    slow_multiplier: Any
+    fast: Fast
+    left: Left
+    d: Any
+    tied: Any
+    missed: Any
+    impulse: Any
+    residual: Any
+    passes: Any
+    result: Any
+
+
+@dataclass(frozen=True)
+class Nested(Solver):
+    """Passes until one more would change neither the slow increments nor those of the micro intervals.
+
+    What it would change the slow ones by is known from the residual, and the others from how their corrections shrink, as in
+    stiff solvers (Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8). Accepted are changes of
+    ``newton.tolerance`` relative to the motion over the macro step and over a micro interval, and round-off of the positions.
+
+    has_kicks: whether a potential acts at the macro nodes.
+    """
+
+    newton: Newton
+    interval: Interval
+    has_kicks: bool
+
+    def init(self, equations: StepEquations, velocity) -> NestedState:
+        system, n_s, n_f = equations.system, equations.q_s.size, equations.q_f.size
+        r, (n_g, n_gs) = equations.scheme.degree, system.num_constraints(equations.q_s, equations.q_f)
+        matrix = self.interval.matrix if self.interval.is_constant else self.interval.no_matrix
+        increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity[0])
+        slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
+        bends = (r, 0 if self.interval.is_explicit else n_f)
+        lines = Lines(LinearPredictor.zero((r, n_g)), LinearPredictor.zero(bends))
+        missed = jnp.ones(())
+        if system.is_constrained:
+            missed = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
+        return NestedState(matrix(equations), slow, lines, missed, jnp.array([0, 2 * MORE]))
+
+    def renew(self, equations: StepEquations, own: NestedState) -> NestedState:
+        """With a new matrix K, unless it is constant.
+
+        A large one is kept for as long as it costs no passes; a number of passes that is fixed needs a new one.
+        """
+        if self.interval.is_constant:
+            return own
+        if self.interval.is_diagonal or len(own.matrix.inverse) <= SMALL or self.newton.fixed_iterations:
+            return own._replace(matrix=self.interval.matrix(equations))
+        stale = own.passes[1] > own.passes[0] + MORE
+        matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: own.matrix)
+        return own._replace(matrix=matrix, passes=own.passes.at[0].set(jnp.where(stale, UNKNOWN, own.passes[0])))
+
+    def solve(self, equations: StepEquations, guess: Unknowns, own: NestedState) -> tuple[Solution, NestedState]:
+        scheme, newton = equations.scheme, self.newton
+        scale, _ = multiplier_scales(scheme, equations.macro_dt)
+        passes = _Passes(equations, own, March(equations, self.interval.is_explicit, own.matrix, scale), newton)
+        done = newton.iterate(passes.next, passes.first(), done=1)
+
+        x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
+        per_h = 1 / equations.micro_dt
+        end = done.left.q_f, equations.p_s + per_h * done.impulse, per_h * done.left.p_f
+        rows, g = done.residual
+        if x.multiplier.size:
+            g = jnp.maximum(max_abs(_constraints(equations, done)), g)
+        status = status_of(equations, done.result, Method.NESTED, done.passes, rows, g, newton.tolerance)
+        return Solution(x, end, status), self._learned(equations, own, done, scale)
+
+    def _learned(self, equations: StepEquations, own: NestedState, done: Pass, scale) -> NestedState:
+        several = equations.scheme.num_micro > 1
+        shared = equations.system.constraint is not None  # two macro steps share the constraint force of their node
+        lambdas = own.lines.multiplier.after_step(done.fast.multiplier / scale, several and self.has_kicks)
+        bend = own.lines.bend.after_step(done.fast.bends, several and (self.has_kicks or shared))
+        before = own.passes[0]
+        fewest = jnp.where(before == UNKNOWN, done.passes, jnp.minimum(before, done.passes))
+        slow = own.slow.add(_joined(done), done.slow.size)
+        return NestedState(own.matrix, slow, Lines(lambdas, bend), done.missed, jnp.stack([fewest, done.passes]))
+
+    def continued(self, own: NestedState, last: NestedState) -> NestedState:
+        multiplier = own.lines.multiplier.continued(last.lines.multiplier)
+        return own._replace(lines=Lines(multiplier, own.lines.bend.continued(last.lines.bend)))
+
+    def lines(self) -> list[str]:
+        inside = "the multipliers alone" if self.interval.is_explicit else "fast increments and multipliers"
+        return [
+            "nested march: the slow path outside, micro intervals in order inside",
+            f"  each interval solves for {inside}, with a matrix {self._matrix_in_words()}",
+        ]
+
+    def _matrix_in_words(self) -> str:
+        kind = "per coordinate" if self.interval.is_diagonal else "of its fast variables"
+        return f"{kind}, {'computed once' if self.interval.is_constant else 'renewed with the macro steps'}"
+
+
+class _Passes:
+    """The iteration over passes of one macro step."""
+
+    def __init__(self, equations: StepEquations, own: NestedState, march: March, newton: Newton):
+        self.equations, self.own, self.march, self.newton = equations, own, march, newton
+        self.slow_equations = SlowEquations.of(equations)
+        self.accepted = Accepted.of(equations, newton)
+        self.mass = constant_mass(equations.system)
+        self.r, self.n_s = equations.scheme.degree, equations.q_s.size
+
+    def first(self) -> Pass:
+        """From the predicted unknowns."""
+        slow, slow_multiplier = self._apart(self.own.slow.next(self.r * self.n_s))
+        fast, left = self.march.first_pass(slow, self.own.lines)
+        tied = self.slow_equations.tied(fast.schur[0])
+        return self._judged(slow, slow_multiplier, fast, left, tied, self.own.missed, left.moved, 1)
+
+    def next(self, last: Pass) -> Pass:
+        """With slow unknowns corrected by what the last pass left."""
+        if not self.n_s:
+            return self._moved_by(last.d, last)
+        return self._with_pairs(last) if self.equations.system.is_constrained else self._with_forces(last)
+
+    def _with_pairs(self, last: Pass) -> Pass:
+        pairs, size = last.missed, self.r * self.n_s
+        is_hard = (self.own.passes[1] > EASY) | (last.passes >= EASY)
+        d = jax.lax.cond(is_hard, lambda: pairs.corrected(last.d, size), lambda: last.d)
+        now = self._moved_by(d, last)
+        noise = NOISE * jnp.finfo(float).eps * (max_abs(self.equations.q_s) + max_abs(last.slow))
+        pairs = jax.lax.cond(is_hard, lambda: pairs.add(d, now.d - last.d, noise, size), lambda: pairs)
+        return now._replace(missed=pairs)
+
+    def _with_forces(self, last: Pass) -> Pass:
+        part = jnp.where(last.passes == 1, last.missed**2, last.missed)  # the fast unknowns take three passes anyway
+        is_hard = part * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0)) > 1
+        wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part
+        x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
+        d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
+        now = self._moved_by(d, last)
+        missed, of = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
+        return now._replace(missed=max_abs(missed) / (max_abs(of) + jnp.finfo(float).tiny))
+
+    def _moved_by(self, d, last: Pass) -> Pass:
+        slow, slow_multiplier = self._apart(_joined(last) + d)
+        fast, left = self.march.next_pass(slow, last.fast)
+        still_moves = expected(left.moved, last.left.moved)
+        return self._judged(slow, slow_multiplier, fast, left, last.tied, last.missed, still_moves, last.passes + 1)
+
+    def _judged(self, slow, slow_multiplier, fast: Fast, left: Left, tied, missed, still_moves, passes) -> Pass:
+        equations, inverse_fast = self.equations, inverse_mass(self.mass.fast)
+        x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
+        d, (rows, g), impulse = self.slow_equations.update(x, left.start, left.increments, tied)
+        arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(left.p_f)
+        motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
+        changes = max_abs(d[: self.r * self.n_s]), still_moves
+        result = self.newton.status(self.accepted.over(changes, (max_abs(slow), motion)), passes)
+        residual = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves), max_abs(g)
+        passes = jnp.asarray(passes)
+        return Pass(slow, slow_multiplier, fast, left, d, tied, missed, impulse, residual, passes, result)
+
+    def _apart(self, z):
+        """Slow increments (r, n_s) and slow multipliers (r, n_gs)."""
+        size = self.r * self.n_s
+        return z[:size].reshape(self.r, self.n_s), z[size:].reshape(self.r, -1)
+
+
+def _joined(at: Pass):
+    """Slow increments and slow multipliers in a row."""
+    return jnp.concatenate([at.slow.reshape(-1), at.slow_multiplier.reshape(-1)])
+
+
+def _constraints(equations: StepEquations, done: Pass):
+    """(num_micro, r, n_g) values of g at the nodes 1..r of the micro intervals."""
+    n, r = equations.scheme.num_micro, equations.scheme.degree
+    slow_nodes = equations.q_s + along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], done.slow)
+    times = equations.t + equations.micro_dt * (np.arange(n)[:, None] + control_nodes(r)[1:])
+    return jax.vmap(jax.vmap(equations.system.g))(times, slow_nodes, done.fast.nodes)

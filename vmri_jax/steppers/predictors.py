@@ -1,0 +1,89 @@
+"""Where unknowns go on: the slow ones from step to step, the fast ones from micro interval to micro interval."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+ORDER = 10
+"""Highest order of the polynomials."""
+FADING = 0.84
+"""By this a miss counts less with every step."""
+
+
+class PolynomialPredictor(NamedTuple):
+    """Backward differences ``d_0 = x_n``, ``d_(j+1) = d_j(x_n) - d_j(x_(n-1))``.
+
+    The polynomial of order k through the last k + 1 values goes on with ``d_0 + ... + d_k``, and d_(k+1) is by how much that
+    of the step before missed x_n. Few or rough steps ask for a low order, smooth ones for a high one.
+
+    differences: (ORDER + 2, n).
+    misses: (ORDER + 1,) the worst miss of every order in the steps before, fading: one lucky step is not to decide.
+    """
+
+    differences: Any
+    misses: Any
+
+    @classmethod
+    def constant(cls, x) -> "PolynomialPredictor":
+        """A past in which nothing changed."""
+        return cls(jnp.zeros((ORDER + 2, x.size)).at[0].set(x), jnp.zeros(ORDER + 1))
+
+    def next(self, measured: int):
+        """Where the values go on, by the lowest order that has missed the first `measured` entries least."""
+        missed, orders = self._missed(measured), jnp.arange(ORDER + 1)
+        best = jnp.min(jnp.where(missed <= jnp.min(missed), orders, ORDER))
+        taken = jnp.arange(ORDER + 2) <= best
+        return jnp.sum(jnp.where(taken[:, None], self.differences, 0.0), axis=0)
+
+    def add(self, x, measured: int) -> "PolynomialPredictor":
+        """With one more step."""
+        rows = [x]
+        for before in self.differences[:-1]:
+            rows.append(rows[-1] - before)
+        missed = self._missed(measured)
+        return PolynomialPredictor(jnp.stack(rows), jnp.where(jnp.isfinite(missed), FADING * missed, 0.0))
+
+    def _missed(self, measured: int):
+        """(ORDER + 1,) by how much each order has missed."""
+        return jnp.maximum(jnp.max(jnp.abs(self.differences[1:, :measured]), axis=1, initial=0.0), self.misses)
+
+
+class LinearPredictor(NamedTuple):
+    """Values of the micro intervals one after the other, extrapolated by the line through the last two.
+
+    A kick at the macro nodes, or half of their constraint force, lets the first value of every macro step stand out from
+    its neighbours.
+
+    last: (2, ...) of the last two intervals, the last one first, without what stands out.
+    jump: (...) by how much the first one of a macro step stands out.
+    """
+
+    last: Any
+    jump: Any
+
+    @classmethod
+    def zero(cls, shape: tuple[int, ...]) -> "LinearPredictor":
+        """The start of a run."""
+        return cls(jnp.zeros((2, *shape)), jnp.zeros(shape))
+
+    def next(self, m):
+        """The value that is expected in interval m of a macro step."""
+        return 2 * self.last[0] - self.last[1] + jnp.where(m == 0, self.jump, 0.0)
+
+    def add(self, m, value) -> "LinearPredictor":
+        """With the value of interval m."""
+        value = value - jnp.where(m == 0, self.jump, 0.0)
+        return self._replace(last=jnp.stack([value, self.last[0]]))
+
+    def after_step(self, values, stands_out: bool) -> "LinearPredictor":
+        """With the values (num_micro, ...) of a macro step, and the jump at its start if there is one."""
+        line, n = self, len(values)
+        if stands_out:
+            line = self._replace(jump=values[0] - (self.last[0] + values[1]) / 2)
+        for m in range(max(n - 2, 0), n):
+            line = line.add(m, values[m])
+        return line
+
+    def continued(self, other: "LinearPredictor") -> "LinearPredictor":
+        """Going on where another line ended."""
+        return self._replace(last=other.last)

@@ -1,0 +1,126 @@
+"""RATTLE: a step on which nothing is left but kinetic energy of constant masses and constraints.
+
+The increments ``x = M^-1 (h p - G_0^T mu)`` follow from the multipliers, so that ``g(q + x) = 0`` is solved for these alone.
+The matrix is ``G_1 M^-1 G_0^T`` at the position that the multipliers of the steps before lead to. With kicks before and
+after this is RATTLE (Andersen 1983).
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.kernels import inverse, matvec, max_abs, regularized
+from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
+from vmri_jax.steppers.interval import Accepted, constant_mass, inverse_mass
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Method
+from vmri_jax.steppers.solved import Solution, Solver, status_of
+
+LEAST = 0.1
+"""Where two steps of a composition undo each other but for so much, their common multiplier says nothing about the force."""
+
+
+class RattleState(NamedTuple):
+    """What a step hands to the next one.
+
+    multiplier: (2, n_g + n_gs) multipliers of the last steps, the last one first.
+    before: length of the last step, 0 where the momenta have been projected since. Otherwise its half of the constraint force at
+        the node between the two steps is left to the next one.
+    """
+
+    multiplier: Any
+    before: Any
+
+
+class Iterate(NamedTuple):
+    """Increments x (n_s + n_f,), scaled multipliers mu, constraint values g there, and the corrections that g asks for."""
+
+    x: Any
+    mu: Any
+    g: Any
+    dx: Any
+    dmu: Any
+    iterations: Any
+    result: Any
+
+
+@dataclass(frozen=True)
+class Rattle(Solver):
+    """Corrects the multipliers until one more correction would change no increment.
+
+    Accepted are changes relative to the motion of the slow and of the fast variables, and round-off of the positions (`Accepted`).
+    """
+
+    newton: Newton
+
+    def init(self, equations: StepEquations, velocity) -> RattleState:
+        count = sum(equations.system.num_constraints(equations.q_s, equations.q_f))
+        return RattleState(jnp.zeros((2, count)), jnp.zeros(()))
+
+    def solve(self, equations: StepEquations, guess: Unknowns, own: RattleState) -> tuple[Solution, RattleState]:
+        system, h, newton = equations.system, equations.macro_dt, self.newton
+        q, n_s = jnp.concatenate([equations.q_s, equations.q_f]), equations.q_s.size
+        mass = constant_mass(system)
+        velocity_s, velocity_f = inverse_mass(mass.slow), inverse_mass(mass.fast)
+
+        def constraints(t, q):
+            return system.constraints(t, q[:n_s], q[n_s:])
+
+        jacobian = jax.jacrev(constraints, argnums=1)(equations.t, q)
+        columns = jnp.concatenate([velocity_s(jacobian[:, :n_s]), velocity_f(jacobian[:, n_s:])], axis=1)
+        straight = h * velocity_s(equations.p_s), h * velocity_f(equations.p_f)
+        scale = self._scale(equations, own)
+        mu = scale * (2 * own.multiplier[0] - own.multiplier[1])
+        x = jnp.concatenate(straight) - _combined(mu, columns)
+        g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
+        schur = inverse(regularized(jax.vmap(push)(columns).T))
+        accepted = Accepted.of(equations, newton).sizes(tuple(map(max_abs, straight)))
+        per_slow, per_fast = (1 / size for size in accepted)
+
+        def at(x, mu, g, iterations) -> Iterate:
+            dmu = matvec(schur, g)
+            dx = _combined(dmu, columns)
+            change = jnp.maximum(per_slow * max_abs(dx[:n_s]), per_fast * max_abs(dx[n_s:]))
+            return Iterate(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
+
+        def corrected(last: Iterate) -> Iterate:
+            x = last.x - last.dx
+            return at(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
+
+        first = corrected(at(x, mu, g, 0))  # nearly all steps take one: outside of the loop it is cheaper
+        done = newton.iterate(corrected, first, done=1)
+
+        impulse = _combined(done.mu, jacobian) / h
+        end = equations.q_f + done.x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
+        status = status_of(
+            equations, done.result, Method.RATTLE, done.iterations, 0.0, max_abs(done.g), newton.tolerance
+        )
+        n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
+        x, mu = done.x[None], done.mu[None]
+        unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
+        tells = jnp.abs(scale) > LEAST * h**2
+        multiplier = jnp.where(tells, done.mu / jnp.where(tells, scale, 1.0), own.multiplier[0])
+        multipliers = jnp.stack([multiplier, own.multiplier[0]])
+        return Solution(unknowns, end, status), RattleState(multipliers, jnp.asarray(h, dtype=float))
+
+    def _scale(self, equations: StepEquations, own: RattleState):
+        """What turns multipliers (n_g + n_gs,) into unknowns."""
+        counts = equations.system.num_constraints(equations.q_s, equations.q_f)
+        scales = multiplier_scales(equations.scheme, equations.macro_dt, own.before)
+        return jnp.concatenate([jnp.broadcast_to(a.reshape(-1)[:1], n) for a, n in zip(scales, counts, strict=True)])
+
+    def continued(self, own: RattleState, last: RattleState) -> RattleState:
+        return last
+
+    def projected(self, own: RattleState) -> RattleState:
+        return own._replace(before=jnp.zeros_like(own.before))
+
+    def lines(self) -> list[str]:
+        return ["drift along the constraints (RATTLE): Newton's iteration on the multipliers"]
+
+
+def _combined(mu, rows):
+    """``sum_j mu_j rows_j``."""
+    return jnp.sum(mu[:, None] * rows, axis=0)

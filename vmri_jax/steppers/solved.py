@@ -1,0 +1,163 @@
+"""A step whose equations are solved by iteration: start of the iteration, solver, derivative of the solution."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.kernels import max_abs
+from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
+from vmri_jax.mechanics.state import State, project_momentum
+from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.schemes.equations import StepEquations, Unknowns, physical_multipliers
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton.implicit import differentiable
+from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
+
+
+class Solution(NamedTuple):
+    """Unknowns x of a macro step, (q_f, p_s, p_f) at its end, and how they were found."""
+
+    x: Unknowns
+    end: tuple[Any, Any, Any]
+    status: Status
+
+
+@dataclass(frozen=True)
+class Solver:
+    """Solves the equations of a step: ``own = init(equations, velocity)``, then ``solution, own = solve(equations, guess, own)``."""
+
+    def init(self, equations: StepEquations, velocity) -> Any:
+        """What the first step starts from; velocity (v_s, v_f) at the start of the run."""
+        return ()
+
+    def renew(self, equations: StepEquations, own) -> Any:
+        """`own` with what is computed once for a whole macro step."""
+        return own
+
+    def solve(self, equations: StepEquations, guess: Unknowns, own) -> tuple[Solution, Any]:
+        """The root of ``equations.residual``, found from a guess and what the last step handed on."""
+        raise NotImplementedError
+
+    def continued(self, own, last) -> Any:
+        """For a stage of a composition, see `Stepper.continued`."""
+        return own
+
+    def projected(self, own) -> Any:
+        """After the momenta have been projected."""
+        return own
+
+    def lines(self) -> list[str]:
+        raise NotImplementedError
+
+
+class SolvedState(NamedTuple):
+    """Where the next iteration starts.
+
+    velocity: (v_s, v_f) after the last projection; with constant masses it follows from the momenta instead.
+    multiplier, slow_multiplier: (n_g,), (n_gs,) Lagrange multipliers at the last control nodes that have any.
+    solver: what the solver carries.
+    """
+
+    velocity: tuple[Any, Any]
+    multiplier: Any
+    slow_multiplier: Any
+    solver: Any
+
+
+@dataclass(frozen=True)
+class Solved(Stepper):
+    """All unknowns of a step by a solver; the solution is differentiable in both modes, twice.
+
+    The derivative is that of the root, ``dx = -(dR/dx)^-1 dR``, so that iterations are never differentiated.
+    """
+
+    system: System
+    scheme: Scheme
+    solver: Solver
+
+    def init(self, state: State, macro_dt) -> SolvedState:
+        kinetic = self.system.kinetic
+        constant = isinstance(kinetic, ConstantMass)
+        velocity = kinetic.velocity(state.p_s, state.p_f) if constant else project_momentum(self.system, state)[2:]
+        n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
+        solver = self.solver.init(self._equations(state, macro_dt), velocity)
+        return SolvedState(velocity, jnp.zeros(n_g), jnp.zeros(n_gs), solver)
+
+    def renew(self, state: State, own: SolvedState, macro_dt) -> SolvedState:
+        return own._replace(solver=self.solver.renew(self._equations(state, macro_dt), own.solver))
+
+    def move(self, state: State, own: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
+        equations = self._equations(state, macro_dt)
+        velocity = own.velocity
+        if isinstance(self.system.kinetic, ConstantMass):
+            velocity = self.system.kinetic.velocity(state.p_s, state.p_f)  # with the kicks
+        guess = equations.guess(*velocity, own.multiplier, own.slow_multiplier)
+        found, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, own.solver)))
+        x, (q_f, p_s, p_f) = differentiable(equations, found.x, found.end)
+
+        lambdas = physical_multipliers(self.scheme, macro_dt, x.multiplier, x.slow_multiplier)
+        q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])
+        info = StepInfo(*found.status, q_f_micro, *lambdas)
+        end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
+        return end, info, SolvedState(own.velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
+
+    def project(self, state: State, own: SolvedState) -> tuple[State, SolvedState]:
+        p_s, p_f, *velocity = project_momentum(self.system, state, own.velocity)
+        own = own._replace(velocity=tuple(velocity), solver=self.solver.projected(own.solver))
+        return State(state.t, state.q_s, state.q_f, p_s, p_f), own
+
+    def continued(self, own: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:
+        return last._replace(solver=self.solver.continued(own.solver, last.solver))
+
+    def _equations(self, state: State, macro_dt) -> StepEquations:
+        return StepEquations(self.system, self.scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
+
+    def lines(self) -> list[str]:
+        return self.solver.lines()
+
+
+@dataclass(frozen=True)
+class Fallback(Solver):
+    """`first`, and where it does not converge `exact`."""
+
+    first: Solver
+    exact: Solver
+
+    def init(self, equations: StepEquations, velocity) -> Any:
+        return self.first.init(equations, velocity)
+
+    def renew(self, equations: StepEquations, own) -> Any:
+        return self.first.renew(equations, own)
+
+    def solve(self, equations: StepEquations, guess: Unknowns, own) -> tuple[Solution, Any]:
+        found, learned = self.first.solve(equations, guess, own)
+        converged = found.status.result <= Result.CONVERGED_AT_ROUNDOFF
+        own = jax.tree.map(partial(jnp.where, converged), learned, own)  # nothing is learned from a failure
+        return jax.lax.cond(converged, lambda: found, lambda: self.exact.solve(equations, guess, ())[0]), own
+
+    def continued(self, own, last) -> Any:
+        return self.first.continued(own, last)
+
+    def projected(self, own) -> Any:
+        return self.first.projected(own)
+
+    def lines(self) -> list[str]:
+        return [*self.first.lines(), "where that does not converge:", *indented(self.exact.lines())]
+
+
+def status_of(equations: StepEquations, result, method, iterations, rows, g, tolerance) -> Status:
+    """How a solver ended, from the largest row of the momentum equations times h and the largest constraint value.
+
+    Increments that converged with constraints that are not kept mean rows that contradict each other.
+    """
+    if equations.system.is_constrained:
+        violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
+        contradicts = (result <= Result.CONVERGED_AT_ROUNDOFF) & violated
+        result = jnp.where(contradicts, Result.CONSTRAINT_VIOLATED, result)
+    momentum = jnp.maximum(max_abs(equations.p_s), max_abs(equations.p_f)) * equations.micro_dt
+    residual = jnp.maximum(rows / jnp.where(momentum > 0, momentum, 1.0), g)
+    return Status(result, jnp.asarray(int(method)), iterations, residual)

@@ -1,0 +1,101 @@
+"""What every stepper offers, and what a macro step tells about itself."""
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.state import State
+from vmri_jax.steppers.results import Method, Result
+
+
+class StepInfo(eqx.Module):
+    """What a macro step did.
+
+    result: status code, see `Result`.
+    method: code of the stepper that ran, see `Method`; with "auto" ARROWHEAD says that the first choice did not converge.
+    iterations: Newton iterations or passes, the most that any of its solves took; 0 for explicit steps.
+    residual: largest residual left, relative to the momentum, and of the constraints; 0 where equations are linear.
+    q_f_micro: (num_micro, n_f) fast positions at the micro nodes, the start excluded.
+    multiplier, slow_multiplier: (num_micro, r, n_g) and (r, n_gs) Lagrange multipliers at the control nodes; of the
+        stages of a composition one after the other, (s r, n_gs).
+    """
+
+    result: Any
+    method: Any
+    iterations: Any
+    residual: Any
+    q_f_micro: Any
+    multiplier: Any
+    slow_multiplier: Any
+
+    @property
+    def status(self) -> "Status":
+        """Without the arrays along the step."""
+        return Status(self.result, self.method, self.iterations, self.residual)
+
+
+class Status(NamedTuple):
+    """How a step ended: the first four fields of `StepInfo`."""
+
+    result: Any
+    method: Any
+    iterations: Any
+    residual: Any
+
+    @classmethod
+    def direct(cls, method: Method) -> "Status":
+        """Of a step that solves nothing by iteration: known before it is taken."""
+        return cls(np.asarray(int(Result.CONVERGED)), np.asarray(int(method)), np.asarray(0), np.zeros(()))
+
+    def worse(self, other: "Status") -> "Status":
+        """Field by field the larger one."""
+        return Status(*(jnp.maximum(a, b) for a, b in zip(self, other, strict=True)))
+
+
+@dataclass(frozen=True)
+class Stepper:
+    """Takes macro steps: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)`` again and again.
+
+    `own` is what a stepper carries from step to step, a NamedTuple that its file documents.
+    """
+
+    def init(self, state: State, macro_dt) -> Any:
+        """What the first step starts from besides the state."""
+        return ()
+
+    def renew(self, state: State, own, macro_dt) -> Any:
+        """`own` with what is computed once for a whole macro step, however many micro steps share it."""
+        return own
+
+    def move(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
+        """The step itself; its momenta are those of the discrete Legendre transform."""
+        raise NotImplementedError
+
+    def step(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
+        """A macro step: `renew`, then `move`; NON_FINITE where a momentum is, since positions follow momenta."""
+        state, info, own = self.move(state, self.renew(state, own, macro_dt), macro_dt)
+        finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))
+        return state, replace(info, result=jnp.where(finite, info.result, Result.NON_FINITE)), own
+
+    def project(self, state: State, own) -> tuple[State, Any]:
+        """Momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
+        return state, own
+
+    def continued(self, own, last, state: State, macro_dt) -> Any:
+        """For a stage of a composition: what it learned in the macro step before, going on where the last stage ended."""
+        return own
+
+    def lines(self) -> list[str]:
+        """This stepper and what is inside of it in words, one line each."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+
+def indented(lines: list[str]) -> list[str]:
+    """Lines of an inner stepper."""
+    return ["  " + line for line in lines]
