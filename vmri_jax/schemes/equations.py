@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import Sum, lagrangian
 from vmri_jax.schemes.path import Nodes, Path, control_nodes, lagrange_basis, velocity_nodes
@@ -51,6 +52,11 @@ class StepEquations(eqx.Module):
     p_s: Any
     p_f: Any
     macro_dt: Any
+
+    @classmethod
+    def of(cls, system: System, scheme: Scheme, state: State, macro_dt) -> "StepEquations":
+        """Those of a step from a state."""
+        return cls(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
 
     @property
     def micro_dt(self):

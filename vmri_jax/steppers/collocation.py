@@ -27,70 +27,12 @@ from vmri_jax.kernels import inverse, matmul, max_abs, regularized
 from vmri_jax.mechanics.structure import curved_directions
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
-from vmri_jax.schemes.quadrature import interpolatory_weights
-from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.steppers.interval import Accepted, constant_mass, expected, inverse_mass
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
-
-FEW_MODES = 4
-"""Parts of no mode are added to more pairs of modes than that, if they are odd: half a vector register costs as much as a full one."""
-
-
-class TimeModes(NamedTuple):
-    """Eigenvectors of ``A^-1 B``, one of every complex pair.
-
-    What has one entry per part of a mode has all real parts before all imaginary ones. Two real modes share what a complex one
-    takes, and parts of no mode fill vector registers.
-
-    gamma (2, modes): eigenvalues.
-    mode (k,): which mode it is a part of.
-    of_rows: (r, r) ``A^-1``, from the rows of the momentum equations to increments.
-    of_values: (r, k) from values at the nodes to modes.
-    increments, multipliers: (k, r) from modes to increments, and (through A) to multipliers.
-    """
-
-    gamma: Any
-    mode: Any
-    of_rows: Any
-    of_values: Any
-    increments: Any
-    multipliers: Any
-
-    @classmethod
-    def of(cls, scheme: Scheme) -> "TimeModes":
-        """Of the polynomials and the nodes of the rules for T and W."""
-        a, b = (
-            _form(basis, scheme.degree, placed.rule.nodes)[:-1, 1:]
-            for basis, placed in ((lagrange_derivative, scheme.kinetic), (lagrange_basis, scheme.fast))
-        )
-        gamma, vectors = np.linalg.eig(np.linalg.solve(a, b))
-        order = np.argsort(-np.sign(np.imag(gamma)), kind="stable")  # of pairs, real ones, the others of pairs
-        gamma, vectors = gamma[order], vectors[:, order]
-        pairs, distinct = int(np.sum(np.imag(gamma) > 0)), int(np.sum(np.imag(gamma) >= 0))
-        half = (pairs + distinct + 1) // 2
-        first, second = np.arange(half), np.concatenate([np.arange(pairs), np.arange(half, distinct)])
-        width = half + (half % 2 if half > FEW_MODES else 0)
-
-        def parts(z):
-            """Of modes (r, m), those of no mode zero."""
-            imaginary = np.where(np.imag(gamma)[:, None] == 0, z.real, z.imag)
-            some = z.real[first], imaginary[second]
-            return np.concatenate([np.pad(a, [(0, width - len(a)), (0, 0)]) for a in some])
-
-        to = np.linalg.inv(vectors)
-        back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T  # a mode and its conjugate: the real part
-        mode = np.concatenate([np.pad(a, (0, width - len(a)), mode="edge") for a in (first, second)])
-        eigenvalues = np.stack([np.real(gamma), np.imag(gamma)])[:, :distinct]
-        return cls(eigenvalues, mode, np.linalg.inv(a).T, parts(to).T, parts(back), parts(back @ a.T))
-
-
-def _form(basis, degree: int, nodes) -> np.ndarray:
-    """``sum_n w_n l_i(c_n) l_j(c_n)`` (r + 1, r + 1) of the interpolatory rule on these nodes."""
-    at = basis(degree, np.array(nodes))
-    return at.T @ (interpolatory_weights(nodes)[:, None] * at)
+from vmri_jax.steppers.time_modes import TimeModes, product, taken, times_i
 
 
 class CollocatedInterval:
@@ -215,12 +157,6 @@ class Forces(NamedTuple):
     g: Any
 
 
-def taken(a, index: np.ndarray):
-    """What is at a known index of the last axis, as slices."""
-    runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
-    return jnp.concatenate([a[..., run[0] : run[-1] + 1] for run in runs], axis=-1)
-
-
 class Saddles(NamedTuple):
     """The saddles of all modes, eliminated; with z = L x for the d combinations of variables that the potentials are curved along.
 
@@ -296,18 +232,6 @@ class Saddles(NamedTuple):
         """Or times the conjugate of gamma."""
         re, im = self.gamma
         return re * z + sign * im * times_i(z)
-
-
-def times_i(z):
-    """Complex numbers, all real parts before all imaginary ones."""
-    re, im = jnp.split(z, 2, axis=-1)
-    return jnp.concatenate([-im, re], axis=-1)
-
-
-def product(matrix, z):
-    """Of complex matrices, their real and their imaginary parts (columns, rows, k), and vectors (columns, k)."""
-    re, im = matrix
-    return jnp.sum(re * z[:, None] + im * times_i(z)[:, None], axis=0)
 
 
 class Iterate(NamedTuple):

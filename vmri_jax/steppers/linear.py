@@ -23,12 +23,12 @@ class Linear(Stepper):
     interval: Interval
 
     def init(self, state: State, macro_dt) -> DiagonalMatrix | FullMatrix:
-        return self.interval.matrix(self._equations(state, macro_dt))
+        return self.interval.matrix(StepEquations.of(self.system, self.scheme, state, macro_dt))
 
     def move(
         self, state: State, own: DiagonalMatrix | FullMatrix, macro_dt
     ) -> tuple[State, StepInfo, DiagonalMatrix | FullMatrix]:
-        equations = self._equations(state, macro_dt)
+        equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         h, rest = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
         path = equations.path(Unknowns(jnp.zeros((self.scheme.degree, 0)), None, rest[None], None))
         d = jax.grad(equations.without_kinetic)(path, path)
@@ -43,9 +43,6 @@ class Linear(Stepper):
 
     def continued(self, own, last, state: State, macro_dt):
         return own  # the matrix of a stage belongs to its length
-
-    def _equations(self, state: State, macro_dt) -> StepEquations:
-        return StepEquations(self.system, self.scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
 
     def lines(self) -> list[str]:
         return ["linear equations: one product with a matrix computed once"]

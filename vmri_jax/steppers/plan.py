@@ -35,11 +35,51 @@ from vmri_jax.steppers.nested import SMALL, Nested
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Fallback, Solved, Solver
-from vmri_jax.steppers.stepper import Stepper
+from vmri_jax.steppers.stepper import StepInfo, Stepper
 
 
-def plan(system: System, scheme: Scheme | Composition, newton: Newton, state: State) -> Stepper:
-    """The stepper for a system and a scheme; ``print`` shows it in words.
+@dataclass(frozen=True)
+class Plan:
+    """A stepper with what it was planned for: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)``.
+
+    ``print`` shows it in words.
+
+    Attributes:
+        system, scheme, newton: as they were given.
+        stepper: the tree of steppers.
+        projects_rarely: momenta are on the hidden constraints only after `project`, which is needed where they are looked at;
+            else every step ends with it.
+    """
+
+    system: System
+    scheme: Scheme | Composition
+    newton: Newton
+    stepper: Stepper
+    projects_rarely: bool
+
+    def init(self, state: State, macro_dt):
+        """What the first step starts from besides the state."""
+        return self.stepper.init(state, macro_dt)
+
+    def step(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
+        """One macro step."""
+        return self.stepper.step(state, own, macro_dt)
+
+    def project(self, state: State, own) -> tuple[State, Any]:
+        """Momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
+        return self.stepper.project(state, own)
+
+    @property
+    def has_fallback(self) -> bool:
+        """Whether some solver inside may give way to another one."""
+        return any(isinstance(solver, Fallback) for solver in _solvers(self.stepper))
+
+    def __str__(self) -> str:
+        return str(self.stepper)
+
+
+def plan(system: System, scheme: Scheme | Composition, newton: Newton, state: State) -> Plan:
+    """The plan for a system and a scheme.
 
     Args:
         system, scheme: what moves, and how.
@@ -49,36 +89,31 @@ def plan(system: System, scheme: Scheme | Composition, newton: Newton, state: St
     Raises:
         ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
     """
-    stage = stage_scheme(scheme)
-    stepper: Stepper = _whole_step(system, stage, newton, state.q_s, state.q_f)
-    needs_projection = system.is_constrained or not isinstance(system.kinetic, ConstantMass)
-    if needs_projection and not projects_rarely(stepper):
+    stepper: Stepper = _whole_step(system, stage_scheme(scheme), newton, state.q_s, state.q_f)
+    rarely = _projects_rarely(stepper)
+    if not rarely and (system.is_constrained or not isinstance(system.kinetic, ConstantMass)):
         stepper = Projected(stepper)
-    return Composed(scheme.coefficients, stepper) if isinstance(scheme, Composition) else stepper
+    if isinstance(scheme, Composition):
+        stepper = Composed(scheme.coefficients, stepper)
+    return Plan(system, scheme, newton, stepper, rarely)
 
 
-def projects_rarely(stepper: Stepper) -> bool:
+def _projects_rarely(stepper: Stepper) -> bool:
     """Whether momenta have to be projected only where they are looked at.
 
-    A projection is a shift by ``G^T mu``, which the multipliers of the next step take back where nothing but a drift moves along
-    the constraints.
+    A projection is a shift by ``G^T mu``, which the multipliers of the next step take back where nothing but drifts move along
+    constraints.
     """
-    if isinstance(stepper, Composed):
-        return projects_rarely(stepper.stage)
-    if isinstance(stepper, Kicked):
-        return projects_rarely(stepper.inner)
-    if isinstance(stepper, Decoupled):
-        parts = [part.inner for part in (stepper.slow, stepper.fast)]
-        return any(map(projects_rarely, parts)) and all(
-            projects_rarely(part) for part in parts if isinstance(part, Solved) and part.system.is_constrained
-        )
-    return isinstance(stepper, Solved) and isinstance(_first(stepper.solver), Rattle)
+    solvers = [_first(solver) for solver in _solvers(stepper, constrained=True)]
+    return bool(solvers) and all(isinstance(solver, Rattle) for solver in solvers)
 
 
-def has_fallback(stepper: Stepper) -> bool:
-    """Whether a solver inside may give way to another one."""
-    inner = [getattr(stepper, name) for name in ("inner", "stage", "slow", "fast") if hasattr(stepper, name)]
-    return any(map(has_fallback, inner)) or (isinstance(stepper, Solved) and isinstance(stepper.solver, Fallback))
+def _solvers(stepper: Stepper, constrained: bool = False) -> list[Solver]:
+    """The solvers of a tree of steppers, all or those of constrained systems."""
+    if isinstance(stepper, Solved):
+        return [stepper.solver] if stepper.system.is_constrained or not constrained else []
+    inner = [getattr(stepper, name) for name in ("stage", "inner", "slow", "fast") if hasattr(stepper, name)]
+    return [solver for part in inner for solver in _solvers(part, constrained)]
 
 
 def _first(solver: Solver) -> Solver:

@@ -84,14 +84,16 @@ class Solved(Stepper):
         constant = isinstance(kinetic, ConstantMass)
         velocity = kinetic.velocity(state.p_s, state.p_f) if constant else project_momentum(self.system, state)[2:]
         n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
-        solver = self.solver.init(self._equations(state, macro_dt), velocity)
+        solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt), velocity)
         return SolvedState(velocity, jnp.zeros(n_g), jnp.zeros(n_gs), solver)
 
     def renew(self, state: State, own: SolvedState, macro_dt) -> SolvedState:
-        return own._replace(solver=self.solver.renew(self._equations(state, macro_dt), own.solver))
+        return own._replace(
+            solver=self.solver.renew(StepEquations.of(self.system, self.scheme, state, macro_dt), own.solver)
+        )
 
     def move(self, state: State, own: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
-        equations = self._equations(state, macro_dt)
+        equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         velocity = own.velocity
         if isinstance(self.system.kinetic, ConstantMass):
             velocity = self.system.kinetic.velocity(state.p_s, state.p_f)  # with the kicks
@@ -112,9 +114,6 @@ class Solved(Stepper):
 
     def continued(self, own: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:
         return last._replace(solver=self.solver.continued(own.solver, last.solver))
-
-    def _equations(self, state: State, macro_dt) -> StepEquations:
-        return StepEquations(self.system, self.scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
 
     def lines(self) -> list[str]:
         return self.solver.lines()
