@@ -13,6 +13,8 @@ The cheapest stepper that the rules and the system allow is found from outside t
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 
