@@ -5,7 +5,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.simulate import simulate
+from vmri_jax.running.simulate import Simulation, prepare, simulate
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes import quadrature
@@ -37,6 +37,7 @@ __all__ = [
     "Result",
     "Rheonomic",
     "Scheme",
+    "Simulation",
     "SimulationError",
     "State",
     "StepInfo",
@@ -56,6 +57,7 @@ __all__ = [
     "macro_step",
     "micro",
     "mollified_impulse",
+    "prepare",
     "quadrature",
     "runtime",
     "simulate",

@@ -13,7 +13,7 @@ from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.checks import check_params, check_type
 from vmri_jax.mechanics.state import State, check_constraints
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.simulate import check_run, run, run_memory
+from vmri_jax.running.arguments import check_run
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.runtime import OPTIONS
 from vmri_jax.schemes.composition import Composition, stage_scheme

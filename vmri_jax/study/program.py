@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.simulate import check_run, run
+from vmri_jax.running.arguments import check_run
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.runtime import OPTIONS, in_one_kernel
 from vmri_jax.schemes.composition import Composition

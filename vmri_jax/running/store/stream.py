@@ -15,7 +15,7 @@ from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.state import State, check_constraints
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.simulate import Simulation, prepare
+from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import differences, environment, identity
 from vmri_jax.running.store.layout import Record
