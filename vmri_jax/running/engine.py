@@ -78,22 +78,25 @@ class Engine:
     def _run(self, stepper: Stepper, state: State, own, t_start, macro_dt, step, save_every):
         """`num_saves * save_every` macro steps from step number `step`."""
         system, tolerance, num_micro = stepper.system, stepper.newton.tolerance, stepper.scheme.num_micro
+        no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
         no_micro = jnp.zeros((num_micro, state.q_f.shape[0])) if self.save_micro else None
+        take = _step_of(stepper, t_start, macro_dt, self.save_micro)
 
-        def save(at: _At, _):
-            worst = RunInfo(jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
-            take = _step_of(stepper, t_start, macro_dt, self.save_micro)
-            at, worst, micro = jax.lax.fori_loop(0, save_every, take, (at, worst, no_micro))
+        def interval(at: _At):
+            at, worst, micro = jax.lax.fori_loop(0, save_every, take, (at, no_info, no_micro))
             if stepper.projects_rarely:
                 state, own = stepper.project(at.state, at.own)
                 at = at._replace(state=state, own=own)
+            return at, worst, micro
+
+        def save(at: _At, is_start):  # one place for the first node and all others: compiled once
+            at, worst, micro = jax.lax.cond(is_start, lambda at: (at, no_info, no_micro), interval, at)
             node, at = _node(system, tolerance, at)
             return at, (node, worst, micro)
 
-        at = _At(state, own, jnp.asarray(step), jnp.asarray(int(Result.CONVERGED)), jnp.asarray(-1))
-        first, at = _node(system, tolerance, at)
-        at, (later, worst, micro) = jax.lax.scan(save, at, length=self.num_saves)
-        nodes = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, later)
+        at = _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
+        at, (nodes, *between) = jax.lax.scan(save, at, np.arange(self.num_saves + 1) == 0)
+        worst, micro = jax.tree.map(lambda a: a[1:], between)
         t_micro = None if micro is None else nodes[0][1:, None] - macro_dt * (1 - stepper.scheme.micro_times)
         return Trajectory(*nodes, worst, at.result, at.failed_at, t_micro, micro), at.state, at.own
 
@@ -147,7 +150,7 @@ def _node(system: System, tolerance, at: _At):
     """
     state = at.state
     phase = state.q_s, state.q_f, state.p_s, state.p_f
-    energy, residual = _energy_and_residual(system, state)
+    energy, residual = diagnostics.energy(system, *phase), diagnostics.constraint_residual(system, state)
     finite, kept = jnp.isfinite(energy), residual[0] <= jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
     breaks = (at.failed_at < 0) & ~(finite & kept)
     cause = jnp.where(finite, Result.CONSTRAINT_VIOLATED, Result.NON_FINITE)
@@ -155,10 +158,3 @@ def _node(system: System, tolerance, at: _At):
     failed_at = jnp.where(breaks, jnp.maximum(at.step - 1, 0), at.failed_at)
     values = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))
     return (state.t, *values), at._replace(result=result, failed_at=failed_at)
-
-
-@jax.jit
-def _energy_and_residual(system: System, state: State):
-    """Compiled in a program of its own nowhere; traced once for the first node and all later ones."""
-    energy = diagnostics.energy(system, state.q_s, state.q_f, state.p_s, state.p_f)
-    return energy, diagnostics.constraint_residual(system, state)

@@ -234,11 +234,11 @@ class Simulation:
         """Programs for another number of saved intervals."""
         return engine(self.structure, num_saves, self.save_micro, falls_back)
 
-    def check(self) -> None:
+    def check(self, what: str = "simulate: the state") -> None:
         """Refuse a system whose functions return something else than they should, and constraints that cannot be kept."""
         shapes = tuple(a.shape for a in self.start_arrays)
         numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.leaves)
-        _check_once(_Known((self.structure, shapes, numbers), self.system, self.state))
+        _check_once(_Known((self.structure, shapes, numbers), self.system, self.state, what))
 
     def traced(self) -> Trajectory:
         """The whole run under transformations of JAX."""
@@ -316,12 +316,13 @@ class _Known:
     key: tuple
     system: System = field(compare=False)
     state: State = field(compare=False)
+    what: str = field(compare=False)
 
 
 @lru_cache(maxsize=256)
 def _check_once(known: _Known) -> None:
     check_system(known.system, known.state.q_s, known.state.q_f)
-    check_constraints(known.system, known.state, "simulate: the state")
+    check_constraints(known.system, known.state, known.what)
 
 
 def _shown_sizes(num_saves: int) -> Iterator[int]:

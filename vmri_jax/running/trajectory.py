@@ -6,6 +6,7 @@ from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -175,4 +176,12 @@ def from_named_arrays(arrays: dict) -> Trajectory:
 
 def from_arrays(arrays: list) -> Trajectory:
     """The trajectory with these leaves."""
-    return Trajectory(*arrays[:7], RunInfo(*arrays[7:10]), *arrays[10:])
+    return jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
+
+
+_STRUCTURES = {
+    leaves.num_leaves: leaves
+    for micro in (None, 0)
+    for leaves in [jax.tree.structure(Trajectory(*NODES, RunInfo(0, 0, 0), 0, 0, micro, micro))]
+}
+"""Of trajectories without and with micro nodes, by the number of their arrays."""
