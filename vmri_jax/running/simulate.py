@@ -234,11 +234,11 @@ class Simulation:
         """Programs for another number of saved intervals."""
         return engine(self.structure, num_saves, self.save_micro, falls_back)
 
-    def check(self, what: str = "simulate: the state") -> None:
+    def check(self, what: str = "simulate: the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return something else than they should, and constraints that cannot be kept."""
         shapes = tuple(a.shape for a in self.start_arrays)
         numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.leaves)
-        _check_once(_Known((self.structure, shapes, numbers), self.system, self.state, what))
+        _check_once(_Known((self.structure, shapes, numbers), self.system, self.state, what, constraints))
 
     def traced(self) -> Trajectory:
         """The whole run under transformations of JAX."""
@@ -317,12 +317,14 @@ class _Known:
     system: System = field(compare=False)
     state: State = field(compare=False)
     what: str = field(compare=False)
+    constraints: bool
 
 
 @lru_cache(maxsize=256)
 def _check_once(known: _Known) -> None:
     check_system(known.system, known.state.q_s, known.state.q_f)
-    check_constraints(known.system, known.state, known.what)
+    if known.constraints:
+        check_constraints(known.system, known.state, known.what)
 
 
 def _shown_sizes(num_saves: int) -> Iterator[int]:

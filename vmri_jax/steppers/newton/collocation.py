@@ -30,7 +30,6 @@ from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import interpolatory_weights
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.lanes import over_lanes
 from vmri_jax.steppers.newton.interval import (
     Accepted,
     constant_mass,
@@ -192,7 +191,7 @@ class Interval:
             return g, -pull(mu)[0]
 
         later = jnp.concatenate([mu[:, 1:], jnp.zeros_like(mu[:, :1])], axis=1)
-        g, total = over_lanes(at_node, self.r)((self.times[1:], q, later))
+        g, total = over_nodes(at_node)((self.times[1:], q, later))
         first = -jnp.sum(mu[:, :1] * self.at_start, axis=0)
         for term in self.potentials:
             theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
@@ -201,10 +200,10 @@ class Interval:
             before, k = int(np.argmax(basis[0, 1:])), len(theta)
             consecutive = np.eye(self.r + 1)[before + 1 : before + 1 + k]
             if np.array_equal(basis, consecutive):  # nodes of the path: nothing to interpolate
-                d = over_lanes(gradient, k)(q[:, before : before + k])
+                d = over_nodes(gradient)(q[:, before : before + k])
                 total += jnp.pad(weights * d, ((0, 0), (before, self.r - before - k)))
             else:
-                d = over_lanes(gradient, k)(self.q[:, None] + x @ basis[:, 1:].T)
+                d = over_nodes(gradient)(self.q[:, None] + x @ basis[:, 1:].T)
                 first += d @ (weights * basis[:, 0])
                 total += d @ (weights[:, None] * basis[:, 1:])
         inside = jnp.concatenate([(self.h * self.p + first)[:, None], total[:, :-1]], axis=1)
@@ -217,6 +216,11 @@ class Interval:
     def momentum(self, x, forces: "Forces"):
         """At the end of the step (n,)."""
         return (self.times_mass(x @ self.form[:, -1:])[:, 0] + forces.last) / self.h
+
+
+def over_nodes(function):
+    """`function` at all nodes; every array of its argument and of its result has the nodes as its last axis."""
+    return jax.vmap(function, in_axes=-1, out_axes=-1)
 
 
 class Forces(NamedTuple):
