@@ -5,7 +5,8 @@ from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.simulate import simulate
+from vmri_jax.running.macro_step import macro_step
+from vmri_jax.running.simulate import Simulation, prepare, simulate
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes import quadrature
@@ -24,7 +25,6 @@ from vmri_jax.schemes.scheme import (
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result, SimulationError
 from vmri_jax.steppers.stepper import StepInfo
-from vmri_jax.running.simulate import macro_step
 
 from vmri_jax import systems  # isort: skip  (written with the names above)
 
@@ -38,6 +38,7 @@ __all__ = [
     "Result",
     "Rheonomic",
     "Scheme",
+    "Simulation",
     "SimulationError",
     "State",
     "StepInfo",
@@ -57,6 +58,7 @@ __all__ = [
     "macro_step",
     "micro",
     "mollified_impulse",
+    "prepare",
     "quadrature",
     "runtime",
     "simulate",

@@ -9,11 +9,11 @@ import numpy as np
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.state import State, project_momentum
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton, dense
-from vmri_jax.running.simulate import macro_step
 
 
 def energy_parts(system: System, q_s, q_f, p_s, p_f) -> dict:

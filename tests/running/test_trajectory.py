@@ -38,7 +38,7 @@ def test_a_file_is_not_lost_to_a_full_disk(trajectory, tmp_path, monkeypatch):
     trajectory.save(tmp_path / "run.npz")
     monkeypatch.setattr(np, "savez_compressed", full)
     with pytest.raises(OSError, match="No space left"):
-        trajectory.first(2).save(tmp_path / "run.npz")
+        trajectory.save(tmp_path / "run.npz")
     assert Trajectory.load(tmp_path / "run.npz").t.shape == (5,)
     assert [path.name for path in tmp_path.iterdir()] == ["run.npz"]
 

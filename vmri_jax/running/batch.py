@@ -1,38 +1,28 @@
 """Batches of runs: many starts, step sizes or parameters of one system, lane by lane independent."""
 
-import dataclasses
-from functools import lru_cache, partial
+from dataclasses import replace
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 from jax.sharding import PartitionSpec
 
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.checks import check_params, check_type
-from vmri_jax.mechanics.state import State, check_constraints
+from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.simulate import _alone, check_run, run, run_memory
-from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.runtime import OPTIONS
-from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.running.engine import Engine
+from vmri_jax.running.simulate import Simulation, simulation
+from vmri_jax.running.trajectory import Trajectory, from_arrays
+from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 
-WORKING_SET = 4096
-"""Numbers that the lanes of a chunk may hold together, 32 kB: the first-level cache."""
-FEWEST, MOST = 64, 1024
-"""Lanes of a chunk. Loops over fewer are written out instead of run, which takes twice the time per lane even where 64 do not fit
-into the cache."""
-IN_A_CALL = 16
-"""Chunks that a call computes at most. A call takes as long as a hundred steps of a small system."""
-RESULTS = 4_000_000
-"""Numbers that their results may hold together, 32 MB: with more, loops are no single kernels (`vmri_jax.runtime.configure`)."""
-MATRICES = 10_000_000
-"""Numbers that the matrices of a chunk may hold together (80 MB), before the lanes become fewer than that."""
-CACHE = 130_000
-"""The same where all of them are read in every pass (`is_collocation`): the second-level cache, 1 MB."""
+WORKING_SET = 40_000
+"""Variables times micro steps that the lanes of a chunk may have together."""
+FEWEST, MOST = 16, 1024
+"""Lanes of a chunk."""
 
 
 def simulate_batch(
@@ -52,8 +42,7 @@ def simulate_batch(
 ) -> Trajectory:
     """Simulate a batch of states, each lane as `simulate` would; the arrays returned have a leading batch axis.
 
-    Lanes are computed side by side, with the batch axis contiguous in memory, in chunks that fit into the cache. A lane
-    that fails is NaN from there on and has its status in ``.result`` and ``.failed_at``; others do not notice, and
+    Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. A lane that fails is NaN from there on and has its status in ``.result`` and ``.failed_at``; others do not notice, and
     nothing is raised. Lanes that the nested march does not solve are run again with the exact arrowhead.
 
     Args:
@@ -69,23 +58,13 @@ def simulate_batch(
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
     """
-    newton = newton or Newton()
     lanes = _check_states(states)
     check_type("simulate_batch: system", system, System, "a vmri_jax.System")
     if params is not None:
         _check_params(system, params, lanes)
-    states, params = jax.tree.map(np.asarray, (states, params))  # cut into pieces without a compiled program for each
-    first = jax.tree.map(lambda a: a[0], states)
-    check_run(
-        system,
-        scheme,
-        first,
-        newton,
-        *(_first(dt) for dt in (macro_dt, micro_dt)),
-        num_steps=num_steps,
-        save_every=save_every,
-        save_micro=save_micro,
-    )
+    first = jax.tree.map(lambda a: np.asarray(a)[0], states)
+    steps = [_first(dt) for dt in (macro_dt, micro_dt)]
+    run = simulation(system, scheme, first, newton, *steps, num_steps, save_every, save_micro)
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
     dt = np.asarray(real_array(f"simulate_batch: {name}", dt))
     if dt.shape not in ((), (lanes,)):
@@ -94,29 +73,21 @@ def simulate_batch(
         )
     if not (np.all(np.isfinite(dt)) and np.all(dt > 0)):
         raise ValueError(f"simulate_batch: every {name} must be a positive number, got {dt}.")
-    if not 1 <= devices <= jax.device_count():
-        raise ValueError(
-            f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call runtime.configure(devices={devices}) "
-            "before JAX starts."
-        )
-    if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
-        raise ValueError(f"simulate_batch: chunk is {chunk!r}; it must be an integer of at least 1, or None.")
-    if params is None:
-        check_constraints(system, first, "simulate_batch: the first state")
-    macro_dt = dt * (scheme.num_micro if micro_dt is not None else 1)
-    size = _chunk(system, stage_scheme(scheme), first) if chunk is None else chunk
-    static = {"num_saves": num_steps // save_every, "save_every": save_every, "save_micro": save_micro}
-    go = partial(_in_chunks, system, scheme, chunk=size, devices=devices, **static)
-    alone = _alone(newton, system, scheme)
-    batch = {"state": states}  # what differs between the lanes
-    batch |= {} if params is None else {"params": params}
-    batch |= {} if dt.ndim == 0 else {"macro_dt": macro_dt}
-    go = partial(go, macro_dt)
-    trajectory = go(alone, batch)
+    _check_devices(devices, chunk)
+    run.check("simulate_batch: the first state", constraints=params is None)
+    width = (_chunk(run) if chunk is None else chunk) * devices
+    batch = {
+        "params": None if params is None else [np.asarray(leaf) for leaf in jax.tree.leaves(params)],
+        "state": tuple(np.asarray(a, dtype=float) for a in vars(states).values()),
+        "macro_dt": None if dt.ndim == 0 else run.macro_dt / dt[0] * dt,
+    }
+    trajectory = _in_chunks(run, run.engine, batch, width, devices)
     failed = np.flatnonzero(np.asarray(trajectory.failed_at) >= 0)
-    if failed.size and alone is not newton:
-        exact = dataclasses.replace(newton, method="arrowhead")
-        again = go(exact, jax.tree.map(lambda a: a[failed], batch))
+    if failed.size and run.plan.has_fallback:
+        exact = replace(
+            run.engine, structure=jax.tree.structure((replace(run.newton, method="arrowhead"), scheme, system))
+        )
+        again = _in_chunks(run, exact, jax.tree.map(lambda a: a[failed], batch), width, devices)
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b), trajectory, again)
     return trajectory
 
@@ -159,88 +130,50 @@ def _check_states(states) -> int:
     return lanes[0]
 
 
-def _chunk(system: System, scheme: Scheme, state: State) -> int:
+def _check_devices(devices, chunk) -> None:
+    if not 1 <= devices <= jax.device_count():
+        raise ValueError(
+            f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call runtime.configure(devices={devices}) "
+            "before JAX starts."
+        )
+    if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
+        raise ValueError(f"simulate_batch: chunk is {chunk!r}; it must be an integer of at least 1, or None.")
+
+
+def _chunk(run: Simulation) -> int:
     """A power of two of lanes: those whose unknowns fit into the working set, but not too few."""
-    leaves, structure = jax.tree.flatten((system, scheme, state))
-    unknowns, most = _unknowns(structure, tuple((np.shape(a), jnp.result_type(a)) for a in leaves))
-    variables = state.q_s.shape[0] + state.q_f.shape[0]
-    fitting = WORKING_SET / (8 * variables + unknowns)
-    enough = min(FEWEST, max(8.0, most / (unknowns * variables + 1)))
-    return 2 ** int(np.log2(np.clip(fitting, enough, MOST)))
+    size = run.scheme.num_micro * (run.state.q_s.size + run.state.q_f.size)
+    return 2 ** int(np.log2(np.clip(WORKING_SET / size, FEWEST, MOST)))
 
 
-@lru_cache
-def _unknowns(structure, leaves) -> tuple[int, int]:
-    """Fast unknowns of a macro step that are solved for together, and numbers that their matrices may hold in all lanes.
-
-    The functions of a system are traced for it.
-    """
-    found = [(0, MATRICES)]
-
-    def count(system, scheme, state):
-        if split(system, scheme, state.q_s, state.q_f) is None:
-            n_g = system.num_constraints(state.q_s, state.q_f)[0]
-            at_once = is_collocation(system, scheme, state.q_s, state.q_f)
-            unknowns = scheme.num_micro * scheme.degree * (state.q_f.shape[0] + n_g)
-            found.append((unknowns, CACHE if at_once else MATRICES))
-
-    jax.eval_shape(count, *jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*a) for a in leaves]))
-    return found[-1]
-
-
-def _in_chunks(system, scheme, macro_dt, newton, batch, *, chunk: int, devices: int, **static) -> Trajectory:
-    """All lanes, `chunk` per device at a time; the last ones are filled up with copies, so that one program does all."""
-    state = batch["state"]
-    lanes, (n_s, n_f) = state.q_s.shape[0], (state.q_s.shape[1], state.q_f.shape[1])
-    width = min(chunk * devices, -(-lanes // devices) * devices)
-    numbers = static["num_saves"] * (2 * (n_s + n_f) + static["save_micro"] * scheme.num_micro * n_f)
-    together = IN_A_CALL if width < lanes and IN_A_CALL * width * numbers < RESULTS else 1
+def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices: int) -> Trajectory:
+    """All lanes, so many at a time; the last ones are filled up with copies, so that one program does all."""
+    lanes = len(batch["state"][0])
+    width = min(width, -(-lanes // devices) * devices)
+    program = _side_by_side(engine, batch["params"] is not None, batch["macro_dt"] is not None, devices)
     pieces = []
-    for start in range(0, lanes, together * width):
-        index = np.minimum(np.arange(start, start + together * width), lanes - 1).reshape(together, width)
-        count = min(together, -(-(lanes - start) // width))
+    for start in range(0, lanes, width):
+        index = np.minimum(np.arange(start, start + width), lanes - 1)
         piece = jax.tree.map(lambda a, index=index: a[index], batch)
-        pieces.append(_chunks(system, scheme, macro_dt, newton, piece, count, devices, **static))
-    return pieces[0] if lanes == together * width else _join(pieces, lanes)
+        macro_dt = run.macro_dt if piece["macro_dt"] is None else piece["macro_dt"]
+        num_params = 0 if piece["params"] is None else len(piece["params"])
+        shared = run.leaves[: len(run.leaves) - num_params]
+        pieces.append(program(shared, piece["params"] or [], piece["state"], macro_dt, run.save_every))
+    return from_arrays([jnp.asarray(np.concatenate(parts)[:lanes]) for parts in zip(*pieces, strict=True)])
 
 
-@partial(jax.jit, static_argnames="lanes")
-def _join(pieces, lanes: int) -> Trajectory:
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:lanes], *pieces)
+@lru_cache(maxsize=32)
+def _side_by_side(engine: Engine, own_params: bool, own_steps: bool, devices: int):
+    """``program(leaves, params, state, macro_dt, save_every)``: the runs of `engine`, a lane each."""
 
+    def lane(leaves, params, state, macro_dt, save_every):
+        return jax.tree.leaves(engine.trajectory(leaves + params, state, macro_dt, save_every))
 
-@partial(jax.jit, static_argnames=("devices", "num_saves", "save_micro"), compiler_options=OPTIONS)
-def _chunks(
-    system, scheme, macro_dt, newton, batch, count, devices, *, num_saves, save_every, save_micro
-) -> Trajectory:
-    """The first `count` chunks of a batch with arrays (chunks, lanes, ...), one after the other; zeros for the others."""
-
-    def side_by_side(system, scheme, macro_dt, newton, save_every, batch):
-        def lane(batch):
-            state, dt = batch["state"], batch.get("macro_dt", macro_dt)
-            own = system.replace(params=batch.get("params", system.params))
-            memory = run_memory(own, scheme, state, dt, newton)
-            return run(own, scheme, newton, dt, state.t, state, memory, 0, num_saves, save_every, save_micro)[0]
-
-        lanes = batch["state"].t.shape[0]
-        result = over_lanes(lane, lanes)(jax.tree.map(lambda a: jnp.moveaxis(a, 0, -1), batch))
-        return jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), result)
-
+    lanes = (False, own_params, True, own_steps, False)
+    program = jax.vmap(lane, [0 if own else None for own in lanes])
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
-        shared, spread = PartitionSpec(), PartitionSpec("lanes")
-        specs = {"in_specs": (shared,) * 5 + (spread,), "out_specs": spread}
-        side_by_side = jax.shard_map(side_by_side, mesh=mesh, **specs, check_vma=False)
-    go = partial(side_by_side, system, scheme, macro_dt, newton, save_every)
-    chunks = batch["state"].t.shape[0]
-    if chunks == 1:
-        return go(jax.tree.map(lambda a: a[0], batch))
-    traced, shape = jax.make_jaxpr(go, return_shape=True)(jax.tree.map(lambda a: a[0], batch))
-    shapes, structure = jax.tree.flatten(shape)
-
-    def chunk(i, results):
-        found = core.jaxpr_as_fun(traced)(*(a[i] for a in jax.tree.leaves(batch)))
-        return [result.at[i].set(one) for result, one in zip(results, found, strict=True)]
-
-    results = jax.lax.fori_loop(0, count, chunk, [jnp.zeros((chunks, *a.shape), a.dtype) for a in shapes])
-    return jax.tree.unflatten(structure, [a.reshape(-1, *a.shape[2:]) for a in results])
+        spread = PartitionSpec("lanes")
+        specs = tuple(spread if own else PartitionSpec() for own in lanes)
+        program = jax.shard_map(program, mesh=mesh, in_specs=specs, out_specs=spread, check_vma=False)
+    return jax.jit(program)

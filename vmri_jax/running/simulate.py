@@ -1,35 +1,26 @@
 """Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
 
-import dataclasses
-from functools import partial
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import diagnostics
-from vmri_jax.mechanics.arrays import is_concrete, real_array
-from vmri_jax.mechanics.checks import (
-    CONSTRAINT_TOLERANCE,
-    check_arrays,
-    check_flags,
-    check_number,
-    check_params,
-    check_system,
-    check_type,
-    require_x64,
-)
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.checks import check_flags, check_system
 from vmri_jax.mechanics.state import State, check_constraints
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.arguments import check_run
+from vmri_jax.running.engine import Engine, engine
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.trajectory import RunInfo, Trajectory, join
-from vmri_jax.runtime import OPTIONS, in_one_kernel
-from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.running.traced import traced_run
+from vmri_jax.running.trajectory import Trajectory, from_arrays, join
+from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.plan import has_fallback, plan
-from vmri_jax.steppers.plan import projects_rarely as _projects_rarely
+from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
 
 
@@ -52,7 +43,7 @@ def simulate(
     Compiled once per system structure, scheme structure and number of saved nodes: step sizes, parameters, rule
     weights, initial states and `save_every` may vary without compiling again. Works under ``jax.vmap`` over state,
     params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised.
-    Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "march".
+    Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "nested".
 
     Args:
         system, scheme: what moves, and how.
@@ -76,23 +67,50 @@ def simulate(
         Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
     """
     check_flags(throw=throw, progress=progress)
-    simulation, start = prepare(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
-    num_saves = num_steps // save_every
-    if not simulation.is_concrete(start):
-        return simulation.all(start, num_saves)
-
-    at, pieces = simulation.start(start), []
-    check_constraints(system, start, "simulate: the state")
-    with interrupts_noted(progress) as interrupted:
-        for saves in _sizes(num_saves, progress):
-            piece, at = simulation.advance(at, saves)
-            pieces.append(piece)
-            if interrupted():
-                raise Interrupted(join(pieces), at.step, num_steps)
-    trajectory = join(pieces)
+    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    if not run.is_concrete:
+        return run.traced()
+    run.check()
+    trajectory = run.in_parts() if progress else run()
+    if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
+        check_constraints(system, state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
-        raise simulation_error(trajectory, simulation.macro_dt, save_every)
+        raise simulation_error(trajectory, run.macro_dt, save_every)
     return trajectory
+
+
+def prepare(
+    system: System,
+    scheme: Scheme | Composition,
+    state: State,
+    *,
+    macro_dt=None,
+    micro_dt=None,
+    num_steps: int,
+    save_every: int = 1,
+    save_micro: bool = False,
+    newton: Newton | None = None,
+) -> "Simulation":
+    """Check and compile what `simulate` would run, to be run again and again.
+
+        run = vm.prepare(system, scheme, state, macro_dt=0.01, num_steps=1000, save_every=10)
+        trajectory = run()
+        other = run(other_state, macro_dt=0.02, params=other_params)
+
+    A call costs some ten microseconds besides its steps. Arguments as of `simulate`.
+
+    Returns:
+        The `Simulation`.
+
+    Raises:
+        ValueError, TypeError: bad arguments, as of `simulate`.
+    """
+    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    if not run.is_concrete:
+        raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
+    run.check()
+    jax.block_until_ready(run.engine.whole(run.leaves, run.start_arrays, run.macro_dt, 0))  # no steps: it only compiles
+    return run
 
 
 class Checkpoint(NamedTuple):
@@ -100,7 +118,7 @@ class Checkpoint(NamedTuple):
 
     step: macro steps done.
     state, memory: at the node reached, and what the last step hands on.
-    fell_back: whether the nested march has given way to its fallback.
+    fell_back: whether the first method has given way to its fallback.
     """
 
     step: int
@@ -109,250 +127,212 @@ class Checkpoint(NamedTuple):
     fell_back: bool = False
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Simulation:
-    """What stays the same all along a run, whose pieces are computed one after the other from a `Checkpoint`."""
+    """A run whose arguments have been checked: at once by a call, or piece by piece from a `Checkpoint`.
+
+    "auto" is first the nested march alone, since its fallback takes long to compile. Only what the march does not solve is
+    computed with the fallback, which is then compiled.
+
+    Attributes:
+        system, scheme, newton, state, num_steps, save_every, save_micro: as of `simulate`.
+        macro_dt: an array of shape ().
+    """
 
     system: System
     scheme: Scheme | Composition
     newton: Newton
+    state: State
     macro_dt: Any
-    t_start: Any
+    num_steps: int
     save_every: int
     save_micro: bool
+    leaves: list = field(repr=False)
+    structure: Any = field(repr=False)
 
-    def is_concrete(self, start: State) -> bool:
+    def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = False) -> Trajectory:
+        """The run, or the same from another start, with another step size, other parameters, another number of steps.
+
+        Args:
+            state, macro_dt, params: of the same shapes as before; None for those of the run.
+            num_steps: a multiple of the number of saved intervals, which stays; None for that of the run.
+            throw: raise `SimulationError` if a step fails; else the status is in the trajectory.
+        """
+        arguments = self._arguments(state, macro_dt, params, num_steps)
+        trajectory = from_arrays(self.engine.whole(*arguments))
+        if int(trajectory.failed_at) < 0:
+            return trajectory
+        if self._fallback_helps(trajectory):
+            trajectory = from_arrays(self.exact_engine.whole(*arguments))
+        if throw and int(trajectory.failed_at) >= 0:
+            raise simulation_error(trajectory, arguments[2], arguments[3])
+        return trajectory
+
+    def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
+        """A function without arguments that makes such a run and waits for it, for a clock.
+
+        It takes the fallback if the run needs it.
+        """
+        arguments = self._arguments(state, macro_dt, params, num_steps)
+        arguments = jax.device_put(arguments[:3]) + arguments[3:]
+        helps = self._fallback_helps(from_arrays(self.engine.whole(*arguments)))
+        program = self.exact_engine.whole if helps else self.engine.whole
+        program(*arguments)
+        return lambda: program(*arguments)[0].block_until_ready()  # the arrays of one program are ready together
+
+    def _arguments(self, state, macro_dt, params, num_steps) -> tuple:
+        """What the programs of the engine are called with."""
+        leaves, start, save_every = self.leaves, self.start_arrays, self.save_every
+        if state is not None:
+            start = _arrays(state)
+            if [a.shape for a in start] != [a.shape for a in self.start_arrays]:
+                raise ValueError(
+                    f"the arrays of state have shapes {[a.shape for a in start]}; the run was prepared for "
+                    f"{[a.shape for a in self.start_arrays]}."
+                )
+        if params is not None:
+            leaves = self._leaves_with(params)
+        if num_steps is not None:
+            if num_steps < 1 or num_steps % self.num_saves:
+                raise ValueError(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
+            save_every = num_steps // self.num_saves
+        return leaves, start, self.macro_dt if macro_dt is None else np.asarray(macro_dt, dtype=float), save_every
+
+    def _leaves_with(self, params) -> list:
+        own, structure = jax.tree.flatten(self.system.params)
+        given, structure_given = jax.tree.flatten(params)
+        if structure_given != structure or list(map(np.shape, given)) != list(map(np.shape, own)):
+            raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
+        return self.leaves[: len(self.leaves) - len(own)] + [np.asarray(leaf) for leaf in given]
+
+    @property
+    def num_saves(self) -> int:
+        """Saved intervals."""
+        return self.num_steps // self.save_every
+
+    @property
+    def is_concrete(self) -> bool:
         """Whether there are only numbers, no tracers of a transformation."""
-        return is_concrete((self.system, self.scheme, start, self.macro_dt, self.newton))
+        return is_concrete((self.leaves, self.start_arrays, self.macro_dt))
 
-    def newton_for(self, fell_back: bool) -> Newton:
-        """How steps are solved: "auto" is first the march alone (its fallback takes long to compile)."""
-        return self.newton if fell_back or not self.newton.falls_back else _alone(self.newton, self.system, self.scheme)
+    @cached_property
+    def plan(self) -> Plan:
+        """How its steps are taken; ``print`` shows it in words."""
+        return plan(self.system, self.scheme, self.newton, self.state)
 
-    def start(self, state: State, step: int = 0, fell_back: bool = False) -> Checkpoint:
+    @cached_property
+    def start_arrays(self) -> tuple:
+        """The arrays of the start."""
+        return _arrays(self.state)
+
+    @cached_property
+    def engine(self) -> Engine:
+        """Its programs without the fallback."""
+        return self.engine_for(False, self.num_saves)
+
+    @cached_property
+    def exact_engine(self) -> Engine:
+        """Its programs with the fallback."""
+        return self.engine_for(True, self.num_saves)
+
+    def engine_for(self, falls_back: bool, num_saves: int) -> Engine:
+        """Programs for another number of saved intervals."""
+        return engine(self.structure, num_saves, self.save_micro, falls_back)
+
+    def check(self, what: str = "simulate: the state", constraints: bool = True) -> None:
+        """Refuse a system whose functions return something else than they should, and constraints that cannot be kept."""
+        shapes = tuple(a.shape for a in self.start_arrays)
+        numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.leaves)
+        _check_once(_Known((self.structure, shapes, numbers), self.system, self.state, what, constraints))
+
+    def traced(self) -> Trajectory:
+        """The whole run under transformations of JAX."""
+        check_system(self.system, self.state.q_s, self.state.q_f)
+        return traced_run(self)
+
+    def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """Before the first step, or before any as if it was the first one."""
-        memory = run_memory(self.system, self.scheme, state, self.macro_dt, self.newton_for(fell_back))
-        return Checkpoint(step, state, memory, fell_back)
+        start = self.start_arrays if state is None else _arrays(state)
+        memory = self.engine_for(fell_back, 1).start(self.leaves, start, self.macro_dt)
+        return Checkpoint(step, State(*start), memory, fell_back)
 
     def advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
-        """The next `saves` saved intervals, compiled once per number of them.
+        """The next `saves` saved intervals, compiled once per number of them; again with the fallback if the first method fails."""
+        piece, end = self._advance(at, saves)
+        if not at.fell_back and self._fallback_helps(piece):
+            return self._advance(self.start(at.state, at.step, fell_back=True), saves)
+        return piece, end
 
-        Where the march fails the run goes on from the last saved node before with the fallback.
-        """
-        newton = self.newton_for(at.fell_back)
-        piece, end = self._advance(at, saves, newton)
-        failed = int(piece.failed_at)
-        if failed < 0 or newton is self.newton:
-            return piece, end
-        if int(jnp.max(piece.info.method)) < Method.RATTLE:  # explicit or linear: no other method helps
-            return piece, end
-        kept = (failed - at.step) // self.save_every
-        good = [piece.first(kept)] if kept else []
-        state = good[0].final_state if kept else at.state
-        at = self.start(state, at.step + kept * self.save_every, fell_back=True)
-        rest, end = self._advance(at, saves - kept, self.newton)
-        return join([*good, rest]), end
-
-    def _advance(self, at: Checkpoint, saves: int, newton: Newton) -> tuple[Trajectory, Checkpoint]:
-        piece, state, memory = _run_in_one_kernel(
-            self.system, self.scheme, newton, self.macro_dt, self.t_start, at.state, at.memory, at.step, saves,
-            self.save_every, self.save_micro,
-        )  # fmt: skip
+    def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
+        program = self.engine_for(at.fell_back, saves).onwards
+        numbers = self.start_arrays[0], self.macro_dt, at.step, self.save_every
+        piece, state, memory = program(self.leaves, _arrays(at.state), at.memory, *numbers)
         return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
 
-    def all(self, state: State, saves: int) -> Trajectory:
-        """The whole run as one piece, under transformations of JAX."""
-        check_system(self.system, state.q_s, state.q_f)
-        at = self.system, self.scheme, self.newton, self.macro_dt, self.t_start, state
-        rules = stage_scheme(self.scheme)
-        falls_back = iterates = has_fallback(plan(self.system, rules, self.newton, state))
-        whole = _march_first if falls_back and iterates else _whole
-        return whole(saves, self.save_every, self.save_micro, at)
+    def _fallback_helps(self, piece: Trajectory) -> bool:
+        """Whether a step failed that another method may solve: none does where equations are explicit or linear."""
+        return int(piece.failed_at) >= 0 and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
+
+    def in_parts(self) -> Trajectory:
+        """The whole run with a progress bar; Ctrl-C raises `Interrupted` with what was computed."""
+        at, pieces = self.start(), []
+        with interrupts_noted() as interrupted:
+            for saves in _shown_sizes(self.num_saves):
+                piece, at = self.advance(at, saves)
+                pieces.append(piece)
+                if interrupted():
+                    raise Interrupted(join(pieces), at.step, self.num_steps)
+        return join(pieces)
 
 
-def _alone(newton, system, scheme):
-    """Temporary."""
-    from vmri_jax.steppers.plan import _can_be_nested
-
-    return newton.without_fallback() if _can_be_nested(system, stage_scheme(scheme)) else newton
-
-
-def run(
-    system, scheme, newton, macro_dt, t_start, state, memory, first_step, num_saves, save_every, save_micro
-) -> tuple[Trajectory, Any]:
-    """`num_saves * save_every` macro steps from step number `first_step`; also the memory for the next one."""
-    stepper = plan(system, scheme, newton, state)
-    n, rarely = scheme.num_micro, _projects_rarely(stepper)
-
-    def step(_, carry):
-        state, memory, k, (result, failed_at), worst, _ = carry
-        state, info, memory = stepper.step(state, memory, macro_dt)
-        alive = failed_at < 0  # until the step before
-        ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
-        now = (info.method, info.iterations, info.residual)
-        worst = tuple(jnp.where(alive, jnp.maximum(w, x), w) for w, x in zip(worst, now, strict=True))
-        result = jnp.where(alive, jnp.maximum(result, info.result), result)
-        status = (result, jnp.where(alive & ~ok, k, failed_at))
-        p_s, p_f = jnp.where(ok, state.p_s, jnp.nan), jnp.where(ok, state.p_f, jnp.nan)  # positions follow, see below
-        state = State(t_start + (k + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
-        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
-        return state, memory, k + 1, status, worst, micro
-
-    def save(carry, _):
-        state, memory, k, status = carry
-        worst = (jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
-        micro = jnp.zeros((n, state.q_f.shape[0])) if save_micro else None
-        carry = (state, memory, k, status, worst, micro)
-        state, memory, k, status, worst, micro = jax.lax.fori_loop(0, save_every, step, carry)
-        if rarely:
-            state, memory = stepper.project(state, memory)
-        return (state, memory, k, status), (state, worst, micro)
-
-    status = (jnp.asarray(int(Result.CONVERGED)), jnp.asarray(-1))
-    carry = (state, memory, jnp.asarray(first_step), status)
-    (_, memory, _, status), (states, worst, micro) = jax.lax.scan(save, carry, length=num_saves)
-    nodes = jax.tree.map(lambda first, later: jnp.concatenate([first[None], later]), state, states)
-    phase = (nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f)
-    energy = jax.vmap(partial(diagnostics.energy, system))(*phase)
-
-    # The energy is NaN from a failing step on. A potential may also be NaN where its gradient is not (a logarithm beyond
-    # its pole), and a lane of a batch may start off its constraints: such nodes are no result either.
-    residual = jax.vmap(partial(diagnostics.constraint_residual, system))(nodes)
-    kept = residual[:, 0] <= jnp.maximum(CONSTRAINT_TOLERANCE, 100 * newton.tolerance)
-    broken = jnp.cumsum(~jnp.isfinite(energy) | ~kept) > 0
-    first = jnp.argmax(broken)
-    at_node = first_step + first * save_every - 1
-    newly = broken.any() & ((status[1] < 0) | (at_node < status[1]))
-    cause = jnp.where(jnp.isfinite(energy[first]), Result.CONSTRAINT_VIOLATED, Result.NON_FINITE)
-    status = (jnp.where(newly, cause, status[0]), jnp.where(newly, jnp.maximum(at_node, 0), status[1]))
-    energy = jnp.where(broken, jnp.nan, energy)
-    phase = tuple(jnp.where(broken[:, None], jnp.nan, a) for a in phase)
-
-    trajectory = Trajectory(
-        nodes.t,
-        *phase,
-        energy=energy,
-        constraint_residual=jnp.where(broken[:, None], jnp.nan, residual),
-        info=RunInfo(*worst),
-        result=status[0],
-        failed_at=status[1],
-        t_micro=nodes.t[1:, None] - macro_dt * (1 - scheme.micro_times) if save_micro else None,
-        q_f_micro=micro,
+def simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro) -> Simulation:
+    """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
+    macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    newton = newton or Newton()
+    leaves, structure = jax.tree.flatten((newton, scheme, system))
+    leaves = [leaf if isinstance(leaf, jax.Array) else np.asarray(leaf) for leaf in leaves]
+    state = State(*_arrays(state))
+    return Simulation(
+        system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, leaves, structure
     )
-    return trajectory, memory
 
 
-# A traced save_every lets a sweep over step sizes compile once; under a transformation it is static instead, so that
-# the trip count of the loop is known and reverse mode works.
-_run_static = jax.jit(run, static_argnames=("num_saves", "save_micro", "save_every"))
+def _arrays(state: State) -> tuple:
+    return tuple(_float(a) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f))
 
 
-def _whole(num_saves: int, save_every: int, save_micro: bool, at) -> Trajectory:
-    """All of a run at once, with one Newton for every step."""
-    system, scheme, newton, macro_dt, t_start, state = at
-    memory, saves = run_memory(system, scheme, state, macro_dt, newton), (num_saves, save_every, save_micro)
-    trajectory, _ = _run_static(system, scheme, newton, macro_dt, t_start, state, memory, 0, *saves)
-    return trajectory
+def _float(value):
+    """Numbers as an array of float64, of JAX if they are."""
+    if isinstance(value, jax.Array):
+        return value if value.dtype == float else value.astype(float)
+    return np.asarray(value, dtype=float)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
-def _march_first(num_saves: int, save_every: int, save_micro: bool, at) -> Trajectory:
-    """`_whole` by the nested march alone, whose loops are single kernels; by the arrowhead if that fails."""
+@dataclass(frozen=True)
+class _Known:
+    """A system with a start at which it has been checked; with the same key it need not be checked again."""
 
-    def by(newton: Newton) -> Trajectory:
-        return _whole(num_saves, save_every, save_micro, (system, scheme, newton, *rest))
-
-    system, scheme, newton, *rest = at
-    found = by(_alone(newton, system, scheme))
-    exact = dataclasses.replace(newton, method="arrowhead")
-    return jax.lax.cond(found.failed_at < 0, lambda: found, lambda: by(exact))
+    key: tuple
+    system: System = field(compare=False)
+    state: State = field(compare=False)
+    what: str = field(compare=False)
+    constraints: bool
 
 
-@_march_first.defjvp
-def _of_each_step(num_saves, save_every, save_micro, primals, tangents):
-    """Derivatives are those of the run that falls back step by step: one program instead of two."""
-    return jax.jvp(partial(_whole, num_saves, save_every, save_micro), primals, tangents)
+@lru_cache(maxsize=256)
+def _check_once(known: _Known) -> None:
+    check_system(known.system, known.state.q_s, known.state.q_f)
+    if known.constraints:
+        check_constraints(known.system, known.state, known.what)
 
 
-@partial(jax.jit, static_argnames=("num_saves", "save_micro"), compiler_options=OPTIONS)
-def _run_in_one_kernel(
-    system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro
-):
-    """Also the state at the end."""
-
-    @in_one_kernel
-    def go(macro_dt, t_start, at, memory, first_step):
-        return run(system, scheme, newton, macro_dt, t_start, at, memory, first_step, num_saves, save_every, save_micro)
-
-    piece, memory = go(macro_dt, t_start, at, memory, first_step)
-    return piece, piece.final_state, memory
-
-
-@jax.jit
-def run_memory(system, scheme, state, macro_dt, newton):
-    """`start_memory`; what the user's functions return is checked while tracing."""
-    check_system(system, state.q_s, state.q_f)
-    return plan(system, scheme, newton, state).init(state, macro_dt)
-
-
-def _sizes(num_saves: int, progress: bool):
-    """Numbers of saved nodes per compiled call; one call, or about 50 equal ones with a progress bar around them."""
-    if not progress:
-        yield num_saves
-        return
+def _shown_sizes(num_saves: int) -> Iterator[int]:
+    """About 50 equal numbers of saved nodes, with a progress bar around them."""
     from rich.progress import track
 
     size = -(-num_saves // 50)
     sizes = [size] * (num_saves // size) + ([num_saves % size] if num_saves % size else [])
     yield from track(sizes, description="simulating", transient=True)
-
-
-def prepare(
-    system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro
-) -> tuple[Simulation, State]:
-    """The simulation that these arguments of `simulate` ask for, and its start; bad ones are refused."""
-    macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
-    start = State(jnp.asarray(state.t, dtype=float), *check_arrays(**_vectors(state)))
-    macro_dt = jnp.asarray(macro_dt, dtype=float)
-    return Simulation(system, scheme, newton or Newton(), macro_dt, start.t, save_every, save_micro), start
-
-
-def _vectors(state: State) -> dict:
-    return {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
-
-
-def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro=False):
-    """Refuse bad arguments of `simulate`; returns macro_dt."""
-    require_x64()
-    if not isinstance(scheme, Scheme | Composition):
-        raise TypeError(
-            f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
-        )
-    check_type("simulate: system", system, System, "a vmri_jax.System")
-    check_type("simulate: state", state, State, "a State, e.g. from initial_state(...)")
-    check_params(system.params)
-    if not isinstance(newton, Newton | None):
-        raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(method='dense').")
-    if (macro_dt is None) == (micro_dt is None):
-        got = "neither" if macro_dt is None else "both"
-        raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")
-    name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
-    check_flags(save_micro=save_micro)
-    if is_concrete(real_array(f"simulate: {name}", dt, 0)) and not (np.isfinite(dt) and dt > 0):
-        raise ValueError(f"simulate: {name} is {dt}; it must be a positive number.")
-    check_number("simulate: the t of state", state.t)
-    for name, value in (("num_steps", num_steps), ("save_every", save_every)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"simulate: {name} is {value!r}; it must be an integer of at least 1.")
-    if num_steps % save_every:
-        raise ValueError(
-            f"simulate: num_steps = {num_steps} is not a multiple of save_every = {save_every}; the last saved node would "
-            "not be the end."
-        )
-    vectors = _vectors(state)
-    if is_concrete(vectors):
-        check_arrays(**vectors)
-    return dt if micro_dt is None else scheme.num_micro * micro_dt
 
 
 def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> SimulationError:
@@ -367,10 +347,3 @@ def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> Simul
         float(trajectory.info.residual[interval]),
         trajectory,
     )
-
-
-def macro_step(system, scheme, state, macro_dt, newton=None):
-    """One macro step."""
-    stepper = plan(system, scheme, newton or Newton(), state)
-    state, info, own = stepper.step(state, stepper.init(state, macro_dt), macro_dt)
-    return (stepper.project(state, own)[0] if _projects_rarely(stepper) else state), info

@@ -6,10 +6,12 @@ from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.mechanics.state import State
 from vmri_jax.running.files import replaced
 from vmri_jax.steppers.results import Result
 
@@ -17,12 +19,17 @@ FORMAT = "vmri_jax trajectory 2"
 NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 """Fields with one entry per saved node; all others but `STATUS` have one per saved interval."""
 STATUS = ("result", "failed_at")
+MICRO = ("t_micro", "q_f_micro")
+"""Fields that may be None."""
 
 
 class RunInfo(NamedTuple):
-    """What the solver did between saved nodes: most expensive method, most iterations and largest residual of a step.
+    """What the solver did from one saved node to the next, each (k - 1,).
 
-    As in `StepInfo`; `Method` names the codes of the methods.
+    Attributes:
+        method: code of the most expensive method that a step took, see `Method`.
+        iterations: most Newton iterations of a step, 0 for explicit ones.
+        residual: largest residual that a step left, relative to the momentum, and of the constraints.
     """
 
     method: Any
@@ -38,7 +45,7 @@ class Trajectory(eqx.Module):
         q_s, q_f, p_s, p_f: (k, n) positions and momenta; NaN after a failure.
         energy: (k,) Hamiltonian.
         constraint_residual: (k, 2) largest |g| and largest |G v|.
-        info: `RunInfo`, the most Newton iterations and the largest residual of a step since the node before, (k - 1,).
+        info: `RunInfo`, what the solver did since the node before.
         t_micro, q_f_micro: (k - 1, num_micro) and (k - 1, num_micro, n_f), the micro nodes of the macro step that ends
             at each saved node (its start excluded); None unless asked for.
         result: status of the run, a `Result`; the first that was no success.
@@ -65,18 +72,7 @@ class Trajectory(eqx.Module):
     @property
     def final_state(self):
         """`State` at the last saved node (of every run, in a batch)."""
-        from vmri_jax.mechanics.state import State
-
         return State(self.t[..., -1], *(x[..., -1, :] for x in (self.q_s, self.q_f, self.p_s, self.p_f)))
-
-    def first(self, count: int) -> "Trajectory":
-        """The first `count` saved intervals of a run that had not failed by then."""
-        stops = dict.fromkeys(NODES, count + 1)
-        flat = {
-            name: a if a is None or name in STATUS else a[: stops.get(name, count)]
-            for name, a in named_arrays(self).items()
-        }
-        return from_named_arrays(flat | {"result": jnp.asarray(int(Result.CONVERGED)), "failed_at": jnp.asarray(-1)})
 
     def save(self, path, drawing: dict | None = None) -> None:
         """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
@@ -114,7 +110,7 @@ class Trajectory(eqx.Module):
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
         arrays.pop("drawing", None)
         fields = {field.name for field in dataclasses.fields(cls)} - {"info"} | set(RunInfo._fields)
-        missing = fields - set(arrays) - {"t_micro", "q_f_micro"}
+        missing = fields - set(arrays) - set(MICRO)
         if missing or set(arrays) - fields:
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
@@ -153,18 +149,17 @@ def join(pieces: list[Trajectory]) -> Trajectory:
     if len(pieces) == 1:
         return pieces[0]
     flat = [named_arrays(piece) for piece in pieces]
-    worst = max(flat, key=lambda f: int(f["result"]))
-    status = next((f for f in flat if int(f["failed_at"]) >= 0), worst)
+    failed = [f for f in flat if int(f["failed_at"]) >= 0]
+    status = failed[0] if failed else max(flat, key=lambda f: int(f["result"]))
 
-    def joined(name, first):
-        if first is None:
-            return None
-        if name in STATUS:
-            return jnp.asarray(status[name])
+    def joined(name: str):
+        first = flat[0][name]
+        if first is None or name in STATUS:
+            return status[name]
         skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
-        return jnp.concatenate([first] + [f[name][skip:] for f in flat[1:]])
+        return jnp.asarray(np.concatenate([first, *(f[name][skip:] for f in flat[1:])]))
 
-    return from_named_arrays({name: joined(name, first) for name, first in flat[0].items()})
+    return from_named_arrays({name: joined(name) for name in flat[0]})
 
 
 def named_arrays(trajectory: Trajectory) -> dict:
@@ -177,3 +172,16 @@ def from_named_arrays(arrays: dict) -> Trajectory:
     """The inverse of `named_arrays`; those that may be None may be absent."""
     info = RunInfo(**{name: arrays.pop(name) for name in RunInfo._fields})
     return Trajectory(**arrays, info=info)
+
+
+def from_arrays(arrays: list) -> Trajectory:
+    """The trajectory with these leaves."""
+    return jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
+
+
+_STRUCTURES = {
+    leaves.num_leaves: leaves
+    for micro in (None, 0)
+    for leaves in [jax.tree.structure(Trajectory(*NODES, RunInfo(0, 0, 0), 0, 0, micro, micro))]
+}
+"""Of trajectories without and with micro nodes, by the number of their arrays."""

@@ -227,7 +227,7 @@ def _placed(rule: Rule, grid: Literal["macro", "micro"]) -> PlacedRule:
 def mollified(placed: PlacedRule) -> PlacedRule:
     """The same nodes, with the slow potential at averaged fast positions: ``V(q_s, a(q_s, q_f))``.
 
-    The average is that of the fast motion from rest over the macro step (`vmri_jax.steppers.step.averaging`). Kicks by V then
+    The average is that of the fast motion from rest over the macro step (`vmri_jax.steppers.kicked.average_over_fast_motion`). Kicks by V then
     act through ``a'(q)^T grad V``, which filters out the vibrations that they would excite where a macro step is a
     multiple of half their period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
     differential equations* (1998), the mollified impulse method with LongAverage.

@@ -12,12 +12,12 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import QUICK
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
-from vmri_jax.running.simulate import macro_step
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ import numpy as np
 
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import QUICK, SmallMotions
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.running.simulate import macro_step
 
 LANES = 64
 """Step sizes that one compiled call does side by side, where the system is small."""

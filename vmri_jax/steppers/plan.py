@@ -41,6 +41,14 @@ from vmri_jax.steppers.stepper import StepInfo, Stepper
 
 
 @dataclass(frozen=True)
+class _Choice:
+    """How implicit equations are solved, and whether the first choice may give way to another one."""
+
+    newton: Newton
+    falls_back: bool
+
+
+@dataclass(frozen=True)
 class Plan:
     """A stepper with what it was planned for: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)``.
 
@@ -80,18 +88,20 @@ class Plan:
         return str(self.stepper)
 
 
-def plan(system: System, scheme: Scheme | Composition, newton: Newton, state: State) -> Plan:
+def plan(system: System, scheme: Scheme | Composition, newton: Newton, state: State, fallback: bool = True) -> Plan:
     """The plan for a system and a scheme.
 
     Args:
         system, scheme: what moves, and how.
         newton: how implicit equations are solved.
         state: any state of the system; only the shapes of its arrays matter.
+        fallback: whether a first choice that does not converge gives way to another one, which takes long to compile.
 
     Raises:
         ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
     """
-    stepper: Stepper = _whole_step(system, stage_scheme(scheme), newton, state.q_s, state.q_f)
+    choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None)
+    stepper: Stepper = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
     rarely = _projects_rarely(stepper)
     if not rarely and (system.is_constrained or not isinstance(system.kinetic, ConstantMass)):
         stepper = Projected(stepper)
@@ -122,18 +132,19 @@ def _first(solver: Solver) -> Solver:
     return solver.first if isinstance(solver, Fallback) else solver
 
 
-def _whole_step(system: System, scheme: Scheme, newton: Newton, q_s, q_f) -> Kicked:
+def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Kicked:
     """Kicks, and what happens between them."""
     kicks = lagrangian(system, scheme).kicks
-    average = _average(system, scheme, newton)
+    average = _average(system, scheme, choice)
     if is_decoupled(system, scheme, q_s, q_f):
-        between = _decoupled(system, scheme, newton, q_s, q_f)
+        between = _decoupled(system, scheme, choice, q_s, q_f)
         kicks = tuple(term for term in kicks if term.grid == "macro" and not term.inside.groups)
         return Kicked(kicks, between, average)
-    return Kicked(kicks, _between_kicks(system, scheme, newton, q_s, q_f), average)
+    return Kicked(kicks, _between_kicks(system, scheme, choice, q_s, q_f), average)
 
 
-def _between_kicks(system: System, scheme: Scheme, newton: Newton, q_s, q_f) -> Stepper:
+def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Stepper:
+    newton = choice.newton
     can_be_nested = _can_be_nested(system, scheme)
     if newton.method == "nested" and not can_be_nested:
         raise ValueError(
@@ -149,7 +160,7 @@ def _between_kicks(system: System, scheme: Scheme, newton: Newton, q_s, q_f) -> 
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
     solver = _first_choice(system, scheme, newton, interval, q_s, q_f)
-    if newton.falls_back:
+    if choice.falls_back:
         solver = Fallback(solver, Coupled(newton, "arrowhead"))
     return Solved(system, scheme, solver)
 
@@ -216,7 +227,7 @@ def _inside_potentials(system: System, scheme: Scheme) -> tuple[Callable | None,
     return slow, fast
 
 
-def _decoupled(system: System, scheme: Scheme, newton: Newton, q_s, q_f) -> Decoupled:
+def _decoupled(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Decoupled:
     """Two systems of fast variables alone, each on a single interval."""
     assert isinstance(system.kinetic, ConstantMass)
     n_s, n_f, params = q_s.shape[0], q_f.shape[0], system.params
@@ -249,13 +260,13 @@ def _decoupled(system: System, scheme: Scheme, newton: Newton, q_s, q_f) -> Deco
     slow_scheme = Scheme(1, kinetic=drift, slow=drift, fast=PlacedRule(scheme.slow.rule, scheme.slow.grid))
     fast_scheme = Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast)
     return Decoupled(
-        _whole_step(slow, slow_scheme, newton, none, q_s),
-        _whole_step(fast, fast_scheme, newton, none, q_f),
+        _whole_step(slow, slow_scheme, choice, none, q_s),
+        _whole_step(fast, fast_scheme, choice, none, q_f),
         scheme.num_micro,
     )
 
 
-def _average(system: System, scheme: Scheme, newton: Newton) -> Callable | None:
+def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None:
     """The filter of a mollified slow potential, if that is what the scheme has."""
     if not scheme.slow.mollified:
         return None
@@ -267,7 +278,7 @@ def _average(system: System, scheme: Scheme, newton: Newton) -> Callable | None:
     def stepper_of(q_s) -> Kicked:
         alone, rules = _fast_alone(system, scheme, q_s)
         q_f = jnp.zeros(alone.kinetic.fast.shape[0])
-        return _whole_step(alone, rules, newton, jnp.zeros(0), q_f)
+        return _whole_step(alone, rules, choice, jnp.zeros(0), q_f)
 
     return average_over_fast_motion(stepper_of, scheme.num_micro)
 

@@ -92,7 +92,7 @@ class Search:
         program = self.programs.pop(key, None)
         if program is None:
             scheme, saves = family.make(num_micro), self.reference.num_saves
-            newton = self.newton.alone(self.problem.system, scheme)
+            newton = self.newton
             program = Program(self.problem, scheme, self.t_end, saves, newton)
         self.programs[key] = program  # the last one now
         if len(self.programs) > PROGRAMS:

@@ -8,14 +8,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from vmri_jax.mechanics.checks import check_system
-from vmri_jax.mechanics.state import State, check_constraints
+from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.simulate import Simulation, prepare
+from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import differences, environment, identity
 from vmri_jax.running.store.layout import Record
@@ -81,31 +79,30 @@ def stream(
         Interrupted: Ctrl-C; the chunk at work was finished first (a second Ctrl-C does not wait for it).
     """
     path = Path(out)
-    simulation, start = prepare(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
-    if not simulation.is_concrete(start):
+    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    if not run.is_concrete:
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
-    check_system(system, start.q_s, start.q_f)
-    check_constraints(system, start, "stream: the state")
+    run.check("stream: the state")
     _check_place(path, resume, overwrite)
     attributes = {
         "num_steps": num_steps,
         "save_every": save_every,
         "save_micro": save_micro,
-        "chunk": _chunk(simulation, start, num_steps) if chunk is None else _given(chunk),
-        "identity": identity(simulation, start),
+        "chunk": _chunk(run) if chunk is None else _given(chunk),
+        "identity": identity(run, run.state),
         "made_with": environment(),
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     with interrupts_noted() as interrupted:
         if overwrite or not path.exists():
             with _explained(path, 0):
-                layout.create(path, attributes, Record.of(simulation.start(start)))
+                layout.create(path, attributes, Record.of(run.start()))
         with layout.locked(path):
             stored = StoredTrajectory(path)
             _check_same_run(stored, attributes, chunk)
             _lengthen(stored, num_steps)
             layout.clear(path)
-            for step in _go_on(StoredTrajectory(path), simulation, start, progress):
+            for step in _go_on(StoredTrajectory(path), run, progress):
                 if interrupted():
                     raise Interrupted(StoredTrajectory(path), step, num_steps)
     stored = StoredTrajectory(path)
@@ -114,22 +111,22 @@ def stream(
     return stored
 
 
-def _go_on(stored: StoredTrajectory, simulation: Simulation, start: State, progress: bool) -> Iterator[int]:
+def _go_on(stored: StoredTrajectory, run: Simulation, progress: bool) -> Iterator[int]:
     """Compute and write what is not there yet; yields the number of macro steps done after every chunk."""
     path, chunk, record = stored.path, stored.chunk, stored.record
-    rows = stored.num_steps // simulation.save_every
+    rows = stored.num_steps // run.save_every
     if record.saved == rows or not stored.success:
         return
     try:
-        at = record.checkpoint(like=jax.eval_shape(simulation.start, start))
+        at = record.checkpoint(like=run.start())
     except ValueError as error:
         raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
     writer = layout.Writer(path, rows, chunk)
     ends = [*range((record.saved // chunk + 1) * chunk, rows, chunk), rows]
     sizes = [end - begin for begin, end in pairwise([record.saved, *ends])]
     for size in _shown(sizes, -(-rows // chunk)) if progress else sizes:
-        piece, at = simulation.advance(at, size)
-        with _explained(path, at.step - size * simulation.save_every):
+        piece, at = run.advance(at, size)
+        with _explained(path, at.step - size * run.save_every):
             writer.append(piece, record.saved)
             result = max(record.result, int(piece.result))  # failures are larger
             record = Record.of(at, record.saved + size, result, int(piece.failed_at))
@@ -200,14 +197,12 @@ def _lengthen(stored: StoredTrajectory, num_steps: int) -> None:
             layout.change_attributes(stored.path, num_steps=num_steps)
 
 
-def _chunk(simulation: Simulation, start: State, num_steps: int) -> int:
+def _chunk(run: Simulation) -> int:
     """Saved intervals per chunk where none are given."""
-    num_micro, save_every = simulation.scheme.num_micro, simulation.save_every
-    n_s, n_f = start.q_s.shape[0], start.q_f.shape[0]
-    numbers = 2 * (n_s + n_f) + 8 + (num_micro * (n_f + 1) if simulation.save_micro else 0)
-    saves = num_steps // save_every
-    wanted = max(saves // PARTS, LEAST_MICRO_STEPS // (num_micro * save_every))
-    return max(1, min(wanted, saves, MOST_BYTES // (8 * numbers)))
+    num_micro, n_s, n_f = run.scheme.num_micro, run.state.q_s.shape[0], run.state.q_f.shape[0]
+    numbers = 2 * (n_s + n_f) + 8 + (num_micro * (n_f + 1) if run.save_micro else 0)
+    wanted = max(run.num_saves // PARTS, LEAST_MICRO_STEPS // (num_micro * run.save_every))
+    return max(1, min(wanted, run.num_saves, MOST_BYTES // (8 * numbers)))
 
 
 def _given(chunk) -> int:

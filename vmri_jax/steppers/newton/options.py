@@ -1,6 +1,5 @@
 """How the implicit equations of a step are solved."""
 
-from dataclasses import replace
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -57,15 +56,6 @@ class Newton(eqx.Module):
         for name, value in numbers.items():
             if is_concrete(value) and not real_array(f"Newton: {name}", value, 0) > 0:
                 raise ValueError(f"Newton: {name} is {value}; it must be positive.")
-
-    @property
-    def falls_back(self) -> bool:
-        """Whether a step that "nested" does not solve is solved by the exact arrowhead."""
-        return self.method == "auto" and self.fixed_iterations is None
-
-    def without_fallback(self) -> "Newton":
-        """The first choice alone; the fallback takes long to compile."""
-        return replace(self, method="nested")
 
     def status(self, change, iterations):
         """`Result` after so many iterations, from the largest change still to come over what is accepted, or RUNNING."""

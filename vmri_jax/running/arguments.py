@@ -1,0 +1,65 @@
+"""Arguments of runs: bad ones are refused, with what came, what was expected and what to do."""
+
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_type, require_x64
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+
+
+def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro=False):
+    """Refuse bad arguments of `simulate`; returns macro_dt."""
+    require_x64()
+    if not isinstance(scheme, Scheme | Composition):
+        raise TypeError(
+            f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
+        )
+    check_type("simulate: system", system, System, "a vmri_jax.System")
+    check_type("simulate: state", state, State, "a State, e.g. from initial_state(...)")
+    check_params(system.params)
+    if not isinstance(newton, Newton | None):
+        raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(method='dense').")
+    check_flags(save_micro=save_micro)
+    dt = check_step_size(scheme, macro_dt, micro_dt)
+    check_number("simulate: the t of state", state.t)
+    check_counts(num_steps, save_every)
+    if is_concrete(vars(state)):
+        check_vectors(state)
+    return dt
+
+
+def check_step_size(scheme: Scheme | Composition, macro_dt, micro_dt):
+    """Exactly one step size is given, and it is positive; returns macro_dt."""
+    if (macro_dt is None) == (micro_dt is None):
+        got = "neither" if macro_dt is None else "both"
+        raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")
+    name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
+    if is_concrete(real_array(f"simulate: {name}", dt, 0)) and not (np.isfinite(dt) and dt > 0):
+        raise ValueError(f"simulate: {name} is {dt}; it must be a positive number.")
+    return dt if micro_dt is None else scheme.num_micro * micro_dt
+
+
+def check_counts(num_steps, save_every) -> None:
+    """Whole numbers of steps, the last of which is saved."""
+    for name, value in (("num_steps", num_steps), ("save_every", save_every)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            raise ValueError(f"simulate: {name} is {value!r}; it must be an integer of at least 1.")
+    if num_steps % save_every:
+        raise ValueError(
+            f"simulate: num_steps = {num_steps} is not a multiple of save_every = {save_every}; the last saved node would "
+            "not be the end."
+        )
+
+
+def check_vectors(state: State) -> None:
+    """Positions and momenta are finite vectors of float64 that fit together."""
+    vectors = {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
+    q_s, q_f, p_s, p_f = arrays = [np.asarray(a) for a in vectors.values()]
+    fits = q_s.shape == p_s.shape and q_f.shape == p_f.shape
+    good = all(a.dtype == float and a.ndim == 1 and np.isfinite(a).all() for a in arrays)
+    if not (fits and good):
+        check_arrays(**vectors)

@@ -1,0 +1,152 @@
+"""The engine of all runs: a loop of macro steps inside a scan over saved nodes, compiled once per structure."""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax import diagnostics
+from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.trajectory import RunInfo, Trajectory
+from vmri_jax.steppers.plan import Plan, plan
+from vmri_jax.steppers.results import Result
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Compiled runs of all systems and schemes of one structure; what they compute with is handed over as bare arrays.
+
+    The programs take `leaves`, the arrays of (newton, scheme, system), the five arrays of a `State`, and numbers.
+
+    Attributes:
+        structure: of the pytree (newton, scheme, system).
+        num_saves: saved intervals of a run.
+        save_micro: whether micro nodes are saved.
+        falls_back: whether a step that the first method does not solve goes to the fallback of `newton`, which takes long to
+            compile.
+    """
+
+    structure: Any
+    num_saves: int
+    save_micro: bool
+    falls_back: bool
+
+    @cached_property
+    def whole(self):
+        """``whole(leaves, state, macro_dt, save_every)``: a run from its first step, as the arrays of its `Trajectory`."""
+        return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)))
+
+    @cached_property
+    def whole_of_known_length(self):
+        """The same as a `Trajectory`, with `save_every` static: loops of known length have derivatives in reverse mode."""
+        return jax.jit(self.trajectory, static_argnums=3)
+
+    @cached_property
+    def start(self):
+        """``start(leaves, state, macro_dt)``: what the stepper takes along into the first step."""
+        return jax.jit(
+            lambda leaves, state, macro_dt: self._stepper(leaves, State(*state)).init(State(*state), macro_dt)
+        )
+
+    @cached_property
+    def onwards(self):
+        """``onwards(leaves, state, own, t_start, macro_dt, step, save_every)``: trajectory, state and own at its end."""
+
+        def onwards(leaves, state, own, t_start, macro_dt, step, save_every):
+            stepper = self._stepper(leaves, State(*state))
+            return self._run(stepper, State(*state), own, t_start, macro_dt, step, save_every)
+
+        return jax.jit(onwards)
+
+    def trajectory(self, leaves, state, macro_dt, save_every) -> Trajectory:
+        """A run from its first step, not compiled."""
+        start = State(*state)
+        stepper = self._stepper(leaves, start)
+        own = stepper.init(start, macro_dt)
+        return self._run(stepper, start, own, start.t, macro_dt, 0, save_every)[0]
+
+    def _stepper(self, leaves, state: State) -> Plan:
+        newton, scheme, system = jax.tree.unflatten(self.structure, leaves)
+        return plan(system, scheme, newton, state, fallback=self.falls_back)
+
+    def _run(self, stepper: Plan, state: State, own, t_start, macro_dt, step, save_every):
+        """`num_saves * save_every` macro steps from step number `step`."""
+        system, tolerance, num_micro = stepper.system, stepper.newton.tolerance, stepper.scheme.num_micro
+        no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
+        no_micro = jnp.zeros((num_micro, state.q_f.shape[0])) if self.save_micro else None
+        take = _step_of(stepper, t_start, macro_dt, self.save_micro)
+
+        def interval(at: _At):
+            at, worst, micro = jax.lax.fori_loop(0, save_every, take, (at, no_info, no_micro))
+            if stepper.projects_rarely:
+                state, own = stepper.project(at.state, at.own)
+                at = at._replace(state=state, own=own)
+            return at, worst, micro
+
+        def save(at: _At, is_start):  # one place for the first node and all others: compiled once
+            at, worst, micro = jax.lax.cond(is_start, lambda at: (at, no_info, no_micro), interval, at)
+            node, at = _node(system, tolerance, at)
+            return at, (node, worst, micro)
+
+        at = _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
+        at, (nodes, *between) = jax.lax.scan(save, at, np.arange(self.num_saves + 1) == 0)
+        worst, micro = jax.tree.map(lambda a: a[1:], between)
+        t_micro = None if micro is None else nodes[0][1:, None] - macro_dt * (1 - stepper.scheme.micro_times)
+        return Trajectory(*nodes, worst, at.result, at.failed_at, t_micro, micro), at.state, at.own
+
+
+engine = lru_cache(maxsize=32)(Engine)
+"""The engine with these attributes. Thousands of programs would exhaust the memory maps that a process may have."""
+
+
+class _At(NamedTuple):
+    """Where a run is: before macro step `step`, with the worst `result` so far and the step that failed, -1 if none did."""
+
+    state: State
+    own: Any
+    step: Any
+    result: Any
+    failed_at: Any
+
+
+def _step_of(stepper: Plan, t_start, macro_dt, save_micro: bool):
+    """A macro step as the body of a loop. From a failure on momenta are NaN, and by them all positions after it."""
+
+    def step(_, carry):
+        at, worst, _ = carry
+        alive = at.failed_at < 0
+        state, info, own = stepper.step(at.state, at.own, macro_dt)
+        ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
+        now = RunInfo(info.method, info.iterations, info.residual)
+        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, now)
+        p_s, p_f = (jnp.where(ok, p, jnp.nan) for p in (state.p_s, state.p_f))
+        state = State(t_start + (at.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
+        result = jnp.where(alive, jnp.maximum(at.result, info.result), at.result)
+        failed_at = jnp.where(alive & ~ok, at.step, at.failed_at)
+        micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
+        return _At(state, own, at.step + 1, result, failed_at), worst, micro
+
+    return step
+
+
+def _node(system: System, tolerance, at: _At):
+    """What is saved of a node, the first seven fields of a `Trajectory`; and the status after a look at it.
+
+    A potential may be NaN where its gradient is not (a logarithm beyond its pole), and a lane of a batch may start off its
+    constraints: such nodes are no result either.
+    """
+    state = at.state
+    phase = state.q_s, state.q_f, state.p_s, state.p_f
+    energy, residual = diagnostics.energy(system, *phase), diagnostics.constraint_residual(system, state)
+    finite, kept = jnp.isfinite(energy), residual[0] <= jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
+    breaks = (at.failed_at < 0) & ~(finite & kept)
+    cause = jnp.where(finite, Result.CONSTRAINT_VIOLATED, Result.NON_FINITE)
+    result = jnp.where(breaks, cause, at.result)
+    failed_at = jnp.where(breaks, jnp.maximum(at.step - 1, 0), at.failed_at)
+    values = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))
+    return (state.t, *values), at._replace(result=result, failed_at=failed_at)
