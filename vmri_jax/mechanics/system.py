@@ -1,7 +1,6 @@
 """The physics: what a user writes, as plain JAX functions of slow and fast variables."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 

@@ -30,7 +30,7 @@ into the cache."""
 IN_A_CALL = 16
 """Chunks that a call computes at most. A call takes as long as a hundred steps of a small system."""
 RESULTS = 4_000_000
-"""Numbers that their results may hold together, 32 MB: with more, loops are no single kernels (`vmri_jax.runtime.configure`)."""
+"""Numbers that their results may hold together, 32 MB: with more, loops are no single kernels (`vmri_jax.configure`)."""
 MATRICES = 10_000_000
 """Numbers that the matrices of a chunk may hold together (80 MB), before the lanes become fewer than that."""
 CACHE = 130_000
@@ -66,7 +66,7 @@ def simulate_batch(
         num_steps, save_every, save_micro, newton: as in `simulate`.
         params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
-        devices: CPU devices over which chunks are spread, see `vmri_jax.runtime.configure`.
+        devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
 
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
@@ -98,7 +98,7 @@ def simulate_batch(
         raise ValueError(f"simulate_batch: every {name} must be a positive number, got {dt}.")
     if not 1 <= devices <= jax.device_count():
         raise ValueError(
-            f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call runtime.configure(devices={devices}) "
+            f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call vm.configure(devices={devices}) "
             "before JAX starts."
         )
     if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
