@@ -13,7 +13,6 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.measure import Tell, silent
 from benchmarks.report import Report
-from vmri_jax import runtime
 from vmri_jax.running.store.layout import CHECKPOINT
 from vmri_jax.running.trajectory import STATUS, named_arrays
 
@@ -112,7 +111,7 @@ def _timed(start, path: Path) -> tuple[float, float]:
 
 def _child(out: str, cache: str) -> None:
     """Start the run, or go on with it."""
-    runtime.configure(cache=cache)
+    vm.configure(cache=cache)
     problem = vm.systems.fermi_pasta_ulam()
     scheme, steps = vm.fully_implicit(3), CHUNKS * PER_CHUNK * 2
     arguments = {"macro_dt": 0.01, "num_steps": steps, "save_every": 2, "save_micro": True, "chunk": PER_CHUNK}

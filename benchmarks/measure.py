@@ -2,7 +2,7 @@
 
 import os
 
-from vmri_jax import runtime
+from vmri_jax.configure import cache_folder, configure
 from vmri_jax.study.timing import Ratio, Tell, interleaved, machine, ratio, silent, steps_for
 
 __all__ = ["Ratio", "Tell", "interleaved", "machine", "pin", "prepare", "ratio", "silent", "steps_for"]
@@ -27,4 +27,4 @@ def prepare(core: int | None = -1, cache: bool = True, devices: int = 1) -> None
     """Before JAX starts: keep to one core, set the compiler's flags and its cache, switch 64-bit floats on."""
     pin(core)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices here are small: threads only make times scatter
-    runtime.configure(devices=devices if devices > 1 else None, cache=runtime.cache_folder() if cache else None)
+    configure(devices=devices if devices > 1 else None, cache=cache_folder() if cache else None)

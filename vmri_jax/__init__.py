@@ -1,6 +1,9 @@
 """Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories."""
 
-from vmri_jax import diagnostics, runtime
+from importlib.metadata import version
+
+from vmri_jax import diagnostics
+from vmri_jax.configure import NotConfiguredWarning, configure
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.running.batch import simulate_batch
@@ -28,12 +31,15 @@ from vmri_jax.steppers.stepper import StepInfo
 
 from vmri_jax import systems  # isort: skip  (written with the names above)
 
+__version__ = version("vmri_jax")
+
 __all__ = [
     "Composition",
     "ConstantMass",
     "Interrupted",
     "Method",
     "Newton",
+    "NotConfiguredWarning",
     "Problem",
     "Result",
     "Rheonomic",
@@ -45,7 +51,9 @@ __all__ = [
     "StoredTrajectory",
     "System",
     "Trajectory",
+    "__version__",
     "compose",
+    "configure",
     "diagnostics",
     "discrete_lagrangian",
     "discrete_legendre",
@@ -60,7 +68,6 @@ __all__ = [
     "mollified_impulse",
     "prepare",
     "quadrature",
-    "runtime",
     "simulate",
     "simulate_batch",
     "stream",

@@ -133,9 +133,9 @@ def test_devices_share_a_batch_and_configure_comes_first():
     """In a process of its own: flags are read when JAX starts."""
     program = """
 import numpy as np
-from vmri_jax import runtime
-runtime.configure(devices=2)
-import jax, jax.numpy as jnp, vmri_jax as vm
+import vmri_jax as vm
+vm.configure(devices=2)
+import jax, jax.numpy as jnp
 problem = vm.systems.fermi_pasta_ulam()
 states = jax.tree.map(lambda a: a + 1e-3 * jnp.arange(5.0).reshape(5, *[1] * a.ndim), problem.state())
 one, two, chunks = (
@@ -145,10 +145,10 @@ one, two, chunks = (
 assert jax.device_count() == 2
 assert np.abs(one.q_f - two.q_f).max() < 1e-13 and np.abs(one.q_f - chunks.q_f).max() < 1e-13
 try:
-    runtime.configure(devices=3)
+    vm.configure(devices=3)
 except RuntimeError as error:
     assert "already started" in str(error)
-runtime.configure(devices=2)  # nothing new: fine
+vm.configure(devices=2)  # nothing new: fine
 print("same")
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=False)

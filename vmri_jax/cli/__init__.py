@@ -8,10 +8,10 @@ import os
 import jax
 import typer
 
-from vmri_jax import runtime
 from vmri_jax.cli import lists, run, scenes, stability, study
 from vmri_jax.cli.animate import animate
 from vmri_jax.cli.hard import hard
+from vmri_jax.configure import cache_folder, configure
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -27,7 +27,7 @@ app.command()(animate)
 
 def main() -> None:
     """Entry point."""
-    runtime.configure(cache=runtime.cache_folder())
+    configure(cache=cache_folder())
     app()
 
 

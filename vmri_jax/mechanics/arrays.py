@@ -1,25 +1,62 @@
-"""Numbers as users give them: real, and float64 wherever they are not traced."""
+"""Numbers as users give them: real, and float64."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+ADVICE = "give float64: lists of numbers, NumPy arrays by .astype(float), JAX arrays made after vm.configure()"
+"""What to do about numbers of less than 64 bits."""
+
 
 def is_concrete(tree) -> bool:
     """Whether a pytree holds values, rather than tracers of jit, vmap or grad."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))  # pyright: ignore
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def require_x64() -> None:
+    """Raise unless JAX's 64-bit mode is on."""
+    if jnp.result_type(float) != np.float64:
+        raise ValueError(
+            "vmri_jax needs 64-bit floats: Newton and the constraints are solved to round-off. Switch them on at the start "
+            "of the program with vm.configure() (vm is vmri_jax), which also makes runs fast, or with "
+            'jax.config.update("jax_enable_x64", True).'
+        )
+
+
+def is_short(value) -> bool:
+    """Whether a value is an array of floats with less than 64 bits each."""
+    dtype = getattr(value, "dtype", None)
+    return dtype is not None and jnp.issubdtype(dtype, jnp.inexact) and jnp.finfo(dtype).bits < 64
+
+
+def check_precision(name: str, value) -> None:
+    """Refuse floats of less than 64 bits: the digits that they lack cannot come back.
+
+    Raises:
+        ValueError: the 64-bit mode is off, where all arrays of JAX are short; or this array is.
+    """
+    if is_short(value):
+        if isinstance(value, jax.Array):
+            require_x64()
+        raise ValueError(f"{name} has dtype {value.dtype}; {ADVICE}.")
 
 
 def real_array(name: str, value, ndim: int | None = None):
-    """Numbers as users give them as an array of floats, of JAX if they are, else of NumPy; refused is what is not real."""
+    """Numbers as users give them as an array of float64, of JAX if they are, else of NumPy.
+
+    Raises:
+        TypeError: what is not real.
+        ValueError: floats of less than 64 bits, or another number of dimensions.
+    """
     advice = "give a real number" if ndim == 0 else "give real numbers, an array of float64"
     if is_concrete(value):
         try:
-            kind = np.asarray(value).dtype.kind
+            kind = "f" if is_short(value) else np.asarray(value).dtype.kind
         except Exception:  # ragged lists, and whatever an object of one's own raises
             kind = ""
         if kind not in tuple("biuf"):
             raise TypeError(f"{name} is {value!r}; {advice}.")
+    check_precision(name, value)
     given = isinstance(value, jax.Array) or not is_concrete(value)
     array = jnp.asarray(value, dtype=float) if given else np.asarray(value, dtype=float)
     if ndim is not None and array.ndim != ndim:

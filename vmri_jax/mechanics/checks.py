@@ -4,28 +4,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
-from vmri_jax.mechanics.system import ConstantMass, System, with_time
+from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
+from vmri_jax.mechanics.arrays import require_x64 as require_x64
+from vmri_jax.mechanics.functions import with_time
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.system import System
 
 CONSTRAINT_TOLERANCE = 1e-6
 """Largest constraint value, in the constraint's own unit, that counts as kept; more where the Newton tolerance is loose."""
-
-
-def require_x64() -> None:
-    """Raise unless JAX's 64-bit mode is on."""
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise ValueError(
-            "vmri_jax needs 64-bit floats: Newton and the constraints are solved to round-off. Switch them on at the start "
-            'of the program with jax.config.update("jax_enable_x64", True), or set JAX_ENABLE_X64=1.'
-        )
 
 
 def check_arrays(**arrays):
     """Arrays as float64 vectors; slow and fast velocities shaped like their positions; finite where concrete."""
     out = {}
     for name, value in arrays.items():
-        if getattr(value, "dtype", None) in (np.float32, np.float16):
-            raise ValueError(f"{name} has dtype {value.dtype}; give float64, e.g. {name}.astype(float).")
         array = jnp.asarray(real_array(name, value))
         if array.ndim != 1:
             raise ValueError(f"{name} has shape {array.shape}; it must be a vector of coordinates, shape (n,).")
@@ -62,12 +54,14 @@ def check_type(name: str, value, kind: type, example: str) -> None:
 
 
 def check_params(params) -> None:
-    """Refuse parameters that are no numbers, naming where they are in the pytree."""
+    """Refuse parameters that are no numbers, or floats of less than 64 bits, naming where they are in the pytree."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        name = f"System: params{jax.tree_util.keystr(path)}"
+        check_precision(name, leaf)
         if is_concrete(leaf) and getattr(leaf, "dtype", np.asarray(leaf).dtype).kind not in "biufc":
             raise TypeError(
-                f"System: params{jax.tree_util.keystr(path)} is {leaf!r}; give arrays of numbers, which are handed to every "
-                "function. What is no number belongs into the functions themselves."
+                f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. What is no number "
+                "belongs into the functions themselves."
             )
 
 
@@ -75,11 +69,9 @@ def check_system(system: System, q_s, q_f) -> None:
     """Check shapes of masses and of what every user function returns for these positions (without evaluating them)."""
     n_s, n_f = q_s.shape[0], q_f.shape[0]
     if isinstance(system.kinetic, ConstantMass):
-        for name, mass, n in (("slow", system.kinetic.slow, n_s), ("fast", system.kinetic.fast, n_f)):
-            if mass.shape[0] != n:
-                raise ValueError(
-                    f"ConstantMass: {name} is for {mass.shape[0]} coordinates, the state has {n} {name} ones."
-                )
+        for name, mass, n in (("slow", system.kinetic.slow_mass, n_s), ("fast", system.kinetic.fast_mass, n_f)):
+            if mass.size != n:
+                raise ValueError(f"ConstantMass: {name} is for {mass.size} coordinates, the state has {n} {name} ones.")
     scalars = {
         "kinetic": (system.kinetic, (q_s, q_f, q_s, q_f)),
         "slow_potential": (system.slow_potential, (q_s, q_f)),

@@ -53,7 +53,7 @@ def simulate_batch(
         num_steps, save_every, save_micro, newton: as in `simulate`.
         params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
-        devices: CPU devices over which chunks are spread, see `vmri_jax.runtime.configure`.
+        devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
 
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
@@ -133,7 +133,7 @@ def _check_states(states) -> int:
 def _check_devices(devices, chunk) -> None:
     if not 1 <= devices <= jax.device_count():
         raise ValueError(
-            f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call runtime.configure(devices={devices}) "
+            f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call vm.configure(devices={devices}) "
             "before JAX starts."
         )
     if chunk is not None and (not isinstance(chunk, int) or chunk < 1):

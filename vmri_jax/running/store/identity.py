@@ -11,8 +11,9 @@ from importlib.metadata import version
 import jax
 import numpy as np
 
+from vmri_jax.mechanics.functions import TracedOnce, with_time
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import KineticFunction, System, with_time
+from vmri_jax.mechanics.system import KineticFunction, System
 from vmri_jax.running.simulate import Simulation
 
 IN_FULL = 8
@@ -53,6 +54,8 @@ def describe(name: str, value) -> dict[str, str]:
 
 
 def _words(leaf) -> str:
+    if isinstance(leaf, TracedOnce):
+        leaf = leaf.function
     if callable(leaf):
         return f"{getattr(leaf, '__module__', '')}.{getattr(leaf, '__qualname__', type(leaf).__name__)}"
     if isinstance(leaf, str | bool):

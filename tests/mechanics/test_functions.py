@@ -1,0 +1,51 @@
+"""Functions of users: their Python code runs once, systems are equal if their functions are."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from vmri_jax import ConstantMass, Rheonomic, System, explicit_slow, fully_implicit, simulate
+from vmri_jax.mechanics.functions import TracedOnce, traced_once
+
+
+@pytest.mark.parametrize("name", ["fpu", "tsp"])
+def test_the_code_of_a_function_runs_once(name, request):
+    problem = request.getfixturevalue(name)
+    calls = []
+
+    def counted(name):
+        function = getattr(problem.system, name)
+        return function and (lambda *arguments: (calls.append(name), function.function(*arguments))[1])
+
+    names = "slow_potential", "fast_potential", "constraint", "slow_constraint"
+    system = problem.system.replace(**{name: counted(name) for name in names})
+    state = type(problem)(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f).state()
+    for scheme in (fully_implicit(2), explicit_slow(3)):
+        simulate(system, scheme, state, macro_dt=0.01, num_steps=2)
+    assert sorted(calls) == sorted(name for name in names if getattr(system, name))
+
+
+def soft(q_s, q_f, params):
+    return jnp.sum(q_s**2)
+
+
+def held(t, q_s, q_f, params):
+    return q_f - t
+
+
+def test_systems_compare_by_the_functions_of_users():
+    def system():
+        return System(ConstantMass([1.0], [1.0]), soft, constraint=Rheonomic(held))
+
+    assert jax.tree.structure(system()) == jax.tree.structure(system())
+    assert jax.tree.structure(system().replace(params=None)) == jax.tree.structure(system())
+    assert system().slow_potential == TracedOnce(soft)
+    assert traced_once(traced_once(soft)).function is soft
+    assert pickle.loads(pickle.dumps(system())).slow_potential.function is soft
+
+
+def test_operations_are_taken_over_in_place():
+    jaxpr = jax.make_jaxpr(jax.grad(traced_once(soft)))(jnp.ones(2), jnp.ones(1), None)
+    assert not any("jit" in equation.primitive.name for equation in jaxpr.eqns)

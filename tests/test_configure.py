@@ -1,0 +1,64 @@
+"""Settings of JAX: made before it starts, and one warning where they were forgotten."""
+
+import os
+import subprocess
+import sys
+
+
+def printed(program: str) -> str:
+    """What a program prints, also as errors and warnings, in a process whose JAX has no settings."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+def test_configure_before_jax_starts():
+    program = """
+import os, jax, vmri_jax as vm
+from vmri_jax.configure import warn_if_slow
+os.environ["XLA_FLAGS"] = "--xla_cpu_enable_fast_math=false"
+vm.configure(devices=2, cache="/tmp/vmri_jax_nothing")
+vm.configure()
+print(os.environ["XLA_FLAGS"], jax.device_count(), jax.numpy.ones(1).dtype)
+warn_if_slow()
+vm.configure(devices=2)
+try:
+    vm.configure(devices=3)
+except RuntimeError as error:
+    print(error)
+"""
+    assert printed(program).splitlines() == [
+        "--xla_cpu_enable_fast_math=false --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000 "
+        "2 float64",
+        "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made.",
+    ]
+
+
+def test_import_and_questions_change_nothing():
+    program = """
+import os, jax, vmri_jax as vm
+assert "XLA_FLAGS" not in os.environ and not jax.config.jax_enable_x64
+assert jax.config.jax_num_cpu_devices == -1
+print(jax.device_count())
+try:
+    vm.configure()
+except RuntimeError as error:
+    print("already started" in str(error), jax.config.jax_num_cpu_devices, jax.config.jax_enable_x64)
+"""
+    assert printed(program).splitlines() == ["1", "True -1 False"]
+
+
+def test_one_warning_with_the_line_to_add():
+    program = """
+import warnings
+import jax
+from vmri_jax import NotConfiguredWarning
+from vmri_jax.configure import warn_if_slow
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    warn_if_slow()
+    warn_if_slow()
+print(len(caught), caught[0].category is NotConfiguredWarning, "vm.configure()" in str(caught[0].message))
+"""
+    assert printed(program).split() == ["1", "True", "True"]

@@ -1,0 +1,58 @@
+"""The user's functions: Python code that runs once for all programs that they are part of."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import lru_cache
+
+import jax
+
+
+@dataclasses.dataclass(frozen=True)
+class TracedOnce:
+    """A function of arrays whose Python code runs once per process and shapes of its arguments.
+
+    Programs take over what was traced, operation by operation, as if the function had been called in them. Two of these
+    are equal if their functions are.
+    """
+
+    function: Callable
+
+    def __call__(self, *arguments):
+        return _traced(self.function)(*arguments)
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+
+@lru_cache(maxsize=1024)
+def _traced(function: Callable) -> Callable:
+    return jax.jit(function, inline=True)
+
+
+def traced_once(function: Callable) -> TracedOnce:
+    """`function` as `TracedOnce`, if it is not one already."""
+    return function if isinstance(function, TracedOnce) else TracedOnce(function)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rheonomic:
+    """A holonomic constraint that depends on time: a function with the time as its first argument.
+
+        System(..., constraint=Rheonomic(guided))  # guided(t, q_s, q_f, params) -> (n_g,)
+
+    Its hidden constraint is ``G v + dg/dt = 0``. It does work: energy is not kept.
+
+    Raises:
+        TypeError: function is no function.
+    """
+
+    function: Callable
+
+    def __post_init__(self):
+        if not callable(self.function):
+            raise TypeError(f"Rheonomic: function is {self.function!r}; give a function of (t, q_s, q_f, params).")
+
+
+def with_time(function, t, *arguments):
+    """A constraint as a plain function and its arguments, the time the first of them if it is `Rheonomic`."""
+    return (function.function, (t, *arguments)) if isinstance(function, Rheonomic) else (function, arguments)

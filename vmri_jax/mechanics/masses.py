@@ -1,0 +1,133 @@
+"""Masses: a matrix that multiplies velocities, kept as its diagonal where nothing else is in it."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.kernels import cpu as algebra
+from vmri_jax.mechanics.arrays import is_concrete, real_array
+
+
+class Diagonal(eqx.Module):
+    """A mass for each coordinate.
+
+    Args:
+        masses: (n,) positive.
+    """
+
+    masses: Any
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates n."""
+        return self.masses.shape[0]
+
+    @property
+    def matrix(self):
+        """``M`` as an array (n, n)."""
+        return jnp.diag(self.masses)
+
+    def times(self, v):
+        """``M v`` for (..., n)."""
+        return self.masses * v
+
+    def solve(self, p):
+        """``M^-1 p`` for (..., n)."""
+        return p * (1 / self.masses)
+
+    def inverse(self) -> "Diagonal":
+        """``M^-1`` as an operator, computed once."""
+        return Diagonal(1 / self.masses)
+
+
+class Dense(eqx.Module):
+    """A mass matrix.
+
+    Args:
+        matrix: (n, n) symmetric positive definite.
+    """
+
+    matrix: Any
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates n."""
+        return self.matrix.shape[0]
+
+    def times(self, v):
+        """``M v`` for (..., n)."""
+        return algebra.matvec(self.matrix, v)
+
+    def solve(self, p):
+        """``M^-1 p`` for (..., n)."""
+        return jnp.linalg.solve(self.matrix, p[..., None])[..., 0]
+
+    def inverse(self) -> "Dense":
+        """``M^-1`` as an operator, computed once."""
+        return Dense(algebra.inverse(self.matrix))
+
+
+def mass_array(name: str, mass):
+    """Masses (n,), or a mass matrix (n, n), as `ConstantMass` takes them: an array of float64.
+
+    It is an array of NumPy where users give lists or arrays of NumPy: these keep all digits before 64-bit mode is on, too.
+    """
+    mass = real_array(f"ConstantMass: {name}", mass)
+    if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
+        raise ValueError(f"ConstantMass: {name} has shape {mass.shape}; give (n,) masses or an (n, n) mass matrix.")
+    if not is_concrete(mass):
+        return mass
+    values = np.asarray(mass)
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"ConstantMass: {name} = {values} is not finite.")
+    if mass.ndim == 1 and np.any(values <= 0):
+        raise ValueError(f"ConstantMass: {name} = {values}; every mass must be positive.")
+    if mass.ndim == 2 and (not np.allclose(values, values.T) or np.any(np.linalg.eigvalsh(values) <= 0)):
+        raise ValueError(f"ConstantMass: {name} must be a symmetric positive definite matrix.")
+    return mass
+
+
+class ConstantMass(eqx.Module):
+    """Kinetic energy ``T = v_s^T M_s v_s / 2 + v_f^T M_f v_f / 2`` with constant masses.
+
+    Args:
+        slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix.
+
+    Raises:
+        TypeError: masses that are not real numbers.
+        ValueError: a mass that is not positive, a matrix that is not symmetric positive definite, arrays of float32.
+    """
+
+    slow: Any
+    fast: Any
+
+    def __init__(self, slow, fast):
+        self.slow, self.fast = mass_array("slow", slow), mass_array("fast", fast)
+
+    @property
+    def slow_mass(self) -> Diagonal | Dense:
+        """``M_s`` as an operator."""
+        return _operator(self.slow)
+
+    @property
+    def fast_mass(self) -> Diagonal | Dense:
+        """``M_f`` as an operator."""
+        return _operator(self.fast)
+
+    def __call__(self, q_s, q_f, v_s, v_f, params):
+        p_s, p_f = self.momentum(v_s, v_f)
+        return (jnp.sum(v_s * p_s) + jnp.sum(v_f * p_f)) / 2
+
+    def momentum(self, v_s, v_f):
+        """``(M_s v_s, M_f v_f)``, over any leading axes."""
+        return self.slow_mass.times(v_s), self.fast_mass.times(v_f)
+
+    def velocity(self, p_s, p_f):
+        """``(M_s^-1 p_s, M_f^-1 p_f)``, over any leading axes."""
+        return self.slow_mass.solve(p_s), self.fast_mass.solve(p_f)
+
+
+def _operator(mass) -> Diagonal | Dense:
+    return Diagonal(mass) if mass.ndim == 1 else Dense(mass)
