@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels import cpu as algebra
+from vmri_jax import kernels
 from vmri_jax.mechanics.arrays import is_concrete, real_array
 
 
@@ -58,7 +58,7 @@ class Dense(eqx.Module):
 
     def times(self, v):
         """``M v`` for (..., n)."""
-        return algebra.matvec(self.matrix, v)
+        return kernels.matvec(self.matrix, v)
 
     def solve(self, p):
         """``M^-1 p`` for (..., n)."""
@@ -66,7 +66,7 @@ class Dense(eqx.Module):
 
     def inverse(self) -> "Dense":
         """``M^-1`` as an operator, computed once."""
-        return Dense(algebra.inverse(self.matrix))
+        return Dense(kernels.inverse(self.matrix))
 
 
 def mass_array(name: str, mass):

@@ -28,7 +28,7 @@ from vmri_jax.mechanics.structure import curved_directions
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
-from vmri_jax.steppers.interval import Accepted, constant_mass, expected, inverse_mass
+from vmri_jax.steppers.interval import Accepted, constant_mass, expected
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
@@ -52,8 +52,9 @@ class CollocatedInterval:
         terms = lagrangian(self.system, equations.scheme)
         self.form = terms.kinetic.fast_form[1:]
         self.potentials = [term for term in terms.potentials.terms if term.inside.groups]
-        mass = constant_mass(self.system)
-        self.velocities = inverse_mass(mass.slow), inverse_mass(mass.fast)
+        kinetic = constant_mass(self.system)
+        self.masses = kinetic.slow_mass, kinetic.fast_mass
+        self.inverse_masses = kinetic.slow_mass.inverse(), kinetic.fast_mass.inverse()
         self.num_curved = equations.q_f.size or self.q.size
         directions = curved_directions(partial(self.potential_of_curved, self.q), self.q[-self.num_curved :])
         self.directions = np.pad(directions, ((0, 0), (self.q.size - self.num_curved, 0)))
@@ -70,18 +71,13 @@ class CollocatedInterval:
 
     def times_mass(self, x):
         """``M x`` for (n, m)."""
-        mass, parts = constant_mass(self.system), (x[: self.n_s], x[self.n_s :])
-        return jnp.concatenate(
-            [
-                m[:, None] * a if m.ndim == 1 else matmul(m, a)
-                for m, a in zip((mass.slow, mass.fast), parts, strict=True)
-            ]
-        )
+        parts = zip(self.masses, (x[: self.n_s], x[self.n_s :]), strict=True)
+        return jnp.concatenate([mass.times(part.T).T for mass, part in parts])
 
     def over_mass(self, x):
         """``M^-1 x`` for (n, m)."""
-        parts = x[: self.n_s], x[self.n_s :]
-        return jnp.concatenate([velocity(a.T).T for velocity, a in zip(self.velocities, parts, strict=True)])
+        parts = zip(self.inverse_masses, (x[: self.n_s], x[self.n_s :]), strict=True)
+        return jnp.concatenate([inverse.times(part.T).T for inverse, part in parts])
 
     def by_name(self, term: Term, q) -> tuple:
         """What a term takes of (n, ...) joined variables."""

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.kernels import inverse, matmul, matvec, max_abs, regularized, solve
+from vmri_jax.kernels import inverse, matvec, max_abs, regularized, solve
+from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian
-from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
@@ -59,15 +60,6 @@ def constant_mass(system: System) -> ConstantMass:
     """The masses of a system that can be cut."""
     assert isinstance(system.kinetic, ConstantMass)
     return system.kinetic
-
-
-def inverse_mass(mass):
-    """``p -> M^-1 p``, with the inverse computed once."""
-    if mass.ndim == 1:
-        inverse_diagonal = 1 / mass
-        return lambda p: inverse_diagonal * p
-    matrix = inverse(mass)
-    return lambda p: matmul(jnp.atleast_2d(p), matrix).reshape(p.shape)
 
 
 def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
@@ -142,7 +134,7 @@ class Interval:
         terms = implicit_terms(system, scheme)
         of_fast = [term for term in terms if term.arguments == ("q_f",)]
         sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
-        is_diagonal = constant_mass(system).fast.ndim == 1 and (not terms or sums)
+        is_diagonal = isinstance(constant_mass(system).fast_mass, Diagonal) and (not terms or sums)
         is_constant = True
         if is_diagonal:
             terms = of_fast

@@ -116,13 +116,13 @@ def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
     the macro step, as the scheme resolves it, has the average zero, so that V cannot excite it.
 
     Args:
-        stepper_of: ``q_s -> Kicked``, the stepper of one micro interval of the fast variables with the slow ones at rest.
+        stepper_of: ``(q_s, q_f) -> Kicked``, the stepper of one micro interval of the fast variables with the slow ones at rest.
         num_micro: micro steps per macro step.
     """
 
     def average(macro_dt):
         def averaged(q_s, q_f):
-            stepper, micro_dt, none = stepper_of(q_s), macro_dt / num_micro, jnp.zeros(0)
+            stepper, micro_dt, none = stepper_of(q_s, q_f), macro_dt / num_micro, jnp.zeros(0)
             start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
             own = stepper.renew(start, stepper.init(start, micro_dt), micro_dt)
             _, info, _ = stepper.move_many(start, own, micro_dt, num_micro)

@@ -10,7 +10,7 @@ from vmri_jax.kernels import inverse, matvec, max_abs, regularized
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import DiagonalMatrix, FullMatrix, constant_mass, interval_problem, inverse_mass
+from vmri_jax.steppers.interval import DiagonalMatrix, FullMatrix, constant_mass, interval_problem
 from vmri_jax.steppers.predictors import LinearPredictor
 
 
@@ -74,7 +74,7 @@ class March(NamedTuple):
     def first_pass(self, slow, lines: Lines) -> tuple[Fast, Left]:
         """With fast unknowns from where the intervals before lead to, for slow increments (r, n_s)."""
         r = self.equations.scheme.degree
-        velocity = inverse_mass(constant_mass(self.equations.system).fast)
+        velocity = constant_mass(self.equations.system).fast_mass.inverse().times
 
         def interval(carry, at):
             (arriving, lines), (m, basis, scale) = carry, at
@@ -105,7 +105,7 @@ class March(NamedTuple):
                 bend = (done.increments - straight) / self.equations.micro_dt**2
             return left, done._replace(bends=bend)
 
-        velocity = inverse_mass(constant_mass(self.equations.system).fast)
+        velocity = constant_mass(self.equations.system).fast_mass.inverse().times
         left, fast = jax.lax.scan(interval, self._start(slow), (*self._intervals(), fast))
         return fast, left
 

@@ -33,7 +33,6 @@ from vmri_jax.steppers.interval import (
     Interval,
     constant_mass,
     expected,
-    inverse_mass,
 )
 from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March, along
 from vmri_jax.steppers.newton import Newton
@@ -225,7 +224,7 @@ class _Passes:
         return self._judged(slow, slow_multiplier, fast, left, last.tied, last.missed, still_moves, last.passes + 1)
 
     def _judged(self, slow, slow_multiplier, fast: Fast, left: Left, tied, missed, still_moves, passes) -> Pass:
-        equations, inverse_fast = self.equations, inverse_mass(self.mass.fast)
+        equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
         x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
         d, (rows, g), impulse = self.slow_equations.update(x, left.start, left.increments, tied)
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(left.p_f)

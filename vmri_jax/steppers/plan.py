@@ -20,10 +20,9 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.structure import depends_on
-from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
-from vmri_jax.schemes.quadrature import PlacedRule, micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed, Projected
@@ -35,6 +34,7 @@ from vmri_jax.steppers.kicked import Kicked, average_over_fast_motion
 from vmri_jax.steppers.linear import Linear
 from vmri_jax.steppers.nested import SMALL, Nested
 from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.parts import fast_alone, fast_part, slow_part
 from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Fallback, Solved, Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper
@@ -103,7 +103,7 @@ def plan(system: System, scheme: Scheme | Composition, newton: Newton, state: St
     choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None)
     stepper: Stepper = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
     rarely = _projects_rarely(stepper)
-    if not rarely and (system.is_constrained or not isinstance(system.kinetic, ConstantMass)):
+    if not rarely and (system.is_constrained or not system.has_constant_mass):
         stepper = Projected(stepper)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
@@ -182,7 +182,7 @@ def _can_be_nested(system: System, scheme: Scheme) -> bool:
     potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
     local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
     force = system.force is None or scheme.force.grid == "micro"
-    return isinstance(system.kinetic, ConstantMass) and local and force
+    return system.has_constant_mass and local and force
 
 
 def _is_drift(system: System, scheme: Scheme) -> bool:
@@ -190,7 +190,7 @@ def _is_drift(system: System, scheme: Scheme) -> bool:
     terms = lagrangian(system, scheme).terms
     return (
         scheme.num_micro == scheme.degree == 1
-        and isinstance(system.kinetic, ConstantMass)
+        and system.has_constant_mass
         and system.force is None
         and not any(term.inside.groups for term in terms if isinstance(term, Term))
     )
@@ -206,7 +206,7 @@ def _is_linear(system: System, scheme: Scheme, interval: Interval, q_s) -> bool:
 def is_decoupled(system: System, scheme: Scheme, q_s, q_f) -> bool:
     """Whether, kicks aside, the slow equations do not see the fast unknowns."""
     params = system.params
-    if scheme.degree > 1 or system.force is not None or not isinstance(system.kinetic, ConstantMass):
+    if scheme.degree > 1 or system.force is not None or not system.has_constant_mass:
         return False
     if scheme.num_micro == 1 and not q_s.shape[0]:
         return False  # a part already
@@ -228,37 +228,10 @@ def _inside_potentials(system: System, scheme: Scheme) -> tuple[Callable | None,
 
 
 def _decoupled(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Decoupled:
-    """Two systems of fast variables alone, each on a single interval."""
-    assert isinstance(system.kinetic, ConstantMass)
-    n_s, n_f, params = q_s.shape[0], q_f.shape[0], system.params
     slow_potential, fast_potential = _inside_potentials(system, scheme)
-
-    def potential_of_slow(q, params):
-        return slow_potential(q, jnp.zeros(n_f), params)  # pyright: ignore[reportOptionalCall]
-
-    @Rheonomic
-    def constraint_of_slow(t, _, q, params):
-        return system.replace(params=params).g_slow(t, q)
-
-    @Rheonomic
-    def constraint_of_fast(t, _, q, params):
-        return system.replace(params=params).g(t, jnp.zeros(n_s), q)
-
-    none, drift = jnp.zeros(0), micro(midpoint)
-    slow = System(
-        ConstantMass(none, system.kinetic.slow),
-        fast_potential=None if slow_potential is None else potential_of_slow,
-        constraint=None if system.slow_constraint is None else constraint_of_slow,
-        params=params,
-    )
-    fast = System(
-        ConstantMass(none, system.kinetic.fast),
-        fast_potential=fast_potential,
-        constraint=None if system.constraint is None else constraint_of_fast,
-        params=params,
-    )
-    slow_scheme = Scheme(1, kinetic=drift, slow=drift, fast=PlacedRule(scheme.slow.rule, scheme.slow.grid))
-    fast_scheme = Scheme(1, kinetic=drift, slow=drift, fast=scheme.fast)
+    slow, slow_scheme = slow_part(system, scheme, slow_potential, q_f.size)
+    fast, fast_scheme = fast_part(system, scheme, fast_potential, q_s.size)
+    none = jnp.zeros(0)
     return Decoupled(
         _whole_step(slow, slow_scheme, choice, none, q_s),
         _whole_step(fast, fast_scheme, choice, none, q_f),
@@ -270,35 +243,13 @@ def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None
     """The filter of a mollified slow potential, if that is what the scheme has."""
     if not scheme.slow.mollified:
         return None
-    if not isinstance(system.kinetic, ConstantMass) or system.is_rheonomic:
+    if not system.has_constant_mass or system.is_rheonomic:
         raise ValueError(
             "Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass, without Rheonomic constraints."
         )
 
-    def stepper_of(q_s) -> Kicked:
-        alone, rules = _fast_alone(system, scheme, q_s)
-        q_f = jnp.zeros(alone.kinetic.fast.shape[0])
+    def stepper_of(q_s, q_f) -> Kicked:
+        alone, rules = fast_alone(system, scheme, q_s)
         return _whole_step(alone, rules, choice, jnp.zeros(0), q_f)
 
     return average_over_fast_motion(stepper_of, scheme.num_micro)
-
-
-def _fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
-    """The fast variables under W and g with the slow ones at rest in q_s, and the scheme of one micro interval of them."""
-    assert isinstance(system.kinetic, ConstantMass)
-    fast_potential = system.fast_potential
-
-    def potential(q, at):
-        return fast_potential(q, at[0])  # pyright: ignore[reportOptionalCall]
-
-    def constraint_at_rest(_, q, at):
-        return system.replace(params=at[0]).g(jnp.zeros(()), at[1], q)
-
-    alone = System(
-        ConstantMass(jnp.zeros(0), system.kinetic.fast),
-        fast_potential=None if fast_potential is None else potential,
-        constraint=None if system.constraint is None else constraint_at_rest,
-        params=(system.params, q_s),
-    )
-    rule = micro(scheme.kinetic.rule)
-    return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from vmri_jax.kernels import inverse, matvec, max_abs, regularized
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
-from vmri_jax.steppers.interval import Accepted, constant_mass, inverse_mass
+from vmri_jax.steppers.interval import Accepted, constant_mass
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
@@ -62,8 +62,8 @@ class Rattle(Solver):
     def solve(self, equations: StepEquations, guess: Unknowns, own: RattleState) -> tuple[Solution, RattleState]:
         system, h, newton = equations.system, equations.macro_dt, self.newton
         q, n_s = jnp.concatenate([equations.q_s, equations.q_f]), equations.q_s.size
-        mass = constant_mass(system)
-        velocity_s, velocity_f = inverse_mass(mass.slow), inverse_mass(mass.fast)
+        kinetic = constant_mass(system)
+        velocity_s, velocity_f = kinetic.slow_mass.inverse().times, kinetic.fast_mass.inverse().times
 
         def constraints(t, q):
             return system.constraints(t, q[:n_s], q[n_s:])

@@ -22,7 +22,7 @@ from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import gauss
-from vmri_jax.steppers.interval import constant_mass, interval_problem, inverse_mass, solve_saddle
+from vmri_jax.steppers.interval import constant_mass, interval_problem, solve_saddle
 
 NODES = 4
 """Gauss nodes of a macro step at which the slow forces are linearised."""
@@ -55,7 +55,7 @@ class SlowEquations(NamedTuple):
     def of(cls, equations: StepEquations) -> "SlowEquations":
         kinetic = lagrangian(equations.system, equations.scheme).kinetic
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
-        return cls(equations, kinetic, inverse_form, inverse_mass(constant_mass(equations.system).slow))
+        return cls(equations, kinetic, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
 
     def tied(self, schur) -> Tied | None:
         """The masses tied by the constraints of the first micro interval, with its (r n_g, r n_g) matrix S."""

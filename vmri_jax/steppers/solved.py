@@ -10,9 +10,10 @@ import jax.numpy as jnp
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.state import State, project_momentum
-from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns, physical_multipliers
 from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton.implicit import differentiable
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
@@ -80,9 +81,10 @@ class Solved(Stepper):
     solver: Solver
 
     def init(self, state: State, macro_dt) -> SolvedState:
-        kinetic = self.system.kinetic
-        constant = isinstance(kinetic, ConstantMass)
-        velocity = kinetic.velocity(state.p_s, state.p_f) if constant else project_momentum(self.system, state)[2:]
+        if self.system.has_constant_mass:
+            velocity = constant_mass(self.system).velocity(state.p_s, state.p_f)
+        else:
+            velocity = project_momentum(self.system, state)[2:]
         n_g, n_gs = self.system.num_constraints(state.q_s, state.q_f)
         solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt), velocity)
         return SolvedState(velocity, jnp.zeros(n_g), jnp.zeros(n_gs), solver)
@@ -94,10 +96,10 @@ class Solved(Stepper):
 
     def move(self, state: State, own: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
-        velocity = own.velocity
-        if isinstance(self.system.kinetic, ConstantMass):
-            velocity = self.system.kinetic.velocity(state.p_s, state.p_f)  # with the kicks
-        guess = equations.guess(*velocity, own.multiplier, own.slow_multiplier)
+        v_s, v_f = own.velocity
+        if self.system.has_constant_mass:
+            v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)  # with the kicks
+        guess = equations.guess(v_s, v_f, own.multiplier, own.slow_multiplier)
         found, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, own.solver)))
         x, (q_f, p_s, p_f) = differentiable(equations, found.x, found.end)
 
@@ -108,8 +110,8 @@ class Solved(Stepper):
         return end, info, SolvedState(own.velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
 
     def project(self, state: State, own: SolvedState) -> tuple[State, SolvedState]:
-        p_s, p_f, *velocity = project_momentum(self.system, state, own.velocity)
-        own = own._replace(velocity=tuple(velocity), solver=self.solver.projected(own.solver))
+        p_s, p_f, v_s, v_f = project_momentum(self.system, state, own.velocity)
+        own = own._replace(velocity=(v_s, v_f), solver=self.solver.projected(own.solver))
         return State(state.t, state.q_s, state.q_f, p_s, p_f), own
 
     def continued(self, own: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:

@@ -58,8 +58,8 @@ def linearize(equations: StepEquations, x: Unknowns) -> Blocks:
 
     for term in lagrangian(system, scheme).terms:
         if isinstance(term, QuadraticKinetic):
-            blocks["ff"] += _constant_block(term.fast_form, term.mass.fast)
-            blocks["ss"] += _constant_block(term.slow_form / n, term.mass.slow)
+            blocks["ff"] += _constant_block(term.fast_form, term.mass.fast_mass.matrix)
+            blocks["ss"] += _constant_block(term.slow_form / n, term.mass.slow_mass.matrix)
         elif term.inside.groups:
             z = term.inside.sample(path, term.arguments)
             hessian = jax.vmap(jax.jacfwd(jax.grad(_of_dict(term.integrand, term.arguments))))(z)
@@ -122,9 +122,8 @@ def _group_by_node(at_nodes, num_micro: int, degree: int):
     return jnp.swapaxes(by_interval, 0, 1).reshape(at_nodes.shape)
 
 
-def _constant_block(form, mass):
+def _constant_block(form, matrix):
     """Mass times a quadratic form in the increments: the start moves all points alike, hence nothing."""
-    matrix = jnp.diag(mass) if mass.ndim == 1 else mass
     return jnp.einsum("ij,ab->iajb", form.at[:, 0].set(0.0), matrix)
 
 

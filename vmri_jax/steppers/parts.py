@@ -1,0 +1,122 @@
+"""Systems taken apart: the slow and the fast variables as systems of their own, each of fast variables on a single interval.
+
+Functions of the parts are values that are equal where what they are made of is, so that they are traced once.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.functions import Rheonomic, with_time
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.quadrature import PlacedRule, micro, midpoint
+from vmri_jax.schemes.scheme import Scheme
+
+
+@dataclass(frozen=True)
+class PotentialOfSlow:
+    """V where it does not see the fast variables, as a function of the slow ones."""
+
+    potential: Callable
+    num_fast: int
+
+    def __call__(self, q, params):
+        return self.potential(q, jnp.zeros(self.num_fast), params)
+
+
+@dataclass(frozen=True)
+class ConstraintOfSlow:
+    """g_s as a constraint of fast variables."""
+
+    constraint: Callable | Rheonomic
+
+    def __call__(self, t, _, q, params):
+        function, arguments = with_time(self.constraint, t, q, params)
+        return function(*arguments)
+
+
+@dataclass(frozen=True)
+class ConstraintOfFast:
+    """g where it does not see the slow variables."""
+
+    constraint: Callable | Rheonomic
+    num_slow: int
+
+    def __call__(self, t, _, q, params):
+        function, arguments = with_time(self.constraint, t, jnp.zeros(self.num_slow), q, params)
+        return function(*arguments)
+
+
+def slow_part(system: System, scheme: Scheme, potential: Callable | None, num_fast: int) -> tuple[System, Scheme]:
+    """The slow variables, and the scheme of their step over the macro interval.
+
+    Args:
+        potential: V, None where it only kicks.
+    """
+    alone = System(
+        ConstantMass(jnp.zeros(0), _constant(system).slow),
+        fast_potential=None if potential is None else PotentialOfSlow(potential, num_fast),
+        constraint=None if system.slow_constraint is None else Rheonomic(ConstraintOfSlow(system.slow_constraint)),
+        params=system.params,
+    )
+    return alone, _single(PlacedRule(scheme.slow.rule, scheme.slow.grid))
+
+
+def fast_part(system: System, scheme: Scheme, potential: Callable | None, num_slow: int) -> tuple[System, Scheme]:
+    """The fast variables, and the scheme of their steps over the micro intervals.
+
+    Args:
+        potential: W, None where it only kicks at the macro nodes.
+    """
+    alone = System(
+        ConstantMass(jnp.zeros(0), _constant(system).fast),
+        fast_potential=potential,
+        constraint=None if system.constraint is None else Rheonomic(ConstraintOfFast(system.constraint, num_slow)),
+        params=system.params,
+    )
+    return alone, _single(scheme.fast)
+
+
+@dataclass(frozen=True)
+class PotentialAtRest:
+    """W with parameters ``(params, q_s)``."""
+
+    potential: Callable
+
+    def __call__(self, q, at):
+        return self.potential(q, at[0])
+
+
+@dataclass(frozen=True)
+class ConstraintAtRest:
+    """g with the slow variables at rest, parameters ``(params, q_s)``."""
+
+    constraint: Callable
+
+    def __call__(self, _, q, at):
+        return self.constraint(at[1], q, at[0])
+
+
+def fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
+    """The fast variables under W and g with the slow ones at rest in q_s, and the scheme of one micro interval of them."""
+    alone = System(
+        ConstantMass(jnp.zeros(0), _constant(system).fast),
+        fast_potential=None if system.fast_potential is None else PotentialAtRest(system.fast_potential),
+        constraint=None if system.constraint is None else ConstraintAtRest(system.constraint),  # pyright: ignore[reportArgumentType]
+        params=(system.params, q_s),
+    )
+    rule = micro(scheme.kinetic.rule)
+    return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)
+
+
+def _single(fast: PlacedRule) -> Scheme:
+    """A scheme of fast variables alone on one interval."""
+    drift = micro(midpoint)
+    return Scheme(1, kinetic=drift, slow=drift, fast=fast)
+
+
+def _constant(system: System) -> ConstantMass:
+    assert isinstance(system.kinetic, ConstantMass)
+    return system.kinetic
