@@ -85,10 +85,10 @@ def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
     theta, interval, weights = quadrature_nodes(placed, n)
     local = theta * n - interval
     points = fast[interval[:, None] * r + np.arange(r + 1)]  # (k, r + 1, n_f): those of the micro interval of each node
-    slopes = [l.deriv() for l in basis]
+    slopes = [polynomial.deriv() for polynomial in basis]
 
     def values(polynomials, at):
-        return np.stack([l(at) for l in polynomials], axis=1)
+        return np.stack([polynomial(at) for polynomial in polynomials], axis=1)
 
     return Samples(
         theta,
@@ -153,7 +153,7 @@ def virtual_work(system: System, scheme: Scheme, path, along, t, macro_dt):
 def constraints(system: System, scheme: Scheme, slow, fast, t, macro_dt):
     """g at all micro control nodes (num_micro r + 1, n_g), and g_s at all macro control nodes (r + 1, n_gs)."""
     theta = np.array(scheme.constraint.composite(scheme.num_micro).nodes)
-    q_s = np.stack([l(theta) for l in lagrange_polynomials(scheme)], axis=1) @ slow
+    q_s = np.stack([polynomial(theta) for polynomial in lagrange_polynomials(scheme)], axis=1) @ slow
     slow_theta = np.array(scheme.slow_constraint.rule.nodes)
     return jax.vmap(system.g)(t + macro_dt * theta, q_s, fast), jax.vmap(system.g_slow)(t + macro_dt * slow_theta, slow)
 
