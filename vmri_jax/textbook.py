@@ -131,7 +131,7 @@ def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Call
 
     def product(A, B, q_s, q_f):
         a, b = (jax.grad(potential, argnums=(0, 1))(q_s, q_f) for potential in (A, B))
-        return sum(jnp.sum(x * y) for x, y in zip(a, system.kinetic.velocity(*b), strict=True))
+        return sum(jnp.sum(x * y) for x, y in zip(a, system.kinetic.velocity(*b), strict=True))  # pyright: ignore[reportAttributeAccessIssue]
 
     def corrected_V(q_s, q_f):
         mixed = micro_dt**2 / 12 * product(V, W, q_s, q_f) if scheme.fast.corrected else 0.0
@@ -145,7 +145,7 @@ def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Call
 
 def virtual_work(system: System, scheme: Scheme, path, along, t, macro_dt):
     """Lagrange-d'Alembert: ``sum H w_i F(t_i, q_i, v_i) . q_i``, with the forces along one path and q_i on another."""
-    at, q = (sample(scheme, scheme.force, *control_points, macro_dt) for control_points in (along, path))
+    at, q = (sample(scheme, scheme.force, slow, fast, macro_dt) for slow, fast in (along, path))
     f_s, f_f = jax.vmap(system.forces)(t + macro_dt * at.theta, at.q_s, at.q_f, at.v_s, at.v_f)
     return macro_dt * (jnp.sum(q.weights[:, None] * f_s * q.q_s) + jnp.sum(q.weights[:, None] * f_f * q.q_f))
 
@@ -231,8 +231,9 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
 
     def action(path, along, x: Unknowns):
         """A times h, which keeps Newton's matrix of the size of masses and constraint Jacobians whatever the step size."""
-        g, g_slow = constraints(system, scheme, *path, t, macro_dt)
-        free = discrete_lagrangian(system, scheme, *path, macro_dt)
+        slow, fast = path
+        g, g_slow = constraints(system, scheme, slow, fast, t, macro_dt)
+        free = discrete_lagrangian(system, scheme, slow, fast, macro_dt)
         free += virtual_work(system, scheme, path, along, t, macro_dt)
         return micro_dt * free - jnp.sum(x.multiplier * g[:-1]) - jnp.sum(x.slow_multiplier * g_slow[:-1])
 
