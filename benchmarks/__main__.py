@@ -102,6 +102,24 @@ def fuzz_command(
         raise typer.Exit(1)
 
 
+@app.command("oracle")
+def oracle_command(
+    count: Annotated[int, typer.Option(min=1, help="Systems.")] = 500,
+    seed: Annotated[int, typer.Option(help="Other seeds are other systems.")] = 0,
+    core: Core = None,
+    out: Out = OUT,
+) -> None:
+    """Random systems: every stepper against the textbook."""
+    prepare(core)
+    from benchmarks import oracle  # only now: the textbook starts JAX
+
+    path = out / f"oracle_{seed}.json"
+    with progress("oracle", count) as tell:
+        found = oracle.run(count, seed, path, tell)
+    oracle.show(found, console)
+    console.print(f"written to {path}\n")
+
+
 @app.command("scenes")
 def scenes_command(full: Full = False, core: Core = None, out: Out = OUT, only: Tables = None) -> None:
     """What an effect costs that a scene does not have, a scene against a system by hand, orders under forces."""

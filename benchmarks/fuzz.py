@@ -6,17 +6,21 @@ are written as they come, so that a run that was stopped goes on where it was.
 
 import dataclasses
 import json
+import linecache
 import multiprocessing
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from random import Random
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import vmri_jax as vm
 from benchmarks.measure import Tell, silent
 from tests.verification import random_systems as rs
+from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 
 DRAWS = 50
 """Runs of a structure, which share its compiled programs."""
@@ -40,12 +44,103 @@ def calls(runs: list[int], seed: int) -> Iterator[tuple[int, ...]]:
         yield tuple(together)
 
 
+def verdicts(of: rs.Structure, draws: list[rs.Draw]) -> list[str]:
+    """What becomes of each draw: the name of its `Result`, "REFUSED" with an error of ours, or what is wrong.
+
+    A structure with lanes takes so many draws at once, with the masses and the scheme of the first.
+    """
+    try:
+        first, problems = draws[0], [rs.problem(of, at) for at in draws]
+        how = {
+            "num_steps": of.num_saves * first.save_every,
+            "save_every": first.save_every,
+            "save_micro": of.save_micro,
+            "newton": vm.Newton(of.method, first.tolerance, first.max_iterations, of.fixed_iterations),  # pyright: ignore
+        }
+        made = rs.scheme(of, first)
+        if of.lanes is None:
+            start = problems[0].state(project=first.project)
+            found = [vm.simulate(problems[0].system, made, start, macro_dt=first.macro_dt, throw=False, **how)]
+        else:
+            found = _batch(problems, made, draws, how)
+    except Exception as error:
+        return [refusal(error)] * len(draws)
+    return [judge(run, first.tolerance, how["num_steps"]) for run in found]
+
+
+def _batch(problems, made, draws, how) -> list[vm.Trajectory]:
+    """Lanes that `initial_state` refuses start from the state it would have projected, unprojected."""
+    starts = []
+    for at in problems:
+        try:
+            starts.append(at.state())
+        except ValueError:
+            v = np.zeros_like(at.q_s), np.zeros_like(at.q_f)
+            starts.append(vm.State(at.t, at.q_s, at.q_f, *v))
+    stacked = [
+        {name: np.stack([np.asarray(x[name]) for x in lanes]) for name in lanes[0]}
+        for lanes in ([vars(s) for s in starts], [p.system.params for p in problems])
+    ]
+    dt = np.array([at.macro_dt for at in draws])
+    runs = vm.simulate_batch(problems[0].system, made, vm.State(**stacked[0]), params=stacked[1], macro_dt=dt, **how)
+    fields = {f.name: getattr(runs, f.name) for f in dataclasses.fields(runs) if getattr(runs, f.name) is not None}
+    info = fields.pop("info")
+    return [
+        vm.Trajectory(**{k: a[i] for k, a in fields.items()}, info=type(info)(*(a[i] for a in info)))
+        for i in range(len(draws))
+    ]
+
+
+HONEST = "REFUSED", *vm.Result.__members__
+"""Outcomes of a run that are as they should be; all others say what is wrong."""
+
+
+def refusal(error: Exception) -> str:
+    """ "REFUSED" for a ValueError or TypeError that this package raised itself, else what it was and where."""
+    at = error.__traceback__
+    while at is not None and at.tb_next is not None:
+        at = at.tb_next
+    where = at.tb_frame.f_globals.get("__name__", "?") if at is not None else "?"
+    raised = at is not None and "raise" in linecache.getline(at.tb_frame.f_code.co_filename, at.tb_lineno)
+    if isinstance(error, ValueError | TypeError) and where.split(".")[0] == "vmri_jax" and raised:
+        return "REFUSED"
+    return f"foreign error: {type(error).__name__} in {where}: {str(error)[:200]}"
+
+
+def judge(run: vm.Trajectory, tolerance: float, num_steps: int) -> str:
+    """The name of the `Result` of an honest run, else what is wrong with it."""
+    code, failed_at, saves = int(run.result), int(run.failed_at), len(run.t) - 1
+    if code not in set(vm.Result):
+        return f"unknown status: {code}"
+    status = vm.Result(code)
+    if status.success != (failed_at < 0) or failed_at >= num_steps:
+        return f"status at odds: {status.name} with failed_at {failed_at}"
+    nodes = {name: np.asarray(getattr(run, name)) for name in ("q_s", "q_f", "p_s", "p_f", "energy")}
+    kept = 1 + (saves if status.success else failed_at * saves // num_steps)
+    if not status.success and not np.isfinite(nodes["energy"][0]):
+        kept = 0  # the start itself is outside the domain of a function
+    for name, a in nodes.items():
+        finite = np.isfinite(a).reshape(len(a), -1)
+        if not finite[:kept].all():
+            return f"not finite: {name} at a node with success (status {status.name})"
+        if finite[kept:].any() and finite.size:
+            return f"stale numbers: {name} after a failure (status {status.name})"
+    if run.q_f_micro is not None and not np.isfinite(np.asarray(run.q_f_micro)[: max(0, kept - 1)]).all():
+        return "not finite: q_f_micro at a node with success"
+    g = np.asarray(run.constraint_residual)[:kept, 0].max(initial=0.0)
+    if not g <= max(CONSTRAINT_TOLERANCE, 100 * tolerance):
+        return f"constraint violated: by {g:.1e} at a node with success (status {status.name})"
+    if not np.isfinite(np.asarray(run.info.residual)[: max(0, kept - 1)]).all():
+        return "not finite: residual of a step with success"
+    return status.name
+
+
 def compute(seed: int, runs: tuple[int, ...]) -> list[str]:
     """The outcomes of runs that are computed together."""
     structure = draws_of(seed, runs[0])[0]
     draws = [draws_of(seed, run)[1] for run in runs]
     draws += draws[-1:] * ((structure.lanes or 1) - len(draws))
-    return rs.run(structure, draws)[: len(runs)]
+    return verdicts(structure, draws)[: len(runs)]
 
 
 def _work(connection, seed: int, runs: list[int]) -> None:
@@ -121,14 +216,14 @@ def kind(outcome: str) -> str:
 
 def wrong(found: dict[int, str]) -> dict[int, str]:
     """The runs that did not end as they should."""
-    return {run: outcome for run, outcome in sorted(found.items()) if outcome not in rs.HONEST}
+    return {run: outcome for run, outcome in sorted(found.items()) if outcome not in HONEST}
 
 
 def table(found: dict[int, str], console: Console) -> None:
     """Print how often each kind of outcome came, and every run that is wrong."""
     number = Counter(map(kind, found.values()))
     counts = Table("outcome", "runs", title=f"{len(found)} runs", title_justify="left", box=None, header_style="bold")
-    for name in (*rs.HONEST, *sorted(set(number) - set(rs.HONEST))):
+    for name in (*HONEST, *sorted(set(number) - set(HONEST))):
         counts.add_row(name, str(number[name]))
     console.print(counts)
     console.print(f"{len(wrong(found))} ended wrong")
@@ -141,7 +236,7 @@ def reduce(seed: int, run: int, tell: Tell = silent) -> tuple[rs.Structure, rs.D
     structure, draw = draws_of(seed, run)
 
     def outcome(structure, draw):
-        return rs.run(structure, [draw] * (structure.lanes or 1))[0]
+        return verdicts(structure, [draw] * (structure.lanes or 1))[0]
 
     wrong = outcome(structure, draw)
     simpler = [

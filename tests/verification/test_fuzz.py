@@ -52,9 +52,9 @@ def test_runs_end_as_they_should(name):
     @given(st.randoms(note_method_calls=False, use_true_random=False))
     @settings(max_examples=30)
     def check(random):
-        (outcome,) = rs.run(structure, [rs.draw(random, structure)])
+        (outcome,) = fuzz.verdicts(structure, [rs.draw(random, structure)])
         seen.add(outcome)
-        assert outcome in rs.HONEST
+        assert outcome in fuzz.HONEST
 
     check()
     assert len(seen) > 1  # not all refused, or all at rest
@@ -65,8 +65,8 @@ def test_lanes_of_a_batch_end_as_they_should():
     found = []
     for seed in range(8):
         random = Random(seed)
-        found += rs.run(structure, [rs.draw(random, structure) for _ in range(4)])
-    assert set(found) <= set(rs.HONEST)
+        found += fuzz.verdicts(structure, [rs.draw(random, structure) for _ in range(4)])
+    assert set(found) <= set(fuzz.HONEST)
     assert {"CONVERGED", "NON_FINITE"} <= set(found)
 
 
@@ -82,7 +82,7 @@ def verdict(**changes) -> str:
         "result": 0,
         "failed_at": -1,
     }
-    return rs.judge(vm.Trajectory(**fields | changes), 1e-12, num_steps=6)
+    return fuzz.judge(vm.Trajectory(**fields | changes), 1e-12, num_steps=6)
 
 
 NAN, LAST = np.array([1.0, 1.0, 1.0, np.nan]), {"result": 2, "failed_at": 5}
@@ -114,10 +114,10 @@ def test_errors_of_others_are_no_refusals():
     for wrong in (lambda: jnp.ones(2) + jnp.ones(3), lambda: vm.ConstantMass.velocity(None, 0, 0), lambda: {}["x"]):  # pyright: ignore
         with pytest.raises(Exception) as caught:  # noqa: PT011
             wrong()
-        assert rs.refusal(caught.value).startswith("foreign error: " + type(caught.value).__name__)
+        assert fuzz.refusal(caught.value).startswith("foreign error: " + type(caught.value).__name__)
     with pytest.raises(ValueError, match="positive") as caught:
         vm.ConstantMass([-1.0], [1.0])
-    assert rs.refusal(caught.value) == "REFUSED"
+    assert fuzz.refusal(caught.value) == "REFUSED"
 
 
 def test_draws_are_named_by_their_run():

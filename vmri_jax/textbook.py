@@ -1,0 +1,281 @@
+"""The whole method on one page: variational multirate integration as in a textbook, without any speed.
+
+A macro step of length H carries a slow polynomial of degree r, and one fast polynomial of degree r on each of its ``num_micro``
+micro intervals. Both go through control points at Gauss-Lobatto nodes, S_0..S_r and F_0..F_{num_micro r}. The discrete
+Lagrangian is a sum over the terms of the Lagrangian, each at the nodes of its own quadrature rule,
+
+    L_d(S, F) = sum over terms, over nodes i:  H w_i term(q(theta_i), qdot(theta_i)),
+
+and constraints are held at the control nodes by multipliers, which have absorbed their weights, in the augmented action
+
+    A = L_d - sum_j lambda_j . g(node j) - sum_i nu_i . g_s(S_i)              (all control nodes but the last).
+
+A step solves, from the momenta p at its start,
+
+    p + D_first A = 0,    D_inner A = 0,    g = 0 and g_s = 0 at all control nodes but the first,
+
+and ends with ``p+ = D_last A``, projected onto the hidden constraints ``G v + dg/dt = 0``. Kicks (rules with nodes at the ends of the
+step), forces and compositions need nothing else. The steppers that `vmri_jax.simulate` takes solve the same equations faster;
+they are tested against this page. Source: Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from numpy.polynomial import Polynomial
+
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule
+from vmri_jax.schemes.scheme import Scheme
+
+
+class Unknowns(NamedTuple):
+    """Unknowns of a step: control points but the first, (r, n_s) and (num_micro r, n_f), and as many multipliers."""
+
+    slow: Any
+    fast: Any
+    multiplier: Any
+    slow_multiplier: Any
+
+
+class Samples(NamedTuple):
+    """Position and velocity of the path at the nodes of a rule, and the weights (k,) of the nodes."""
+
+    theta: Any
+    q_s: Any
+    q_f: Any
+    v_s: Any
+    v_f: Any
+    weights: Any
+
+
+def lagrange_polynomials(scheme: Scheme) -> list[Polynomial]:
+    """The polynomials l_j of degree r with ``l_j(c_k) = delta_jk`` at the control nodes c_k of [0, 1]."""
+    nodes = np.array(scheme.slow_constraint.rule.nodes)
+    products = [Polynomial.fromroots(np.delete(nodes, j)) for j in range(len(nodes))]
+    return [product / product(c) for product, c in zip(products, nodes, strict=True)]
+
+
+def quadrature_nodes(placed: PlacedRule, num_micro: int):
+    """Nodes theta_i in [0, 1], the micro interval in which each lies, and weights.
+
+    A node where two micro intervals meet belongs to both of them: there the fast velocity has two values.
+    """
+    nodes = np.array(placed.rule.nodes)
+    if placed.grid == "macro":
+        interval = np.minimum(np.floor(nodes * num_micro + NODE_TOLERANCE).astype(int), num_micro - 1)
+        return nodes, interval, jnp.asarray(placed.rule.weights)
+    interval = np.repeat(np.arange(num_micro), len(nodes))
+    return (
+        (interval + np.tile(nodes, num_micro)) / num_micro,
+        interval,
+        jnp.tile(placed.rule.weights, num_micro) / num_micro,
+    )
+
+
+def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
+    """The path through the control points at the nodes of a rule."""
+    r, n, basis = scheme.degree, scheme.num_micro, lagrange_polynomials(scheme)
+    theta, interval, weights = quadrature_nodes(placed, n)
+    local = theta * n - interval
+    points = fast[interval[:, None] * r + np.arange(r + 1)]  # (k, r + 1, n_f): those of the micro interval of each node
+    slopes = [polynomial.deriv() for polynomial in basis]
+
+    def values(polynomials, at):
+        return np.stack([polynomial(at) for polynomial in polynomials], axis=1)
+
+    return Samples(
+        theta,
+        values(basis, theta) @ slow,
+        jnp.einsum("kj,kjn->kn", values(basis, local), points),
+        values(slopes, theta) @ slow / macro_dt,
+        jnp.einsum("kj,kjn->kn", values(slopes, local), points) / (macro_dt / n),
+        weights,
+    )
+
+
+def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
+    """The discrete Lagrangian ``L_d = sum H w_i (T - V - W)`` of a macro step.
+
+    Args:
+        slow: (r + 1, n_s) slow control points.
+        fast: (num_micro r + 1, n_f) fast control points, shared ones once.
+        macro_dt: length H of the step.
+    """
+
+    def action(placed, term):
+        at = sample(scheme, placed, slow, fast, macro_dt)
+        return macro_dt * jnp.sum(at.weights * jax.vmap(term)(at.q_s, at.q_f, at.v_s, at.v_f))
+
+    slow_potential, fast_potential = potentials(system, scheme, macro_dt)
+    kinetic = action(scheme.kinetic, lambda q_s, q_f, v_s, v_f: system.kinetic(q_s, q_f, v_s, v_f, system.params))
+    kinetic -= action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
+    return kinetic - action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
+
+
+def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Callable]:
+    """V and W as functions of (q_s, q_f); a corrected one is less a square of gradients, see `quadrature.corrected`."""
+    micro_dt = macro_dt / scheme.num_micro
+
+    def V(q_s, q_f):
+        return system.slow_potential(q_s, q_f, system.params) if system.slow_potential else 0.0 * jnp.sum(q_s)
+
+    def W(q_s, q_f):
+        return system.fast_potential(q_f, system.params) if system.fast_potential else 0.0 * jnp.sum(q_f)
+
+    def product(A, B, q_s, q_f):
+        a, b = (jax.grad(potential, argnums=(0, 1))(q_s, q_f) for potential in (A, B))
+        return sum(jnp.sum(x * y) for x, y in zip(a, system.kinetic.velocity(*b), strict=True))  # pyright: ignore[reportAttributeAccessIssue]
+
+    def corrected_V(q_s, q_f):
+        mixed = micro_dt**2 / 12 * product(V, W, q_s, q_f) if scheme.fast.corrected else 0.0
+        return V(q_s, q_f) - macro_dt**2 / 24 * product(V, V, q_s, q_f) - mixed
+
+    def corrected_W(q_s, q_f):
+        return W(q_s, q_f) - micro_dt**2 / 24 * product(W, W, q_s, q_f)
+
+    return corrected_V if scheme.slow.corrected else V, corrected_W if scheme.fast.corrected else W
+
+
+def virtual_work(system: System, scheme: Scheme, path, along, t, macro_dt):
+    """Lagrange-d'Alembert: ``sum H w_i F(t_i, q_i, v_i) . q_i``, with the forces along one path and q_i on another."""
+    at, q = (sample(scheme, scheme.force, slow, fast, macro_dt) for slow, fast in (along, path))
+    f_s, f_f = jax.vmap(system.forces)(t + macro_dt * at.theta, at.q_s, at.q_f, at.v_s, at.v_f)
+    return macro_dt * (jnp.sum(q.weights[:, None] * f_s * q.q_s) + jnp.sum(q.weights[:, None] * f_f * q.q_f))
+
+
+def constraints(system: System, scheme: Scheme, slow, fast, t, macro_dt):
+    """g at all micro control nodes (num_micro r + 1, n_g), and g_s at all macro control nodes (r + 1, n_gs)."""
+    theta = np.array(scheme.constraint.composite(scheme.num_micro).nodes)
+    q_s = np.stack([polynomial(theta) for polynomial in lagrange_polynomials(scheme)], axis=1) @ slow
+    slow_theta = np.array(scheme.slow_constraint.rule.nodes)
+    return jax.vmap(system.g)(t + macro_dt * theta, q_s, fast), jax.vmap(system.g_slow)(t + macro_dt * slow_theta, slow)
+
+
+def newton(residual: Callable, guess, max_iterations: int = 50):
+    """The root of ``residual(x)`` with shapes as x, by Newton's method; NaN where it does not converge.
+
+    Goes on until a change is below 1e-9 of x, and then once more, to round-off. Differentiable by the implicit function theorem.
+    """
+    start, unravel = ravel_pytree(guess)
+
+    def flat_residual(x):
+        return ravel_pytree(residual(unravel(x)))[0]
+
+    def solve(residual, x):
+        def iteration(carry):
+            x, _, last_change, k = carry
+            change = jnp.linalg.solve(jax.jacfwd(residual)(x), residual(x))
+            size = jnp.max(jnp.abs(change)) / (jnp.max(jnp.abs(x)) + 1e-300)
+            return x - change, last_change, size, k + 1
+
+        def goes_on(carry):
+            return (carry[1] > 1e-9) & (carry[3] < max_iterations)
+
+        x, last_but_one, _, _ = jax.lax.while_loop(goes_on, iteration, (x, jnp.inf, jnp.inf, 0))
+        return jnp.where(last_but_one <= 1e-9, x, jnp.nan)
+
+    def solve_linear(product, y):
+        return jnp.linalg.solve(jax.jacfwd(product)(jnp.zeros_like(y)), y)
+
+    return unravel(jax.lax.custom_root(flat_residual, start, solve, solve_linear))
+
+
+def project(system: System, state: State, v_s, v_f):
+    """The state with its momenta on the hidden constraints, ``p - G^T mu = dT/dv`` with ``G v + dg/dt = 0``, and v.
+
+    Args:
+        v_s, v_f: velocities from which Newton's method starts.
+    """
+    t, q_s, q_f = state.t, state.q_s, state.q_f
+    values, pull = jax.vjp(lambda q_s, q_f: system.constraints(t, q_s, q_f), q_s, q_f)
+
+    def residual(x):
+        v_s, v_f, mu = x
+        p_s, p_f = jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
+        force_s, force_f = pull(mu)
+        rates = system.constraint_rates(t, q_s, q_f, v_s, v_f)
+        return p_s + force_s - state.p_s, p_f + force_f - state.p_f, rates
+
+    v_s, v_f, mu = newton(residual, (v_s, v_f, jnp.zeros_like(values)))
+    force_s, force_f = pull(mu)
+    return State(t, q_s, q_f, state.p_s - force_s, state.p_f - force_f), (v_s, v_f)
+
+
+def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -> State:
+    """One macro step; the state is NaN where Newton's method does not converge.
+
+    Args:
+        system, scheme: what moves, and how.
+        state: a consistent state, from `vmri_jax.initial_state` or a former step.
+        macro_dt: length H of the macro step.
+
+    Raises:
+        ValueError: a scheme with mollified kicks, or corrected kicks without a ConstantMass.
+    """
+    if isinstance(scheme, Composition):
+        stages = macro_dt * jnp.asarray(scheme.coefficients)
+        return jax.lax.scan(lambda state, dt: (step(system, scheme.scheme, state, dt), None), state, stages)[0]
+    check(system, scheme)
+    n, r, t = scheme.num_micro, scheme.degree, state.t
+    micro_dt = macro_dt / n
+
+    def path(x: Unknowns):
+        return jnp.concatenate([state.q_s[None], x.slow]), jnp.concatenate([state.q_f[None], x.fast])
+
+    def action(path, along, x: Unknowns):
+        """A times h, which keeps Newton's matrix of the size of masses and constraint Jacobians whatever the step size."""
+        slow, fast = path
+        g, g_slow = constraints(system, scheme, slow, fast, t, macro_dt)
+        free = discrete_lagrangian(system, scheme, slow, fast, macro_dt)
+        free += virtual_work(system, scheme, path, along, t, macro_dt)
+        return micro_dt * free - jnp.sum(x.multiplier * g[:-1]) - jnp.sum(x.slow_multiplier * g_slow[:-1])
+
+    def slots(x: Unknowns):
+        """h D A by every slow and by every fast control point."""
+        return jax.grad(action)(path(x), path(x), x)
+
+    def residual(x: Unknowns) -> Unknowns:
+        d_slow, d_fast = slots(x)
+        g, g_slow = constraints(system, scheme, *path(x), t, macro_dt)
+        d_slow, d_fast = d_slow.at[0].add(micro_dt * state.p_s), d_fast.at[0].add(micro_dt * state.p_f)
+        return Unknowns(d_slow[:-1], d_fast[:-1], g[1:], g_slow[1:])
+
+    _, (v_s, v_f) = project(system, state, jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f))
+    theta, slow_theta = (
+        np.array(rule.nodes)[1:, None] for rule in (scheme.constraint.composite(n), scheme.slow_constraint.rule)
+    )
+    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    straight = state.q_s + macro_dt * slow_theta * v_s, state.q_f + macro_dt * theta * v_f
+    x = newton(residual, Unknowns(*straight, jnp.zeros((n * r, n_g)), jnp.zeros((r, n_gs))))
+    d_slow, d_fast = slots(x)
+    end = State(t + macro_dt, x.slow[-1], x.fast[-1], d_slow[-1] / micro_dt, d_fast[-1] / micro_dt)
+    return project(system, end, v_s, v_f)[0]
+
+
+def check(system: System, scheme: Scheme) -> None:
+    """Refuse what this page leaves out."""
+    if scheme.slow.mollified:
+        raise ValueError(
+            "textbook.step: the slow potential of this scheme is mollified, which the textbook leaves out; "
+            "take macro_step or simulate, or a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
+        )
+    if (scheme.slow.corrected or scheme.fast.corrected) and not isinstance(system.kinetic, ConstantMass):
+        raise ValueError("textbook.step: corrected kicks need a System whose kinetic is a ConstantMass.")
+
+
+def simulate(system: System, scheme: Scheme | Composition, state: State, macro_dt, num_steps: int) -> State:
+    """The states after 0, 1, ..., num_steps macro steps, stacked along a first axis."""
+
+    def go_on(state, _):
+        state = step(system, scheme, state, macro_dt)
+        return state, state
+
+    later = jax.lax.scan(go_on, state, length=num_steps)[1]
+    return jax.tree.map(lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest]), state, later)
