@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.geometry import grid
 from vmri_jax.animation.motion import Motion
 
 TURNS = (4, 14)
@@ -18,17 +19,28 @@ LEVEL = 0.9
 
 @dataclass(frozen=True)
 class Ground:
-    """A rectangle of a plane: `center`, two unit `sides` with half lengths `halves`, `normal`, width `step` of its grid.
+    """A rectangle of a plane.
 
-    solid: given by the drawing; else a floor below the scene that shows depth only.
+    Attributes:
+        center: (3,).
+        normal: (3,) unit vector.
+        sides: (2, 3) unit vectors along its sides.
+        corners: (4, 3).
+        grid: (n, 7) pieces of lines, as of `vmri_jax.animation.geometry.grid`.
+        solid: given by the drawing; else a floor below the scene that shows depth only.
     """
 
     center: np.ndarray
-    sides: np.ndarray
-    halves: tuple[float, float]
     normal: np.ndarray
-    step: float
+    sides: np.ndarray
+    corners: np.ndarray
+    grid: np.ndarray
     solid: bool
+
+    @property
+    def bears(self) -> bool:
+        """Whether shadows fall on it."""
+        return bool(self.normal[2] > 0.5)
 
 
 @dataclass(frozen=True)
@@ -90,8 +102,7 @@ def layout(motion: Motion) -> Layout:
     coil = min(0.015 * size, 0.16 * min(sprung, default=size))
     turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS).astype(int).tolist()
     grounds = _grounds(drawing, box, float(radii.max()), size)
-    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    corners = [g.center + (1.0 if g.solid else FADED) * signs * g.halves @ g.sides for g in grounds]
+    corners = [g.center + (1.0 if g.solid else FADED) * (g.corners - g.center) for g in grounds]
     flat = drawing.dimension < 3
     return Layout(
         size,
@@ -149,7 +160,9 @@ def _ground(point, normal, box, size: float, *, solid: bool) -> Ground:
     extent = np.ptp(box @ sides.T, axis=0) / 2 + margin
     step = nice(max(float(extent.max()) / (6 if level else 2), size / 16))
     center = middle - ((middle - point) @ normal) * normal
-    return Ground(center, sides, (float(extent[0]), float(extent[1])), normal, step, solid)
+    halves = float(extent[0]), float(extent[1])
+    corners = center + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * halves @ sides
+    return Ground(center, normal, sides, corners, grid(center, sides, halves, step, fades=not solid), solid)
 
 
 def _hull(points: np.ndarray, count: int = 200) -> np.ndarray:

@@ -1,37 +1,27 @@
 // Planes with a grid that fades outwards, shadows on those that bear, and fixed spheres.
 
 function drawPlane(painter, plane, positions) {
-  const { context, camera, colors } = painter, { center, sides, halves, step, normal, solid } = plane;
-  const place = (u, v) => camera.project(plus(plus(center, sides[0], u), sides[1], v));
-  const near = 0.02 * camera.distance;
-  if (solid) {
+  const { context, camera, colors } = painter, near = 0.02 * camera.distance;
+  if (plane.solid) {
     context.beginPath();
-    outline(context, [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([u, v]) => place(u * halves[0], v * halves[1])), near);
+    outline(context, plane.corners.map((corner) => camera.project(corner)), near);
     context.fillStyle = painter.tone(colors.faint);
     context.globalAlpha = 0.45;
     context.fill();
   }
   context.strokeStyle = painter.tone(mix(colors.faint, colors.ink, 0.12));
   context.lineWidth = 1;
-  const strength = (u, v) => (solid ? 1 : clamped(1 - Math.hypot(u / halves[0], v / halves[1])));
-  for (const across of [0, 1]) {
-    const [along, beside] = [halves[1 - across], halves[across]], count = Math.floor(beside / step);
-    for (let k = -count; k <= count; k++) {
-      for (let i = 0; i < 16; i++) {
-        const [low, high] = [i, i + 1].map((j) => along * (j / 8 - 1)), corner = (w) => (across ? [w, k * step] : [k * step, w]);
-        const [from, to] = [place(...corner(low)), place(...corner(high))];
-        if (Math.min(from[2], to[2]) < near) continue;
-        context.globalAlpha = strength(...corner((low + high) / 2));
-        if (!context.globalAlpha) continue;
-        context.beginPath();
-        context.moveTo(from[0], from[1]);
-        context.lineTo(to[0], to[1]);
-        context.stroke();
-      }
-    }
+  for (let i = 0; i < plane.lines.length; i += 7) {
+    const [from, to] = [i, i + 3].map((k) => camera.project(plane.lines.subarray(k, k + 3)));
+    if (Math.min(from[2], to[2]) < near) continue;
+    context.globalAlpha = plane.lines[i + 6];
+    context.beginPath();
+    context.moveTo(from[0], from[1]);
+    context.lineTo(to[0], to[1]);
+    context.stroke();
   }
   context.globalAlpha = 1;
-  if (normal[2] > 0.5) shadows(painter, plane, positions);
+  if (plane.bears) shadows(painter, plane, positions);
 }
 
 // Straight down onto the plane.

@@ -7,6 +7,7 @@ const clamped = (x) => Math.min(1, Math.max(0, x));
 class Painter {
   constructor(canvas, data) {
     Object.assign(this, { canvas, data, context: canvas.getContext("2d"), names: false });
+    for (const plane of data.planes) plane.lines = decoded(plane.grid, Float32Array);
     this.recolor();
   }
 

@@ -1,8 +1,5 @@
 // Bodies as balls, links as rods, springs as helices, and where bodies have been.
 
-const LAMP = unit([-0.45, 0.7, 0.55]); // where light comes from, as right, up, back of the view
-const SPAN = 0.8; // joints end this far into a ball, in its radius
-
 function ball(painter, center, radius, color) {
   const { camera } = painter, [x, y, depth] = camera.project(center), r = Math.max(1.2, (camera.scale * radius) / depth);
   painter.add(depth, (context) => {
@@ -16,16 +13,16 @@ function ball(painter, center, radius, color) {
 }
 
 // Where a joint of two balls starts and ends, and its direction; null if they touch or an end lies within the other ball.
-function joint(a, b, reachA, reachB) {
+function joint({ span }, a, b, reachA, reachB) {
   const gap = plus(b, a, -1), length = Math.hypot(...gap);
-  if (length <= Math.max(SPAN * (reachA + reachB), reachA, reachB)) return null;
+  if (length <= Math.max(span * (reachA + reachB), reachA, reachB)) return null;
   const along = unit(gap);
-  return [plus(a, along, SPAN * reachA), plus(b, along, -SPAN * reachB), along];
+  return [plus(a, along, span * reachA), plus(b, along, -span * reachB), along];
 }
 
 // In pieces, each with its own depth, so that a rod may pass in front of one ball and behind another.
 function rod(painter, a, b, reachA, reachB) {
-  const ends = joint(a, b, reachA, reachB);
+  const ends = joint(painter.data, a, b, reachA, reachB);
   if (!ends) return;
   const { camera, data } = painter, [start, end] = ends, gap = plus(end, start, -1);
   const pieces = Math.min(12, Math.ceil((10 * Math.hypot(...gap)) / data.size) || 1);
@@ -40,7 +37,7 @@ function rod(painter, a, b, reachA, reachB) {
 function rodPiece(painter, context, from, to) {
   const { camera, data, colors } = painter, [dx, dy] = [to[0] - from[0], to[1] - from[1]], length = Math.hypot(dx, dy);
   if (length < 1e-6) return;
-  const side = dy * LAMP[0] + dx * LAMP[1] > 0 ? 1 : -1; // towards the light
+  const side = dy * data.lamp[0] + dx * data.lamp[1] > 0 ? 1 : -1; // towards the light
   const [nx, ny] = [(side * dy) / length, (-side * dx) / length], [ox, oy] = [(0.5 * dx) / length, (0.5 * dy) / length];
   const [w, v] = [from[2], to[2]].map((depth) => Math.max(0.8, (camera.scale * data.rod) / depth));
   const [x, y] = [(from[0] + to[0]) / 2, (from[1] + to[1]) / 2], depth = (from[2] + to[2]) / 2;
@@ -57,16 +54,14 @@ function rodPiece(painter, context, from, to) {
 
 // A helix with straight ends: its turns stay the same when it stretches.
 function spring(painter, a, b, reachA, reachB, color, turns) {
-  const ends = joint(a, b, reachA, reachB);
+  const ends = joint(painter.data, a, b, reachA, reachB);
   if (!ends) return;
   const { camera, data } = painter, [start, end, along] = ends, gap = plus(end, start, -1);
   const sideways = unit(cross(along, [0.36, 0.48, 0.8])), third = cross(along, sideways);
-  const perTurn = data.connections.length > 20 ? 10 : 16, steps = turns * perTurn, lead = 0.1;
-  const place = (i) => {
-    const angle = (2 * Math.PI * i) / perTurn, grown = Math.min(1, i / perTurn, (steps - i) / perTurn);
-    const radial = plus(plus([0, 0, 0], sideways, Math.cos(angle)), third, Math.sin(angle));
-    const axis = plus(start, gap, lead + ((1 - 2 * lead) * i) / steps);
-    return [camera.project(plus(axis, radial, data.coil * grown)), radial];
+  const lamp = unit(data.lamp), [first, ...others] = data.helices[turns];
+  const place = ([share, radius, cos, sin]) => {
+    const radial = plus(plus([0, 0, 0], sideways, cos), third, sin);
+    return [camera.project(plus(plus(start, gap, share), radial, data.coil * radius)), radial];
   };
   const piece = (from, to, shade) => {
     const depth = (from[2] + to[2]) / 2;
@@ -79,12 +74,12 @@ function spring(painter, a, b, reachA, reachB, color, turns) {
       context.stroke();
     });
   };
-  let [last, radial] = place(0);
+  let [last, radial] = place(first);
   piece(camera.project(start), last, 0);
-  for (let i = 1; i <= steps; i++) {
+  for (const row of others) {
     const from = last;
-    [last, radial] = place(i);
-    const bright = dot(radial, camera.right) * LAMP[0] + dot(radial, camera.up) * LAMP[1] + dot(radial, camera.back) * LAMP[2];
+    [last, radial] = place(row);
+    const bright = [camera.right, camera.up, camera.back].reduce((sum, axis, k) => sum + dot(radial, axis) * lamp[k], 0);
     piece(from, last, bright < 0 ? 0.42 * bright : 0.5 * bright);
   }
   piece(last, camera.project(end), 0);
