@@ -15,10 +15,7 @@ function drawPlane(painter, plane, positions) {
     const [from, to] = [i, i + 3].map((k) => camera.project(plane.lines.subarray(k, k + 3)));
     if (Math.min(from[2], to[2]) < near) continue;
     context.globalAlpha = plane.lines[i + 6];
-    context.beginPath();
-    context.moveTo(from[0], from[1]);
-    context.lineTo(to[0], to[1]);
-    context.stroke();
+    stroke(context, [from, to]);
   }
   context.globalAlpha = 1;
   if (plane.bears) shadows(painter, plane, positions);
@@ -38,8 +35,7 @@ function shadows(painter, plane, positions) {
   for (const { body, other, point } of connections) {
     const [from, to] = [at(body), point ?? at(other)].map((p) => camera.project(dropped(plane, p)));
     if (Math.min(from[2], to[2]) < near) continue;
-    context.moveTo(from[0], from[1]);
-    context.lineTo(to[0], to[1]);
+    trace(context, [from, to]);
   }
   context.stroke();
   const balls = [...bodies.map(({ radius }, i) => ({ center: at(i), radius })), ...spheres];
@@ -63,7 +59,7 @@ function ring(painter, { sides }, center, radius) {
 // Adds a polygon to the path; nothing if a corner lies behind the eye.
 function outline(context, corners, near) {
   if (corners.some((corner) => corner[2] < near)) return;
-  corners.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+  trace(context, corners);
   context.closePath();
 }
 
@@ -74,9 +70,7 @@ function obstacle(painter, { center, radius }) {
     [[0, 0.5], [0.5, 0.1], [1, -0.15]].forEach(([at, shade]) => shine.addColorStop(at, painter.tone(colors.faint, shade, depth)));
     context.fillStyle = shine;
     context.globalAlpha = 0.92;
-    context.beginPath();
-    context.arc(x, y, r, 0, 2 * Math.PI);
-    context.fill();
+    disc(context, x, y, r);
     context.globalAlpha = 1;
   });
 }

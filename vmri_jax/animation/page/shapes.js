@@ -6,9 +6,7 @@ function ball(painter, center, radius, color) {
     const shine = context.createRadialGradient(x - 0.34 * r, y - 0.42 * r, 0.03 * r, x - 0.12 * r, y - 0.16 * r, 1.2 * r);
     [[0, 0.8], [0.22, 0.35], [0.55, 0], [1, -0.5]].forEach(([at, shade]) => shine.addColorStop(at, painter.tone(color, shade, depth)));
     context.fillStyle = shine;
-    context.beginPath();
-    context.arc(x, y, r, 0, 2 * Math.PI);
-    context.fill();
+    disc(context, x, y, r);
   });
 }
 
@@ -44,11 +42,9 @@ function rodPiece(painter, context, from, to) {
   const across = context.createLinearGradient(x + nx * w, y + ny * w, x - nx * w, y - ny * w);
   [[0, 0.1], [0.3, 0.5], [1, -0.45]].forEach(([at, shade]) => across.addColorStop(at, painter.tone(colors.rod, shade, depth)));
   context.fillStyle = across;
+  const edge = ([x, y], along, across) => [x + across * nx + along * ox, y + across * ny + along * oy];
   context.beginPath();
-  context.moveTo(from[0] + nx * w - ox, from[1] + ny * w - oy); // pieces overlap by a pixel, or seams would show
-  context.lineTo(to[0] + nx * v + ox, to[1] + ny * v + oy);
-  context.lineTo(to[0] - nx * v + ox, to[1] - ny * v + oy);
-  context.lineTo(from[0] - nx * w - ox, from[1] - ny * w - oy);
+  trace(context, [edge(from, -1, w), edge(to, 1, v), edge(to, 1, -v), edge(from, -1, -w)]); // they overlap by a pixel, or seams would show
   context.fill();
 }
 
@@ -68,10 +64,7 @@ function spring(painter, a, b, reachA, reachB, color, turns) {
     painter.add(depth, (context) => {
       context.strokeStyle = painter.tone(color, shade, depth);
       context.lineWidth = Math.max(1.1, (2 * camera.scale * data.wire) / depth);
-      context.beginPath();
-      context.moveTo(from[0], from[1]);
-      context.lineTo(to[0], to[1]);
-      context.stroke();
+      stroke(context, [from, to]);
     });
   };
   let [last, radial] = place(first);
@@ -100,10 +93,7 @@ function drawTrail(painter, trail, i, now, radius) {
       context.lineCap = "butt"; // round ends would show as dots where they overlap
       context.strokeStyle = painter.tone(color, 0, depth);
       context.lineWidth = 0.6 + 1.6 * (1 - age);
-      context.beginPath();
-      context.moveTo(from[0], from[1]);
-      context.lineTo(to[0], to[1]);
-      context.stroke();
+      stroke(context, [from, to]);
       context.globalAlpha = 1;
       context.lineCap = "round";
     });
