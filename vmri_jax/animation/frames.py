@@ -77,6 +77,7 @@ def write_gif(
 
     Raises:
         ValueError: seconds that are not positive.
+        OSError: the file cannot be written.
     """
     if not 0 < seconds < np.inf:
         raise ValueError(f"write_gif: seconds is {seconds}; it must be a positive number.")

@@ -27,6 +27,9 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
         motion: from `vmri_jax.animation.motion`.
         path: of the file.
         title: over the picture.
+
+    Raises:
+        OSError: the file cannot be written.
     """
     every = -(-motion.points.size // MOST_NUMBERS)
     drawing, sizes = motion.drawing, layout(motion)
@@ -71,8 +74,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "connections": [_plain(connection) for connection in sizes.connections],
         "planes": [_plain(ground) | {"grid": _packed(ground.grid), "bears": ground.bears} for ground in sizes.grounds],
         "spheres": [
-            {"center": center.tolist(), "radius": sphere.radius}
-            for center, sphere in zip(sizes.spheres, drawing.spheres, strict=True)
+            {"center": c.tolist(), "radius": float(r)} for c, r in zip(sizes.spheres, sizes.sphere_radii, strict=True)
         ],
         "helices": {n: helix(n, 10 if many else 16).tolist() for n in {c.turns for c in springs}},
         "lamp": LAMP,
@@ -111,7 +113,8 @@ def _packed(array: np.ndarray, dtype: type = np.float32) -> str:
 def _description(motion: Motion) -> str:
     drawing = motion.drawing
     names = [body.name for body in drawing.bodies]
-    counts = {"link": len(drawing.links), "spring": len(drawing.springs), "fixed point": len(drawing.anchors)}
+    kinds = [joint.kind if joint.point is None else "fixed point" for joint in drawing.joints]
+    counts = {kind: kinds.count(kind) for kind in ("link", "spring", "fixed point")}
     joints = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]
     bodies = f"{len(names)} bodies" if len(names) > 6 else ", ".join(names)
     return f"Animation of {', '.join([bodies, *joints])} from t = {motion.t[0]:g} to {motion.t[-1]:g}."

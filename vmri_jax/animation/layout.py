@@ -67,7 +67,7 @@ class Layout:
         radii: of the bodies.
         rod, coil, wire: radius of links, of springs, and of their wire.
         connections: links, springs and anchors.
-        spheres: (n_spheres, 3) centres.
+        spheres, sphere_radii: (n, 3) centres and (n,) radii of fixed spheres.
         grounds: given planes, or a floor.
         hull: (n, 3) points that must be seen.
         azimuth, elevation: of the first view.
@@ -80,6 +80,7 @@ class Layout:
     wire: float
     connections: list[Connection]
     spheres: np.ndarray
+    sphere_radii: np.ndarray
     grounds: list[Ground]
     hull: np.ndarray
     azimuth: float
@@ -90,10 +91,11 @@ def layout(motion: Motion) -> Layout:
     """Sizes that suit the picture: balls do not touch their neighbours, springs keep inside the space they have."""
     drawing, points = motion.drawing, motion.thinned(500).points
     connections = _connections(drawing)
-    anchors = drawing.place([anchor.point for anchor in drawing.anchors])
+    fixed = np.array([c.point for c in connections if c.point is not None]).reshape(-1, 3)
     spheres = drawing.place([sphere.center for sphere in drawing.spheres])
-    reach = np.array([sphere.radius for sphere in drawing.spheres]).reshape(-1, 1)
-    box = np.concatenate([points.reshape(-1, 3), anchors, spheres - reach, spheres + reach])
+    sphere_radii = np.array([sphere.radius for sphere in drawing.spheres])
+    reach = sphere_radii[:, None]
+    box = np.concatenate([points.reshape(-1, 3), fixed, spheres - reach, spheres + reach])
     size = float(np.linalg.norm(np.ptp(box, axis=0))) or 1.0
     lengths = [_median_length(connection, points) or size for connection in connections]
     small = min(0.02 * size, 0.3 * min(lengths, default=size))
@@ -112,6 +114,7 @@ def layout(motion: Motion) -> Layout:
         wire=0.11 * coil,
         connections=[replace(c, turns=count) for c, count in zip(connections, turns, strict=True)],
         spheres=spheres,
+        sphere_radii=sphere_radii,
         grounds=grounds,
         hull=_hull(np.concatenate([box, *corners])),
         azimuth=math.radians(-88 if flat else -62),
@@ -121,14 +124,12 @@ def layout(motion: Motion) -> Layout:
 
 def _connections(drawing: Drawing) -> list[Connection]:
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
+    points = drawing.place([joint.point or () for joint in drawing.joints])
     found = []
-    for kind, joints in (("link", drawing.links), ("spring", drawing.springs)):
-        for joint in joints:
-            a, b = joint.bodies
-            found.append(Connection(kind, index[a], index[b], None, drawing.pace(joint), 0))
-    points = drawing.place([anchor.point for anchor in drawing.anchors])
-    for anchor, point in zip(drawing.anchors, points, strict=True):
-        found.append(Connection(anchor.kind, index[anchor.body], None, point, drawing.pace(anchor), 0))
+    for joint, point in zip(drawing.joints, points, strict=True):
+        body, *others = (index[name] for name in joint.bodies)
+        ends = {"other": others[0], "point": None} if others else {"other": None, "point": point}
+        found.append(Connection(joint.kind, body, **ends, pace=drawing.pace(joint), turns=0))
     return found
 
 

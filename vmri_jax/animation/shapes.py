@@ -80,15 +80,14 @@ class Stage:
 
     def _draw_around(self, pen: "_Pen", points: np.ndarray) -> None:
         """Planes with the shadows on them, and fixed spheres."""
-        sizes, spheres = self.sizes, self.motion.drawing.spheres
-        centers = np.concatenate([points, sizes.spheres])
-        radii = [*sizes.radii, *(sphere.radius for sphere in spheres)]
+        sizes = self.sizes
+        centers, radii = np.concatenate([points, sizes.spheres]), np.concatenate([sizes.radii, sizes.sphere_radii])
         for ground in sizes.grounds:
             pen.ground(ground)
             if ground.bears:
                 pen.shadows(ground, centers, radii, self._ends(points), sizes.rod)
-        for center, sphere in zip(sizes.spheres, spheres, strict=True):
-            pen.ball(center, sphere.radius, self.theme.faint)
+        for center, radius in zip(sizes.spheres, sizes.sphere_radii, strict=True):
+            pen.ball(center, radius, self.theme.faint)
 
     def _draw_trails(self, pen: "_Pen", time: float, trail: float) -> None:
         past = self.motion.at(np.linspace(max(self.motion.t[0], time - trail), time, 160))
@@ -193,7 +192,7 @@ class _Pen:
         feet = dropped(ground.center, ground.normal, points)
         above = (points - ground.center) @ ground.normal > 0
         for grown in np.arange(0.7, 1.5, 0.1):
-            balls = zip(feet[above], np.array(radii)[above], strict=True)
+            balls = zip(feet[above], radii[above], strict=True)
             self.polygons([foot + grown * radius * circle for foot, radius in balls], color, 0.026 * strength, -2)
         if joints:
             ends = dropped(ground.center, ground.normal, np.array(joints).reshape(-1, 3))
