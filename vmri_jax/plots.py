@@ -4,10 +4,11 @@ Every function returns a matplotlib `Figure` made without pyplot: no window open
 notebook shows it when it is the value of a cell. Colours follow Okabe and Ito, told apart by the colour-blind.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
-from typing import TYPE_CHECKING
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,22 +20,24 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocat
 from vmri_jax import diagnostics
 from vmri_jax.running.trajectory import Trajectory
 
-if TYPE_CHECKING:
-    from vmri_jax.study import ConvergenceStudy, CostStudy, WorkPrecision
-
 
 @dataclass(frozen=True)
 class Theme:
-    """Colours of a figure: paper, text, faint lines, and the cycle of the curves."""
+    """Colours of a figure: paper, text, faint lines, rods of animations, and the cycle of the curves."""
 
     paper: str
     ink: str
     faint: str
+    rod: str
     curves: tuple[str, ...]
 
 
-LIGHT = Theme("#ffffff", "#1f2428", "#d9dde1", ("#0072b2", "#d55e00", "#009e73", "#a3508a", "#b98700", "#3d8fc4"))
-DARK = Theme("#15191d", "#e3e6e8", "#384048", ("#62b5e8", "#f08a4b", "#3cc79b", "#dd92c4", "#e3b341", "#9ad0f0"))
+LIGHT = Theme(
+    "#ffffff", "#1f2428", "#d9dde1", "#8d979f", ("#0072b2", "#d55e00", "#009e73", "#a3508a", "#b98700", "#3d8fc4")
+)
+DARK = Theme(
+    "#15191d", "#e3e6e8", "#384048", "#8b969f", ("#62b5e8", "#f08a4b", "#3cc79b", "#dd92c4", "#e3b341", "#9ad0f0")
+)
 MARKERS = ("o", "s", "^", "D", "v", "P")
 MAX_NAMED = 6
 """More curves than this in one panel are drawn alike and not named one by one."""
@@ -50,7 +53,11 @@ class NotebookFigure(Figure):
 
 
 def style(theme: Theme = LIGHT):
-    """Context in which figures are made and saved: ``with style(theme): ...``."""
+    """Context in which figures are made and saved: ``with style(theme): ...``.
+
+    Args:
+        theme: colours.
+    """
     return matplotlib.rc_context(
         {
             "figure.facecolor": theme.paper,
@@ -89,8 +96,33 @@ def style(theme: Theme = LIGHT):
     )
 
 
+@contextmanager
+def new_figure(width: float, height: float, title: str, theme: Theme) -> Iterator[NotebookFigure]:
+    """A figure to fill within the context, in its style; the title is set at the end.
+
+    Args:
+        width, height: in inches.
+        title: over the figure.
+        theme: colours.
+    """
+    with style(theme):
+        figure = NotebookFigure(figsize=(width, height))
+        yield figure
+        figure.suptitle(title, x=0.01, ha="left")
+
+
 def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
-    """Write a figure in the format of the file's ending, with the colours it was made in."""
+    """Write a figure in the format of the file's ending.
+
+    Args:
+        figure: of any function here.
+        path: of the file.
+        theme: the colours that the figure was made in.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: an ending that matplotlib does not know.
+    """
     with style(theme):
         figure.savefig(path)
 
@@ -106,27 +138,23 @@ def plot_trajectory(trajectory: Trajectory, title: str = "", theme: Theme = LIGH
     t = np.asarray(trajectory.t)
     residual = np.asarray(trajectory.constraint_residual)
     constrained = bool(np.nanmax(residual) > 0)
-    with style(theme):
-        figure = NotebookFigure(figsize=(7.2, 7.6 if constrained else 6.0))
+    error, label = _energy_error(np.asarray(trajectory.energy))
+    with new_figure(7.2, 7.6 if constrained else 6.0, title, theme) as figure:
         axes = figure.subplots(3 + constrained, sharex=True)
         _coordinates(axes[0], t, np.asarray(trajectory.q_s), "s", theme)
-        axes[0].set(ylabel=r"slow positions $q_s$")
         _coordinates(axes[1], t, np.asarray(trajectory.q_f), "f", theme)
-        axes[1].set(ylabel=r"fast positions $q_f$")
-        error, label = _energy_error(np.asarray(trajectory.energy))
         axes[2].plot(t, error, color=theme.curves[0], linewidth=_thin(t))
-        axes[2].set(ylabel=label)
+        labels = [r"slow positions $q_s$", r"fast positions $q_f$", label]
         if constrained:
             shown = np.where(residual > 0, residual, np.nan)
-            for values, name, linestyle, color in zip(
-                shown.T, ("position $|g|$", "velocity $|G v|$"), ("-", "--"), theme.curves, strict=False
-            ):
-                axes[3].semilogy(t, values, linestyle, color=color, linewidth=_thin(t), label=name)
-            axes[3].set(ylabel="constraint residual")
+            axes[3].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
+            axes[3].semilogy(t, shown[:, 1], "--", linewidth=_thin(t), label="velocity $|G v|$")
             _legend_beside(axes[3])
+            labels.append("constraint residual")
+        for panel, label in zip(axes, labels, strict=True):
+            panel.set(ylabel=label)
         axes[-1].set(xlabel="time $t$", xlim=(t[0], t[-1]))
         figure.align_ylabels()
-        figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
@@ -141,117 +169,100 @@ def plot_oscillatory_energies(trajectory: Trajectory, omega, title: str = "", th
     """
     t = np.asarray(trajectory.t)
     energies = np.asarray(diagnostics.oscillatory_energies(omega, trajectory.q_f, trajectory.p_f))
-    with style(theme):
-        figure = NotebookFigure(figsize=(7.2, 3.4))
+    with new_figure(7.2, 3.4, title, theme) as figure:
         axes = figure.subplots()
         axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
         _coordinates(axes, t, energies, "I", theme)
         axes.set(xlabel="time $t$", ylabel="oscillatory energy", xlim=(t[0], t[-1]))
         axes.set_ylim(bottom=0)
-        figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
-def plot_convergence(
-    study: "ConvergenceStudy", orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT
-) -> NotebookFigure:
+def plot_convergence(study: Any, orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Errors of positions and of momenta against the macro step, with guide triangles of the given slopes.
 
     Args:
-        study: from `vmri_jax.study.convergence_study`.
+        study: has `schemes`, and by scheme and quantity ("q" or "p") `errors`, `usable` errors (macro steps and errors each)
+            and `order`, as of `vmri_jax.study.convergence_study`.
         orders: slopes to draw for comparison.
         title: over the figure.
         theme: colours.
     """
-    with style(theme):
-        figure = NotebookFigure(figsize=(7.6, 3.7))
+    with new_figure(7.6, 3.7, title, theme) as figure:
         panels = figure.subplots(1, 2, sharex=True)
         for axes, quantity, name in zip(panels, ("q", "p"), ("positions", "momenta"), strict=True):
+            steps = []
             for i, scheme in enumerate(study.schemes):
                 macro_dt, errors = study.errors(scheme, quantity)
                 order = study.order(scheme, quantity)
-                axes.loglog(
-                    macro_dt,
-                    errors,
-                    marker=MARKERS[i % len(MARKERS)],
-                    color=theme.curves[i % len(theme.curves)],
-                    markerfacecolor=theme.paper,
-                    label=f"{scheme}   order {order:.2f}" if np.isfinite(order) else f"{scheme}   failed",
-                )
+                label = f"{scheme}   order {order:.2f}" if np.isfinite(order) else f"{scheme}   failed"
+                axes.loglog(macro_dt, errors, label=label, **_look(i, i, theme))
+                steps += list(macro_dt)
             for order in orders:
                 _guide_triangle(axes, study, quantity, order, theme)
             axes.set(title=name, xlabel="macro step $H$")
             axes.set(ylabel=rf"largest error $|{quantity} - {quantity}_{{\mathrm{{ref}}}}|$")
-            _log_ticks(axes.xaxis, [row.macro_dt for row in study.rows])
+            _log_ticks(axes.xaxis, steps)
             axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=1, handlelength=2.4)
-        figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
-def plot_work_precision(
-    study: "WorkPrecision", title: str = "", work: str = "seconds", theme: Theme = LIGHT
-) -> NotebookFigure:
+WORK = {
+    "seconds": "computing time of the run",
+    "slow_evaluations": r"evaluations of $\nabla V$",
+    "fast_evaluations": r"evaluations of $\nabla W$",
+    "solves": "systems of equations solved",
+}
+"""What `plot_work_precision` has on its axis, by the name in the rows."""
+
+
+def plot_work_precision(study: Any, title: str = "", work: str = "seconds", theme: Theme = LIGHT) -> NotebookFigure:
     """Error of the positions against work, one curve per scheme; the Pareto front is underlaid.
 
     Args:
-        study: from `vmri_jax.study.work_precision`, or the runs of a recommendation.
+        study: has `schemes`, rows by scheme (`curve`) and the best of all (`pareto`), and a `reference`, as of
+            `vmri_jax.study.work_precision` or the runs of a recommendation.
         title: over the figure.
         work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
         theme: colours.
+
+    Raises:
+        ValueError: another kind of work.
     """
-    labels = {
-        "seconds": "computing time of the run",
-        "slow_evaluations": r"evaluations of $\nabla V$",
-        "fast_evaluations": r"evaluations of $\nabla W$",
-        "solves": "systems of equations solved",
-    }
-    if work not in labels:
-        raise ValueError(f"plot_work_precision: work is {work!r}; it must be one of {', '.join(labels)}.")
+    if work not in WORK:
+        raise ValueError(f"plot_work_precision: work is {work!r}; it must be one of {', '.join(WORK)}.")
     front = [row for row in study.pareto(work) if getattr(row, work) > 0]
-    with style(theme):
-        figure = NotebookFigure(figsize=(7.2, 4.3))
+    with new_figure(7.2, 4.3, title, theme) as figure:
         axes = figure.subplots()
-        axes.loglog(
-            [getattr(row, work) for row in front],
-            [row.error_q for row in front],
-            color=theme.faint,
-            linewidth=7,
-            solid_capstyle="round",
-            zorder=1,
-            label="best of all",
-        )
+        best, errors = [getattr(row, work) for row in front], [row.error_q for row in front]
+        under = {"color": theme.faint, "linewidth": 7, "solid_capstyle": "round", "zorder": 1}
+        axes.loglog(best, errors, label="best of all", **under)
         for i, scheme in enumerate(study.schemes):
             curve = sorted(study.curve(scheme), key=lambda row: row.num_steps)
-            axes.loglog(
-                [getattr(row, work) or np.nan for row in curve],
-                [row.error_q for row in curve],
-                marker=MARKERS[i // len(theme.curves) % len(MARKERS)],
-                markersize=4,
-                color=theme.curves[i % len(theme.curves)],
-                markerfacecolor=theme.paper,
-                linewidth=1.1,
-                label=scheme,
-            )
-        axes.set(xlabel=labels[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
-        worst = max((row.error_q for row in front), default=1.0)
-        axes.set_ylim(top=30 * worst)
+            x, y = [getattr(row, work) or np.nan for row in curve], [row.error_q for row in curve]
+            look = _look(i, i // len(theme.curves), theme)
+            axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **look)
+        axes.set(xlabel=WORK[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
+        axes.set_ylim(top=30 * max(errors, default=1.0))
         if study.reference.error_q > axes.get_ylim()[0]:
-            axes.axhline(study.reference.error_q, color=theme.ink, linewidth=0.8, linestyle=":")
-            axes.text(
-                0.995,
-                study.reference.error_q,
-                "error of the reference ",
-                transform=axes.get_yaxis_transform(),
-                ha="right",
-                va="bottom",
-                fontsize=7.5,
-            )
+            _reference_line(axes, study.reference.error_q, theme)
         if work == "seconds":
             axes.xaxis.set_major_formatter(lambda x, _: _seconds(x))
         axes.xaxis.set_minor_formatter(NullFormatter())
         _legend_beside(axes)
-        figure.suptitle(title, x=0.01, ha="left")
     return figure
+
+
+def _reference_line(axes: Axes, error: float, theme: Theme) -> None:
+    axes.axhline(error, color=theme.ink, linewidth=0.8, linestyle=":")
+    text = "error of the reference "
+    axes.text(0.995, error, text, transform=axes.get_yaxis_transform(), ha="right", va="bottom", fontsize=7.5)
+
+
+def _look(color: int, marker: int, theme: Theme) -> dict[str, Any]:
+    """Colour and marker of a curve by their numbers."""
+    look = {"color": theme.curves[color % len(theme.curves)], "marker": MARKERS[marker % len(MARKERS)]}
+    return look | {"markerfacecolor": theme.paper}
 
 
 def _seconds(x: float) -> str:
@@ -263,7 +274,7 @@ def _seconds(x: float) -> str:
 
 
 def plot_cost(
-    studies: Mapping[str, "CostStudy"],
+    studies: Mapping[str, Any],
     paper_minima: Mapping[str, int] | None = None,
     title: str = "",
     theme: Theme = LIGHT,
@@ -271,15 +282,15 @@ def plot_cost(
     """Computing time per micro step against num_micro, one panel per study, the cheapest point of each curve circled.
 
     Args:
-        studies: cost studies by the title of their panel.
+        studies: by the title of their panel; each has `curves`, pairs of a label and a method, and by pair the `curve` of
+            num_micro and microseconds per micro step, as of `vmri_jax.study.cost_study`.
         paper_minima: num_micro to mark, by the title of the panel.
         title: over the figure.
         theme: colours.
     """
     columns = 2 if len(studies) == 4 else min(3, len(studies))
     lines = -(-len(studies) // columns)
-    with style(theme):
-        figure = NotebookFigure(figsize=(max(5.2, 0.6 + 3.0 * columns), 0.6 + 2.7 * lines))
+    with new_figure(max(5.2, 0.6 + 3.0 * columns), 0.6 + 2.7 * lines, title, theme) as figure:
         panels = figure.subplots(lines, columns, squeeze=False).reshape(-1)
         handles: dict = {}
         for axes, (name, study) in zip(panels, studies.items(), strict=False):
@@ -294,14 +305,13 @@ def plot_cost(
         for axes in panels[::columns]:
             axes.set(ylabel="µs per micro step")
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, len(handles)))
-        figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
-def _cost_panel(axes: Axes, study: "CostStudy", paper_minimum: int | None, theme: Theme) -> None:
+def _cost_panel(axes: Axes, study: Any, paper_minimum: int | None, theme: Theme) -> None:
     one_label = len({label for label, _ in study.curves}) == 1
-    for i, (label, method) in enumerate(study.curves):
-        num_micro, cost = study.curve(label, method)
+    curves = [study.curve(label, method) for label, method in study.curves]
+    for i, ((label, method), (num_micro, cost)) in enumerate(zip(study.curves, curves, strict=True)):
         name = method if one_label else f"{label}, {method}"
         color = theme.curves[i % len(theme.curves)]
         axes.loglog(num_micro, cost, marker=MARKERS[i], markersize=4, color=color, label=name)
@@ -310,13 +320,13 @@ def _cost_panel(axes: Axes, study: "CostStudy", paper_minimum: int | None, theme
             axes.plot(num_micro[best], cost[best], "o", markersize=11, markerfacecolor="none", color=color)
     if paper_minimum is not None:
         axes.axvline(paper_minimum, color=theme.ink, linestyle=":", linewidth=1.1, label="minimum in the paper")
-    ticks = np.unique([row.num_micro for row in study.rows])
+    ticks = np.unique(np.concatenate([num_micro for num_micro, _ in curves]))
     if len(ticks) > 7:
         ticks = np.array([1, 4, 12, 40, 100])
     axes.xaxis.set_major_locator(FixedLocator(ticks.tolist()))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter("{x:.0f}")
-    _log_ticks(axes.yaxis, [row.us_per_micro_step for row in study.rows])
+    _log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
 
 
 def _coordinates(axes: Axes, t, values, letter: str, theme: Theme) -> None:
@@ -349,7 +359,7 @@ def _energy_error(energy) -> tuple[np.ndarray, str]:
     return error, r"energy error $\Delta E$"
 
 
-def _log_ticks(axis: Axis, values: Sequence[float]) -> None:
+def _log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
     """Labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them."""
     finite = [value for value in values if np.isfinite(value)]
     axis.set_minor_formatter(NullFormatter())
@@ -358,7 +368,7 @@ def _log_ticks(axis: Axis, values: Sequence[float]) -> None:
         axis.set_major_formatter("{x:g}")
 
 
-def _guide_triangle(axes: Axes, study: "ConvergenceStudy", quantity: str, order: int, theme: Theme) -> None:
+def _guide_triangle(axes: Axes, study: Any, quantity: str, order: int, theme: Theme) -> None:
     """Triangle of slope `order` right below the most accurate curve of about that order."""
     lowest = None
     for scheme in study.schemes:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.animation.support import PENDULUM, reference_run, swinging
-from vmri_jax.animation import Anchor, Drawing, Joint, bars, built_in, motion
+from vmri_jax.animation import Drawing, Joint, bars, built_in, motion
 from vmri_jax.animation import defaults as defaults_module
 
 
@@ -20,16 +20,15 @@ def test_plain_data_and_its_json_text_give_the_same_drawing():
     drawing = Drawing.from_dict(PENDULUM)
     assert drawing == Drawing.from_dict(json.dumps(PENDULUM))
     assert [body.pace for body in drawing.bodies] == ["slow", "fast"]
-    assert drawing.links == (Joint(("bob", "tip")),)
-    assert drawing.anchors == (Anchor("bob", (0.0, 0.0), "spring"),)
+    assert drawing.joints == (Joint("link", ("bob", "tip")), Joint("spring", ("bob",), (0.0, 0.0)))
     assert drawing.dimension == 2
 
 
 def test_pace_of_a_joint_is_its_own_or_that_of_its_bodies():
     drawing = Drawing.from_dict(PENDULUM)
-    assert drawing.pace(Joint(("bob", "tip"))) == "slow"
-    assert drawing.pace(Joint(("tip", "tip"))) == "fast"
-    assert drawing.pace(Joint(("bob", "tip"), "fast")) == "fast"
+    assert drawing.pace(Joint("link", ("bob", "tip"))) == "slow"
+    assert drawing.pace(Joint("link", ("tip", "tip"))) == "fast"
+    assert drawing.pace(Joint("spring", ("bob", "tip"), pace="fast")) == "fast"
 
 
 def test_linear_forms_and_offsets():
@@ -126,9 +125,13 @@ def test_links_of_built_in_drawings_keep_their_length_along_a_run(name, macro_dt
     drawing = Drawing.from_dict(built_in(name[:3], run.q_s.shape[1]))
     points = motion(run, drawing).points
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
-    ends = [(points[:, index[a]], points[:, index[b]]) for a, b in (link.bodies for link in drawing.links)]
-    fixed = zip(drawing.anchors, drawing.place([anchor.point for anchor in drawing.anchors]), strict=True)
-    ends += [(points[:, index[anchor.body]], point) for anchor, point in fixed if anchor.kind == "link"]
+    links = [joint for joint in drawing.joints if joint.kind == "link"]
+    fixed = drawing.place([link.point or () for link in links])
+    ends = [
+        (points[:, index[link.bodies[0]]], points[:, index[link.bodies[1]]] if link.point is None else point)
+        for link, point in zip(links, fixed, strict=True)
+    ]
+    assert len(ends) == {"tsp": 2, "sam": 4}[name[:3]]
     lengths = np.array([np.linalg.norm(a - b, axis=-1) for a, b in ends])
     assert np.ptp(lengths, axis=1).max() < 1e-9  # measured 2e-13
     assert np.ptp(points, axis=0).max() > 0.01
@@ -139,14 +142,20 @@ def test_the_drawn_chain_stretches_as_its_potentials_say(fpu, monkeypatch):
     run = reference_run("fpu3_fully_implicit_p1", 0.05)
     drawing = Drawing.from_dict(built_in("fpu", 3))
     x = motion(run, drawing).points[..., 0]
-    walls = [point[0] for point in drawing.place([anchor.point for anchor in drawing.anchors])]
+    walls = [joint.point[0] for joint in drawing.joints if joint.point is not None]
     x = np.concatenate([np.full((len(x), 1), walls[0]), x, np.full((len(x), 1), walls[1])], axis=1)
     stretch = np.diff(x, axis=1) - np.diff([walls[0], *(body.offset[0] for body in drawing.bodies), walls[1]])
     system, q_s, q_f = fpu.system, run.q_s[-1], run.q_f[-1]
     soft, stiff = stretch[-1, ::2], stretch[-1, 1::2]
     np.testing.assert_allclose(np.sum((np.sqrt(2) * soft) ** 4) / 4, system.slow_potential(q_s, q_f, system.params))
     np.testing.assert_allclose(stiff, np.sqrt(2) * q_f, atol=1e-14)
-    assert [drawing.pace(spring) for spring in drawing.springs] == ["fast", "slow", "fast", "slow", "fast"]
+    assert [drawing.pace(spring) for spring in drawing.joints if spring.point is None] == [
+        "fast",
+        "slow",
+        "fast",
+        "slow",
+        "fast",
+    ]
 
 
 def test_without_a_drawing_every_coordinate_is_a_bar_at_its_scale():
@@ -170,7 +179,7 @@ def test_blocks_stand_upright_beside_the_points(coordinates, up):
     moved = motion(run, Drawing.from_dict({"bodies": [bob], "blocks": blocks, "up": up}))
     point, bars = moved.points[:, 0], moved.points[:, 1:]
     assert bars[..., 0].min() > point[:, 0].max()
-    feet = moved.drawing.place([anchor.point for anchor in moved.drawing.anchors])
+    feet = moved.drawing.place([joint.point or () for joint in moved.drawing.joints])
     heights = bars - feet
     scale = heights[0, 1, 2] / run.q_f[0, 1]
     np.testing.assert_allclose(heights[..., 2], scale * run.q_f, atol=1e-13)

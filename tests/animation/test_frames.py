@@ -12,8 +12,8 @@ from tests.animation.support import PENDULUM, swinging
 from vmri_jax import plots
 from vmri_jax.animation import Drawing, motion, plot_strip, write_gif
 from vmri_jax.animation.camera import FILLED, Camera
-from vmri_jax.animation.frames import view
 from vmri_jax.animation.layout import layout, nice
+from vmri_jax.animation.shapes import Stage
 
 
 def test_camera_looks_at_its_target_with_perspective():
@@ -61,7 +61,8 @@ def test_bodies_are_drawn_where_the_camera_sees_them(pendulum, theme):
     figure = plot_strip(pendulum, [1.3], theme=theme)
     image = pixels(figure)
     height, width, _ = image.shape
-    camera, aspect = view(layout(pendulum))
+    stage = Stage.of(pendulum, theme)
+    camera, aspect = stage.camera, stage.aspect
     assert width / height == pytest.approx(aspect, rel=0.02)
     for place, color in zip(camera.project(pendulum.at([1.3])[0])[0], (theme.curves[0], "#aa3311"), strict=True):
         x, y = (place / [aspect, 1] + 1) / 2 * [width, height]

@@ -14,7 +14,9 @@ import pytest
 
 from tests.animation.support import PENDULUM, swinging
 from vmri_jax.animation import Drawing, motion, write_html
+from vmri_jax.animation.geometry import joint, spring
 from vmri_jax.animation.html import MOST_NUMBERS
+from vmri_jax.animation.layout import layout
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 NODE = shutil.which("node")
@@ -94,6 +96,30 @@ def test_the_script_interpolates_as_python_does(pendulum, tmp_path):
     )
     seen = subprocess.run([str(NODE), "-e", program], capture_output=True, text=True, check=True).stdout
     np.testing.assert_allclose(np.array(json.loads(seen)).reshape(-1, 2, 3), pendulum.at(times), atol=1e-6)
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node")
+def test_the_script_draws_the_shapes_that_pictures_have(pendulum, tmp_path):
+    data, sizes = data_of(page_of(pendulum, tmp_path / "run.html")), layout(pendulum)
+    np.testing.assert_allclose(unpacked(data["planes"][0]["grid"]).reshape(-1, 7), sizes.grounds[0].grid, atol=1e-6)
+    a, b, reach = np.array([0.0, 1.0, 2.0]), np.array([2.0, -1.0, 0.5]), (0.2, 0.1)
+    [turns] = {connection.turns for connection in sizes.connections if connection.kind == "spring"}
+    arguments = f"painter, {a.tolist()}, {b.tolist()}, {reach[0]}, {reach[1]}"
+    program = (
+        "".join((SCRIPTS / name).read_text() for name in ("camera.js", "shapes.js"))
+        + "const seen = [], axes = { right: [1, 0, 0], up: [0, 1, 0], back: [0, 0, 1] };"
+        + "const camera = { ...axes, project: (point) => (seen.push(point), point) };"
+        + f"const painter = {{ camera, data: {json.dumps(data)}, add() {{}} }};"
+        + f"spring({arguments}, [0, 0, 0], {turns});"
+        + f"console.log(JSON.stringify([joint(painter.data, {arguments.removeprefix('painter, ')}).slice(0, 2), seen]));"
+    )
+    seen = subprocess.run([str(NODE), "-e", program], capture_output=True, text=True, check=True).stdout
+    ends, points = json.loads(seen)
+    expected = joint(a, b, reach)
+    assert expected is not None
+    np.testing.assert_allclose(ends, expected, atol=1e-14)
+    first, start, *rest = points  # the helix is asked for before its straight ends
+    np.testing.assert_allclose([start, first, *rest], spring(*expected, sizes.coil, turns)[0], atol=1e-13)
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs chromium")

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from vmri_jax import cli
-from vmri_jax.cli.catalogue import find_problem
+from vmri_jax.cli.catalogue import SCHEMES, find_problem, find_scheme
 from vmri_jax.running.simulate import Simulation
 from vmri_jax.study import families, reference, reference_solution
 
@@ -343,6 +343,13 @@ def test_what_the_search_refuses(vmri, arguments, message):
     code, text = vmri(*arguments)
     assert code == 2
     assert message in text
+
+
+@pytest.mark.parametrize("name", SCHEMES)
+def test_schemes_are_found_with_dashes_and_underscores(name):
+    options = {"degree": 2} if name == "galerkin" else {}
+    found = find_scheme(name.replace("-", "_"), 3, **options)
+    assert found == SCHEMES[name].factory(3, **options)
 
 
 def test_simulate_composes(vmri):

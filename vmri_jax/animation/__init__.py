@@ -2,13 +2,12 @@
 
 from vmri_jax.animation.bars import bars
 from vmri_jax.animation.defaults import built_in
-from vmri_jax.animation.drawing import Anchor, Block, Body, Drawing, Joint, Plane, Sphere
+from vmri_jax.animation.drawing import Block, Body, Drawing, Joint, Plane, Sphere
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
 
 __all__ = [
-    "Anchor",
     "Block",
     "Body",
     "Drawing",

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from vmri_jax.animation.drawing import Anchor, Body, Drawing, check_index, frame
+from vmri_jax.animation.drawing import Body, Drawing, Joint, check_index, frame
 from vmri_jax.running.trajectory import Trajectory
 
 RADIUS = 0.24
@@ -13,7 +13,14 @@ RADIUS = 0.24
 
 
 def bars(trajectory: Trajectory) -> dict:
-    """A drawing of any run: all coordinates of q_s, and all of q_f, as bars."""
+    """A drawing of any run: all coordinates of q_s, and all of q_f, as bars.
+
+    Args:
+        trajectory: one run.
+
+    Returns:
+        Plain data for `Drawing.from_dict`.
+    """
     sizes = {part: np.shape(q)[1] for part, q in (("s", trajectory.q_s), ("f", trajectory.q_f))}
     blocks = [{"name": f"q_{part}", "coordinates": [[part, i] for i in range(n)]} for part, n in sizes.items() if n > 0]
     return {"blocks": blocks}
@@ -40,7 +47,7 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
     corner, height = _room(drawing, q_s, q_f)
     unit = height / max(2.0, 0.22 * sum(len(block.coordinates) for block in drawing.blocks))
     axes = frame(drawing.up, max(2, drawing.dimension))
-    bodies, anchors, scales, x = [], [], [], 0.0
+    bodies, posts, scales, x = [], [], [], 0.0
     for block in drawing.blocks:
         largest = max(float(np.abs(values[part][:, i]).max()) for part, i in block.coordinates)
         scale = _round(height / largest) if largest > 0 else 1.0
@@ -49,7 +56,7 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
             foot = tuple(((corner + np.array([x, 0.0, 0.0])) @ axes).tolist())
             forms = tuple(((scale * float(weight), *coordinate),) if weight else () for weight in axes[2])
             bodies.append(Body(f"{block.name}[{i}]", forms, foot, RADIUS * unit))
-            anchors.append(Anchor(bodies[-1].name, foot, "link"))
+            posts.append(Joint("link", (bodies[-1].name,), foot))
             x += unit
         x += unit
     heights = f"Heights are {', '.join(scales[:-1])}{' and ' if scales[:-1] else ''}{scales[-1]}."
@@ -57,7 +64,7 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
         drawing,
         bodies=(*drawing.bodies, *bodies),
         blocks=(),
-        anchors=(*drawing.anchors, *anchors),
+        joints=(*drawing.joints, *posts),
         caption=f"{drawing.caption} {heights}".strip(),
     )
 

@@ -1,7 +1,7 @@
 """Checks of plain data that a user wrote: what came, what was expected, and where."""
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ def entries(data: dict, key: str, where: str) -> list:
     return list(found)
 
 
-def near(name: str, known: Sequence[str]) -> str:
+def near(name: str, known: Collection[str]) -> str:
     """A question with the known name that is most like it; empty if none is."""
     close = difflib.get_close_matches(name, known, n=1)
     return f" Did you mean {close[0]}?" if close else ""

@@ -67,7 +67,12 @@ def _point(name: str, part: str, number: int, radius: float) -> dict:
 
 
 def built_in(name: str, n_s: int) -> dict | None:
-    """The drawing of a built-in system with n_s slow variables; None if it is not one."""
+    """The drawing of a built-in system as plain data for `Drawing.from_dict`; None if it is not one.
+
+    Args:
+        name: "fpu", "tsp" or "sam".
+        n_s: number of its slow variables.
+    """
     if name == "fpu":
         return fermi_pasta_ulam(n_s)
     return {"tsp": triple_spherical_pendulum, "sam": simple_atomic_model}.get(name, lambda: None)()

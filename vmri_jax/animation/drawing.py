@@ -5,6 +5,7 @@ import operator
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -52,19 +53,18 @@ class Block:
 
 @dataclass(frozen=True)
 class Joint:
-    """A link or spring between two bodies; `pace` "slow" or "fast" colours a spring, None for that of the bodies."""
+    """A link or spring between two bodies, or from a body to a fixed point.
 
-    bodies: tuple[str, str]
-    pace: str | None = None
+    Attributes:
+        kind: "link" or "spring".
+        bodies: one name or two.
+        point: the fixed point, if there is one body.
+        pace: "slow" or "fast", colours a spring; None for that of the bodies.
+    """
 
-
-@dataclass(frozen=True)
-class Anchor:
-    """A link or spring (`kind`) from a body to a fixed point."""
-
-    body: str
-    point: tuple[float, ...]
     kind: str
+    bodies: tuple[str, ...]
+    point: tuple[float, ...] | None = None
     pace: str | None = None
 
 
@@ -96,9 +96,7 @@ class Drawing:
 
     bodies: tuple[Body, ...]
     blocks: tuple[Block, ...] = ()
-    links: tuple[Joint, ...] = ()
-    springs: tuple[Joint, ...] = ()
-    anchors: tuple[Anchor, ...] = ()
+    joints: tuple[Joint, ...] = ()
     planes: tuple[Plane, ...] = ()
     spheres: tuple[Sphere, ...] = ()
     up: tuple[float, ...] | None = None
@@ -128,42 +126,37 @@ class Drawing:
             except json.JSONDecodeError as error:
                 raise ValueError(f"drawing: not valid JSON ({error}).") from error
         check_keys(data, KEYS, (), "drawing")
-        bodies = tuple(_body(e, f"drawing: bodies[{i}]") for i, e in enumerate(entries(data, "bodies", "drawing")))
-        blocks = tuple(_block(e, f"drawing: blocks[{i}]") for i, e in enumerate(entries(data, "blocks", "drawing")))
+
+        def all_of(key: str, read: Callable) -> tuple:
+            return tuple(read(entry, f"drawing: {key}[{i}]") for i, entry in enumerate(entries(data, key, "drawing")))
+
+        bodies, blocks = all_of("bodies", _body), all_of("blocks", _block)
         names = [body.name for body in bodies]
         if not bodies and not blocks:
             raise ValueError("drawing: there are no bodies and no blocks; there must be at least one.")
         for name in (every := [*names, *(block.name for block in blocks)]):
             if every.count(name) > 1:
                 raise ValueError(f"drawing: {every.count(name)} bodies are named {name!r}; names must be unique.")
-
-        def all_of(key: str, read: Callable) -> tuple:
-            return tuple(
-                read(entry, names, f"drawing: {key}[{i}]") for i, entry in enumerate(entries(data, key, "drawing"))
-            )
-
+        links, springs = (all_of(f"{kind}s", partial(_joint, kind, names)) for kind in KINDS)
         return cls(
             bodies=bodies,
             blocks=blocks,
-            links=all_of("links", _joint),
-            springs=all_of("springs", _joint),
-            anchors=all_of("anchors", _anchor),
+            joints=links + springs + all_of("anchors", partial(_anchor, names)),
             planes=all_of("planes", _plane),
             spheres=all_of("spheres", _sphere),
             up=None if data.get("up") is None else direction(data["up"], "drawing: up"),
             caption=str(data.get("caption") or ""),
         )
 
-    def pace(self, joint: Joint | Anchor) -> str:
+    def pace(self, joint: Joint) -> str:
         """ "slow" or "fast": as it says, else "fast" if all its bodies are."""
-        ends = joint.bodies if isinstance(joint, Joint) else (joint.body,)
-        fast = all(body.pace == "fast" for body in self.bodies if body.name in ends)
+        fast = all(body.pace == "fast" for body in self.bodies if body.name in joint.bodies)
         return joint.pace or ("fast" if fast else "slow")
 
     @property
     def dimension(self) -> int:
         """Coordinates of a point: 1, 2 or 3, the most of any body or given point."""
-        points = [anchor.point for anchor in self.anchors] + [sphere.center for sphere in self.spheres]
+        points = [joint.point or () for joint in self.joints] + [sphere.center for sphere in self.spheres]
         points += [vector for plane in self.planes for vector in (plane.point, plane.normal)]
         points += [vector for body in self.bodies for vector in (body.forms, body.offset)] + [self.up or ()]
         return max((len(point) for point in points), default=1)
@@ -260,29 +253,30 @@ def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
     return tuple(terms)
 
 
-def _joint(entry: Any, names: Sequence[str], where: str) -> Joint:
+def _joint(kind: str, names: Sequence[str], entry: Any, where: str) -> Joint:
     if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
         raise ValueError(f"{where} is {entry!r}; it must be a pair of names, or one and 'slow' or 'fast'.")
     a, b = (_body_name(name, names, where) for name in entry[:2])
     if a == b:
         raise ValueError(f"{where} joins {a!r} with itself.")
-    return Joint((a, b), _pace(entry[2] if len(entry) == 3 else None, where))
+    return Joint(kind, (a, b), pace=_pace(entry[2] if len(entry) == 3 else None, where))
 
 
-def _anchor(data: Any, names: Sequence[str], where: str) -> Anchor:
+def _anchor(names: Sequence[str], data: Any, where: str) -> Joint:
     check_keys(data, ("body", "point", "kind", "pace"), ("body", "point", "kind"), where)
     if data["kind"] not in KINDS:
         raise ValueError(f"{where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
     point = numbers(data["point"], f"{where}: point")
-    return Anchor(_body_name(data["body"], names, where), point, data["kind"], _pace(data.get("pace"), where))
+    body = _body_name(data["body"], names, where)
+    return Joint(data["kind"], (body,), point, _pace(data.get("pace"), where))
 
 
-def _plane(data: Any, _: Sequence[str], where: str) -> Plane:
+def _plane(data: Any, where: str) -> Plane:
     check_keys(data, ("point", "normal"), ("point", "normal"), where)
     return Plane(numbers(data["point"], f"{where}: point"), direction(data["normal"], f"{where}: normal"))
 
 
-def _sphere(data: Any, _: Sequence[str], where: str) -> Sphere:
+def _sphere(data: Any, where: str) -> Sphere:
     check_keys(data, ("center", "radius"), ("center", "radius"), where)
     return Sphere(numbers(data["center"], f"{where}: center"), positive(data["radius"], f"{where}: radius"))
 

@@ -9,10 +9,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vmri_jax import plots
-from vmri_jax.animation.camera import Camera
-from vmri_jax.animation.layout import Layout, layout
 from vmri_jax.animation.motion import Motion
-from vmri_jax.animation.shapes import draw_moment
+from vmri_jax.animation.shapes import Stage
 
 FRAMES_PER_SECOND = 20
 WIDTH = 9.0
@@ -38,8 +36,8 @@ def plot_strip(
     moments = np.linspace(motion.t[0], motion.t[-1], times) if isinstance(times, int) else np.asarray(times, float)
     if moments.ndim != 1 or not moments.size:
         raise ValueError(f"plot_strip: times is {times!r}; give at least one.")
-    sizes = layout(motion)
-    camera, aspect = view(sizes)
+    stage = Stage.of(motion, theme)
+    aspect = stage.aspect
     columns = len(moments) if aspect < 1.3 else 3 if aspect < 3.5 else 1
     columns = min(columns, len(moments), 6)
     rows = -(-len(moments) // columns)
@@ -49,13 +47,10 @@ def plot_strip(
         width = WIDTH / columns
         height = rows * width / aspect + TITLE * (bool(title) + bool(caption))
         figure = plots.NotebookFigure(figsize=(WIDTH, height))
-        figure.set_layout_engine("none")
         for k, time in enumerate(moments):
             row, column = divmod(k, columns)
             bottom = (rows - 1 - row) * width / aspect / height
-            panel = figure.add_axes((column / columns, bottom, 1 / columns, width / aspect / height))
-            panel.set_axis_off()
-            draw_moment(panel, motion, sizes, camera, aspect, width, time, trail, theme)
+            stage.draw(figure, (column / columns, bottom, 1 / columns, width / aspect / height), time, trail)
         if title:
             figure.text(0.1 / WIDTH, 1 - 0.1 / height, title, va="top", fontsize=11, color=theme.ink)
         if caption:
@@ -82,22 +77,20 @@ def write_gif(
 
     Raises:
         ValueError: seconds that are not positive.
+        OSError: the file cannot be written.
     """
     if not 0 < seconds < np.inf:
         raise ValueError(f"write_gif: seconds is {seconds}; it must be a positive number.")
     count = max(2, round(FRAMES_PER_SECOND * seconds))
     times = np.linspace(motion.t[0], motion.t[-1], count)
-    trail, sizes = 1.2 * (motion.t[-1] - motion.t[0]) / seconds, layout(motion)
-    camera, aspect = view(sizes)
+    trail = 1.2 * (motion.t[-1] - motion.t[0]) / seconds
+    stage = Stage.of(motion, theme)
     width = GIF_WIDTH / 100
     images = []
     with plots.style(theme):
         for i, time in enumerate(times):
-            figure = Figure(figsize=(width, width / aspect), dpi=100)
-            figure.set_layout_engine("none")
-            panel = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-            panel.set_axis_off()
-            draw_moment(panel, motion, sizes, camera, aspect, width, time, trail, theme)
+            figure = Figure(figsize=(width, width / stage.aspect), dpi=100)
+            stage.draw(figure, (0.0, 0.0, 1.0, 1.0), time, trail)
             canvas = FigureCanvasAgg(figure)
             canvas.draw()
             images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
@@ -105,12 +98,3 @@ def write_gif(
     palette = images[count // 2].quantize(255)  # one for all: colours must not flicker
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     first.save(path, save_all=True, append_images=others, duration=1000 // FRAMES_PER_SECOND, loop=0, optimize=True)
-
-
-def view(sizes: Layout) -> tuple[Camera, float]:
-    """The first view, in a frame as wide as the scene asks for."""
-    radius = float(sizes.radii.max())
-    start = Camera(sizes.azimuth, sizes.elevation, np.zeros(3), 1.0)
-    low, high = start.fitted(sizes.hull, radius, 1.0).bounds(sizes.hull, radius)
-    aspect = float(np.clip((high[0] - low[0]) / (high[1] - low[1]), 0.5, 8.0))
-    return start.fitted(sizes.hull, radius, aspect), aspect

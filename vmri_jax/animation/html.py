@@ -8,7 +8,8 @@ import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.animation.drawing import Drawing
-from vmri_jax.animation.layout import Layout, layout, nice
+from vmri_jax.animation.geometry import LAMP, SPAN, helix
+from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
 
 MOST_NUMBERS = 600_000
@@ -26,6 +27,9 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
         motion: from `vmri_jax.animation.motion`.
         path: of the file.
         title: over the picture.
+
+    Raises:
+        OSError: the file cannot be written.
     """
     every = -(-motion.points.size // MOST_NUMBERS)
     drawing, sizes = motion.drawing, layout(motion)
@@ -53,6 +57,8 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     drawing, t = motion.drawing, motion.t
     duration = float(t[-1] - t[0])
     speed = 1.0 if 0.15 * WATCHED <= duration <= 3 * WATCHED or duration == 0 else nice(duration / WATCHED)
+    springs = [connection for connection in sizes.connections if connection.kind == "spring"]
+    many = len(sizes.connections) > 20  # every helix is drawn anew in every picture
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
     return {
         "t": _packed(t, np.float64),
@@ -65,25 +71,14 @@ def _data(motion: Motion, sizes: Layout) -> dict:
             {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius)}
             for body, radius in zip(drawing.bodies, sizes.radii, strict=True)
         ],
-        "connections": [
-            {**vars(connection), "point": None if connection.point is None else connection.point.tolist()}
-            for connection in sizes.connections
-        ],
-        "planes": [
-            {
-                "center": ground.center.tolist(),
-                "sides": ground.sides.tolist(),
-                "halves": ground.halves,
-                "normal": ground.normal.tolist(),
-                "step": ground.step,
-                "solid": ground.solid,
-            }
-            for ground in sizes.grounds
-        ],
+        "connections": [_plain(connection) for connection in sizes.connections],
+        "planes": [_plain(ground) | {"grid": _packed(ground.grid), "bears": ground.bears} for ground in sizes.grounds],
         "spheres": [
-            {"center": center.tolist(), "radius": sphere.radius}
-            for center, sphere in zip(sizes.spheres, drawing.spheres, strict=True)
+            {"center": c.tolist(), "radius": float(r)} for c, r in zip(sizes.spheres, sizes.sphere_radii, strict=True)
         ],
+        "helices": {n: helix(n, 10 if many else 16).tolist() for n in {c.turns for c in springs}},
+        "lamp": LAMP,
+        "span": SPAN,
         "size": sizes.size,
         "rod": sizes.rod,
         "coil": sizes.coil,
@@ -105,6 +100,11 @@ def _paces(drawing: Drawing, sizes: Layout) -> set[str]:
     return springs | {body.pace for body in drawing.bodies if body.color is None}
 
 
+def _plain(record: Connection | Ground) -> dict:
+    """Its fields, arrays as lists."""
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(record).items()}
+
+
 def _packed(array: np.ndarray, dtype: type = np.float32) -> str:
     """Little-endian bytes in base 64."""
     return base64.b64encode(np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
@@ -113,7 +113,8 @@ def _packed(array: np.ndarray, dtype: type = np.float32) -> str:
 def _description(motion: Motion) -> str:
     drawing = motion.drawing
     names = [body.name for body in drawing.bodies]
-    counts = {"link": len(drawing.links), "spring": len(drawing.springs), "fixed point": len(drawing.anchors)}
+    kinds = [joint.kind if joint.point is None else "fixed point" for joint in drawing.joints]
+    counts = {kind: kinds.count(kind) for kind in ("link", "spring", "fixed point")}
     joints = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]
     bodies = f"{len(names)} bodies" if len(names) > 6 else ", ".join(names)
     return f"Animation of {', '.join([bodies, *joints])} from t = {motion.t[0]:g} to {motion.t[-1]:g}."

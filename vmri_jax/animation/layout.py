@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.geometry import grid
 from vmri_jax.animation.motion import Motion
 
 TURNS = (4, 14)
@@ -18,17 +19,28 @@ LEVEL = 0.9
 
 @dataclass(frozen=True)
 class Ground:
-    """A rectangle of a plane: `center`, two unit `sides` with half lengths `halves`, `normal`, width `step` of its grid.
+    """A rectangle of a plane.
 
-    solid: given by the drawing; else a floor below the scene that shows depth only.
+    Attributes:
+        center: (3,).
+        normal: (3,) unit vector.
+        sides: (2, 3) unit vectors along its sides.
+        corners: (4, 3).
+        grid: (n, 7) pieces of lines, as of `vmri_jax.animation.geometry.grid`.
+        solid: given by the drawing; else a floor below the scene that shows depth only.
     """
 
     center: np.ndarray
-    sides: np.ndarray
-    halves: tuple[float, float]
     normal: np.ndarray
-    step: float
+    sides: np.ndarray
+    corners: np.ndarray
+    grid: np.ndarray
     solid: bool
+
+    @property
+    def bears(self) -> bool:
+        """Whether shadows fall on it."""
+        return bool(self.normal[2] > 0.5)
 
 
 @dataclass(frozen=True)
@@ -55,7 +67,7 @@ class Layout:
         radii: of the bodies.
         rod, coil, wire: radius of links, of springs, and of their wire.
         connections: links, springs and anchors.
-        spheres: (n_spheres, 3) centres.
+        spheres, sphere_radii: (n, 3) centres and (n,) radii of fixed spheres.
         grounds: given planes, or a floor.
         hull: (n, 3) points that must be seen.
         azimuth, elevation: of the first view.
@@ -68,6 +80,7 @@ class Layout:
     wire: float
     connections: list[Connection]
     spheres: np.ndarray
+    sphere_radii: np.ndarray
     grounds: list[Ground]
     hull: np.ndarray
     azimuth: float
@@ -78,10 +91,11 @@ def layout(motion: Motion) -> Layout:
     """Sizes that suit the picture: balls do not touch their neighbours, springs keep inside the space they have."""
     drawing, points = motion.drawing, motion.thinned(500).points
     connections = _connections(drawing)
-    anchors = drawing.place([anchor.point for anchor in drawing.anchors])
+    fixed = np.array([c.point for c in connections if c.point is not None]).reshape(-1, 3)
     spheres = drawing.place([sphere.center for sphere in drawing.spheres])
-    reach = np.array([sphere.radius for sphere in drawing.spheres]).reshape(-1, 1)
-    box = np.concatenate([points.reshape(-1, 3), anchors, spheres - reach, spheres + reach])
+    sphere_radii = np.array([sphere.radius for sphere in drawing.spheres])
+    reach = sphere_radii[:, None]
+    box = np.concatenate([points.reshape(-1, 3), fixed, spheres - reach, spheres + reach])
     size = float(np.linalg.norm(np.ptp(box, axis=0))) or 1.0
     lengths = [_median_length(connection, points) or size for connection in connections]
     small = min(0.02 * size, 0.3 * min(lengths, default=size))
@@ -90,8 +104,7 @@ def layout(motion: Motion) -> Layout:
     coil = min(0.015 * size, 0.16 * min(sprung, default=size))
     turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS).astype(int).tolist()
     grounds = _grounds(drawing, box, float(radii.max()), size)
-    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    corners = [g.center + (1.0 if g.solid else FADED) * signs * g.halves @ g.sides for g in grounds]
+    corners = [g.center + (1.0 if g.solid else FADED) * (g.corners - g.center) for g in grounds]
     flat = drawing.dimension < 3
     return Layout(
         size,
@@ -101,6 +114,7 @@ def layout(motion: Motion) -> Layout:
         wire=0.11 * coil,
         connections=[replace(c, turns=count) for c, count in zip(connections, turns, strict=True)],
         spheres=spheres,
+        sphere_radii=sphere_radii,
         grounds=grounds,
         hull=_hull(np.concatenate([box, *corners])),
         azimuth=math.radians(-88 if flat else -62),
@@ -110,14 +124,12 @@ def layout(motion: Motion) -> Layout:
 
 def _connections(drawing: Drawing) -> list[Connection]:
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
+    points = drawing.place([joint.point or () for joint in drawing.joints])
     found = []
-    for kind, joints in (("link", drawing.links), ("spring", drawing.springs)):
-        for joint in joints:
-            a, b = joint.bodies
-            found.append(Connection(kind, index[a], index[b], None, drawing.pace(joint), 0))
-    points = drawing.place([anchor.point for anchor in drawing.anchors])
-    for anchor, point in zip(drawing.anchors, points, strict=True):
-        found.append(Connection(anchor.kind, index[anchor.body], None, point, drawing.pace(anchor), 0))
+    for joint, point in zip(drawing.joints, points, strict=True):
+        body, *others = (index[name] for name in joint.bodies)
+        ends = {"other": others[0], "point": None} if others else {"other": None, "point": point}
+        found.append(Connection(joint.kind, body, **ends, pace=drawing.pace(joint), turns=0))
     return found
 
 
@@ -149,7 +161,9 @@ def _ground(point, normal, box, size: float, *, solid: bool) -> Ground:
     extent = np.ptp(box @ sides.T, axis=0) / 2 + margin
     step = nice(max(float(extent.max()) / (6 if level else 2), size / 16))
     center = middle - ((middle - point) @ normal) * normal
-    return Ground(center, sides, (float(extent[0]), float(extent[1])), normal, step, solid)
+    halves = float(extent[0]), float(extent[1])
+    corners = center + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * halves @ sides
+    return Ground(center, normal, sides, corners, grid(center, sides, halves, step, fades=not solid), solid)
 
 
 def _hull(points: np.ndarray, count: int = 200) -> np.ndarray:

@@ -1,72 +1,110 @@
 """One moment of a motion in a matplotlib panel, the farthest things first, as in the script of the page."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
 from vmri_jax import plots
 from vmri_jax.animation.camera import Camera
-from vmri_jax.animation.layout import Ground, Layout
+from vmri_jax.animation.geometry import LAMP, dropped, joint, spring
+from vmri_jax.animation.layout import Ground, Layout, layout
 from vmri_jax.animation.motion import Motion
 
-LAMP = np.array([-0.45, 0.7, 0.55])
-"""Where light comes from: right, up, back of the view."""
-ROD = {plots.LIGHT: "#8d979f", plots.DARK: "#8b969f"}
-SPAN = 0.8
-"""Joints end this far into a ball, in its radius."""
-LEAD = 0.1
-"""Part of a spring that is straight, at each end."""
 ON_TOP = 1e9
+"""In front of all things, of whatever depth."""
 
 
-def draw_moment(
-    axes: Axes,
-    motion: Motion,
-    sizes: Layout,
-    camera: Camera,
-    aspect: float,
-    width: float,
-    time: float,
-    trail: float,
-    theme: plots.Theme,
-) -> None:
-    """Draw bodies, joints, ground, shadows, and where the bodies were a time `trail` ago; `width` in inches."""
-    axes.set(xlim=(-aspect, aspect), ylim=(-1, 1), aspect="equal")
-    pen = _Pen(axes, camera, theme, 72 * width / (2 * aspect))
-    drawing, points = motion.drawing, motion.at([time])[0]
-    paces = {"slow": theme.curves[0], "fast": theme.curves[1]}
-    colors = [body.color or paces[body.pace] for body in drawing.bodies]
-    ends = [(points[c.body], points[c.other] if c.point is None else c.point) for c in sizes.connections]
-    for ground in sizes.grounds:
-        pen.ground(ground)
-        if ground.normal[2] > 0.5:
-            centers = np.concatenate([points, sizes.spheres])
-            radii = [*sizes.radii, *(sphere.radius for sphere in drawing.spheres)]
-            pen.shadows(ground, centers, radii, ends, sizes.rod)
-    for center, sphere in zip(sizes.spheres, drawing.spheres, strict=True):
-        pen.ball(center, sphere.radius, theme.faint)
-    past = motion.at(np.linspace(max(motion.t[0], time - trail), time, 160))
-    for i, color in enumerate(colors):
-        pen.trail(past[:, i], color, sizes.radii[i])
-    for connection, (a, b) in zip(sizes.connections, ends, strict=True):
-        reach = (sizes.radii[connection.body], 0.0 if connection.other is None else sizes.radii[connection.other])
-        if connection.kind == "link":
-            pen.rod(a, b, reach, sizes.rod, sizes.size)
-        else:
-            pen.spring(a, b, reach, sizes.coil, sizes.wire, paces[connection.pace], connection.turns)
-        if connection.point is not None and np.linalg.norm(a - b) > reach[0]:  # else within the body
-            pen.ball(connection.point, 1.5 * sizes.rod, ROD[theme])
-    for point, radius, color in zip(points, sizes.radii, colors, strict=True):
-        pen.ball(point, radius, color)
-    span = float(motion.t[-1] - motion.t[0])
-    digits = max(0, 2 - math.floor(math.log10(span))) if span > 0 else 2
-    label = f"$t = {time:.{digits}f}$"
-    axes.text(-0.97 * aspect, -0.97, label, va="bottom", fontsize=9, color=theme.ink, zorder=ON_TOP)
+@dataclass(frozen=True)
+class Stage:
+    """What the pictures of one motion have in common: sizes of things, and a view `aspect` times as wide as high."""
+
+    motion: Motion
+    sizes: Layout
+    camera: Camera
+    aspect: float
+    theme: plots.Theme
+
+    @classmethod
+    def of(cls, motion: Motion, theme: plots.Theme) -> "Stage":
+        """With the first view, in a frame as wide as the scene asks for."""
+        sizes = layout(motion)
+        radius = float(sizes.radii.max())
+        start = Camera(sizes.azimuth, sizes.elevation, np.zeros(3), 1.0)
+        low, high = start.fitted(sizes.hull, radius, 1.0).bounds(sizes.hull, radius)
+        aspect = float(np.clip((high[0] - low[0]) / (high[1] - low[1]), 0.5, 8.0))
+        return cls(motion, sizes, start.fitted(sizes.hull, radius, aspect), aspect, theme)
+
+    def draw(self, figure: Figure, place: tuple[float, float, float, float], time: float, trail: float) -> None:
+        """Draw one moment.
+
+        Args:
+            figure: in the style of the theme.
+            place: left, bottom, width and height of the panel, in parts of the figure.
+            time: the moment.
+            trail: so long ago is the oldest place that is shown of a body.
+        """
+        figure.set_layout_engine("none")
+        axes = figure.add_axes(place)
+        axes.set_axis_off()
+        axes.set(xlim=(-self.aspect, self.aspect), ylim=(-1, 1), aspect="equal")
+        pen = _Pen(axes, self.camera, self.theme, 72 * place[2] * figure.get_figwidth() / (2 * self.aspect))
+        points = self.motion.at([time])[0]
+        self._draw_around(pen, points)
+        self._draw_trails(pen, time, trail)
+        self._draw_joints(pen, points)
+        for point, radius, color in zip(points, self.sizes.radii, self._colors, strict=True):
+            pen.ball(point, radius, color)
+        span = float(self.motion.t[-1] - self.motion.t[0])
+        digits = max(0, 2 - math.floor(math.log10(span))) if span > 0 else 2
+        label = f"$t = {time:.{digits}f}$"
+        axes.text(-0.97 * self.aspect, -0.97, label, va="bottom", fontsize=9, color=self.theme.ink, zorder=ON_TOP)
+
+    @property
+    def _paces(self) -> dict[str, str]:
+        return {"slow": self.theme.curves[0], "fast": self.theme.curves[1]}
+
+    @property
+    def _colors(self) -> list[str]:
+        return [body.color or self._paces[body.pace] for body in self.motion.drawing.bodies]
+
+    def _ends(self, points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Centres that a connection joins."""
+        return [(points[c.body], points[c.other] if c.point is None else c.point) for c in self.sizes.connections]
+
+    def _draw_around(self, pen: "_Pen", points: np.ndarray) -> None:
+        """Planes with the shadows on them, and fixed spheres."""
+        sizes = self.sizes
+        centers, radii = np.concatenate([points, sizes.spheres]), np.concatenate([sizes.radii, sizes.sphere_radii])
+        for ground in sizes.grounds:
+            pen.ground(ground)
+            if ground.bears:
+                pen.shadows(ground, centers, radii, self._ends(points), sizes.rod)
+        for center, radius in zip(sizes.spheres, sizes.sphere_radii, strict=True):
+            pen.ball(center, radius, self.theme.faint)
+
+    def _draw_trails(self, pen: "_Pen", time: float, trail: float) -> None:
+        past = self.motion.at(np.linspace(max(self.motion.t[0], time - trail), time, 160))
+        for i, color in enumerate(self._colors):
+            pen.trail(past[:, i], color, self.sizes.radii[i])
+
+    def _draw_joints(self, pen: "_Pen", points: np.ndarray) -> None:
+        sizes = self.sizes
+        for c, (a, b) in zip(sizes.connections, self._ends(points), strict=True):
+            reach = (sizes.radii[c.body], 0.0 if c.other is None else sizes.radii[c.other])
+            ends = joint(a, b, reach)
+            if ends is not None and c.kind == "link":
+                pen.rod(*ends, sizes.rod, sizes.size)
+            elif ends is not None:
+                pen.spring(*ends, sizes.coil, sizes.wire, self._paces[c.pace], c.turns)
+            if c.point is not None and np.linalg.norm(a - b) > reach[0]:  # else within the body
+                pen.ball(c.point, 1.5 * sizes.rod, self.theme.rod)
 
 
 class _Pen:
@@ -97,12 +135,8 @@ class _Pen:
         area = (2 * self.points * r) ** 2
         self.axes.scatter(*xy.T, s=area, c=self.tone(color, shades), linewidths=0, zorder=float(scale))
 
-    def rod(self, a, b, reach, radius: float, size: float) -> None:
+    def rod(self, start, end, radius: float, size: float) -> None:
         """In pieces, each with its own depth."""
-        ends = _joint(a, b, reach)
-        if ends is None:
-            return
-        start, end = ends
         pieces = int(np.clip(np.ceil(10 * np.linalg.norm(end - start) / size), 1, 12))
         places, scale = self.camera.project(start + np.linspace(0, 1, pieces + 1)[:, None] * (end - start))
         along = places[-1] - places[0]
@@ -110,7 +144,7 @@ class _Pen:
         side = np.array([along[1], -along[0]])
         side *= 1.0 if side @ LAMP[:2] > 0 else -1.0
         overlap = 0.3 / self.points * np.array([-along, along])  # or seams would show
-        tones = self.tone(ROD[self.theme], [-0.35, 0.05, 0.5])
+        tones = self.tone(self.theme.rod, [-0.35, 0.05, 0.5])
         for k in range(pieces):
             w = radius * (scale[k] + scale[k + 1])
             middle = float(scale[k] + scale[k + 1]) / 2
@@ -118,20 +152,10 @@ class _Pen:
             widths = self.points * np.array([1.0, 0.72, 0.25]) * w
             self.lines(places[[k, k + 1]] + overlap + shifts, tones, widths, middle, capstyle="butt")
 
-    def spring(self, a, b, reach, coil: float, wire: float, color, turns: int) -> None:
-        """A helix with straight ends."""
-        ends = _joint(a, b, reach)
-        if ends is None:
-            return
-        start, end = ends
-        along = (end - start) / np.linalg.norm(end - start)
-        sideways = np.cross(along, [0.36, 0.48, 0.8])
-        sideways /= np.linalg.norm(sideways)
-        turn = np.linspace(0, turns, 16 * turns + 1)[:, None]
-        grown = np.minimum(1, np.minimum(turn, turns - turn))
-        radial = np.cos(2 * np.pi * turn) * sideways + np.sin(2 * np.pi * turn) * np.cross(along, sideways)
-        helix = start + (LEAD + (1 - 2 * LEAD) * turn / turns) * (end - start) + coil * grown * radial
-        places, scale = self.camera.project(np.concatenate([start[None], helix, end[None]]))
+    def spring(self, start, end, coil: float, wire: float, color, turns: int) -> None:
+        """A helix, lit from the side of the lamp."""
+        points, radial = spring(start, end, coil, turns)
+        places, scale = self.camera.project(points)
         bright = 0.45 * (radial @ self.camera.axes.T) @ LAMP
         shades = np.concatenate([[0.0], bright[1:], [0.0]])
         order = np.argsort(scale[:-1] + scale[1:])
@@ -153,40 +177,25 @@ class _Pen:
         self.lines(segments, color, 0.5 + 0.9 * young, behind, alpha=0.7 * young**1.5, capstyle="butt")
 
     def ground(self, ground: Ground) -> None:
-        """A grid that fades outwards; a solid plane is tinted too."""
-        segments, strengths = [], []
-        for across in (0, 1):
-            along, beside = ground.halves[1 - across], ground.halves[across]
-            count = int(beside / ground.step)
-            for k in range(-count, count + 1):
-                w = np.linspace(-along, along, 17)
-                uv = np.stack([np.full(17, k * ground.step), w], axis=1)[:, :: -1 if across else 1]
-                line = ground.center + uv @ ground.sides
-                segments.append(np.stack([line[:-1], line[1:]], axis=1))
-                middle = (uv[:-1] + uv[1:]) / 2 / ground.halves
-                fade = np.clip(1 - np.linalg.norm(middle, axis=1), 0, 1)
-                strengths.append(np.ones(16) if ground.solid else fade)
-        places, scale = self.camera.project(np.concatenate(segments))
+        """Its grid; a solid plane is tinted too."""
+        places, scale = self.camera.project(ground.grid[:, :6].reshape(-1, 2, 3))
         seen = (scale > 0).all(axis=1)
-        self.lines(places[seen], self.theme.faint, 0.7, -3, alpha=np.concatenate(strengths)[seen])
+        self.lines(places[seen], self.theme.faint, 0.7, -3, alpha=ground.grid[seen, 6])
         if ground.solid:
-            corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * ground.halves
-            self.polygons([ground.center + corners @ ground.sides], self.theme.faint, 0.4, -4)
+            self.polygons([ground.corners], self.theme.faint, 0.4, -4)
 
     def shadows(self, ground: Ground, points, radii, joints, rod: float) -> None:
         """Straight down onto a plane that bears; where those of a kind overlap they are no darker."""
         angle = np.linspace(0, 2 * np.pi, 25)[:-1]
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ ground.sides
         color, strength = "#000000", 1.0 if self.theme is plots.LIGHT else 2.0
+        feet = dropped(ground.center, ground.normal, points)
+        above = (points - ground.center) @ ground.normal > 0
         for grown in np.arange(0.7, 1.5, 0.1):
-            rings = [
-                _dropped(ground, point) + grown * radius * circle
-                for point, radius in zip(points, radii, strict=True)
-                if (point - ground.center) @ ground.normal > 0
-            ]
-            self.polygons(rings, color, 0.026 * strength, -2)
+            balls = zip(feet[above], radii[above], strict=True)
+            self.polygons([foot + grown * radius * circle for foot, radius in balls], color, 0.026 * strength, -2)
         if joints:
-            ends = np.array([[_dropped(ground, a), _dropped(ground, b)] for a, b in joints]).reshape(-1, 3)
+            ends = dropped(ground.center, ground.normal, np.array(joints).reshape(-1, 3))
             places, scale = self.camera.project(ends)
             path = Path(places, [Path.MOVETO, Path.LINETO] * len(joints))
             width = max(0.5, 2 * self.points * rod * float(scale.mean()))
@@ -198,17 +207,3 @@ class _Pen:
         if len(corners):
             path = Path.make_compound_path_from_polys(self.camera.project(np.array(corners))[0])
             self.axes.add_patch(PathPatch(path, facecolor=color, linewidth=0, alpha=alpha, zorder=zorder))
-
-
-def _joint(a, b, reach):
-    """Where a joint of two balls starts and ends; None if they touch or an end lies within the other ball."""
-    gap = b - a
-    length = float(np.linalg.norm(gap))
-    if length <= max(SPAN * sum(reach), *reach):
-        return None
-    return a + SPAN * reach[0] / length * gap, b - SPAN * reach[1] / length * gap
-
-
-def _dropped(ground: Ground, point):
-    """The point straight below on the plane."""
-    return point + np.array([0.0, 0.0, (ground.center - point) @ ground.normal / ground.normal[2]])

@@ -6,9 +6,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
 
 from vmri_jax import plots
 from vmri_jax.animation.bars import bars
@@ -18,21 +16,12 @@ from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
 from vmri_jax.cli.catalogue import SYSTEMS, find_problem
+from vmri_jax.cli.common import PICTURES, check_target_file, console, progress_bar, refusals
 from vmri_jax.running.store import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
 
 MOST_NODES = 100_000
 """Read from a store; of longer runs every k-th node is."""
-SUFFIXES = (".html", ".png", ".svg", ".pdf", ".gif")
-
-console = Console()
-
-
-class _BadInput(typer.BadParameter):
-    """Something the user typed: shown in a panel, exit code 2."""
-
-    def format_message(self) -> str:
-        return self.message
 
 
 def animate(
@@ -55,28 +44,15 @@ def animate(
 
     The drawing is the one stored with the run, else that of --system; without one every coordinate is a bar.
     """
-    try:
+    with refusals():
         out = run.with_suffix(".html") if out is None else out
-        _check_out(out)
+        check_target_file("--out", out, (".html", *PICTURES, ".gif"))
         shown = _motion(run, system, drawing).between(start, end)
-    except (ValueError, TypeError, FileNotFoundError) as error:
-        raise _BadInput(str(error)) from error
-    name = title or (SYSTEMS[system].title if system in SYSTEMS else run.stem)
-    try:
+        name = title or (SYSTEMS[system].title if system in SYSTEMS else run.stem)
         _write(shown, out, name, frames, seconds, plots.DARK if dark else plots.LIGHT)
-    except OSError as error:
-        raise _BadInput(f"--out {out}: {error.strerror}; give a file that can be written.") from error
     if shown.ending:
         console.print(f"[yellow]{escape(shown.ending)}[/yellow]")
     console.print(f"[bold]{escape(str(out))}[/bold]  {out.stat().st_size / 1e6:.2g} MB", soft_wrap=True)
-
-
-def _check_out(out: Path) -> None:
-    if out.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"--out {out} must end with {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}.")
-    if out.is_dir() or not out.parent.is_dir():
-        reason = "is a folder" if out.is_dir() else f"the folder {out.parent} does not exist"
-        raise ValueError(f"--out {out}: {reason}; give a file in a folder that exists.")
 
 
 def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
@@ -120,8 +96,7 @@ def _write(shown: Motion, out: Path, title: str, frames: int, seconds: float, th
     if suffix == ".html":
         write_html(shown, out, title)
     elif suffix == ".gif":
-        with Progress(console=console, transient=True) as bar:
-            task = bar.add_task("drawing")
-            write_gif(shown, out, seconds, theme, lambda done, total: bar.update(task, completed=done, total=total))
+        with progress_bar() as tell:
+            write_gif(shown, out, seconds, theme, lambda done, total: tell("drawing", done, total))
     else:
         plots.save(plot_strip(shown, frames, title, theme), out, theme)

@@ -1,14 +1,14 @@
 """Built-in systems and schemes by name, and problems from a user's own file: what the command line accepts."""
 
-import difflib
 import importlib.util
 import sys
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from vmri_jax import systems
+from vmri_jax.animation.checks import near
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.scene import Scene
 from vmri_jax.schemes import composition
@@ -142,17 +142,21 @@ def _find_own(name: str) -> Problem | Scene:
 
 
 def find_scheme(name: str, num_micro: int, compose: str | None = None, **options) -> Scheme | Composition:
-    """A built-in scheme by name; options that are None keep their defaults.
+    """A built-in scheme by name, with dashes or underscores; options that are None keep their defaults.
 
     Args:
+        name: one of `SCHEMES`.
+        num_micro: micro steps per macro step.
         compose: name of a composition of it, see `vmri_jax.compose`.
+        options: alpha, degree, rule, where the scheme has them.
 
     Raises:
         ValueError: an unknown name, or an option the scheme does not have.
         TypeError: an option that is needed.
     """
-    if name not in SCHEMES:
+    if _dashed(name) not in SCHEMES:
         raise ValueError(_unknown("scheme", name, SCHEMES))
+    name = _dashed(name)
     scheme = SCHEMES[name]
     given = {key: value for key, value in options.items() if value is not None}
     for key in given:
@@ -165,11 +169,13 @@ def find_scheme(name: str, num_micro: int, compose: str | None = None, **options
     return made if compose is None else composition.compose(made, compose)
 
 
-def _unknown(kind: str, name: str, known: Iterable[str]) -> str:
-    known = list(known)
-    near = difflib.get_close_matches(name.lower().replace("_", "-"), known, n=1)
-    hint = f" Did you mean {near[0]}?" if near else ""
-    return f"there is no {kind} {name!r}.{hint} There are {', '.join(known)}."
+def _unknown(kind: str, name: str, known: Collection[str]) -> str:
+    return f"there is no {kind} {name!r}.{near(_dashed(name), known)} There are {', '.join(known)}."
+
+
+def _dashed(name: str) -> str:
+    """A name as it is listed: fully_explicit and Fully-Explicit are fully-explicit."""
+    return name.lower().replace("_", "-")
 
 
 def _run_file(path: Path):
@@ -195,10 +201,8 @@ def _found_in(module, path: Path, attribute: str) -> Problem | Scene:
     found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
     if attribute not in found:
         problems = [name for name, value in found.items() if isinstance(value, Problem | Scene)]
-        near = difflib.get_close_matches(attribute, found, n=1)
-        hint = f" Did you mean {near[0]}?" if near else ""
         listed = f" Problems in it: {', '.join(problems)}." if problems else ""
-        raise ValueError(f"{path} has no name {attribute!r}.{hint}{listed}")
+        raise ValueError(f"{path} has no name {attribute!r}.{near(attribute, found)}{listed}")
     problem = found[attribute]
     if callable(problem) and not isinstance(problem, Problem | Scene):
         try:

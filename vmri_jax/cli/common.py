@@ -1,4 +1,4 @@
-"""What all commands share: the console, refusals and failures, a progress bar, files to be written."""
+"""What all commands share: the console, refusals and failures, tables, a progress bar, files to be written."""
 
 import os
 from collections.abc import Iterator
@@ -7,13 +7,18 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
 from rich.text import Text
 
 from vmri_jax.study.table import Progress as StudyProgress
 
 console = Console()
+
+PICTURES = (".png", ".svg", ".pdf")
+"""Endings of files that a figure is written to."""
 
 
 class BadInput(typer.BadParameter):
@@ -21,6 +26,23 @@ class BadInput(typer.BadParameter):
 
     def format_message(self) -> str:
         return self.message
+
+
+@contextmanager
+def refusals() -> Iterator[None]:
+    """Errors of what is called within become panels.
+
+    Raises:
+        BadInput: an argument was wrong, or a file is missing or in the way.
+        typer.Exit: a file could not be written.
+    """
+    try:
+        yield
+    except (ValueError, TypeError, FileExistsError, FileNotFoundError) as error:
+        raise BadInput(str(error)) from error
+    except OSError as error:
+        print_failure("Not written", error.strerror or str(error))
+        raise typer.Exit(1) from error
 
 
 @contextmanager
@@ -37,11 +59,25 @@ def print_failure(title: str, text: str) -> None:
     Console(stderr=True).print(Panel(Text(text), title=title, title_align="left", border_style="red"))
 
 
+def print_written(what: str, path: Path) -> None:
+    """Say where something is; long paths are not broken into lines."""
+    console.print(f"{what}: [bold]{escape(str(path))}[/bold]", soft_wrap=True)
+
+
+def plain_table(*columns: str, show_header: bool = True) -> Table:
+    """A table without lines."""
+    return Table(*columns, box=None, pad_edge=False, show_header=show_header)
+
+
 def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Refuse a file to be written that has another ending, no folder, or no permission, before anything is computed."""
+    """Refuse a file to be written before anything is computed.
+
+    Raises:
+        ValueError: the file has another ending, no folder, or no permission.
+    """
     if path is None:
         return
-    if path.suffix not in endings:
+    if path.suffix.lower() not in endings:
         raise ValueError(f"{option} {path}: the file must end in {' or '.join(endings)}.")
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{option} {path}: the folder {path.parent} does not exist; make it first.")

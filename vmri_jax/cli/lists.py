@@ -2,10 +2,9 @@
 
 import numpy as np
 import typer
-from rich.table import Table
 
 from vmri_jax.cli.catalogue import SCHEMES, SYSTEMS
-from vmri_jax.cli.common import console
+from vmri_jax.cli.common import console, plain_table
 from vmri_jax.schemes.composition import COMPOSITIONS
 
 app = typer.Typer()
@@ -14,7 +13,7 @@ app = typer.Typer()
 @app.command()
 def systems() -> None:
     """List the built-in systems."""
-    table = Table("name", "system", "slow", "fast", "constraints", "parameters", box=None, pad_edge=False)
+    table = plain_table("name", "system", "slow", "fast", "constraints", "parameters")
     for name, entry in SYSTEMS.items():
         problem = entry.factory()
         n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
@@ -34,7 +33,7 @@ def systems() -> None:
 @app.command()
 def schemes() -> None:
     """List the built-in schemes."""
-    table = Table("name", "order", "options", "what", box=None, pad_edge=False)
+    table = plain_table("name", "order", "options", "what")
     for name, entry in SCHEMES.items():
         options = " ".join(f"--{option}" for option in entry.options)
         table.add_row(f"[bold]{name}[/bold]", entry.order, options, entry.title)
@@ -42,15 +41,13 @@ def schemes() -> None:
     console.print(
         "\nOf higher order, [bold]--compose[/bold] NAME: several steps of a scheme of order 2, some backwards.\n"
     )
-    table = Table("name", "order", "stages", "source", box=None, pad_edge=False)
+    table = plain_table("name", "order", "stages", "source")
     for name, entry in COMPOSITIONS.items():
         table.add_row(f"[bold]{name}[/bold]", f"{entry.order}", f"{len(entry.coefficients)}", entry.source)
     console.print(table)
 
 
 def _short(value) -> str:
-    return (
-        ", ".join(f"{x:g}" for x in np.ravel(value))
-        if np.ndim(value) == 0
-        else f"({', '.join(f'{x:g}' for x in value)})"
-    )
+    """A number, or a vector in brackets."""
+    text = ", ".join(f"{x:g}" for x in np.ravel(value))
+    return f"({text})" if np.ndim(value) else text

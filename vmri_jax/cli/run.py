@@ -3,20 +3,18 @@
 import shlex
 import sys
 import time
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from vmri_jax import plots
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_problem, find_scheme
-from vmri_jax.cli.common import BadInput, check_target_file, console, print_failure
+from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_failure, refusals
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.simulate import simulate as run_at_once
 from vmri_jax.running.store import StoredTrajectory, stream
@@ -62,9 +60,9 @@ def simulate(
     plot: Annotated[Path | None, typer.Option(help="Draw it here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Simulate a system and say how it went."""
-    try:
+    with refusals():
         streamed = _check_out(out, resume, overwrite)
-        check_target_file("--plot", plot, (".png", ".svg", ".pdf"))
+        check_target_file("--plot", plot, PICTURES)
         problem = find_problem(system)
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
@@ -84,26 +82,27 @@ def simulate(
         start = time.perf_counter()
         trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
         seconds = time.perf_counter() - start
-        saved = [str(out)] if out is not None else []
         if out is not None and isinstance(trajectory, Trajectory):
             trajectory.save(out, problem.drawing)
         if plot is not None:
             nodes = trajectory if isinstance(trajectory, Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
             plots.save(plots.plot_trajectory(nodes, f"{system}, {scheme}, {num_micro} micro steps"), plot)
-            saved.append(str(plot))
-    except (ValueError, TypeError, FileExistsError, FileNotFoundError) as error:
-        raise BadInput(str(error)) from error
-    except OSError as error:
-        print_failure("Not written", error.strerror or str(error))
-        raise typer.Exit(1) from error
+    saved = [str(path) for path in (out, plot) if path is not None]
     if stopped is not None:
         raise typer.Exit(_print_stop(stopped, saved, streamed))
-    pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
-    now = steps - (0 if before is None else before.step)
-    summary = _summary(pieces, steps, chosen.num_micro, now, seconds, sum(compiling), saved)
-    if not problem.system.is_constrained:
-        del summary["constraint residual"]
-    console.print(_two_columns(summary))
+    done = (steps - (0 if before is None else before.step)) * chosen.num_micro
+    summary = {
+        "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
+        "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
+        "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
+        **_summary(trajectory, problem.system.is_constrained),
+        "saved": ", ".join(saved) if saved else "nothing; give --out run.npz or --plot run.png",
+    }
+    table = plain_table("", "", show_header=False)
+    for name, value in summary.items():
+        if value:
+            table.add_row(f"[dim]{name}[/dim]", escape(value))
+    console.print(table)
 
 
 def _run(run, problem, scheme, arguments: dict):
@@ -132,7 +131,7 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
 
 def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
     """Whether the run is to be streamed."""
-    streamed = out is not None and out.suffix == ".zarr"
+    streamed = out is not None and out.suffix.lower() == ".zarr"
     if (resume or overwrite) and not streamed:
         option = "--resume" if resume else "--overwrite"
         raise ValueError(f"{option} is for a run that is written all along; give --out with a file that ends in .zarr.")
@@ -153,47 +152,42 @@ def _compile_clock() -> list[float]:
     return seconds
 
 
-def _summary(
-    pieces: Iterable[Trajectory],
-    steps: int,
-    num_micro: int,
-    now: int,
-    seconds: float,
-    compiling: float,
-    saved: list[str],
-) -> dict[str, str]:
-    """About a run, read piece by piece, of which `now` macro steps took these seconds."""
-    found = np.array([_extremes(piece) for piece in pieces])
-    t_start, energy = found[0, :2]
-    t_end = found[-1, 2]
-    position, velocity, method, iterations = found[:, 5:].max(axis=0)
-    absolute = abs(energy) <= 1e-12
-    change = max(found[:, 4].max() - energy, energy - found[:, 3].min()) / (1.0 if absolute else abs(energy))
+def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> dict[str, str]:
+    """How a run went, in words; one on disk is read piece by piece."""
+    pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
+    found = [_extremes(piece) for piece in pieces]
+    first, last = found[0], found[-1]
+    position, velocity, method, iterations = np.max([one.largest for one in found], axis=0)
+    change = max(max(one.highest - first.energy, first.energy - one.lowest) for one in found)
+    relative = abs(first.energy) > 1e-12
+    energy = f"{change / abs(first.energy):.2e} of the energy at the start" if relative else f"{change:.2e}"
     return {
-        "macro steps": f"{steps}, of {num_micro} micro steps each",
-        "simulated time": f"{t_start:g} to {t_end:g}",
-        "wall time": f"{seconds:.2f} s, of which {compiling:.2f} s compiling",
-        "per micro step": f"{1e6 * max(seconds - compiling, 0.0) / (now * num_micro):.3g} µs" if now else "",
+        "simulated time": f"{first.start:g} to {last.end:g}",
         "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
-        "energy change": f"at most {change:.2e}{'' if absolute else ' of the energy at the start'}",
-        "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities",
-        "saved": ", ".join(saved) if saved else "nothing; give --out run.npz or --plot run.png",
+        "energy change": f"at most {energy}",
+        "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if constrained else "",
     }
 
 
-def _two_columns(rows: dict[str, str]) -> Table:
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for name, value in rows.items():
-        if value:
-            table.add_row(f"[dim]{name}[/dim]", escape(value))
-    return table
+class _Extremes(NamedTuple):
+    """Of a piece of a run: times, energy at its start, lowest and highest energy.
+
+    largest: residuals of positions and velocities, dearest method, most iterations.
+    """
+
+    start: float
+    end: float
+    energy: float
+    lowest: float
+    highest: float
+    largest: tuple[float, float, int, int]
 
 
-def _extremes(piece: Trajectory) -> tuple:
-    """Start time and energy; end time; least and largest energy; largest residuals, dearest method, most iterations."""
-    energy, residual = np.asarray(piece.energy), np.asarray(piece.constraint_residual)
-    dearest = int(np.max(piece.info.method)), int(np.max(piece.info.iterations))
-    return float(piece.t[0]), energy[0], float(piece.t[-1]), energy.min(), energy.max(), *residual.max(axis=0), *dearest
+def _extremes(piece: Trajectory) -> _Extremes:
+    energy, info = np.asarray(piece.energy), piece.info
+    position, velocity = np.asarray(piece.constraint_residual).max(axis=0)
+    largest = position, velocity, int(np.max(info.method)), int(np.max(info.iterations))
+    return _Extremes(float(piece.t[0]), float(piece.t[-1]), energy[0], energy.min(), energy.max(), largest)
 
 
 def default_save_every(steps: int) -> int:

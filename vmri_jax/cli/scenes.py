@@ -6,7 +6,7 @@ import typer
 
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_scene, find_scheme
-from vmri_jax.cli.common import BadInput, console
+from vmri_jax.cli.common import console, refusals
 
 app = typer.Typer()
 
@@ -26,11 +26,9 @@ def explain(
     measure: Annotated[bool, typer.Option(help="Compile the scene without each effect in turn and time it.")] = True,
 ) -> None:
     """Where every body and effect of a scene lives, and what it adds: unknowns, evaluations, operations, time."""
-    try:
+    with refusals():
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         found = find_scene(scene)
         with console.status("compiling the scene without each effect in turn" if measure else "looking"):
             ledger = found.explain(chosen, macro_dt=macro_dt, measure=measure)
-    except (ValueError, TypeError) as error:
-        raise BadInput(str(error)) from error
     console.print(ledger.table())

@@ -141,4 +141,4 @@ def _rows_of(found: Recommendation, count: int = 5) -> list[WorkRow]:
 
 def _write_runs(runs: WorkPrecision, out: Path | None) -> None:
     if out is not None:
-        runs.to_csv(out) if out.suffix == ".csv" else runs.to_json(out)
+        runs.to_csv(out) if out.suffix.lower() == ".csv" else runs.to_json(out)

@@ -1,37 +1,24 @@
 // Planes with a grid that fades outwards, shadows on those that bear, and fixed spheres.
 
 function drawPlane(painter, plane, positions) {
-  const { context, camera, colors } = painter, { center, sides, halves, step, normal, solid } = plane;
-  const place = (u, v) => camera.project(plus(plus(center, sides[0], u), sides[1], v));
-  const near = 0.02 * camera.distance;
-  if (solid) {
+  const { context, camera, colors } = painter, near = 0.02 * camera.distance;
+  if (plane.solid) {
     context.beginPath();
-    outline(context, [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([u, v]) => place(u * halves[0], v * halves[1])), near);
+    outline(context, plane.corners.map((corner) => camera.project(corner)), near);
     context.fillStyle = painter.tone(colors.faint);
     context.globalAlpha = 0.45;
     context.fill();
   }
   context.strokeStyle = painter.tone(mix(colors.faint, colors.ink, 0.12));
   context.lineWidth = 1;
-  const strength = (u, v) => (solid ? 1 : clamped(1 - Math.hypot(u / halves[0], v / halves[1])));
-  for (const across of [0, 1]) {
-    const [along, beside] = [halves[1 - across], halves[across]], count = Math.floor(beside / step);
-    for (let k = -count; k <= count; k++) {
-      for (let i = 0; i < 16; i++) {
-        const [low, high] = [i, i + 1].map((j) => along * (j / 8 - 1)), corner = (w) => (across ? [w, k * step] : [k * step, w]);
-        const [from, to] = [place(...corner(low)), place(...corner(high))];
-        if (Math.min(from[2], to[2]) < near) continue;
-        context.globalAlpha = strength(...corner((low + high) / 2));
-        if (!context.globalAlpha) continue;
-        context.beginPath();
-        context.moveTo(from[0], from[1]);
-        context.lineTo(to[0], to[1]);
-        context.stroke();
-      }
-    }
+  for (let i = 0; i < plane.lines.length; i += 7) {
+    const [from, to] = [i, i + 3].map((k) => camera.project(plane.lines.subarray(k, k + 3)));
+    if (Math.min(from[2], to[2]) < near) continue;
+    context.globalAlpha = plane.lines[i + 6];
+    stroke(context, [from, to]);
   }
   context.globalAlpha = 1;
-  if (normal[2] > 0.5) shadows(painter, plane, positions);
+  if (plane.bears) shadows(painter, plane, positions);
 }
 
 // Straight down onto the plane.
@@ -48,8 +35,7 @@ function shadows(painter, plane, positions) {
   for (const { body, other, point } of connections) {
     const [from, to] = [at(body), point ?? at(other)].map((p) => camera.project(dropped(plane, p)));
     if (Math.min(from[2], to[2]) < near) continue;
-    context.moveTo(from[0], from[1]);
-    context.lineTo(to[0], to[1]);
+    trace(context, [from, to]);
   }
   context.stroke();
   const balls = [...bodies.map(({ radius }, i) => ({ center: at(i), radius })), ...spheres];
@@ -73,7 +59,7 @@ function ring(painter, { sides }, center, radius) {
 // Adds a polygon to the path; nothing if a corner lies behind the eye.
 function outline(context, corners, near) {
   if (corners.some((corner) => corner[2] < near)) return;
-  corners.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+  trace(context, corners);
   context.closePath();
 }
 
@@ -84,9 +70,7 @@ function obstacle(painter, { center, radius }) {
     [[0, 0.5], [0.5, 0.1], [1, -0.15]].forEach(([at, shade]) => shine.addColorStop(at, painter.tone(colors.faint, shade, depth)));
     context.fillStyle = shine;
     context.globalAlpha = 0.92;
-    context.beginPath();
-    context.arc(x, y, r, 0, 2 * Math.PI);
-    context.fill();
+    disc(context, x, y, r);
     context.globalAlpha = 1;
   });
 }

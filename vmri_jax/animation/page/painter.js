@@ -4,9 +4,35 @@ const mix = (a, b, share) => a.map((x, k) => x + (b[k] - x) * share);
 const rgb = (text) => [1, 3, 5].map((k) => parseInt(text.trim().slice(k, k + 2), 16));
 const clamped = (x) => Math.min(1, Math.max(0, x));
 
+// Adds a line through points to the path.
+function trace(context, points) {
+  points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+}
+
+function stroke(context, points) {
+  context.beginPath();
+  trace(context, points);
+  context.stroke();
+}
+
+function disc(context, x, y, radius) {
+  context.beginPath();
+  context.arc(x, y, radius, 0, 2 * Math.PI);
+  context.fill();
+}
+
+// Gives a canvas a size in pixels of the page, with as many of its own as the screen has; returns their ratio.
+function sharpen(canvas, width, height) {
+  const ratio = Math.min(3, window.devicePixelRatio || 1);
+  [canvas.width, canvas.height] = [width * ratio, height * ratio].map(Math.round);
+  canvas.getContext("2d").setTransform(ratio, 0, 0, ratio, 0, 0);
+  return ratio;
+}
+
 class Painter {
   constructor(canvas, data) {
     Object.assign(this, { canvas, data, context: canvas.getContext("2d"), names: false });
+    for (const plane of data.planes) plane.lines = decoded(plane.grid, Float32Array);
     this.recolor();
   }
 
@@ -23,11 +49,8 @@ class Painter {
   }
 
   resize(width, height) {
-    const ratio = Math.min(3, window.devicePixelRatio || 1);
     Object.assign(this, { width, height });
-    this.canvas.width = Math.round(width * ratio);
-    this.canvas.height = Math.round(height * ratio);
-    this.context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    sharpen(this.canvas, width, height);
   }
 
   // A colour from dark (shade -1) over itself to light (1), faded into the paper with the distance from the eye.

@@ -1,31 +1,26 @@
 // Bodies as balls, links as rods, springs as helices, and where bodies have been.
 
-const LAMP = unit([-0.45, 0.7, 0.55]); // where light comes from, as right, up, back of the view
-const SPAN = 0.8; // joints end this far into a ball, in its radius
-
 function ball(painter, center, radius, color) {
   const { camera } = painter, [x, y, depth] = camera.project(center), r = Math.max(1.2, (camera.scale * radius) / depth);
   painter.add(depth, (context) => {
     const shine = context.createRadialGradient(x - 0.34 * r, y - 0.42 * r, 0.03 * r, x - 0.12 * r, y - 0.16 * r, 1.2 * r);
     [[0, 0.8], [0.22, 0.35], [0.55, 0], [1, -0.5]].forEach(([at, shade]) => shine.addColorStop(at, painter.tone(color, shade, depth)));
     context.fillStyle = shine;
-    context.beginPath();
-    context.arc(x, y, r, 0, 2 * Math.PI);
-    context.fill();
+    disc(context, x, y, r);
   });
 }
 
 // Where a joint of two balls starts and ends, and its direction; null if they touch or an end lies within the other ball.
-function joint(a, b, reachA, reachB) {
+function joint({ span }, a, b, reachA, reachB) {
   const gap = plus(b, a, -1), length = Math.hypot(...gap);
-  if (length <= Math.max(SPAN * (reachA + reachB), reachA, reachB)) return null;
+  if (length <= Math.max(span * (reachA + reachB), reachA, reachB)) return null;
   const along = unit(gap);
-  return [plus(a, along, SPAN * reachA), plus(b, along, -SPAN * reachB), along];
+  return [plus(a, along, span * reachA), plus(b, along, -span * reachB), along];
 }
 
 // In pieces, each with its own depth, so that a rod may pass in front of one ball and behind another.
 function rod(painter, a, b, reachA, reachB) {
-  const ends = joint(a, b, reachA, reachB);
+  const ends = joint(painter.data, a, b, reachA, reachB);
   if (!ends) return;
   const { camera, data } = painter, [start, end] = ends, gap = plus(end, start, -1);
   const pieces = Math.min(12, Math.ceil((10 * Math.hypot(...gap)) / data.size) || 1);
@@ -40,51 +35,44 @@ function rod(painter, a, b, reachA, reachB) {
 function rodPiece(painter, context, from, to) {
   const { camera, data, colors } = painter, [dx, dy] = [to[0] - from[0], to[1] - from[1]], length = Math.hypot(dx, dy);
   if (length < 1e-6) return;
-  const side = dy * LAMP[0] + dx * LAMP[1] > 0 ? 1 : -1; // towards the light
+  const side = dy * data.lamp[0] + dx * data.lamp[1] > 0 ? 1 : -1; // towards the light
   const [nx, ny] = [(side * dy) / length, (-side * dx) / length], [ox, oy] = [(0.5 * dx) / length, (0.5 * dy) / length];
   const [w, v] = [from[2], to[2]].map((depth) => Math.max(0.8, (camera.scale * data.rod) / depth));
   const [x, y] = [(from[0] + to[0]) / 2, (from[1] + to[1]) / 2], depth = (from[2] + to[2]) / 2;
   const across = context.createLinearGradient(x + nx * w, y + ny * w, x - nx * w, y - ny * w);
   [[0, 0.1], [0.3, 0.5], [1, -0.45]].forEach(([at, shade]) => across.addColorStop(at, painter.tone(colors.rod, shade, depth)));
   context.fillStyle = across;
+  const edge = ([x, y], along, across) => [x + across * nx + along * ox, y + across * ny + along * oy];
   context.beginPath();
-  context.moveTo(from[0] + nx * w - ox, from[1] + ny * w - oy); // pieces overlap by a pixel, or seams would show
-  context.lineTo(to[0] + nx * v + ox, to[1] + ny * v + oy);
-  context.lineTo(to[0] - nx * v + ox, to[1] - ny * v + oy);
-  context.lineTo(from[0] - nx * w - ox, from[1] - ny * w - oy);
+  trace(context, [edge(from, -1, w), edge(to, 1, v), edge(to, 1, -v), edge(from, -1, -w)]); // they overlap by a pixel, or seams would show
   context.fill();
 }
 
 // A helix with straight ends: its turns stay the same when it stretches.
 function spring(painter, a, b, reachA, reachB, color, turns) {
-  const ends = joint(a, b, reachA, reachB);
+  const ends = joint(painter.data, a, b, reachA, reachB);
   if (!ends) return;
   const { camera, data } = painter, [start, end, along] = ends, gap = plus(end, start, -1);
   const sideways = unit(cross(along, [0.36, 0.48, 0.8])), third = cross(along, sideways);
-  const perTurn = data.connections.length > 20 ? 10 : 16, steps = turns * perTurn, lead = 0.1;
-  const place = (i) => {
-    const angle = (2 * Math.PI * i) / perTurn, grown = Math.min(1, i / perTurn, (steps - i) / perTurn);
-    const radial = plus(plus([0, 0, 0], sideways, Math.cos(angle)), third, Math.sin(angle));
-    const axis = plus(start, gap, lead + ((1 - 2 * lead) * i) / steps);
-    return [camera.project(plus(axis, radial, data.coil * grown)), radial];
+  const lamp = unit(data.lamp), [first, ...others] = data.helices[turns];
+  const place = ([share, radius, cos, sin]) => {
+    const radial = plus(plus([0, 0, 0], sideways, cos), third, sin);
+    return [camera.project(plus(plus(start, gap, share), radial, data.coil * radius)), radial];
   };
   const piece = (from, to, shade) => {
     const depth = (from[2] + to[2]) / 2;
     painter.add(depth, (context) => {
       context.strokeStyle = painter.tone(color, shade, depth);
       context.lineWidth = Math.max(1.1, (2 * camera.scale * data.wire) / depth);
-      context.beginPath();
-      context.moveTo(from[0], from[1]);
-      context.lineTo(to[0], to[1]);
-      context.stroke();
+      stroke(context, [from, to]);
     });
   };
-  let [last, radial] = place(0);
+  let [last, radial] = place(first);
   piece(camera.project(start), last, 0);
-  for (let i = 1; i <= steps; i++) {
+  for (const row of others) {
     const from = last;
-    [last, radial] = place(i);
-    const bright = dot(radial, camera.right) * LAMP[0] + dot(radial, camera.up) * LAMP[1] + dot(radial, camera.back) * LAMP[2];
+    [last, radial] = place(row);
+    const bright = [camera.right, camera.up, camera.back].reduce((sum, axis, k) => sum + dot(radial, axis) * lamp[k], 0);
     piece(from, last, bright < 0 ? 0.42 * bright : 0.5 * bright);
   }
   piece(last, camera.project(end), 0);
@@ -105,10 +93,7 @@ function drawTrail(painter, trail, i, now, radius) {
       context.lineCap = "butt"; // round ends would show as dots where they overlap
       context.strokeStyle = painter.tone(color, 0, depth);
       context.lineWidth = 0.6 + 1.6 * (1 - age);
-      context.beginPath();
-      context.moveTo(from[0], from[1]);
-      context.lineTo(to[0], to[1]);
-      context.stroke();
+      stroke(context, [from, to]);
       context.globalAlpha = 1;
       context.lineCap = "round";
     });

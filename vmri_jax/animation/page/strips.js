@@ -18,12 +18,11 @@ class Strip {
 
   // The curves, once per size and theme, on a canvas of their own.
   resize(colors, inset) {
-    const { canvas, still, curves, motion } = this, ratio = Math.min(3, window.devicePixelRatio || 1);
+    const { canvas, still, curves, motion } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const [ratio] = [canvas, still].map((one) => sharpen(one, width, height));
     Object.assign(this, { width, height, inset, colors, ratio });
-    for (const one of [canvas, still]) [one.width, one.height] = [width * ratio, height * ratio].map(Math.round);
     const context = still.getContext("2d"), scaled = this.range();
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.lineJoin = "round";
     if (!this.logarithmic) this.line(context, [[inset, scaled(0)], [width - inset, scaled(0)]], "faint", 1);
     for (const [, values, color] of curves) {
@@ -55,9 +54,7 @@ class Strip {
     if (points.length < 2) return;
     context.strokeStyle = this.colors[color];
     context.lineWidth = width;
-    context.beginPath();
-    points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
-    context.stroke();
+    stroke(context, points);
   }
 
   x(time) {
@@ -82,10 +79,9 @@ class Strip {
 
 // Ticks of time under the strips.
 function drawAxis(canvas, motion, colors, inset) {
-  const ratio = Math.min(3, window.devicePixelRatio || 1), [width, height] = [canvas.clientWidth, canvas.clientHeight];
-  [canvas.width, canvas.height] = [width * ratio, height * ratio].map(Math.round);
-  const context = canvas.getContext("2d"), span = motion.last - motion.first;
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight], span = motion.last - motion.first;
+  const context = canvas.getContext("2d");
+  sharpen(canvas, width, height);
   context.fillStyle = context.strokeStyle = colors.ink;
   context.globalAlpha = 0.74;
   context.font = "12px system-ui, sans-serif";

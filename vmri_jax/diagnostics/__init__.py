@@ -1,0 +1,34 @@
+"""What a discrete trajectory should keep, and how to see whether it does."""
+
+from vmri_jax.diagnostics.invariants import (
+    all_constraints,
+    constraint_residual,
+    energy,
+    energy_parts,
+    momentum_map,
+    oscillatory_energies,
+    rotation_about,
+    translation_along,
+    velocity,
+)
+from vmri_jax.diagnostics.linear import frequencies, step_condition, symplectic_defect, tangents
+from vmri_jax.diagnostics.orders import OrderFit, fit_order, observed_order
+
+__all__ = [
+    "OrderFit",
+    "all_constraints",
+    "constraint_residual",
+    "energy",
+    "energy_parts",
+    "fit_order",
+    "frequencies",
+    "momentum_map",
+    "observed_order",
+    "oscillatory_energies",
+    "rotation_about",
+    "step_condition",
+    "symplectic_defect",
+    "tangents",
+    "translation_along",
+    "velocity",
+]

@@ -1,0 +1,101 @@
+"""What a trajectory keeps: energy, momentum maps, constraints."""
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.kernels.cpu import largest
+from vmri_jax.mechanics.state import State, project_momentum
+from vmri_jax.mechanics.system import System
+
+
+def energy_parts(system: System, q_s, q_f, p_s, p_f) -> dict:
+    """Parts of the Hamiltonian ``p . v - T(q, v) + V + W``: "kinetic", "slow" and "fast"."""
+    v_s, v_f = velocity(system, q_s, q_f, p_s, p_f)
+    kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - system.kinetic(q_s, q_f, v_s, v_f, system.params)
+    slow, fast = potentials(system, q_s, q_f)
+    return {"kinetic": kinetic, "slow": slow, "fast": fast}
+
+
+def potentials(system: System, q_s, q_f):
+    """Values of V and W, zero where there is none."""
+    zero = jnp.zeros(())
+    slow = zero if system.slow_potential is None else system.slow_potential(q_s, q_f, system.params)
+    fast = zero if system.fast_potential is None else system.fast_potential(q_f, system.params)
+    return slow, fast
+
+
+def energy(system: System, q_s, q_f, p_s, p_f):
+    """Hamiltonian ``p . v - T(q, v) + V(q_s, q_f) + W(q_f)`` with v the velocity of p.
+
+    Args:
+        system: masses, potentials and their parameters.
+        q_s, q_f: (n_s,) and (n_f,) positions.
+        p_s, p_f: (n_s,) and (n_f,) momenta.
+    """
+    parts = energy_parts(system, q_s, q_f, p_s, p_f)
+    return parts["kinetic"] + parts["slow"] + parts["fast"]
+
+
+def oscillatory_energies(omega, q_f, p_f):
+    """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of unit-mass harmonic oscillators, e.g. the stiff FPU springs."""
+    return (p_f**2 + omega**2 * q_f**2) / 2
+
+
+def constraint_residual(system: System, state: State):
+    """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,).
+
+    Args:
+        system: its constraints; without any both are zero.
+        state: time, positions and momenta.
+    """
+    return jax.vmap(largest)(jnp.stack(all_constraints(system, state)))
+
+
+def all_constraints(system: System, state: State):
+    """Constraints and hidden constraints, ``(g, G v + dg/dt)``, each (n_g + n_gs,): zero on the constraint manifold."""
+    at = state.t, state.q_s, state.q_f
+    v = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    return system.constraints(*at), system.constraint_rates(*at, *v)
+
+
+def velocity(system: System, q_s, q_f, p_s, p_f):
+    """Velocities ``(v_s, v_f)`` of given momenta (inverse Legendre transform, constraints ignored).
+
+    Args:
+        system: its kinetic energy counts.
+        q_s, q_f: (n_s,) and (n_f,) positions, at which masses that depend on them are taken.
+        p_s, p_f: (n_s,) and (n_f,) momenta.
+    """
+    free = system.replace(constraint=None, slow_constraint=None)
+    return project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))[2:]
+
+
+def momentum_map(generator, q_s, q_f, p_s, p_f):
+    """Momentum map ``p . xi(q)`` of a symmetry.
+
+    Args:
+        generator: its infinitesimal generator, ``generator(q_s, q_f) -> (xi_s, xi_f)``.
+        q_s, q_f, p_s, p_f: positions and momenta.
+    """
+    xi_s, xi_f = generator(q_s, q_f)
+    return p_s @ xi_s + p_f @ xi_f
+
+
+def rotation_about(axis):
+    """Generator of rotations of points in R^3 about an axis through the origin, ``xi(q) = axis x q``."""
+    axis = jnp.asarray(axis, dtype=float)
+
+    def generator(q_s, q_f):
+        return tuple(jnp.cross(axis, q.reshape(-1, 3)).reshape(-1) for q in (q_s, q_f))
+
+    return generator
+
+
+def translation_along(direction):
+    """Generator of translations of points in R^3, ``xi(q) = direction`` for every point."""
+    direction = jnp.asarray(direction, dtype=float)
+
+    def generator(q_s, q_f):
+        return tuple(jnp.tile(direction, q.shape[0] // 3) for q in (q_s, q_f))
+
+    return generator

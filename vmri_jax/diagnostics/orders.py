@@ -1,0 +1,60 @@
+"""Orders of convergence that errors show."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class OrderFit(NamedTuple):
+    """An observed order, half the width of its 95 % confidence interval (NaN for two points), and the points fitted."""
+
+    order: float
+    half_width: float
+    points: int
+
+
+STUDENT = (np.nan, 12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23)
+"""Quantiles 0.975 of Student's t distribution for 0, 1, ... degrees of freedom; about 2 beyond."""
+
+
+def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> OrderFit:
+    """Order of convergence: least-squares slope of log error over log step, round-off plateau masked.
+
+    The plateau is where errors stop falling with the step: from the first interval, towards smaller steps, whose slope
+    is less than half the steepest one. Errors within a factor `plateau` of it, or of `floor`, are left out; at least the
+    two largest steps stay.
+
+    Args:
+        macro_dt: (k,) step sizes.
+        errors: (k,) errors; those that are not finite or zero are ignored.
+        plateau: how far above the round-off plateau an error must lie to count.
+        floor: known error of the reference.
+
+    Raises:
+        ValueError: fewer than two usable errors.
+    """
+    h, e = np.asarray(macro_dt, dtype=float), np.asarray(errors, dtype=float)
+    good = np.isfinite(e) & (e > 0)
+    if good.sum() < 2:
+        raise ValueError(f"fit_order: {good.sum()} usable errors of {np.size(errors)}; at least 2 are needed.")
+    order = np.argsort(-h[good])
+    h, e = h[good][order], e[good][order]
+    slopes = np.diff(np.log(e)) / np.diff(np.log(h))
+    flat = np.flatnonzero(slopes < slopes.max() / 2)
+    flat = flat[flat > slopes.argmax()]
+    level = max(floor, e[flat[0] + 1 :].max() if flat.size else 0.0)
+    keep = e > plateau * level
+    keep[:2] = True
+    x, y = np.log(h[keep]), np.log(e[keep])
+    slope, intercept = np.polyfit(x, y, 1)
+    free = len(x) - 2
+    half_width = np.nan
+    if free:
+        scatter = np.sum((y - slope * x - intercept) ** 2) / free / np.sum((x - x.mean()) ** 2)
+        half_width = (STUDENT[free] if free < len(STUDENT) else 2.0) * np.sqrt(scatter)
+    return OrderFit(float(slope), float(half_width), len(x))
+
+
+def observed_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> float:
+    """The order of `fit_order`."""
+    return fit_order(macro_dt, errors, plateau, floor).order
