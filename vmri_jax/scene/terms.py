@@ -15,7 +15,7 @@ from vmri_jax.scene.layout import Rows
 
 
 @dataclass(frozen=True)
-class Term:
+class EffectTerm:
     """The function of an effect on the elements `select` (None: all of them), whose roles lie at `roles`.
 
     `split` names the parameters that have an entry for each element. The function of a `timed` one has the time before its
@@ -29,7 +29,7 @@ class Term:
     split: tuple[str, ...] = ()
     timed: bool = False
 
-    def own(self, params):
+    def params_of(self, params):
         """What the function gets as params."""
         return params[self.name] if self.select is None else choose(params[self.name], self.select, self.split)
 
@@ -39,15 +39,15 @@ class Term:
 
     def value(self, q_s, q_f, params, t=None):
         """Energy or constraint values."""
-        return self.function(*((t,) if self.timed else ()), self.take(q_s, q_f), self.own(params))
+        return self.function(*((t,) if self.timed else ()), self.take(q_s, q_f), self.params_of(params))
 
     def kinetic(self, q_s, q_f, v_s, v_f, params):
         """Velocity-dependent energy."""
-        return self.function(self.take(q_s, q_f), self.take(v_s, v_f), self.own(params))
+        return self.function(self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates, None where there is none."""
-        forces = self.function(t, self.take(q_s, q_f), self.take(v_s, v_f), self.own(params))
+        forces = self.function(t, self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
         shapes = [
             (rows.size,) if rows.single else (sum(run.count for run in rows.runs), rows.size) for rows in self.roles
         ]
@@ -63,7 +63,7 @@ class TangentDamping:
     """``F = -beta K v``, K the Hessian of the energy of some terms."""
 
     name: str
-    terms: tuple[Term, ...]
+    terms: tuple[EffectTerm, ...]
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates."""
@@ -76,9 +76,9 @@ class TangentDamping:
         return tuple(-params[self.name]["stiffness"] * rate for rate in rates)
 
 
-def choose(own, select: Sequence[int], split: Sequence[str]):
+def choose(params, select: Sequence[int], split: Sequence[str]):
     """Parameters of some elements: entries of those in `split` that have one for each element."""
-    return own | {name: pick(own[name], select) for name in split if name in own and jnp.ndim(own[name])}
+    return params | {name: pick(params[name], select) for name in split if name in params and jnp.ndim(params[name])}
 
 
 def pick(values, select: Sequence[int]):
@@ -99,7 +99,7 @@ def total(values: Sequence):
 class SlowPotential:
     """``V(q_s, q_f, params)``, the sum of its terms."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[EffectTerm, ...]
 
     def __call__(self, q_s, q_f, params):
         return total([term.value(q_s, q_f, params) for term in self.terms])
@@ -109,7 +109,7 @@ class SlowPotential:
 class FastPotential:
     """``W(q_f, params)``, the sum of its terms."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[EffectTerm, ...]
 
     def __call__(self, q_f, params):
         return total([term.value(None, q_f, params) for term in self.terms])
@@ -119,7 +119,7 @@ class FastPotential:
 class MicroConstraint:
     """``g(q_s, q_f, params)``, or ``g(t, q_s, q_f, params)``: the values of its terms one after the other."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[EffectTerm, ...]
 
     def __call__(self, *arguments):
         *t, q_s, q_f, params = arguments
@@ -130,7 +130,7 @@ class MicroConstraint:
 class MacroConstraint:
     """``g_s(q_s, params)``, or ``g_s(t, q_s, params)``: the values of its terms one after the other."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[EffectTerm, ...]
 
     def __call__(self, *arguments):
         *t, q_s, params = arguments
@@ -151,7 +151,7 @@ MASS = "mass"
 class KineticEnergy:
     """``T = sum m v^2 / 2`` and the velocity-dependent terms."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[EffectTerm, ...]
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
         mass = params[MASS]
@@ -163,7 +163,7 @@ class KineticEnergy:
 class TotalForce:
     """``F(t, q_s, q_f, v_s, v_f, params)``, the sum of its terms."""
 
-    terms: tuple[Term | TangentDamping, ...]
+    terms: tuple[EffectTerm | TangentDamping, ...]
 
     def __call__(self, t, q_s, q_f, v_s, v_f, params):
         forces = [term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms]

@@ -1,38 +1,36 @@
 """Anchors: points held at a distance of a fixed point, or by a spring to it."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.scene.effect import Effect, groups
-from vmri_jax.scene.effects.geometry import check_points, squeeze, vector_of
-from vmri_jax.scene.effects.links import START
+from vmri_jax.scene.declare import effect_class, names, positive, vector
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.formulas import elastic_energy, elongation, length_defect
 
 
-def radius_defect(q, params):
-    """``g = (|q - a|^2 - l^2) / 2``."""
-    (q,) = q
-    return (jnp.sum((q - params["point"]) ** 2, axis=-1) - params["length"] ** 2) / 2
+class ToPoint(Effect):
+    """What effects between bodies and a point that is given share."""
+
+    def point_at_start(self, params):
+        """Where the point is at t = 0."""
+        return params["point"]
+
+    def rest(self, q, params):
+        """Distance of a body from the point at the start."""
+        (q,) = q
+        return jnp.sqrt(jnp.sum((q - self.point_at_start(params)) ** 2, axis=-1))
+
+    def require_away(self, bodies, advice: str = "move one of them"):
+        """Refuse bodies that start at the point."""
+        away = self.at_start(bodies, self.parameters(bodies))
+        expected = f"bodies must not start there; {advice}"
+        self.require(away > 0, "the distance of a body from its point", away, expected)
 
 
-def anchored_energy(q, params):
-    """``V = sum k/2 (|q - a| - l)^2``; without a length ``sum k/2 |q - a|^2``."""
-    (q,) = q
-    if "length" not in params:
-        return jnp.sum(params["stiffness"] / 2 * jnp.sum((q - params["point"]) ** 2, axis=-1))
-    elongation = jnp.linalg.norm(q - params["point"], axis=-1) - params["length"]
-    return jnp.sum(params["stiffness"] / 2 * elongation**2)
-
-
-@dataclass(frozen=True, eq=False)
-class _ToPoint(Effect):
+class _ToFixedPoint(ToPoint):
     """What anchors to a fixed point share."""
-
-    bodies: Any
-    point: Any
 
     def __post_init__(self):
         super().__post_init__()
@@ -42,32 +40,21 @@ class _ToPoint(Effect):
                 "point that moves take MovingPivot (a rigid link), Guide (the point itself) or MovingAnchor (a spring)."
             )
 
-    def elements(self, bodies):
-        return groups(self.bodies, 1, self.name)
-
-    def distance(self, bodies):
-        """Distance from the point at the start, (n,), or () of a single body."""
-        point = vector_of(self, "point", self.point, bodies)
-        start = squeeze(jnp.stack([bodies[name].position for (name,) in self.elements(bodies)]))
-        return jnp.sqrt(jnp.sum((start - point) ** 2, axis=-1))
-
-    def require_away(self, bodies):
-        """Refuse bodies that start at the point."""
-        away = self.distance(bodies)
-        self.require(
-            away > 0, "the distance of a body from its point", away, "bodies must not start there; move one of them"
-        )
-
-    def anchored(self, kind: str, bodies):
-        """The drawing of links or springs to the points."""
-        points = np.atleast_2d(np.asarray(vector_of(self, "point", self.point, bodies)))
+    def drawing(self, bodies):
+        points = np.atleast_2d(np.asarray(self.parameters(bodies)["point"]))
         pairs = zip(self.elements(bodies), points, strict=True)
         drawn = [(name, point) for (name,), point in pairs if not bodies[name].block]
-        return {"anchors": [{"body": name, "point": point.tolist(), "kind": kind} for name, point in drawn]}
+        return {"anchors": [{"body": name, "point": point.tolist(), "kind": self.drawn_as} for name, point in drawn]}
 
 
-@dataclass(frozen=True, eq=False)
-class Anchor(_ToPoint):
+def rod(q, params):
+    """``g = (|q - a|^2 - l^2) / 2``."""
+    (q,) = q
+    return length_defect(q - params["point"], params["length"])
+
+
+@effect_class
+class Anchor(_ToFixedPoint):
     """Rigid links to fixed points, ``g = (|q - a|^2 - l^2) / 2 = 0``: a pendulum's rod.
 
     The points stay where they are; `MovingPivot` is a rigid link to a point that moves.
@@ -82,33 +69,31 @@ class Anchor(_ToPoint):
         ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
     """
 
-    length: Any = None
+    bodies: Any = names()
+    point: Any = vector()
+    length: Any = positive(default=None, measured=True)
 
     kind = "constraint"
     default_name = "anchors"
-    numbers, vectors = ("length",), ("point",)
-    function = staticmethod(radius_defect)
+    dimensions = (1, 2, 3)
+    drawn_as = "link"
+    function = staticmethod(rod)
 
-    def parameters(self, bodies):
-        length = self.distance(bodies) if self.length is None else jnp.asarray(self.length, dtype=float)
-        return {"point": vector_of(self, "point", self.point, bodies), "length": length}
-
-    def check(self, bodies):
-        super().check(bodies)
-        check_points(self, bodies)
+    def check_parameters(self, bodies):
         self.require_away(bodies)
-        length, start = self.parameters(bodies)["length"], self.distance(bodies)
-        self.require_positive(length=length)
-        if is_concrete((length, start)):
-            right = np.abs(length - start) <= START * np.asarray(length)
-            self.require(right, "length", length, f"the bodies start {np.asarray(start)} from their points")
-
-    def drawing(self, bodies):
-        return self.anchored("link", bodies)
+        super().check_parameters(bodies)
 
 
-@dataclass(frozen=True, eq=False)
-class SpringAnchor(_ToPoint):
+def anchored_energy(q, params):
+    """``V = sum k/2 (|q - a| - l)^2``; without a length ``sum k/2 |q - a|^2``."""
+    (q,) = q
+    if "length" not in params:
+        return jnp.sum(params["stiffness"] / 2 * jnp.sum((q - params["point"]) ** 2, axis=-1))
+    return elastic_energy(params["stiffness"], elongation(q - params["point"], params["length"]))
+
+
+@effect_class
+class SpringAnchor(_ToFixedPoint):
     """Springs to fixed points, ``V = sum k/2 (|q - a| - l)^2``; without a length the well ``sum k/2 |q - a|^2``.
 
     Args:
@@ -122,25 +107,17 @@ class SpringAnchor(_ToPoint):
         ValueError: (of the scene) numbers that are not positive, bodies that start at the point of a spring with a length.
     """
 
-    stiffness: Any
-    length: Any = None
+    bodies: Any = names()
+    point: Any = vector()
+    stiffness: Any = positive()
+    length: Any = positive(default=None)
 
     kind = "potential"
     default_name = "spring_anchors"
-    numbers, vectors = ("stiffness", "length"), ("point",)
+    drawn_as = "spring"
     function = staticmethod(anchored_energy)
 
-    def parameters(self, bodies):
-        given = {"stiffness": self.stiffness} | ({} if self.length is None else {"length": self.length})
-        arrays = {name: jnp.asarray(value, dtype=float) for name, value in given.items()}
-        return arrays | {"point": vector_of(self, "point", self.point, bodies)}
-
-    def check(self, bodies):
-        super().check(bodies)
-        parameters = self.parameters(bodies)
-        self.require_positive(**{name: parameters[name] for name in self.numbers if name in parameters})
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
         if self.length is not None:
             self.require_away(bodies)
-
-    def drawing(self, bodies):
-        return self.anchored("spring", bodies)

@@ -6,12 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.scene.effect import Effect, groups
-from vmri_jax.scene.effects.geometry import check_points, squeeze
-from vmri_jax.scene.effects.links import START
+from vmri_jax.scene.declare import effect_class, names, positive
+from vmri_jax.scene.effect import START, real_tree
+from vmri_jax.scene.effects.anchors import ToPoint
+from vmri_jax.scene.effects.formulas import length_defect
 
 
 @dataclass(frozen=True)
@@ -20,8 +19,8 @@ class _AlongPath:
 
     path: Callable
 
-    def at(self, t, params):
-        """The point."""
+    def point(self, t, params):
+        """``a(t)``."""
         return self.path(t, params["path"])
 
 
@@ -30,7 +29,7 @@ class PullTo(_AlongPath):
 
     def __call__(self, t, q, v, params):
         (q,) = q
-        return (params["stiffness"][..., None] * (self.at(t, params) - q),)
+        return (params["stiffness"][..., None] * (self.point(t, params) - q),)
 
 
 class RadiusDefect(_AlongPath):
@@ -38,19 +37,19 @@ class RadiusDefect(_AlongPath):
 
     def __call__(self, t, q, params):
         (q,) = q
-        return (jnp.sum((q - self.at(t, params)) ** 2, axis=-1) - params["length"] ** 2) / 2
+        return length_defect(q - self.point(t, params), params["length"])
 
 
-class Distance(_AlongPath):
+class Offset(_AlongPath):
     """``g = q - a(t)``."""
 
     def __call__(self, t, q, params):
         (q,) = q
-        return q - self.at(t, params)
+        return q - self.point(t, params)
 
 
-@dataclass(frozen=True, eq=False)
-class _ToPath(Effect):
+@effect_class
+class _ToPath(ToPoint):
     """What effects between bodies and a moving point share.
 
     Args:
@@ -59,40 +58,32 @@ class _ToPath(Effect):
         params: what `path` gets as params.
     """
 
-    bodies: Any
+    bodies: Any = names()
     path: Callable
     params: Any = field(default_factory=dict, kw_only=True)
 
-    def elements(self, bodies):
-        return groups(self.bodies, 1, self.name)
+    dimensions = (1, 2, 3)
 
     def parameters(self, bodies):
-        return {"path": self._of_path()}
+        return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}
 
-    def _of_path(self):
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), self.params)
+    def point_at_start(self, params):
+        return self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
 
-    def away(self, bodies):
-        """How far the bodies start, at t = 0, from the point, (n,), or () of a single body."""
-        point = self.path(jnp.zeros(()), self._of_path())
-        start = squeeze(jnp.stack([bodies[name].position for (name,) in self.elements(bodies)]))
-        return jnp.sqrt(jnp.sum((start - point) ** 2, axis=-1))
-
-    def check(self, bodies):
+    def check_bodies(self, bodies):
         if not callable(self.path):
             raise TypeError(f"{self.name}: path is {self.path!r}; give a function of (t, params).")
-        check_points(self, bodies)
-        shape = jax.eval_shape(lambda params: jnp.asarray(self.path(jnp.zeros(()), params)), self._of_path()).shape
+        super().check_bodies(bodies)
+        shape = jax.eval_shape(lambda: jnp.asarray(self.point_at_start({}))).shape
         for (name,) in self.elements(bodies):
             needed = (bodies[name].size,)
             if shape != needed:
                 raise ValueError(
                     f"{self.name}: path returns shape {shape}; {name} has dimension {needed[0]}, return {needed}."
                 )
-        super().check(bodies)
 
 
-@dataclass(frozen=True, eq=False)
+@effect_class
 class MovingAnchor(_ToPath):
     """Springs to a moving point, ``F = k (a(t) - q)``: an elastic hold, and a force, because it does work.
 
@@ -103,28 +94,21 @@ class MovingAnchor(_ToPath):
         params: what `path` gets as params.
 
     Raises:
+        TypeError: (of the scene) a path that is no function.
         ValueError: (of the scene) a stiffness that is not positive.
     """
 
-    stiffness: Any
+    stiffness: Any = positive()
 
     kind = "force"
     default_name = "moving_anchors"
-    numbers = ("stiffness",)
 
     @property
     def function(self):
         return PullTo(self.path)
 
-    def parameters(self, bodies):
-        return super().parameters(bodies) | {"stiffness": jnp.asarray(self.stiffness, dtype=float)}
 
-    def check(self, bodies):
-        super().check(bodies)
-        self.require_positive(stiffness=self.stiffness)
-
-
-@dataclass(frozen=True, eq=False)
+@effect_class
 class MovingPivot(_ToPath):
     """Rigid links to a moving point, ``g = (|q - a(t)|^2 - l^2) / 2 = 0``: a pendulum on a pivot that is moved.
 
@@ -135,36 +119,26 @@ class MovingPivot(_ToPath):
         params: what `path` gets as params.
 
     Raises:
+        TypeError: (of the scene) a path that is no function.
         ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
     """
 
-    length: Any = None
+    length: Any = positive(default=None, measured=True)
 
     kind = "constraint"
     timed = True
     default_name = "moving_pivots"
-    numbers = ("length",)
 
     @property
     def function(self):
         return RadiusDefect(self.path)
 
-    def parameters(self, bodies):
-        length = self.away(bodies) if self.length is None else jnp.asarray(self.length, dtype=float)
-        return super().parameters(bodies) | {"length": length}
-
-    def check(self, bodies):
-        super().check(bodies)
-        length, start = self.parameters(bodies)["length"], self.away(bodies)
-        what = "the distance of a body from its point"
-        self.require(start > 0, what, start, "bodies must not start there; move one of them, or take Guide")
-        self.require_positive(length=length)
-        if is_concrete((length, start)):
-            right = np.abs(length - start) <= START * np.asarray(length)
-            self.require(right, "length", length, f"the bodies start {np.asarray(start)} from the point")
+    def check_parameters(self, bodies):
+        self.require_away(bodies, "move one of them, or take Guide")
+        super().check_parameters(bodies)
 
 
-@dataclass(frozen=True, eq=False)
+@effect_class
 class Guide(_ToPath):
     """A body whose motion is given, ``g = q - a(t) = 0``; what holds it there does the work that is needed.
 
@@ -174,6 +148,7 @@ class Guide(_ToPath):
         params: what `path` gets as params.
 
     Raises:
+        TypeError: (of the scene) a path that is no function.
         ValueError: (of the scene) a body that does not start there.
     """
 
@@ -183,11 +158,11 @@ class Guide(_ToPath):
 
     @property
     def function(self):
-        return Distance(self.path)
+        return Offset(self.path)
 
-    def check(self, bodies):
-        super().check(bodies)
-        away = self.away(bodies)
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        away = self.at_start(bodies, self.parameters(bodies))
         size = jnp.max(jnp.abs(jnp.stack([bodies[name].position for (name,) in self.elements(bodies)])))
         what = "the distance of the body from its point at t = 0"
         self.require(away <= START * jnp.maximum(size, 1.0), what, away, "it must start there")

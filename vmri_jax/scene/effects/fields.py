@@ -1,0 +1,98 @@
+"""Uniform fields: gravity on masses, a magnetic field on charges that move."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.scene.declare import array, effect_class, names, number
+from vmri_jax.scene.effect import Effect
+
+
+def weight(q, params):
+    """``V = -sum_i m_i g . q_i``, for a number g downwards along the last axis."""
+    (q,), g = q, params["acceleration"]
+    if jnp.ndim(g) == 0:
+        last = q.shape[-1] - 1
+        return g * jnp.sum(params["mass"] * q.reshape(-1)[last :: last + 1])
+    return -jnp.sum(params["mass"] * jnp.sum(g * q, axis=-1))
+
+
+@effect_class
+class Gravity(Effect):
+    """Uniform gravity, ``V = -sum_i m_i g . q_i``.
+
+    Args:
+        acceleration: g, (d,) m/s^2; a number g is that acceleration downwards, along the last axis: (0, ..., -g).
+        bodies: names; all bodies of the scene by default.
+
+    Raises:
+        ValueError: (of the scene) an acceleration of another dimension than a body, a body with several masses.
+    """
+
+    acceleration: Any = array(default=9.81)
+    bodies: Any = names(default=None)
+
+    kind = "potential"
+    default_name = "gravity"
+    masses = ("mass",)
+    function = staticmethod(weight)
+
+    def drawing(self, bodies):
+        up = -np.asarray(self.acceleration, dtype=float)
+        return {"up": up.tolist()} if up.ndim and up.any() else {}
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        shape = self.parameters(bodies)["acceleration"].shape
+        for (name,) in self.elements(bodies):
+            if shape not in ((), (bodies[name].size,)):
+                raise ValueError(
+                    f"{self.name}: acceleration has shape {shape}, {name} has dimension {bodies[name].size}; they must agree."
+                )
+
+
+def magnetic_term(q, v, params):
+    """``L = sum Q/2 v . (B x q)``; in the plane ``L = sum Q B/2 (x v_y - y v_x)``."""
+    (q,), (v,), field = q, v, params["field"]
+    if jnp.ndim(field) == 0:
+        swept = field * (q[..., 0] * v[..., 1] - q[..., 1] * v[..., 0])
+    else:
+        swept = jnp.sum(v * jnp.cross(jnp.broadcast_to(field, q.shape), q), axis=-1)
+    return jnp.sum(params["charge"] / 2 * swept)
+
+
+@effect_class
+class MagneticField(Effect):
+    """Charges in a uniform magnetic field: ``L = sum Q v . A(q)``, ``A = B x q / 2``, hence the force ``Q v x B``.
+
+    It depends on velocities, so that momenta are ``p = m v + Q A``.
+
+    Args:
+        field: B, T, (3,); for bodies in the plane a number, the component out of it.
+        charge: Q, C; one number, or one for each body.
+        bodies: names; all bodies of the scene by default.
+
+    Raises:
+        ValueError: (of the scene) a field that does not fit the dimension of the bodies.
+    """
+
+    field: Any = array()
+    charge: Any = number()
+    bodies: Any = names(default=None)
+
+    kind = "kinetic"
+    default_name = "magnetic_field"
+    dimensions = (2, 3)
+    function = staticmethod(magnetic_term)
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        shape = self.parameters(bodies)["field"].shape
+        for (name,) in self.elements(bodies):
+            needed = () if bodies[name].size == 2 else (3,)
+            if shape != needed:
+                raise ValueError(
+                    f"{self.name}: field has shape {shape} and {name} has dimension {bodies[name].size}; give a number in the "
+                    "plane, a vector (3,) in space."
+                )
