@@ -83,13 +83,21 @@ def test_body(arguments, message):
             "links: the distance of bob and x is 0.0; they must not start at the same point",
         ),
         ([A, B], [RigidLink(("bob", "tip"), -1.0)], "links: length is -1.0; it must be positive"),
-        ([A, B], [RigidLink(("bob", "tip"), 2.0)], "links: the link bob-tip is 2 long; bob and tip start 1 apart"),
+        (
+            [A, B],
+            [RigidLink(("bob", "tip"), 2.0)],
+            "links: length of bob-tip is 2; it starts as 1; give that, or move a body",
+        ),
         (
             [A, B],
             [Guide("tip", still)],
             r"guides: the distance of the body from its point at t = 0 is .*; it must start there",
         ),
-        ([A, B], [MovingPivot("tip", still, 7.0)], "moving_pivots: length is 7.0; the bodies start .* from the point"),
+        (
+            [A, B],
+            [MovingPivot("tip", still, 7.0)],
+            "moving_pivots: length of tip is 7; it starts as .*; give that, or move a body",
+        ),
         ([A, B], [MovingPivot("tip", still, -2.0)], "moving_pivots: length is -2.0; it must be positive"),
         (SPACE[:1], [MovingPivot("w", still)], r"moving_pivots: path returns shape \(2,\); w has dimension 3"),
         ([A, SPACE[0]], [RigidLink(("bob", "w"))], r"links: bodies of different dimension \(bob 2, w 3\)"),
@@ -104,7 +112,11 @@ def test_body(arguments, message):
             "anchors: the distance of a body from its point is 0.0; bodies must not start there",
         ),
         ([A], [Anchor("bob", [0.0, 0.0, 1.0])], r"anchors: point has shape \(3,\); its bodies have dimension 2"),
-        ([B], [Anchor("tip", [0.0, 0.0], 3.0)], "anchors: length is 3.0; the bodies start 1.0 from their points"),
+        (
+            [B],
+            [Anchor("tip", [0.0, 0.0], 3.0)],
+            "anchors: length of tip is 3; it starts as 1; give that, or move a body",
+        ),
         (
             [Body("block", 1.0, np.ones(5)), Body("b", 1.0, np.zeros(5))],
             [Spring(("block", "b"), 1.0)],

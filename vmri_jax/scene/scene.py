@@ -15,7 +15,7 @@ from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect, unknown
 from vmri_jax.scene.layout import Place, join, layout
-from vmri_jax.scene.ledger import Ledger, ledger
+from vmri_jax.scene.ledger import Contents, Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
@@ -162,7 +162,7 @@ class Scene:
             macro_dt: step that is measured; by default micro steps of a tenth of the fastest vibration's radian.
             measure: compile the scene without each effect in turn and time it; without, the ledger costs nothing.
         """
-        return ledger(self, scheme, macro_dt, measure)
+        return ledger(Contents(self.by_name, self.sorting, self.places, self.start), scheme, macro_dt, measure)
 
     def drawing(self) -> dict[str, list]:
         """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.scene.drawing`."""

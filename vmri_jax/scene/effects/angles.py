@@ -30,11 +30,6 @@ def angle_between(q, params=None):
     return jnp.arccos(cosine(q))
 
 
-def angle_energy(q, params):
-    """``V = sum k/2 (theta - theta_0)^2``."""
-    return elastic_energy(params["stiffness"], angle_between(q) - params["angle"])
-
-
 @effect_class
 class Angle(_AmongPoints):
     """Angles with a rest value, ``V = sum k/2 (theta - theta_0)^2``, theta at b between a and c.
@@ -54,8 +49,11 @@ class Angle(_AmongPoints):
     angle: Any = number(default=None, measured=True)
 
     default_name = "angles"
-    function = staticmethod(angle_energy)
     rest = staticmethod(angle_between)
+
+    @staticmethod
+    def function(q, params):
+        return elastic_energy(params["stiffness"], angle_between(q) - params["angle"])
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
@@ -63,11 +61,6 @@ class Angle(_AmongPoints):
         inside = (angle > 1e-3) & (angle < np.pi - 1e-3)
         expected = "it must lie between 0 and pi, where the energy is smooth; for pi take Bending"
         self.require(inside, "angle", angle, expected)
-
-
-def bending_energy(q, params):
-    """``V = sum k (1 + cos theta)``."""
-    return jnp.sum(params["stiffness"] * (1 + cosine(q)))
 
 
 @effect_class
@@ -88,17 +81,10 @@ class Bending(_AmongPoints):
     stiffness: Any = positive()
 
     default_name = "bending"
-    function = staticmethod(bending_energy)
 
-
-def torsion_energy(q, params):
-    """``V = sum k (1 - cos(m (phi - phi_0)))``, phi the dihedral angle of a-b-c-d."""
-    a, b, c, d = q
-    first, axis, last = b - a, c - b, d - c
-    left, right = jnp.cross(first, axis), jnp.cross(axis, last)
-    sine = jnp.linalg.norm(axis, axis=-1) * jnp.sum(first * right, axis=-1)
-    phi = jnp.arctan2(sine, jnp.sum(left * right, axis=-1))
-    return jnp.sum(params["stiffness"] * (1 - jnp.cos(params["multiplicity"] * (phi - params["angle"]))))
+    @staticmethod
+    def function(q, params):
+        return jnp.sum(params["stiffness"] * (1 + cosine(q)))
 
 
 @effect_class
@@ -125,7 +111,15 @@ class Torsion(_AmongPoints):
 
     default_name = "torsion"
     dimensions = (3,)
-    function = staticmethod(torsion_energy)
+
+    @staticmethod
+    def function(q, params):
+        a, b, c, d = q
+        first, axis, last = b - a, c - b, d - c
+        left, right = jnp.cross(first, axis), jnp.cross(axis, last)
+        sine = jnp.linalg.norm(axis, axis=-1) * jnp.sum(first * right, axis=-1)
+        phi = jnp.arctan2(sine, jnp.sum(left * right, axis=-1))
+        return jnp.sum(params["stiffness"] * (1 - jnp.cos(params["multiplicity"] * (phi - params["angle"]))))
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)

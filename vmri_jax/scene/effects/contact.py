@@ -39,12 +39,6 @@ class _Contact(Effect):
         return {"radii": [[name, float(r)] for (name,), r in zip(elements, radii, strict=True) if r > 0]}
 
 
-def plane_energy(q, params):
-    """`penalty` of ``gap = n . (q - p) - r``."""
-    (q,) = q
-    return penalty(jnp.sum(params["normal"] * (q - params["point"]), axis=-1) - params["radius"], params)
-
-
 @effect_class
 class PlaneContact(_Contact):
     """Contact with the side of a plane that its normal points to: ``V = k/2 sum d^2``, ``d = s log(1 + exp(-gap / s))``.
@@ -68,7 +62,11 @@ class PlaneContact(_Contact):
     normal: Any = common()
 
     default_name = "plane_contact"
-    function = staticmethod(plane_energy)
+
+    @staticmethod
+    def function(q, params):
+        (q,) = q
+        return penalty(jnp.sum(params["normal"] * (q - params["point"]), axis=-1) - params["radius"], params)
 
     def parameters(self, bodies):
         params = super().parameters(bodies)
@@ -83,13 +81,6 @@ class PlaneContact(_Contact):
         params = self.parameters(bodies)
         plane = {name: np.asarray(params[name]).tolist() for name in ("point", "normal")}
         return super().drawing(bodies) | {"planes": [plane]}
-
-
-def sphere_energy(q, params):
-    """`penalty` of ``gap = |q - c| - R - r``."""
-    (q,) = q
-    distance = jnp.sqrt(jnp.sum((q - params["center"]) ** 2, axis=-1))
-    return penalty(distance - params["sphere_radius"] - params["radius"], params)
 
 
 @effect_class
@@ -112,7 +103,12 @@ class SphereContact(_Contact):
     sphere_radius: Any = array(sign="positive")
 
     default_name = "sphere_contact"
-    function = staticmethod(sphere_energy)
+
+    @staticmethod
+    def function(q, params):
+        (q,) = q
+        distance = jnp.sqrt(jnp.sum((q - params["center"]) ** 2, axis=-1))
+        return penalty(distance - params["sphere_radius"] - params["radius"], params)
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)

@@ -6,14 +6,9 @@ import jax.numpy as jnp
 
 from vmri_jax.scene.declare import array, effect_class, names, positive
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.bases import BetweenPoints
 from vmri_jax.scene.effects.formulas import norm
 from vmri_jax.scene.terms import TangentDamping
-
-
-def linear_damping(t, q, v, params):
-    """``F = -c v``."""
-    (v,) = v
-    return (-params["coefficient"][..., None] * v,)
 
 
 @effect_class
@@ -33,13 +28,11 @@ class LinearDamping(Effect):
 
     kind = "force"
     default_name = "damping"
-    function = staticmethod(linear_damping)
 
-
-def quadratic_drag(t, q, v, params):
-    """``F = -c |v| v``."""
-    (v,) = v
-    return (-(params["coefficient"] * norm(v))[..., None] * v,)
+    @staticmethod
+    def function(t, q, v, params):
+        (v,) = v
+        return (-params["coefficient"][..., None] * v,)
 
 
 @effect_class
@@ -59,20 +52,15 @@ class QuadraticDrag(Effect):
 
     kind = "force"
     default_name = "drag"
-    function = staticmethod(quadratic_drag)
 
-
-def dashpot(t, q, v, params):
-    """``F_b = -c ((v_b - v_a) . n) n = -F_a``, n the direction from a to b."""
-    (a, b), (v_a, v_b) = q, v
-    along = b - a
-    rate = jnp.sum((v_b - v_a) * along, axis=-1) / jnp.sum(along**2, axis=-1)
-    force = -(params["coefficient"] * rate)[..., None] * along
-    return -force, force
+    @staticmethod
+    def function(t, q, v, params):
+        (v,) = v
+        return (-(params["coefficient"] * norm(v))[..., None] * v,)
 
 
 @effect_class
-class Dashpot(Effect):
+class Dashpot(BetweenPoints):
     """Dampers between points, against the change of their distance: ``F_b = -c ((v_b - v_a) . n) n = -F_a``.
 
     Args:
@@ -83,20 +71,18 @@ class Dashpot(Effect):
         ValueError: (of the scene) a coefficient that is not positive, ends at one point at the start.
     """
 
-    between: Any = names(2)
     coefficient: Any = positive()
 
     kind = "force"
     default_name = "dashpots"
-    dimensions = (1, 2, 3)
-    apart = True
-    function = staticmethod(dashpot)
 
-
-def mass_damping(t, q, v, params):
-    """``F = -alpha m v``."""
-    (v,) = v
-    return (-(params["mass"] * params["mass_of"])[..., None] * v,)
+    @staticmethod
+    def function(t, q, v, params):
+        (a, b), (v_a, v_b) = q, v
+        along = b - a
+        rate = jnp.sum((v_b - v_a) * along, axis=-1) / jnp.sum(along**2, axis=-1)
+        force = -(params["coefficient"] * rate)[..., None] * along
+        return -force, force
 
 
 @effect_class
@@ -121,7 +107,11 @@ class RayleighDamping(Effect):
 
     kind = "force"
     default_name = "rayleigh_damping"
-    function = staticmethod(mass_damping)
+
+    @staticmethod
+    def function(t, q, v, params):
+        (v,) = v
+        return (-(params["mass"] * params["mass_of"])[..., None] * v,)
 
     @property
     def masses(self):

@@ -8,11 +8,7 @@ import jax.numpy as jnp
 
 from vmri_jax.scene.declare import effect_class, names, number, positive, vector
 from vmri_jax.scene.effect import Effect, real_tree
-
-
-def constant_force(t, q, v, params):
-    """``F = f``."""
-    return (params["force"],)
+from vmri_jax.scene.effects.bases import BetweenPoints
 
 
 @effect_class
@@ -32,12 +28,10 @@ class ConstantForce(Effect):
 
     kind = "force"
     default_name = "constant_force"
-    function = staticmethod(constant_force)
 
-
-def harmonic_force(t, q, v, params):
-    """``F = f cos(w t + phi)``."""
-    return (params["amplitude"] * jnp.cos(params["frequency"] * t + params["phase"])[..., None],)
+    @staticmethod
+    def function(t, q, v, params):
+        return (params["force"],)
 
 
 @effect_class
@@ -61,7 +55,10 @@ class HarmonicDrive(Effect):
 
     kind = "force"
     default_name = "harmonic_drive"
-    function = staticmethod(harmonic_force)
+
+    @staticmethod
+    def function(t, q, v, params):
+        return (params["amplitude"] * jnp.cos(params["frequency"] * t + params["phase"])[..., None],)
 
 
 @dataclass(frozen=True)
@@ -100,15 +97,8 @@ class Drive(Effect):
         return real_tree(f"{self.name}: params", self.params)
 
 
-def follower_force(t, q, v, params):
-    """``F = f (q_b - q_a) / |q_b - q_a|`` on b."""
-    a, b = q
-    direction = (b - a) / jnp.linalg.norm(b - a, axis=-1, keepdims=True)
-    return jnp.zeros_like(a), params["force"][..., None] * direction
-
-
 @effect_class
-class FollowerForce(Effect):
+class FollowerForce(BetweenPoints):
     """A force on b that turns with the line from a to b: ``F = f (q_b - q_a) / |q_b - q_a|``, a jet at the end of a rod.
 
     Args:
@@ -119,11 +109,13 @@ class FollowerForce(Effect):
         ValueError: (of the scene) ends at one point at the start.
     """
 
-    between: Any = names(2)
     force: Any = number()
 
     kind = "force"
     default_name = "follower_force"
-    dimensions = (1, 2, 3)
-    apart = True
-    function = staticmethod(follower_force)
+
+    @staticmethod
+    def function(t, q, v, params):
+        a, b = q
+        direction = (b - a) / jnp.linalg.norm(b - a, axis=-1, keepdims=True)
+        return jnp.zeros_like(a), params["force"][..., None] * direction

@@ -9,15 +9,6 @@ from vmri_jax.scene.declare import array, effect_class, names, number
 from vmri_jax.scene.effect import Effect
 
 
-def weight(q, params):
-    """``V = -sum_i m_i g . q_i``, for a number g downwards along the last axis."""
-    (q,), g = q, params["acceleration"]
-    if jnp.ndim(g) == 0:
-        last = q.shape[-1] - 1
-        return g * jnp.sum(params["mass"] * q.reshape(-1)[last :: last + 1])
-    return -jnp.sum(params["mass"] * jnp.sum(g * q, axis=-1))
-
-
 @effect_class
 class Gravity(Effect):
     """Uniform gravity, ``V = -sum_i m_i g . q_i``.
@@ -36,7 +27,14 @@ class Gravity(Effect):
     kind = "potential"
     default_name = "gravity"
     masses = ("mass",)
-    function = staticmethod(weight)
+
+    @staticmethod
+    def function(q, params):
+        (q,), g = q, params["acceleration"]
+        if jnp.ndim(g) == 0:
+            last = q.shape[-1] - 1
+            return g * jnp.sum(params["mass"] * q.reshape(-1)[last :: last + 1])
+        return -jnp.sum(params["mass"] * jnp.sum(g * q, axis=-1))
 
     def drawing(self, bodies):
         up = -np.asarray(self.acceleration, dtype=float)
@@ -50,16 +48,6 @@ class Gravity(Effect):
                 raise ValueError(
                     f"{self.name}: acceleration has shape {shape}, {name} has dimension {bodies[name].size}; they must agree."
                 )
-
-
-def magnetic_term(q, v, params):
-    """``L = sum Q/2 v . (B x q)``; in the plane ``L = sum Q B/2 (x v_y - y v_x)``."""
-    (q,), (v,), field = q, v, params["field"]
-    if jnp.ndim(field) == 0:
-        swept = field * (q[..., 0] * v[..., 1] - q[..., 1] * v[..., 0])
-    else:
-        swept = jnp.sum(v * jnp.cross(jnp.broadcast_to(field, q.shape), q), axis=-1)
-    return jnp.sum(params["charge"] / 2 * swept)
 
 
 @effect_class
@@ -84,7 +72,15 @@ class MagneticField(Effect):
     kind = "kinetic"
     default_name = "magnetic_field"
     dimensions = (2, 3)
-    function = staticmethod(magnetic_term)
+
+    @staticmethod
+    def function(q, v, params):
+        (q,), (v,), field = q, v, params["field"]
+        if jnp.ndim(field) == 0:
+            swept = field * (q[..., 0] * v[..., 1] - q[..., 1] * v[..., 0])
+        else:
+            swept = jnp.sum(v * jnp.cross(jnp.broadcast_to(field, q.shape), q), axis=-1)
+        return jnp.sum(params["charge"] / 2 * swept)
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)

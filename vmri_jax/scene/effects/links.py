@@ -2,19 +2,13 @@
 
 from typing import Any
 
-from vmri_jax.scene.declare import effect_class, names, positive
-from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.formulas import distance, length_defect
-
-
-def link(q, params):
-    """``g = (|q_b - q_a|^2 - l^2) / 2``."""
-    a, b = q
-    return length_defect(b - a, params["length"])
+from vmri_jax.scene.declare import effect_class, positive
+from vmri_jax.scene.effects.bases import BetweenPoints
+from vmri_jax.scene.effects.formulas import length_defect
 
 
 @effect_class
-class RigidLink(Effect):
+class RigidLink(BetweenPoints):
     """Massless rigid links, ``g = (|q_b - q_a|^2 - l^2) / 2 = 0``.
 
     A link between slow bodies is held at the macro nodes, one that touches a fast body at the micro nodes.
@@ -28,13 +22,13 @@ class RigidLink(Effect):
             the start, links that together are redundant.
     """
 
-    between: Any = names(2)
     length: Any = positive(default=None, measured=True)
 
     kind = "constraint"
     default_name = "links"
-    dimensions = (1, 2, 3)
-    apart = True
     drawn_as = "link"
-    function = staticmethod(link)
-    rest = staticmethod(distance)
+
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        return length_defect(b - a, params["length"])

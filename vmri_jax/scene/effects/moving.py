@@ -2,67 +2,42 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.scene.declare import effect_class, names, positive
+from vmri_jax.scene.declare import effect_class, positive
 from vmri_jax.scene.effect import START, real_tree
-from vmri_jax.scene.effects.anchors import ToPoint
+from vmri_jax.scene.effects.bases import ToPoint
 from vmri_jax.scene.effects.formulas import length_defect
 
 
 @dataclass(frozen=True)
-class _AlongPath:
-    """A function of an effect with a path ``a(t)``; compared by value."""
+class AlongPath:
+    """A formula with the point of a path, ``formula(a(t), q, ..., params)``, as a function of time; compared by value."""
 
+    formula: Callable
     path: Callable
 
-    def point(self, t, params):
-        """``a(t)``."""
-        return self.path(t, params["path"])
-
-
-class PullTo(_AlongPath):
-    """``F = k (a(t) - q)``, towards a moving point."""
-
-    def __call__(self, t, q, v, params):
-        (q,) = q
-        return (params["stiffness"][..., None] * (self.point(t, params) - q),)
-
-
-class RadiusDefect(_AlongPath):
-    """``g = (|q - a(t)|^2 - l^2) / 2``."""
-
-    def __call__(self, t, q, params):
-        (q,) = q
-        return length_defect(q - self.point(t, params), params["length"])
-
-
-class Offset(_AlongPath):
-    """``g = q - a(t)``."""
-
-    def __call__(self, t, q, params):
-        (q,) = q
-        return q - self.point(t, params)
+    def __call__(self, t, *arguments):
+        return self.formula(self.path(t, arguments[-1]["path"]), *arguments)
 
 
 @effect_class
 class _ToPath(ToPoint):
-    """What effects between bodies and a moving point share.
+    """What effects between bodies and a moving point share: ``formula(point, q, ..., params)`` at the point of the path."""
 
-    Args:
-        bodies: a name, or a list of names.
-        path: ``path(t, params) -> (d,)``, the point; define it at module level.
-        params: what `path` gets as params.
-    """
-
-    bodies: Any = names()
     path: Callable
     params: Any = field(default_factory=dict, kw_only=True)
 
+    formula: ClassVar[Any]
     dimensions = (1, 2, 3)
+    timed = True
+
+    @property
+    def function(self):
+        return AlongPath(self.formula, self.path)
 
     def parameters(self, bodies):
         return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}
@@ -103,9 +78,10 @@ class MovingAnchor(_ToPath):
     kind = "force"
     default_name = "moving_anchors"
 
-    @property
-    def function(self):
-        return PullTo(self.path)
+    @staticmethod
+    def formula(point, q, v, params):
+        (q,) = q
+        return (params["stiffness"][..., None] * (point - q),)
 
 
 @effect_class
@@ -126,12 +102,12 @@ class MovingPivot(_ToPath):
     length: Any = positive(default=None, measured=True)
 
     kind = "constraint"
-    timed = True
     default_name = "moving_pivots"
 
-    @property
-    def function(self):
-        return RadiusDefect(self.path)
+    @staticmethod
+    def formula(point, q, params):
+        (q,) = q
+        return length_defect(q - point, params["length"])
 
     def check_parameters(self, bodies):
         self.require_away(bodies, "move one of them, or take Guide")
@@ -153,12 +129,12 @@ class Guide(_ToPath):
     """
 
     kind = "constraint"
-    timed = True
     default_name = "guides"
 
-    @property
-    def function(self):
-        return Offset(self.path)
+    @staticmethod
+    def formula(point, q, params):
+        (q,) = q
+        return q - point
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)

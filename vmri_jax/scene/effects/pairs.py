@@ -11,13 +11,6 @@ from vmri_jax.scene.effect import Effect, real_tree, squeeze
 from vmri_jax.scene.effects.formulas import distance
 
 
-def attraction(q, params):
-    """``V = -G sum m_a m_b / sqrt(|q_a - q_b|^2 + s^2)``."""
-    a, b = q
-    softened = jnp.sqrt(jnp.sum((b - a) ** 2, axis=-1) + params["softening"] ** 2)
-    return -params["constant"] * jnp.sum(params["mass_a"] * params["mass_b"] / softened)
-
-
 @effect_class
 class NBodyGravity(Effect):
     """Newton's gravity between bodies, ``V = -G sum_{a<b} m_a m_b / sqrt(|q_a - q_b|^2 + s^2)``.
@@ -38,16 +31,16 @@ class NBodyGravity(Effect):
     kind = "potential"
     default_name = "nbody_gravity"
     masses = ("mass_a", "mass_b")
-    function = staticmethod(attraction)
+
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        softened = jnp.sqrt(jnp.sum((b - a) ** 2, axis=-1) + params["softening"] ** 2)
+        return -params["constant"] * jnp.sum(params["mass_a"] * params["mass_b"] / softened)
 
     @property
     def apart(self):
         return not (is_concrete(self.softening) and np.all(np.asarray(self.softening) > 0))
-
-
-def coulomb_energy(q, params):
-    """``V = C sum Q_a Q_b / |q_b - q_a|``."""
-    return params["constant"] * jnp.sum(params["charge_a"] * params["charge_b"] / distance(q))
 
 
 @effect_class
@@ -72,7 +65,10 @@ class Coulomb(Effect):
     dimensions = (1, 2, 3)
     apart = True
     derived = ("charge_a", "charge_b")
-    function = staticmethod(coulomb_energy)
+
+    @staticmethod
+    def function(q, params):
+        return params["constant"] * jnp.sum(params["charge_a"] * params["charge_b"] / distance(q))
 
     def elements(self, bodies):
         pairs = super().elements(self.charges if self.between is None else bodies)
@@ -86,13 +82,6 @@ class Coulomb(Effect):
         roles = zip(self.derived, zip(*self.elements(bodies), strict=True), strict=True)
         of_roles = {name: squeeze(jnp.stack([charges[body] for body in role])) for name, role in roles}
         return super().parameters(bodies) | of_roles
-
-
-def lennard_jones_energy(q, params):
-    """``V = 4 eps sum ((s/r)^12 - (s/r)^6)``."""
-    a, b = q
-    sixth = (params["distance"] ** 2 / jnp.sum((b - a) ** 2, axis=-1)) ** 3
-    return jnp.sum(4 * params["depth"] * (sixth**2 - sixth))
 
 
 @effect_class
@@ -116,4 +105,9 @@ class LennardJones(Effect):
     default_name = "lennard_jones"
     dimensions = (1, 2, 3)
     apart = True
-    function = staticmethod(lennard_jones_energy)
+
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        sixth = (params["distance"] ** 2 / jnp.sum((b - a) ** 2, axis=-1)) ** 3
+        return jnp.sum(4 * params["depth"] * (sixth**2 - sixth))

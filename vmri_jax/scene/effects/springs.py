@@ -4,29 +4,13 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.declare import array, effect_class, names, positive
-from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.formulas import distance, elastic_energy, elongation
-
-
-class _BetweenPoints(Effect):
-    """What springs between points share."""
-
-    kind = "potential"
-    dimensions = (1, 2, 3)
-    apart = True
-    drawn_as = "spring"
-    rest = staticmethod(distance)
-
-
-def linear_energy(q, params):
-    """``V = sum k/2 e^2``, ``e = |q_b - q_a| - l``."""
-    a, b = q
-    return elastic_energy(params["stiffness"], elongation(b - a, params["length"]))
+from vmri_jax.scene.declare import array, effect_class, positive
+from vmri_jax.scene.effects.bases import BetweenPoints
+from vmri_jax.scene.effects.formulas import elastic_energy, elongation
 
 
 @effect_class
-class Spring(_BetweenPoints):
+class Spring(BetweenPoints):
     """Linear springs, ``V = sum k/2 (|q_b - q_a| - l)^2``.
 
     Args:
@@ -38,25 +22,21 @@ class Spring(_BetweenPoints):
         ValueError: (of the scene) numbers that are not positive, ends at one point at the start.
     """
 
-    between: Any = names(2)
     stiffness: Any = positive()
     length: Any = positive(default=None, measured=True)
 
+    kind = "potential"
+    drawn_as = "spring"
     default_name = "springs"
-    function = staticmethod(linear_energy)
 
-
-def polynomial_energy(q, params):
-    """``V = sum_j k_j e^(j+1) / (j+1)``."""
-    a, b = q
-    e, energy = elongation(b - a, params["length"]), 0.0
-    for j in range(params["coefficients"].shape[0], 0, -1):
-        energy = (energy + params["coefficients"][j - 1] / (j + 1)) * e
-    return jnp.sum(energy * e)
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        return elastic_energy(params["stiffness"], elongation(b - a, params["length"]))
 
 
 @effect_class
-class NonlinearSpring(_BetweenPoints):
+class NonlinearSpring(BetweenPoints):
     """Springs whose force is a polynomial of the elongation ``e = |q_b - q_a| - l``: ``k_1 e + k_2 e^2 + k_3 e^3 + ...``
 
     ``V = sum_j k_j e^(j+1) / (j+1)``; (k, 0, k_3) is a Duffing spring, stiffening for k_3 > 0.
@@ -70,12 +50,20 @@ class NonlinearSpring(_BetweenPoints):
         ValueError: (of the scene) no coefficients, a length that is not positive, ends at one point at the start.
     """
 
-    between: Any = names(2)
     coefficients: Any = array()
     length: Any = positive(default=None, measured=True)
 
+    kind = "potential"
+    drawn_as = "spring"
     default_name = "nonlinear_springs"
-    function = staticmethod(polynomial_energy)
+
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        e, energy = elongation(b - a, params["length"]), 0.0
+        for j in range(params["coefficients"].shape[0], 0, -1):
+            energy = (energy + params["coefficients"][j - 1] / (j + 1)) * e
+        return jnp.sum(energy * e)
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
