@@ -27,8 +27,8 @@ def real_array(name: str, value, ndim: int | None = None):
     return array
 
 
-def require_double(name: str, value) -> None:
-    """Refuse arrays of fewer than 64 bits in a pytree: the digits that they lack cannot be had back.
+def double_array(name: str, value):
+    """`real_array` of numbers in double precision: the digits that an array of float32 lacks cannot be had back.
 
     Raises:
         ValueError: an array of float32 or float16, as JAX makes them before its 64-bit mode is switched on.
@@ -39,3 +39,4 @@ def require_double(name: str, value) -> None:
                 f"{name} has dtype {leaf.dtype}; give float64. JAX makes arrays of float32 until 64-bit mode is switched on: "
                 'call jax.config.update("jax_enable_x64", True) before any array is made.'
             )
+    return real_array(name, value)

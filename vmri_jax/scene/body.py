@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array, require_double
+from vmri_jax.mechanics.arrays import double_array, is_concrete
 
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3
@@ -60,7 +60,7 @@ class Body:
                 f"Body {self.name}: mass has shape {mass.shape}; give one number, or one for each of {position.size} coordinates."
             )
         if is_concrete(mass) and not np.all(mass > 0):
-            raise ValueError(f"Body {self.name}: mass is {np.asarray(mass)}; every mass must be positive.")
+            raise ValueError(f"Body {self.name}: mass is {mass}; every mass must be positive.")
         if self.radius is not None and is_concrete(self.radius) and not 0 < self.radius < np.inf:
             raise ValueError(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
         block = self.block or position.size > LARGEST_POINT
@@ -68,16 +68,13 @@ class Body:
             object.__setattr__(self, name, value)
 
     def _numbers(self, name: str, given):
-        """Numbers as an array of float64, of NumPy where they are not traced, so that the mode of JAX does not matter."""
-        what = f"Body {self.name}: {name}"
-        require_double(what, given)
-        value = real_array(what, given)
+        """Numbers as an array of float64, of NumPy where they are not traced: so the mode of JAX does not matter."""
+        value = double_array(f"Body {self.name}: {name}", given)
         if not is_concrete(value):
             return value
-        value = np.asarray(value)
         if not np.isfinite(value).all():
-            raise ValueError(f"{what} is {value}, which is not finite.")
-        return value
+            raise ValueError(f"Body {self.name}: {name} is {np.asarray(value)}, which is not finite.")
+        return np.asarray(value)
 
     def _vector(self, name: str, given):
         value = self._numbers(name, given)

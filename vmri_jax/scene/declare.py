@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeVar, dataclass_transform
 from vmri_jax.scene.body import Body
 
 Elements = tuple[tuple[str, ...], ...]
-Sign = Literal["", "positive", "not negative"]
+Sign = Literal["", "positive", "at least zero"]
 Class = TypeVar("Class")
 
 
@@ -66,13 +66,15 @@ class Parameter:
     Args:
         shape: "number", one for all elements, (), or one for each, (n,); "vector", likewise (d,) or (n, d), and repeated;
             "common", a vector (d,) for all elements alike; "array", of any shape, for all elements alike.
-        sign: "positive", "not negative", or "" for any.
+        sign: "positive", "at least zero", or "" for any.
         measured: None stands for the value at the start, see `Effect.rest`. Otherwise a field that is None is left out.
+        may_be_number: a number () is allowed instead of a common vector.
     """
 
     shape: Literal["number", "vector", "common", "array"]
     sign: Sign = ""
     measured: bool = False
+    may_be_number: bool = False
 
 
 def names(count: int = 1, *, default: Any = MISSING, pairs: bool = False) -> Any:
@@ -95,9 +97,9 @@ def vector(*, default: Any = MISSING) -> Any:
     return _parameter(default, Parameter("vector"))
 
 
-def common(*, default: Any = MISSING) -> Any:
+def common(*, default: Any = MISSING, may_be_number: bool = False) -> Any:
     """One vector, the same for all elements."""
-    return _parameter(default, Parameter("common"))
+    return _parameter(default, Parameter("common", may_be_number=may_be_number))
 
 
 def array(*, default: Any = MISSING, sign: Sign = "") -> Any:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array, require_double
+from vmri_jax.mechanics.arrays import double_array, is_concrete
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.declare import Elements, Parameter, effect_class
 from vmri_jax.scene.layout import Place, Rows
@@ -59,7 +59,7 @@ class Effect(ABC):
     same_size: ClassVar[bool] = True
     """All bodies of an element have the same dimension."""
     apart: ClassVar[bool] = False
-    """Neighbouring bodies of an element must not start at one point."""
+    """Neighbouring bodies of an element, or a body and the point it is tied to, must not start at one place."""
     masses: ClassVar[tuple[str, ...]] = ()
     """The masses of the bodies are parameters of these names, role by role."""
     derived: ClassVar[tuple[str, ...]] = ()
@@ -153,11 +153,11 @@ class Effect(ABC):
                 self._check_sizes(element, bodies)
         if any(parameter.shape == "vector" for parameter in self.declared.values()):
             self._check_sizes([element[0] for element in elements], bodies)
-        if self.apart:
-            self.require_apart(bodies)
 
     def check_parameters(self, bodies: Mapping[str, Body]) -> None:
-        """Refuse parameters of another shape or sign, that are not finite, or that are not what a constraint keeps."""
+        """Refuse bodies at one place, parameters of another shape or sign, that are not finite, or that are not what a constraint keeps."""
+        if self.apart:
+            self.require_apart(bodies)
         params = self.parameters(bodies)
         for name, value in params.items():
             for leaf in jax.tree.leaves(value):
@@ -222,17 +222,12 @@ class Effect(ABC):
 
     def _array(self, name: str, parameter: Parameter, bodies: Mapping[str, Body]):
         """A declared parameter as the array that the function gets."""
-        given, what = getattr(self, name), f"{self.name}: {name}"
-        require_double(what, given)
-        value = jnp.asarray(real_array(what, given))
-        if parameter.shape in ("number", "array"):
+        value = jnp.asarray(double_array(f"{self.name}: {name}", getattr(self, name)))
+        if parameter.shape in ("number", "array") or parameter.may_be_number:
             return value
-        value = jnp.atleast_1d(value)
-        return self._repeated(name, value, bodies) if parameter.shape == "vector" else value
-
-    def _repeated(self, name: str, value: jax.Array, bodies: Mapping[str, Body]):
-        """A vector for every element, (n, d), of a single one (d,); one given for all is repeated."""
-        elements = self.elements(bodies)
+        value, elements = jnp.atleast_1d(value), self.elements(bodies)
+        if parameter.shape == "common":
+            return value
         count, size = len(elements), bodies[elements[0][0]].size
         if value.shape not in ((size,), (count, size)):
             raise ValueError(
@@ -271,7 +266,7 @@ class Effect(ABC):
                 f"{self.name}: {name} has shape {shape}; give one number, or one for each of the {len(elements)} elements."
             )
         for (body,) in elements if parameter.shape == "common" else ():
-            if shape != (bodies[body].size,):
+            if shape != (bodies[body].size,) and not (parameter.may_be_number and shape == ()):
                 raise ValueError(
                     f"{self.name}: {name} has shape {shape}, {body} has dimension {bodies[body].size}; they must agree."
                 )
@@ -280,8 +275,7 @@ class Effect(ABC):
         if parameter.sign and is_concrete(given):
             value = np.asarray(given, dtype=float)
             right = value > 0 if parameter.sign == "positive" else value >= 0
-            expected = "it must be positive" if parameter.sign == "positive" else "it must not be negative"
-            self.require(right, name, value, expected)
+            self.require(right, name, value, f"it must be {parameter.sign}")
 
     def _check_start(self, name: str, bodies: Mapping[str, Body], params: dict[str, Any]) -> None:
         """Refuse a value that a constraint keeps and that is not the one at the start."""
@@ -312,9 +306,7 @@ def real_tree(what: str, tree):
     """A pytree of real numbers as one of arrays; what is neither is refused by its place in the tree."""
 
     def convert(path, leaf):
-        place = what + jax.tree_util.keystr(path)
-        require_double(place, leaf)
-        return jnp.asarray(real_array(place, leaf))
+        return jnp.asarray(double_array(what + jax.tree_util.keystr(path), leaf))
 
     return jax.tree_util.tree_map_with_path(convert, tree)
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
 from vmri_jax.scene import drawing as drawings
@@ -44,13 +45,14 @@ class Scene:
 
     Raises:
         TypeError: something else among them.
-        ValueError: no bodies, names that occur twice, what is wrong with an effect (see there), redundant constraints.
+        ValueError: 64-bit mode is off, no bodies, names that occur twice, what is wrong with an effect (see there), redundant constraints.
     """
 
     bodies: Any
     effects: Any = ()
 
     def __post_init__(self):
+        require_x64()
         for name, kind in (("bodies", Body), ("effects", Effect)):
             items = getattr(self, name)
             if isinstance(items, kind) or not isinstance(items, Iterable):

@@ -7,7 +7,7 @@ import numpy as np
 
 from vmri_jax.scene.declare import effect_class, names, number, positive
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.formulas import elastic_energy
+from vmri_jax.scene.effects.springs import elastic_energy
 
 
 class _AmongPoints(Effect):

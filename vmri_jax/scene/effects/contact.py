@@ -24,7 +24,7 @@ class _Contact(Effect):
     _: KW_ONLY
     stiffness: Any = positive()
     smoothing: Any = positive()
-    radius: Any = number(default=0.0, sign="not negative")
+    radius: Any = number(default=0.0, sign="at least zero")
     bodies: Any = names(default=None)
 
     kind = "potential"

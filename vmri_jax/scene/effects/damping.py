@@ -6,9 +6,14 @@ import jax.numpy as jnp
 
 from vmri_jax.scene.declare import array, effect_class, names, positive
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.bases import BetweenPoints
-from vmri_jax.scene.effects.formulas import norm
+from vmri_jax.scene.effects.points import BetweenPoints
 from vmri_jax.scene.terms import TangentDamping
+
+
+def norm(v):
+    """``|v|``, with derivative zero at v = 0."""
+    square = jnp.sum(v**2, axis=-1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 @effect_class

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from vmri_jax.scene.declare import effect_class, names, number, positive, vector
 from vmri_jax.scene.effect import Effect, real_tree
-from vmri_jax.scene.effects.bases import BetweenPoints
+from vmri_jax.scene.effects.points import BetweenPoints
 
 
 @effect_class

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.scene.declare import array, effect_class, names, number
+from vmri_jax.scene.declare import array, common, effect_class, names, number
 from vmri_jax.scene.effect import Effect
 
 
@@ -21,7 +21,7 @@ class Gravity(Effect):
         ValueError: (of the scene) an acceleration of another dimension than a body, a body with several masses.
     """
 
-    acceleration: Any = array(default=9.81)
+    acceleration: Any = common(default=9.81, may_be_number=True)
     bodies: Any = names(default=None)
 
     kind = "potential"
@@ -39,15 +39,6 @@ class Gravity(Effect):
     def drawing(self, bodies):
         up = -np.asarray(self.acceleration, dtype=float)
         return {"up": up.tolist()} if up.ndim and up.any() else {}
-
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
-        shape = self.parameters(bodies)["acceleration"].shape
-        for (name,) in self.elements(bodies):
-            if shape not in ((), (bodies[name].size,)):
-                raise ValueError(
-                    f"{self.name}: acceleration has shape {shape}, {name} has dimension {bodies[name].size}; they must agree."
-                )
 
 
 @effect_class

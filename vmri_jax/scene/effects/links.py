@@ -1,10 +1,17 @@
-"""Rigid links between points."""
+"""Rigid links: between points, to fixed points and to moving ones; a body whose motion is given."""
 
 from typing import Any
 
+import jax.numpy as jnp
+
 from vmri_jax.scene.declare import effect_class, positive
-from vmri_jax.scene.effects.bases import BetweenPoints
-from vmri_jax.scene.effects.formulas import length_defect
+from vmri_jax.scene.effect import START
+from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
+
+
+def length_defect(line, length):
+    """``(|x|^2 - l^2) / 2``, smooth also at x = 0."""
+    return (jnp.sum(line**2, axis=-1) - length**2) / 2
 
 
 @effect_class
@@ -32,3 +39,91 @@ class RigidLink(BetweenPoints):
     def function(q, params):
         a, b = q
         return length_defect(b - a, params["length"])
+
+
+@effect_class
+class Anchor(ToFixedPoint):
+    """Rigid links to fixed points, ``g = (|q - a|^2 - l^2) / 2 = 0``: a pendulum's rod.
+
+    The points stay where they are; `MovingPivot` is a rigid link to a point that moves.
+
+    Args:
+        bodies: a name, or a list of names.
+        point: a, (d,); or one for each body, (n, d).
+        length: l, positive; one number, or one for each. The distance at the start by default.
+
+    Raises:
+        TypeError: a function as point.
+        ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
+    """
+
+    length: Any = positive(default=None, measured=True)
+
+    kind = "constraint"
+    default_name = "anchors"
+    apart = True
+    dimensions = (1, 2, 3)
+    drawn_as = "link"
+
+    @staticmethod
+    def function(q, params):
+        (q,) = q
+        return length_defect(q - params["point"], params["length"])
+
+
+@effect_class
+class MovingPivot(ToPath):
+    """Rigid links to a moving point, ``g = (|q - a(t)|^2 - l^2) / 2 = 0``: a pendulum on a pivot that is moved.
+
+    Args:
+        bodies: a name, or a list of names.
+        path: ``path(t, params) -> (d,)``, the point; define it at module level.
+        length: l, positive; one number, or one for each. The distance at the start, t = 0, by default.
+        params: what `path` gets as params.
+
+    Raises:
+        TypeError: (of the scene) a path that is no function.
+        ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
+    """
+
+    length: Any = positive(default=None, measured=True)
+
+    kind = "constraint"
+    default_name = "moving_pivots"
+    apart = True
+    advice = "move one of them, or take Guide"
+
+    @staticmethod
+    def formula(point, q, params):
+        (q,) = q
+        return length_defect(q - point, params["length"])
+
+
+@effect_class
+class Guide(ToPath):
+    """A body whose motion is given, ``g = q - a(t) = 0``; what holds it there does the work that is needed.
+
+    Args:
+        bodies: a name.
+        path: ``path(t, params) -> (d,)``, where it is; define it at module level.
+        params: what `path` gets as params.
+
+    Raises:
+        TypeError: (of the scene) a path that is no function.
+        ValueError: (of the scene) a body that does not start there.
+    """
+
+    kind = "constraint"
+    default_name = "guides"
+
+    @staticmethod
+    def formula(point, q, params):
+        (q,) = q
+        return q - point
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        away = self.at_start(bodies, self.parameters(bodies))
+        size = jnp.max(jnp.abs(jnp.stack([bodies[name].position for (name,) in self.elements(bodies)])))
+        what = "the distance of the body from its point at t = 0"
+        self.require(away <= START * jnp.maximum(size, 1.0), what, away, "it must start there")

@@ -1,12 +1,21 @@
-"""Springs between points: linear, and with a polynomial law."""
+"""Springs: between points, to fixed points and to moving ones."""
 
 from typing import Any
 
 import jax.numpy as jnp
 
 from vmri_jax.scene.declare import array, effect_class, positive
-from vmri_jax.scene.effects.bases import BetweenPoints
-from vmri_jax.scene.effects.formulas import elastic_energy, elongation
+from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
+
+
+def elastic_energy(stiffness, elongation):
+    """``sum k/2 e^2``."""
+    return jnp.sum(stiffness / 2 * elongation**2)
+
+
+def elongation(line, length):
+    """``|x| - l``."""
+    return jnp.linalg.norm(line, axis=-1) - length
 
 
 @effect_class
@@ -72,3 +81,63 @@ class NonlinearSpring(BetweenPoints):
             raise ValueError(
                 f"{self.name}: coefficients is {self.coefficients!r}; give (k_1, k_2, ...), at least one number."
             )
+
+
+@effect_class
+class SpringAnchor(ToFixedPoint):
+    """Springs to fixed points, ``V = sum k/2 (|q - a| - l)^2``; without a length the well ``sum k/2 |q - a|^2``.
+
+    Args:
+        bodies: a name, or a list of names.
+        point: a, (d,); or one for each body, (n, d).
+        stiffness: k, N/m, positive; one number, or one for each.
+        length: l, at rest, positive; likewise; None for a spring that pulls down to the point itself.
+
+    Raises:
+        TypeError: a function as point.
+        ValueError: (of the scene) numbers that are not positive, bodies that start at the point of a spring with a length.
+    """
+
+    stiffness: Any = positive()
+    length: Any = positive(default=None)
+
+    kind = "potential"
+    default_name = "spring_anchors"
+    drawn_as = "spring"
+
+    @staticmethod
+    def function(q, params):
+        (q,) = q
+        if "length" not in params:
+            return jnp.sum(params["stiffness"] / 2 * jnp.sum((q - params["point"]) ** 2, axis=-1))
+        return elastic_energy(params["stiffness"], elongation(q - params["point"], params["length"]))
+
+    @property
+    def apart(self):
+        return self.length is not None
+
+
+@effect_class
+class MovingAnchor(ToPath):
+    """Springs to a moving point, ``F = k (a(t) - q)``: an elastic hold, and a force, because it does work.
+
+    Args:
+        bodies: a name, or a list of names.
+        path: ``path(t, params) -> (d,)``, the point; define it at module level.
+        stiffness: k, N/m, positive; one number, or one for each body.
+        params: what `path` gets as params.
+
+    Raises:
+        TypeError: (of the scene) a path that is no function.
+        ValueError: (of the scene) a stiffness that is not positive.
+    """
+
+    stiffness: Any = positive()
+
+    kind = "force"
+    default_name = "moving_anchors"
+
+    @staticmethod
+    def formula(point, q, v, params):
+        (q,) = q
+        return (params["stiffness"][..., None] * (point - q),)
