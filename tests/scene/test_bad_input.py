@@ -1,6 +1,7 @@
 # pyright: reportArgumentType=false
 """Scenes that are wrong say what is wrong, with which names, before anything is computed."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -222,3 +223,46 @@ def test_energy_that_is_not_smooth_at_the_start():
 
     with pytest.raises(ValueError, match=r"root: its energy between bob has no finite derivatives at the start"):
         Scene([A], [Potential(root, "bob")])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda x: Body("a", x, [1.0]), "Body a: mass has dtype float32; give float64"),
+        (lambda x: Body("a", 1.0, x[None]), "Body a: position has dtype float32"),
+        (lambda x: Scene([A, B], [Spring(("bob", "tip"), x)]), "springs: stiffness has dtype float32"),
+        (lambda x: Scene([A, B], [Spring(("bob", "tip"), [x])]), "springs: stiffness has dtype float32"),
+        (lambda x: Scene([A, B], [Anchor("tip", [x, 0.0])]), "anchors: point has dtype float32"),
+        (lambda x: Scene([A], [Potential(height, "bob", {"k": x})]), r"height: params\['k'\] has dtype float32"),
+        (lambda x: Scene([B], [Guide("tip", still, params={"k": x})]), r"guides: params\['k'\] has dtype float32"),
+        (
+            lambda x: Scene([A, B], [Coulomb({"bob": x, "tip": 1.0}, 1.0)]),
+            r"coulomb: charges\['bob'\] has dtype float32",
+        ),
+    ],
+)
+def test_numbers_made_before_64_bit_mode(make, message):
+    with pytest.raises(ValueError, match=message):
+        make(jnp.asarray(1.0, dtype=jnp.float32))
+
+
+def test_scenes_made_before_64_bit_mode():
+    """Bodies of plain numbers are of float64 all the same; a scene, which computes with them, is refused."""
+    jax.config.update("jax_enable_x64", False)
+    try:
+        body = Body("a", 0.1, [0.1, 0.2])
+        with pytest.raises(ValueError, match="vmri_jax needs 64-bit floats"):
+            Scene([body])
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert (body.position.dtype, float(body.mass)) == (np.float64, 0.1)
+    assert Scene([body], [Gravity(0.1)]).state().q_s.dtype == np.float64
+
+
+def test_numbers_that_are_none():
+    with pytest.raises(TypeError, match="springs: stiffness is 'stiff'; give real numbers"):
+        Scene([A, B], [Spring(("bob", "tip"), "stiff")])
+    with pytest.raises(TypeError, match="Body a: mass is 'heavy'; give real numbers"):
+        Body("a", "heavy", [1.0])
+    with pytest.raises(ValueError, match="springs: between is None; give 2 names of bodies"):
+        Scene([A, B], [Spring(None, 1.0)])

@@ -55,7 +55,8 @@ class Names:
             items = (items,)
         elements = tuple((item,) if isinstance(item, str) else tuple(item) for item in items)
         if not elements or any(len(element) != self.count for element in elements):
-            raise ValueError(f"{what} is {given!r}; give {self.count} names of bodies, or a list of such.")
+            one = "the name of a body" if self.count == 1 else f"{self.count} names of bodies"
+            raise ValueError(f"{what} is {given!r}; give {one}, or a list of such.")
         return elements
 
 

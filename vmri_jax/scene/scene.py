@@ -40,7 +40,7 @@ class Scene:
 
     Args:
         bodies: `Body` instances; slow ones become q_s and fast ones q_f, in this order.
-        effects: of `vmri_jax.scene`, also one's own: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
+        effects: of `vmri_jax.scene`, also custom ones: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
             summed and constraints joined in this order.
 
     Raises:
