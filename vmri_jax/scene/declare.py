@@ -9,11 +9,16 @@
 `Effect` reads these declarations: elements, arrays of parameters, checks and messages follow from them.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field
 from itertools import combinations
 from typing import Any, Literal, TypeVar, dataclass_transform
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import double_array, is_concrete
 from vmri_jax.scene.body import Body
 
 Elements = tuple[tuple[str, ...], ...]
@@ -77,6 +82,43 @@ class Parameter:
     measured: bool = False
     may_be_number: bool = False
 
+    def array(self, what: str, given: Any, bodies: Sequence[Body]) -> jax.Array:
+        """The numbers as the function gets them.
+
+        Args:
+            what: the names of effect and field, for messages.
+            bodies: the first body of every element.
+
+        Raises:
+            TypeError: what is no real number.
+            ValueError: arrays of float32, vectors of another dimension than the bodies.
+        """
+        value = jnp.asarray(double_array(what, given))
+        if self.shape in ("number", "array") or self.may_be_number:
+            return value
+        value = jnp.atleast_1d(value)
+        if self.shape == "common":
+            return value
+        count, size = len(bodies), bodies[0].size
+        if value.shape not in ((size,), (count, size)):
+            more = f", or one for each, ({count}, {size})." if count > 1 else "."
+            raise ValueError(f"{what} has shape {value.shape}; its bodies have dimension {size}, give ({size},){more}")
+        return squeeze(jnp.broadcast_to(value, (count, size)))
+
+    def check(self, what: str, given: Any, shape: tuple[int, ...], bodies: Sequence[Body]) -> None:
+        """Refuse numbers of another sign, not one or one for each element, and vectors of another dimension than a body."""
+        if self.shape == "number" and shape not in ((), (len(bodies),)):
+            raise ValueError(
+                f"{what} has shape {shape}; give one number, or one for each of the {len(bodies)} elements."
+            )
+        for body in bodies if self.shape == "common" else ():
+            if shape != (body.size,) and not (self.may_be_number and shape == ()):
+                raise ValueError(f"{what} has shape {shape}, {body.name} has dimension {body.size}; they must agree.")
+        if self.sign and is_concrete(given):
+            value = np.asarray(given, dtype=float)
+            if not np.all(value > 0 if self.sign == "positive" else value >= 0):
+                raise ValueError(f"{what} is {value}; it must be {self.sign}.")
+
 
 def names(count: int = 1, *, default: Any = MISSING, pairs: bool = False) -> Any:
     """Names of bodies, `count` in each element; if None is the default it stands for all bodies of the scene."""
@@ -118,3 +160,8 @@ def _parameter(default: Any, parameter: Parameter) -> Any:
 def effect_class(cls: type[Class]) -> type[Class]:
     """A frozen dataclass whose fields may be declared by `names`, `positive` and the like."""
     return dataclass(frozen=True, eq=False)(cls)
+
+
+def squeeze(values):
+    """(n,) values of n elements; of a single one, ()."""
+    return values[0] if len(values) == 1 else values

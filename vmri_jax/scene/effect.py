@@ -13,7 +13,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import double_array, is_concrete
 from vmri_jax.scene.body import Body
-from vmri_jax.scene.declare import Elements, Parameter, effect_class
+from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
 from vmri_jax.scene.layout import Place, Rows
 from vmri_jax.scene.terms import EffectTerm, choose
 
@@ -102,12 +102,13 @@ class Effect(ABC):
 
     def parameters(self, bodies: Mapping[str, Body]) -> dict[str, Any]:
         """What the function gets as params: arrays by name."""
-        params = {}
+        params, elements = {}, self.elements(bodies)
+        firsts = [bodies[element[0]] for element in elements]
         for name, parameter in self.declared.items():
             if getattr(self, name) is not None:
-                params[name] = self._array(name, parameter, bodies)
+                params[name] = parameter.array(f"{self.name}: {name}", getattr(self, name), firsts)
         for role, name in enumerate(self.masses):
-            params[name] = self._masses([element[role] for element in self.elements(bodies)], bodies)
+            params[name] = self._masses([element[role] for element in elements], bodies)
         for name, parameter in self.declared.items():
             if parameter.measured and name not in params:
                 params[name] = self.at_start(bodies, params)
@@ -158,7 +159,7 @@ class Effect(ABC):
         """Refuse bodies at one place, parameters of another shape or sign, that are not finite, or that are not what a constraint keeps."""
         if self.apart:
             self.require_apart(bodies)
-        params = self.parameters(bodies)
+        params, firsts = self.parameters(bodies), [bodies[element[0]] for element in self.elements(bodies)]
         for name, value in params.items():
             for leaf in jax.tree.leaves(value):
                 if is_concrete(leaf) and not np.isfinite(leaf).all():
@@ -167,8 +168,7 @@ class Effect(ABC):
             given = getattr(self, name)
             if given is None:
                 continue
-            self._check_shape(name, parameter, params[name], bodies)
-            self._check_sign(name, parameter, given)
+            parameter.check(f"{self.name}: {name}", given, params[name].shape, firsts)
             if parameter.measured and self.kind == "constraint":
                 self._check_start(name, bodies, params)
 
@@ -220,22 +220,6 @@ class Effect(ABC):
             expected = "they must not start at the same point; move one of them"
             self.require(apart > 0, f"the distance of {a} and {b}", apart, expected)
 
-    def _array(self, name: str, parameter: Parameter, bodies: Mapping[str, Body]):
-        """A declared parameter as the array that the function gets."""
-        value = jnp.asarray(double_array(f"{self.name}: {name}", getattr(self, name)))
-        if parameter.shape in ("number", "array") or parameter.may_be_number:
-            return value
-        value, elements = jnp.atleast_1d(value), self.elements(bodies)
-        if parameter.shape == "common":
-            return value
-        count, size = len(elements), bodies[elements[0][0]].size
-        if value.shape not in ((size,), (count, size)):
-            raise ValueError(
-                f"{self.name}: {name} has shape {value.shape}; its bodies have dimension {size}, give ({size},)"
-                + (f", or one for each, ({count}, {size})." if count > 1 else ".")
-            )
-        return squeeze(jnp.broadcast_to(value, (count, size)))
-
     def _masses(self, names: Sequence[str], bodies: Mapping[str, Body]):
         """Masses of bodies, (n,), or () of a single one."""
         for name in names:
@@ -258,25 +242,6 @@ class Effect(ABC):
             described = ", ".join(f"{name} {size}" for name, size in sizes.items())
             raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must be of the same.")
 
-    def _check_shape(self, name: str, parameter: Parameter, value, bodies: Mapping[str, Body]) -> None:
-        """Refuse numbers that are not one or one for each element, and vectors of another dimension than a body."""
-        elements, shape = self.elements(bodies), np.shape(value)
-        if parameter.shape == "number" and shape not in ((), (len(elements),)):
-            raise ValueError(
-                f"{self.name}: {name} has shape {shape}; give one number, or one for each of the {len(elements)} elements."
-            )
-        for (body,) in elements if parameter.shape == "common" else ():
-            if shape != (bodies[body].size,) and not (parameter.may_be_number and shape == ()):
-                raise ValueError(
-                    f"{self.name}: {name} has shape {shape}, {body} has dimension {bodies[body].size}; they must agree."
-                )
-
-    def _check_sign(self, name: str, parameter: Parameter, given) -> None:
-        if parameter.sign and is_concrete(given):
-            value = np.asarray(given, dtype=float)
-            right = value > 0 if parameter.sign == "positive" else value >= 0
-            self.require(right, name, value, f"it must be {parameter.sign}")
-
     def _check_start(self, name: str, bodies: Mapping[str, Body], params: dict[str, Any]) -> None:
         """Refuse a value that a constraint keeps and that is not the one at the start."""
         start = self.at_start(bodies, params)
@@ -295,11 +260,6 @@ def lasting(value):
     if isinstance(value, Iterator) or (isinstance(value, list | tuple) and any(isinstance(v, Iterator) for v in value)):
         return tuple(lasting(item) for item in value)
     return value
-
-
-def squeeze(values):
-    """(n,) values of n elements; of a single one, ()."""
-    return values[0] if len(values) == 1 else values
 
 
 def real_tree(what: str, tree):

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.scene.declare import array, effect_class, names, number, positive
-from vmri_jax.scene.effect import Effect, real_tree, squeeze
+from vmri_jax.scene.declare import array, effect_class, names, number, positive, squeeze
+from vmri_jax.scene.effect import Effect, real_tree
 from vmri_jax.scene.effects.points import distance
 
 
