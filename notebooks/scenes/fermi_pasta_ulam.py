@@ -1,6 +1,6 @@
 """The Fermi-Pasta-Ulam chain: stiff linear springs, which exchange energy slowly, alternate with soft quartic ones.
 
-Teaches: blocks of general coordinates with potentials of one's own, here the (scaled) centres and elongations of the
+Teaches: blocks of general coordinates with custom potentials, here the (scaled) centres and elongations of the
 stiff springs: Hairer, Lubich, Wanner, *Geometric Numerical Integration*, I.5.1.
 
     vmri simulate notebooks/scenes/fermi_pasta_ulam.py:scene --scheme fully-explicit --num-micro 5 --macro-dt 0.01 --steps 10000 --save-every 2 --out fermi_pasta_ulam.npz

@@ -1,6 +1,6 @@
 """Two valves driven by a cam, the cam by a chain from the crank: the chain is slow, the valves are fast and damped.
 
-Teaches: a constraint, a force and a potential of one's own; work of a drive against losses.
+Teaches: a custom constraint, force and potential; work of a drive against losses.
 
     vmri simulate notebooks/scenes/valve_train.py:scene --num-micro 10 --macro-dt 0.01 --steps 1000 --out valve_train.npz
     vmri animate valve_train.npz

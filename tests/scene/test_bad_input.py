@@ -1,6 +1,7 @@
 # pyright: reportArgumentType=false
 """Scenes that are wrong say what is wrong, with which names, before anything is computed."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -83,13 +84,21 @@ def test_body(arguments, message):
             "links: the distance of bob and x is 0.0; they must not start at the same point",
         ),
         ([A, B], [RigidLink(("bob", "tip"), -1.0)], "links: length is -1.0; it must be positive"),
-        ([A, B], [RigidLink(("bob", "tip"), 2.0)], "links: the link bob-tip is 2 long; bob and tip start 1 apart"),
+        (
+            [A, B],
+            [RigidLink(("bob", "tip"), 2.0)],
+            "links: length of bob-tip is 2; it starts as 1; give that, or move a body",
+        ),
         (
             [A, B],
             [Guide("tip", still)],
             r"guides: the distance of the body from its point at t = 0 is .*; it must start there",
         ),
-        ([A, B], [MovingPivot("tip", still, 7.0)], "moving_pivots: length is 7.0; the bodies start .* from the point"),
+        (
+            [A, B],
+            [MovingPivot("tip", still, 7.0)],
+            "moving_pivots: length of tip is 7; it starts as .*; give that, or move a body",
+        ),
         ([A, B], [MovingPivot("tip", still, -2.0)], "moving_pivots: length is -2.0; it must be positive"),
         (SPACE[:1], [MovingPivot("w", still)], r"moving_pivots: path returns shape \(2,\); w has dimension 3"),
         ([A, SPACE[0]], [RigidLink(("bob", "w"))], r"links: bodies of different dimension \(bob 2, w 3\)"),
@@ -104,7 +113,11 @@ def test_body(arguments, message):
             "anchors: the distance of a body from its point is 0.0; bodies must not start there",
         ),
         ([A], [Anchor("bob", [0.0, 0.0, 1.0])], r"anchors: point has shape \(3,\); its bodies have dimension 2"),
-        ([B], [Anchor("tip", [0.0, 0.0], 3.0)], "anchors: length is 3.0; the bodies start 1.0 from their points"),
+        (
+            [B],
+            [Anchor("tip", [0.0, 0.0], 3.0)],
+            "anchors: length of tip is 3; it starts as 1; give that, or move a body",
+        ),
         (
             [Body("block", 1.0, np.ones(5)), Body("b", 1.0, np.zeros(5))],
             [Spring(("block", "b"), 1.0)],
@@ -210,3 +223,46 @@ def test_energy_that_is_not_smooth_at_the_start():
 
     with pytest.raises(ValueError, match=r"root: its energy between bob has no finite derivatives at the start"):
         Scene([A], [Potential(root, "bob")])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda x: Body("a", x, [1.0]), "Body a: mass has dtype float32; give float64"),
+        (lambda x: Body("a", 1.0, x[None]), "Body a: position has dtype float32"),
+        (lambda x: Scene([A, B], [Spring(("bob", "tip"), x)]), "springs: stiffness has dtype float32"),
+        (lambda x: Scene([A, B], [Spring(("bob", "tip"), [x])]), "springs: stiffness has dtype float32"),
+        (lambda x: Scene([A, B], [Anchor("tip", [x, 0.0])]), "anchors: point has dtype float32"),
+        (lambda x: Scene([A], [Potential(height, "bob", {"k": x})]), r"height: params\['k'\] has dtype float32"),
+        (lambda x: Scene([B], [Guide("tip", still, params={"k": x})]), r"guides: params\['k'\] has dtype float32"),
+        (
+            lambda x: Scene([A, B], [Coulomb({"bob": x, "tip": 1.0}, 1.0)]),
+            r"coulomb: charges\['bob'\] has dtype float32",
+        ),
+    ],
+)
+def test_numbers_made_before_64_bit_mode(make, message):
+    with pytest.raises(ValueError, match=message):
+        make(jnp.asarray(1.0, dtype=jnp.float32))
+
+
+def test_scenes_made_before_64_bit_mode():
+    """Bodies of plain numbers are of float64 all the same; a scene, which computes with them, is refused."""
+    jax.config.update("jax_enable_x64", False)
+    try:
+        body = Body("a", 0.1, [0.1, 0.2])
+        with pytest.raises(ValueError, match="vmri_jax needs 64-bit floats"):
+            Scene([body])
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    assert (body.position.dtype, float(body.mass)) == (np.float64, 0.1)
+    assert Scene([body], [Gravity(0.1)]).state().q_s.dtype == np.float64
+
+
+def test_numbers_that_are_none():
+    with pytest.raises(TypeError, match="springs: stiffness is 'stiff'; give real numbers"):
+        Scene([A, B], [Spring(("bob", "tip"), "stiff")])
+    with pytest.raises(TypeError, match="Body a: mass is 'heavy'; give real numbers"):
+        Body("a", "heavy", [1.0])
+    with pytest.raises(ValueError, match="springs: between is None; give 2 names of bodies"):
+        Scene([A, B], [Spring(None, 1.0)])

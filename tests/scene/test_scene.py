@@ -181,7 +181,7 @@ def turn(q, v, params):
     return params["w"] * jnp.dot(q[0], v[1])
 
 
-def test_own_effects_are_a_function_and_one_line():
+def test_custom_effects_are_a_function_and_one_line():
     bodies = [Body("a", 1.0, [1.0, 0.0], pace="slow"), Body("block", [1.0, 2.0, 3.0, 4.0], np.ones(4), pace="fast")]
     scene = Scene(bodies, [Constraint(swing, "a", {"length": 1.0}), Force(push, ("a", "block"), {"c": 0.5})])
     system = scene.system()
@@ -277,7 +277,7 @@ def test_drawing_is_plain_data():
     assert drawing["planes"] == [{"point": [0.0, 0.0], "normal": [0.0, 1.0]}]
 
 
-def test_effects_of_ones_own_are_drawn_as_they_say():
+def test_custom_effects_are_drawn_as_they_say():
     bodies = [Body(name, 1.0, [float(i), 0.0], pace="fast") for i, name in enumerate("abc")]
 
     def drawing(**how):

@@ -67,7 +67,7 @@ def coupled(q, v, params):
     return params["w"] * jnp.sum(a * v_b - b * v_a) + gauge
 
 
-def test_kinetic_effects_of_ones_own():
+def test_custom_kinetic_effects():
     """M^-1 (A^T - A) has eigenvalues +- 2 i w / sqrt(m_a m_b); gauge terms do not count."""
     bodies = [Body("a", 4.0, [1.0], [2.0]), Body("b", 1.0, [3.0], [-1.0]), Body("c", 1.0, [9.0]), Body("d", 1.0, [8.0])]
     effects = [Kinetic(coupled, ("a", "b"), {"w": 30.0, "gauge": 500.0}), Spring(("c", "d"), 1.0)]

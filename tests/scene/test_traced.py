@@ -38,7 +38,7 @@ def scaled(item, x, **changes):
     """A body or effect with all its numbers multiplied."""
     given = {field.name: getattr(item, field.name) for field in dataclasses.fields(item)} | changes
     return dataclasses.replace(
-        item, **jax.tree.map(lambda leaf: x * leaf if isinstance(leaf, float | jax.Array) else leaf, given)
+        item, **jax.tree.map(lambda leaf: x * leaf if isinstance(leaf, float | jax.Array | np.ndarray) else leaf, given)
     )
 
 

@@ -62,3 +62,18 @@ def real_array(name: str, value, ndim: int | None = None):
     if ndim is not None and array.ndim != ndim:
         raise ValueError(f"{name} has shape {array.shape}; {advice}.")
     return array
+
+
+def double_array(name: str, value):
+    """`real_array` of numbers in double precision: the digits that an array of float32 lacks cannot be had back.
+
+    Raises:
+        ValueError: an array of float32 or float16, as JAX makes them before its 64-bit mode is switched on.
+    """
+    for leaf in jax.tree.leaves(value):
+        if getattr(leaf, "dtype", None) in (np.float32, np.float16):
+            raise ValueError(
+                f"{name} has dtype {leaf.dtype}; give float64. JAX makes arrays of float32 until 64-bit mode is switched on: "
+                'call jax.config.update("jax_enable_x64", True) before any array is made.'
+            )
+    return real_array(name, value)

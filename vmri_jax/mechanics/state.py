@@ -277,7 +277,7 @@ def check_constraints(
         if rows := dependent_rows(jacobian):
             of = "slow variables." if name == "slow_constraint" else f"fast variables. {fix}"
             raise ValueError(
-                f"System: rows {rows} of {name} depend on each other: {len(jacobian)} rows have rank {_rank(jacobian)} in the "
+                f"System: rows {rows} of {name} depend on each other: {len(jacobian)} rows have rank {row_rank(jacobian)} in the "
                 f"{of} Remove redundant ones of these rows, or make the variables they need fast."
             )
 
@@ -298,7 +298,7 @@ def _nearby(q_s, q_f):
     return tuple(q + size * random.normal(size=q.shape) for q in (q_s, q_f))
 
 
-def _rank(jacobian) -> int:
+def row_rank(jacobian) -> int:
     """Rank of the rows, each scaled to length one."""
     size = np.linalg.norm(jacobian, axis=1, keepdims=True)
     return int(np.linalg.matrix_rank(jacobian / np.where(size > 0, size, 1), tol=1e-8))

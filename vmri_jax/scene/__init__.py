@@ -2,19 +2,15 @@
 
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.anchors import Anchor, SpringAnchor
-from vmri_jax.scene.effects.bending import Angle, Bending, Torsion
+from vmri_jax.scene.effects.angles import Angle, Bending, Torsion
 from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
-from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag
+from vmri_jax.scene.effects.custom import Constraint, Force, Kinetic, Potential
+from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag, RayleighDamping
 from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, HarmonicDrive
-from vmri_jax.scene.effects.gravity import Gravity, NBodyGravity
-from vmri_jax.scene.effects.links import RigidLink
-from vmri_jax.scene.effects.magnetic import MagneticField
-from vmri_jax.scene.effects.moving import Guide, MovingAnchor, MovingPivot
-from vmri_jax.scene.effects.own import Constraint, Force, Kinetic, Potential
-from vmri_jax.scene.effects.pairs import Coulomb, LennardJones
-from vmri_jax.scene.effects.rayleigh import RayleighDamping
-from vmri_jax.scene.effects.springs import NonlinearSpring, Spring
+from vmri_jax.scene.effects.fields import Gravity, MagneticField
+from vmri_jax.scene.effects.links import Anchor, Guide, MovingPivot, RigidLink
+from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity
+from vmri_jax.scene.effects.springs import MovingAnchor, NonlinearSpring, Spring, SpringAnchor
 from vmri_jax.scene.scene import Scene
 
 __all__ = [

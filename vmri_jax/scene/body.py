@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import double_array, is_concrete
 
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3
@@ -31,8 +30,9 @@ class Body:
         block: its coordinates are general ones, not those of a point; more than three always are.
 
     Raises:
-        ValueError: an empty name, a mass or radius that is not positive, numbers that are not finite, shapes that do not
-            match, another pace.
+        TypeError: what is no real number.
+        ValueError: an empty name, a mass or radius that is not positive, numbers that are not finite or of float32,
+            shapes that do not match, another pace.
     """
 
     name: str
@@ -48,13 +48,9 @@ class Body:
             raise ValueError(f"Body: name is {self.name!r}; it must be a string that is not empty.")
         if self.pace not in ("slow", "fast", "auto"):
             raise ValueError(f"Body {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
-        position = jnp.atleast_1d(jnp.asarray(self.position, dtype=float))
-        if position.ndim != 1 or not position.size:
-            raise ValueError(
-                f"Body {self.name}: position has shape {position.shape}; give a vector of coordinates, (n,)."
-            )
-        velocity = jnp.zeros_like(position) if self.velocity is None else self.velocity
-        velocity, mass = jnp.atleast_1d(jnp.asarray(velocity, dtype=float)), jnp.asarray(self.mass, dtype=float)
+        position = self._vector("position", self.position)
+        velocity = np.zeros(position.shape) if self.velocity is None else self._vector("velocity", self.velocity)
+        mass = self._numbers("mass", self.mass)
         if velocity.shape != position.shape:
             raise ValueError(
                 f"Body {self.name}: velocity has shape {velocity.shape}, position has {position.shape}; they must be equal."
@@ -63,16 +59,29 @@ class Body:
             raise ValueError(
                 f"Body {self.name}: mass has shape {mass.shape}; give one number, or one for each of {position.size} coordinates."
             )
-        for name, value in (("position", position), ("velocity", velocity), ("mass", mass)):
-            if is_concrete(value) and not np.isfinite(value).all():
-                raise ValueError(f"Body {self.name}: {name} is {np.asarray(value)}, which is not finite.")
-        if is_concrete(mass) and not np.all(np.asarray(mass) > 0):
-            raise ValueError(f"Body {self.name}: mass is {np.asarray(mass)}; every mass must be positive.")
+        if is_concrete(mass) and not np.all(mass > 0):
+            raise ValueError(f"Body {self.name}: mass is {mass}; every mass must be positive.")
         if self.radius is not None and is_concrete(self.radius) and not 0 < self.radius < np.inf:
             raise ValueError(f"Body {self.name}: radius is {self.radius!r}; it must be a positive number, or None.")
         block = self.block or position.size > LARGEST_POINT
         for name, value in (("position", position), ("velocity", velocity), ("mass", mass), ("block", block)):
             object.__setattr__(self, name, value)
+
+    def _numbers(self, name: str, given):
+        """Numbers as an array of float64, of NumPy where they are not traced: so the mode of JAX does not matter."""
+        value = double_array(f"Body {self.name}: {name}", given)
+        if not is_concrete(value):
+            return value
+        if not np.isfinite(value).all():
+            raise ValueError(f"Body {self.name}: {name} is {np.asarray(value)}, which is not finite.")
+        return np.asarray(value)
+
+    def _vector(self, name: str, given):
+        value = self._numbers(name, given)
+        value = value[None] if value.ndim == 0 else value
+        if value.ndim != 1 or not value.size:
+            raise ValueError(f"Body {self.name}: {name} has shape {value.shape}; give a vector of coordinates, (n,).")
+        return value
 
     @property
     def size(self) -> int:

@@ -1,25 +1,30 @@
 """Effects: what a scene calls for. Each contributes one function to the Lagrangian, the constraints or the forces."""
 
 import difflib
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from itertools import combinations
+from dataclasses import field, fields
+from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import double_array, is_concrete
 from vmri_jax.scene.body import Body
+from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
 from vmri_jax.scene.layout import Place, Rows
-from vmri_jax.scene.terms import Term, choose
+from vmri_jax.scene.terms import EffectTerm, choose
 
 Kind = Literal["kinetic", "potential", "constraint", "force"]
-Elements = tuple[tuple[str, ...], ...]
+DRAWN = {"link": "links", "spring": "springs"}
+"""What joins two bodies in a drawing, and its entry there."""
+START = 1e-9
+"""How far, relative to its size, what a constraint keeps may be from its value at the start."""
 
 
-@dataclass(frozen=True, eq=False)
+@effect_class
 class Effect(ABC):
     """What every effect says: its function, the bodies it touches, its parameters.
 
@@ -33,7 +38,8 @@ class Effect(ABC):
     | "kinetic" | ``function(q, v, params)`` | energy added to ``sum m v^2 / 2``, () |
     | "force" | ``function(t, q, v, params)`` | tuple of forces, shaped like q |
 
-    q and v are tuples with one entry per role: the coordinates (d,) of its body or, with n > 1 elements, (n, d).
+    q and v are tuples with one entry per role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). params
+    are the fields that a class declares as numbers, vectors or arrays (see `vmri_jax.scene.declare`), by name.
 
     Args:
         name: of this effect in its scene; by default the name of its class.
@@ -42,15 +48,24 @@ class Effect(ABC):
     """
 
     kind: ClassVar[Kind]
-    default_name: ClassVar[str] = ""
-    same_size: ClassVar[bool] = True
-    numbers: ClassVar[tuple[str, ...]] = ()
-    """Parameters that are one number for all elements, (), or one for each, (n,)."""
-    vectors: ClassVar[tuple[str, ...]] = ()
-    """Parameters that are one vector for each element, (n, d), of a single one (d,)."""
     function: ClassVar[Any]
+    rest: ClassVar[Any] = None
+    """``rest(q, params) -> ()``: the value at the start of a parameter that is `measured`, of one element."""
+    default_name: ClassVar[str] = ""
     timed: ClassVar[bool] = False
     """Whether a constraint depends on time."""
+    dimensions: ClassVar[tuple[int, ...]] = ()
+    """Its bodies are points of one of these dimensions; if there are none, they may be blocks of general coordinates too."""
+    same_size: ClassVar[bool] = True
+    """All bodies of an element have the same dimension."""
+    apart: ClassVar[bool] = False
+    """Neighbouring bodies of an element, or a body and the point it is tied to, must not start at one place."""
+    masses: ClassVar[tuple[str, ...]] = ()
+    """The masses of the bodies are parameters of these names, role by role."""
+    derived: ClassVar[tuple[str, ...]] = ()
+    """Parameters besides the declared ones that have a number for each element."""
+    drawn_as: ClassVar[Literal["link", "spring"] | None] = None
+    """What is drawn between neighbouring bodies of an element."""
 
     name: str = field(default="", kw_only=True)
     rate: Literal["slow", "fast", "auto"] = field(default="auto", kw_only=True)
@@ -63,57 +78,99 @@ class Effect(ABC):
         if self.rate not in ("slow", "fast", "auto"):
             raise ValueError(f"{self.name}: rate is {self.rate!r}; it must be 'slow', 'fast' or 'auto'.")
 
-    def one(self, params: dict[str, Any], i: int, bodies: Mapping[str, Body]) -> dict[str, Any]:
-        """The parameters of element i among those of all."""
-        single = len(self.elements(bodies)) == 1
-        return params if single else choose(params, (i,), self.numbers + self.vectors)
+    @property
+    def declared(self) -> dict[str, Parameter]:
+        """The declared parameters by name."""
+        return {f.name: f.metadata["parameter"] for f in fields(self) if "parameter" in f.metadata}
+
+    @property
+    def split(self) -> tuple[str, ...]:
+        """Names of parameters that have an entry for each element, or one for all."""
+        declared = [name for name, parameter in self.declared.items() if parameter.shape in ("number", "vector")]
+        return (*declared, *self.masses, *self.derived)
 
     @property
     def refers_to(self) -> tuple[str, ...]:
         """Names of the potentials that this effect builds on."""
         return ()
 
-    @abstractmethod
     def elements(self, bodies: Mapping[str, Body]) -> Elements:
         """Names of the bodies of every element."""
+        given = next(f for f in fields(self) if "names" in f.metadata)
+        what = f"{self.name}: {given.name}"
+        return given.metadata["names"].elements(getattr(self, given.name), bodies, what)
 
-    @abstractmethod
     def parameters(self, bodies: Mapping[str, Body]) -> dict[str, Any]:
         """What the function gets as params: arrays by name."""
+        params, elements = {}, self.elements(bodies)
+        firsts = [bodies[element[0]] for element in elements]
+        for name, parameter in self.declared.items():
+            if getattr(self, name) is not None:
+                params[name] = parameter.array(f"{self.name}: {name}", getattr(self, name), firsts)
+        for role, name in enumerate(self.masses):
+            params[name] = self._masses([element[role] for element in elements], bodies)
+        for name, parameter in self.declared.items():
+            if parameter.measured and name not in params:
+                params[name] = self.at_start(bodies, params)
+        return params
+
+    def at_start(self, bodies: Mapping[str, Body], params: dict[str, Any]):
+        """The measured value of every element at the start, (n,), or () of a single one."""
+        elements = self.elements(bodies)
+        starts = [tuple(bodies[name].position for name in element) for element in elements]
+        return squeeze(jnp.stack([self.rest(q, self.one(params, i, bodies)) for i, q in enumerate(starts)]))
+
+    def one(self, params: dict[str, Any], i: int, bodies: Mapping[str, Body]) -> dict[str, Any]:
+        """The parameters of element i among those of all."""
+        single = len(self.elements(bodies)) == 1
+        return params if single else choose(params, (i,), self.split)
 
     def check(self, bodies: Mapping[str, Body]) -> None:
         """Refuse what is wrong with this effect between these bodies.
 
         Raises:
-            ValueError: unknown bodies, a body twice in one element, bodies of different dimension, and what the
-                effect's own numbers forbid.
+            TypeError: parameters that are no real numbers.
+            ValueError: unknown bodies, a body twice in one element, bodies of different dimension, at one point, or of
+                general coordinates where points are needed; parameters of another shape, sign or precision, and what
+                the effect itself forbids.
         """
-        for element in self.elements(bodies):
+        self.check_bodies(bodies)
+        self.check_parameters(bodies)
+
+    def check_bodies(self, bodies: Mapping[str, Body]) -> None:
+        """Refuse bodies that are not there, or that do not fit."""
+        elements = self.elements(bodies)
+        for element in elements:
             for name in element:
                 if name not in bodies:
                     raise ValueError(f"{self.name}: {unknown('body', name, bodies)}")
-            twice = [name for name in element if element.count(name) > 1]
-            if twice:
-                raise ValueError(
-                    f"{self.name}: {twice[0]} occurs twice in {element}; an element is between different bodies."
-                )
-            self._check_sizes(element if self.same_size else (), bodies)
-        self._check_sizes([element[0] for element in self.elements(bodies)] if self.vectors else (), bodies)
-        count = len(self.elements(bodies))
-        for name, value in self.parameters(bodies).items():
-            if name in self.numbers and np.shape(value) not in ((), (count,)):
-                raise ValueError(
-                    f"{self.name}: {name} has shape {np.shape(value)}; give one number, or one for each of the {count} elements."
-                )
+                if element.count(name) > 1:
+                    raise ValueError(
+                        f"{self.name}: {name} occurs twice in {element}; an element is between different bodies."
+                    )
+                if self.dimensions:
+                    self._check_point(name, bodies[name])
+            if self.same_size:
+                self._check_sizes(element, bodies)
+        if any(parameter.shape == "vector" for parameter in self.declared.values()):
+            self._check_sizes([element[0] for element in elements], bodies)
+
+    def check_parameters(self, bodies: Mapping[str, Body]) -> None:
+        """Refuse bodies at one place, parameters of another shape or sign, that are not finite, or that are not what a constraint keeps."""
+        if self.apart:
+            self.require_apart(bodies)
+        params, firsts = self.parameters(bodies), [bodies[element[0]] for element in self.elements(bodies)]
+        for name, value in params.items():
             for leaf in jax.tree.leaves(value):
                 if is_concrete(leaf) and not np.isfinite(leaf).all():
                     raise ValueError(f"{self.name}: {name} is {np.asarray(leaf)}, which is not finite.")
-
-    def _check_sizes(self, names: Sequence[str], bodies: Mapping[str, Body]) -> None:
-        sizes = {name: bodies[name].size for name in names}
-        if len(set(sizes.values())) > 1:
-            described = ", ".join(f"{name} {size}" for name, size in sizes.items())
-            raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must be of the same.")
+        for name, parameter in self.declared.items():
+            given = getattr(self, name)
+            if given is None:
+                continue
+            parameter.check(f"{self.name}: {name}", given, params[name].shape, firsts)
+            if parameter.measured and self.kind == "constraint":
+                self._check_start(name, bodies, params)
 
     def terms(
         self,
@@ -132,17 +189,13 @@ class Effect(ABC):
         elements, by_size = self.elements(bodies), {}
         for i in select:
             by_size.setdefault(tuple(places[name].size for name in elements[i]), []).append(i)
-        return tuple(
-            Term(
-                self.name,
-                self.function,
-                tuple(Rows.of([places[elements[i][role]] for i in some]) for role in range(len(elements[some[0]]))),
-                None if len(some) == len(elements) else tuple(some),
-                self.numbers + self.vectors,
-                self.timed,
-            )
-            for some in by_size.values()
-        )
+        terms = []
+        for some in by_size.values():
+            roles = zip(*(elements[i] for i in some), strict=True)
+            rows = tuple(Rows.of([places[name] for name in role]) for role in roles)
+            chosen = None if len(some) == len(elements) else tuple(some)
+            terms.append(EffectTerm(self.name, self.function, rows, chosen, self.split, self.timed))
+        return tuple(terms)
 
     def curvature(self, bodies: Mapping[str, Body]):
         """Largest second derivative of the energy of each element, () or (n,), where its start does not show it, else None."""
@@ -150,7 +203,9 @@ class Effect(ABC):
 
     def drawing(self, bodies: Mapping[str, Body]) -> dict[str, list]:
         """What there is to see of it, see `vmri_jax.scene.drawing`."""
-        return {}
+        if self.drawn_as is None:
+            return {}
+        return {DRAWN[self.drawn_as]: [list(pair) for element in self.elements(bodies) for pair in pairwise(element)]}
 
     def require(self, condition: Any, what: str, value: Any, expected: str) -> None:
         """Raise ValueError unless a condition on concrete numbers holds everywhere."""
@@ -158,11 +213,46 @@ class Effect(ABC):
             shown = np.asarray(value) if is_concrete(value) else value
             raise ValueError(f"{self.name}: {what} is {shown}; {expected}.")
 
-    def require_positive(self, **values) -> None:
-        """Raise ValueError unless all these numbers are positive."""
-        for name, value in values.items():
-            if is_concrete(value):
-                self.require(np.asarray(value) > 0, name, value, "it must be positive")
+    def require_apart(self, bodies: Mapping[str, Body]) -> None:
+        """Refuse elements whose neighbouring bodies are at one point at the start."""
+        for a, b in (pair for element in self.elements(bodies) for pair in pairwise(element)):
+            apart = jnp.sqrt(jnp.sum((bodies[b].position - bodies[a].position) ** 2))
+            expected = "they must not start at the same point; move one of them"
+            self.require(apart > 0, f"the distance of {a} and {b}", apart, expected)
+
+    def _masses(self, names: Sequence[str], bodies: Mapping[str, Body]):
+        """Masses of bodies, (n,), or () of a single one."""
+        for name in names:
+            if bodies[name].mass.ndim:
+                raise ValueError(
+                    f"{self.name}: {name} has a mass for each coordinate; it needs bodies with one mass. Give bodies=."
+                )
+        return squeeze(jnp.stack([bodies[name].mass for name in names]))
+
+    def _check_point(self, name: str, body: Body) -> None:
+        if body.block or body.size not in self.dimensions:
+            has, allowed = "general " if body.block else "", " or ".join(map(str, self.dimensions))
+            raise ValueError(
+                f"{self.name}: {name} has {body.size} {has}coordinates; this effect is between points of dimension {allowed}."
+            )
+
+    def _check_sizes(self, names: Sequence[str], bodies: Mapping[str, Body]) -> None:
+        sizes = {name: bodies[name].size for name in names}
+        if len(set(sizes.values())) > 1:
+            described = ", ".join(f"{name} {size}" for name, size in sizes.items())
+            raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must be of the same.")
+
+    def _check_start(self, name: str, bodies: Mapping[str, Body], params: dict[str, Any]) -> None:
+        """Refuse a value that a constraint keeps and that is not the one at the start."""
+        start = self.at_start(bodies, params)
+        if not is_concrete((params[name], start)):
+            return
+        elements = self.elements(bodies)
+        values = np.broadcast_arrays(*map(np.atleast_1d, (params[name], start)))
+        for element, given, found in zip(elements, *values, strict=True):
+            what = f"{name} of {'-'.join(element)}"
+            right = abs(given - found) <= START * given
+            self.require(right, what, f"{given:g}", f"it starts as {found:.12g}; give that, or move a body")
 
 
 def lasting(value):
@@ -172,30 +262,13 @@ def lasting(value):
     return value
 
 
-def groups(between, size: int, what: str) -> Elements:
-    """Elements of `size` bodies, from one of them, ``("a", "b")``, or several, ``[("a", "b"), ("b", "c")]``."""
-    items = (between,) if isinstance(between, str) else tuple(between)
-    if size > 1 and items and all(isinstance(item, str) for item in items):
-        items = (items,)
-    elements = tuple((item,) if isinstance(item, str) else tuple(item) for item in items)
-    if not elements or any(len(element) != size for element in elements):
-        raise ValueError(f"{what}: between is {between!r}; give {size} names of bodies, or a list of such.")
-    return elements
+def real_tree(what: str, tree):
+    """A pytree of real numbers as one of arrays; what is neither is refused by its place in the tree."""
 
+    def convert(path, leaf):
+        return jnp.asarray(double_array(what + jax.tree_util.keystr(path), leaf))
 
-def all_pairs(between, bodies: Mapping[str, Body], what: str) -> Elements:
-    """All pairs of a list of bodies (of all bodies if None), or the given pairs."""
-    items = tuple(bodies) if between is None else tuple(between)
-    if items and all(isinstance(item, str) for item in items):
-        if len(items) < 2:
-            raise ValueError(f"{what}: between is {between!r}; give at least two bodies, or a list of pairs.")
-        return tuple(combinations(items, 2))
-    return groups(items, 2, what)
-
-
-def each(bodies_of, bodies: Mapping[str, Body], what: str) -> Elements:
-    """Every body for itself: of a list, or of the whole scene if None."""
-    return groups(tuple(bodies) if bodies_of is None else bodies_of, 1, what)
+    return jax.tree_util.tree_map_with_path(convert, tree)
 
 
 def unknown(kind: str, name: Any, known: Iterable[str]) -> str:

@@ -68,6 +68,11 @@ class Rows:
                 runs.append(Run(part, start, 1, False))
         return cls(size, tuple(runs), len(places) == 1)
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(size,) of a single place, (n, size) of more."""
+        return (self.size,) if self.single else (sum(run.count for run in self.runs), self.size)
+
     def take(self, q_s, q_f):
         """The rows of these vectors, positions or velocities."""
         pieces = [self._take(run, q_s if run.part == "s" else q_f) for run in self.runs]

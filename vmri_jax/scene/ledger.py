@@ -2,26 +2,27 @@
 
 import re
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
+from rich.table import Table
 
 from vmri_jax.diagnostics import frequencies
 from vmri_jax.mechanics.state import initial_state
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.simulate import simulate
+from vmri_jax.running.timing import interleaved
 from vmri_jax.scene.assembly import build
+from vmri_jax.scene.body import Body
+from vmri_jax.scene.layout import Place
+from vmri_jax.scene.sorting import Placed, Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from vmri_jax.scene.scene import Scene
 
 HOMES = {
     "kinetic": "kinetic energy T",
@@ -31,6 +32,8 @@ HOMES = {
     "slow_constraint": "constraint g_s",
     "force": "force F",
 }
+RULES = {"slow_potential": "slow", "fast_potential": "fast"}
+"""What a scheme calls its rules of these parts."""
 STEPS = 20
 """Macro steps of a program that is timed."""
 
@@ -83,31 +86,41 @@ class Ledger:
         """Plain data: "rows", "unknowns", "scene", "bare"."""
         return asdict(self) | {"rows": [asdict(row) for row in self.rows], "unknowns": self.unknowns}
 
-    def table(self) -> "Table":
+    def table(self) -> Table:
         """A table for `rich.print`."""
-        from rich.table import Table
-
-        measured = self.scene is not None
+        costs = ("operations", "time") if self.scene is not None else ()
         table = Table("name", "part of", "grid", "unknowns", "multipliers", "evaluations", box=None, pad_edge=False)
-        for column in ("operations", "time") if measured else ():
+        for column in costs:
             table.add_column(column, justify="right")
         table.add_column("why", style="dim")
         for row in self.rows:
-            shares = [f"{100 * share:.0f} %" if share is not None else "" for share in (row.operations, row.time)]
             numbers = [str(n) if n else "" for n in (row.unknowns, row.multipliers, row.evaluations)]
-            table.add_row(
-                f"[bold]{row.name}[/bold]", row.kind, row.grid, *numbers, *(shares if measured else []), row.why
-            )
-        totals = {"the scene": self.scene, "its bodies alone": self.bare}
-        for name, program in totals.items():
+            shares = [getattr(row, cost) for cost in costs]
+            percents = [f"{100 * share:.0f} %" if share is not None else "" for share in shares]
+            table.add_row(f"[bold]{row.name}[/bold]", row.kind, row.grid, *numbers, *percents, row.why)
+        for name, program in {"the scene": self.scene, "its bodies alone": self.bare}.items():
             if program is not None:
-                cost = (str(program.operations), f"{program.microseconds:.3g} µs")
-                unknowns = str(self.unknowns) if name == "the scene" else ""
-                table.add_row(name, "", "", unknowns, "", "", *cost, f"{program.temporary_bytes} bytes", style="italic")
+                cost = (str(program.operations), f"{program.microseconds:.3g} µs", f"{program.temporary_bytes} bytes")
+                unknowns = str(self.unknowns) if program is self.scene else ""
+                table.add_row(name, "", "", unknowns, "", "", *cost, style="italic")
         return table
 
 
-def ledger(scene: "Scene", scheme: Scheme | Composition, macro_dt: float | None, measure: bool) -> Ledger:
+@dataclass(frozen=True)
+class Contents:
+    """What a ledger is made of: bodies by name, their paces and places, the start, and where every effect lives."""
+
+    bodies: Mapping[str, Body]
+    sorting: Sorting
+    places: Mapping[str, Place]
+    start: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+
+    def system(self, placed: Sequence[Placed]) -> System:
+        """The system of the bodies with some of the effects."""
+        return build(self.bodies, self.places, placed)
+
+
+def ledger(contents: Contents, scheme: Scheme | Composition, macro_dt: float | None, measure: bool) -> Ledger:
     """The ledger of a scene, see `Scene.explain`."""
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(f"Scene.explain: scheme is {scheme!r}; give a Scheme, e.g. fully_implicit(num_micro=10).")
@@ -115,35 +128,18 @@ def ledger(scene: "Scene", scheme: Scheme | Composition, macro_dt: float | None,
     one = stage_scheme(scheme)
     intervals = {"macro": stages * one.degree, "micro": stages * one.degree * one.num_micro}
     rows = []
-    for name, pace in scene.sorting.paces.items():
+    for name, pace in contents.sorting.paces.items():
         grid = "micro" if pace.value == "fast" else "macro"
-        rows.append(
-            Row(name, "body", grid, f"{pace.value}: {pace.reason}", intervals[grid] * scene.by_name[name].size, 0, 0)
-        )
-    whole, bare, shares = _measure(scene, scheme, macro_dt) if measure else (None, None, {})
-    for part in scene.sorting.placed:
-        placed = (
-            one.slow
-            if part.home == "slow_potential"
-            else one.fast
-            if part.home == "fast_potential"
-            else getattr(one, part.home)
-        )
-        alone = build(scene.by_name, scene.places, [part])
-        values = sum(alone.num_constraints(*scene.start[:2]))
+        unknowns = intervals[grid] * contents.bodies[name].size
+        rows.append(Row(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
+    whole, bare, shares = _measure(contents, scheme, macro_dt) if measure else (None, None, {})
+    for part in contents.sorting.placed:
+        name = part.effect.name
+        placed = getattr(one, RULES.get(part.home, part.home))
+        multipliers = intervals[placed.grid] * sum(contents.system([part]).num_constraints(*contents.start[:2]))
         count = stages * evaluations(placed, one.num_micro)
-        rows.append(
-            Row(
-                part.effect.name,
-                HOMES[part.home],
-                placed.grid,
-                part.reason,
-                0,
-                intervals[placed.grid] * values,
-                count,
-                *shares.get(part.effect.name, (None, None)),
-            )
-        )
+        share = shares.get(name, (None, None))
+        rows.append(Row(name, HOMES[part.home], placed.grid, part.reason, 0, multipliers, count, *share))
     return Ledger(tuple(rows), whole, bare)
 
 
@@ -154,28 +150,23 @@ def evaluations(placed, num_micro: int) -> int:
     return len(nodes) - int(shared)
 
 
-def _measure(scene, scheme, macro_dt) -> tuple[Program, Program, dict]:
+def _measure(contents: Contents, scheme, macro_dt) -> tuple[Program, Program, dict]:
     """The scene's program, that of its bodies alone, and shares of operations and time by effect."""
-    from vmri_jax.study.timing import interleaved
-
-    placed, whole, bare = scene.sorting.placed, "whole", "bare"
-    names = {effect.name: f"without {effect.name}" for effect in scene.effects}
+    placed, whole, bare = contents.sorting.placed, "whole", "bare"
+    names = {part.effect.name: f"without {part.effect.name}" for part in placed}
     kept = {key: [part for part in placed if part.effect.name != name] for name, key in names.items()}
-    kept |= {whole: list(placed), bare: []}
-    systems = {key: build(scene.by_name, scene.places, parts) for key, parts in kept.items()}
-    states = {key: initial_state(system, *scene.start) for key, system in systems.items()}
+    systems = {key: contents.system(parts) for key, parts in (kept | {whole: placed, bare: ()}).items()}
+    states = {key: initial_state(system, *contents.start) for key, system in systems.items()}
     if macro_dt is None:
         fastest = float(frequencies(systems[whole], states[whole])[0])
         macro_dt = scheme.num_micro * 0.1 / fastest if fastest > 0 else 0.01
     arguments = {key: (system, scheme, states[key], macro_dt) for key, system in systems.items()}
     compiled = {key: compile_run(*some) for key, some in arguments.items()}
     times = interleaved({key: partial(compiled[key], *some) for key, some in arguments.items()}, 5)
-
-    def program(key: str) -> Program:
+    of = {}
+    for key, program in compiled.items():
         us = 1e6 * float(np.median(times[key])) / STEPS
-        return Program(sum(operations(compiled[key]).values()), temporary_bytes(compiled[key]), us)
-
-    of = {key: program(key) for key in systems}
+        of[key] = Program(sum(operations(program).values()), temporary_bytes(program), us)
     shares = {
         name: (1 - of[key].operations / of[whole].operations, 1 - of[key].microseconds / of[whole].microseconds)
         for name, key in names.items()

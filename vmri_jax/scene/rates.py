@@ -107,8 +107,10 @@ def _linearise(effect: Effect, bodies: Mapping[str, Body]) -> list[Linearised]:
     params, found = effect.parameters(bodies), []
     for i, element in enumerate(effect.elements(bodies)):
         q, v = (tuple(getattr(bodies[name], what) for name in element) for what in ("position", "velocity"))
-        own = effect.one(params, i, bodies)
-        found.append(Linearised(*map(np.asarray, _derivatives(effect.function, effect.kind == "kinetic", q, v, own))))
+        chosen = effect.one(params, i, bodies)
+        found.append(
+            Linearised(*map(np.asarray, _derivatives(effect.function, effect.kind == "kinetic", q, v, chosen)))
+        )
         if not all(np.isfinite(part).all() for part in found[-1]):
             raise ValueError(
                 f"{effect.name}: its energy between {', '.join(element)} has no finite derivatives at the start; move them, or smooth it."

@@ -9,64 +9,52 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.state import dependent_rows, row_rank
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.layout import Place
 from vmri_jax.scene.sorting import Placed
 
-TOLERANCE = 1e-8
-"""Singular values below this, of rows scaled to length one, are zero."""
+HOMES = ("slow_constraint", "constraint")
 
 
 def check_constraints(bodies: Mapping[str, Body], places: Mapping[str, Place], placed: Sequence[Placed]) -> None:
     """Refuse constraints that are redundant, or that the fast bodies cannot keep, naming them.
 
     Raises:
-        ValueError: with the names of the links that are too many.
+        ValueError: with the names of the constraints that are too many.
     """
-    held = [part for part in placed if part.effect.kind == "constraint"]
-    if not held or not is_concrete(
-        [[body.position for body in bodies.values()], *[p.effect.parameters(bodies) for p in held]]
-    ):
+    held = [part for part in placed if part.home in HOMES]
+    positions = [body.position for body in bodies.values()]
+    if not held or not is_concrete((positions, [part.effect.parameters(bodies) for part in held])):
         return
-    rows = {
-        home: _rows(bodies, places, [p for p in held if p.home == home]) for home in ("slow_constraint", "constraint")
-    }
-    names = [name for some in rows.values() for name, _ in some]
-    _refuse(names, np.array([row for some in rows.values() for _, row in some]), "leave one of them out")
+    macro, micro = ([row for p in held if p.home == home for row in _rows(bodies, places, p)] for home in HOMES)
+    _refuse(macro + micro, 0, "leave one of them out")
     fast = [name for name, place in places.items() if place.part == "f"]
-    n_f = sum(places[name].size for name in fast)
-    if rows["constraint"]:
-        names, matrix = zip(*rows["constraint"], strict=True)
+    if micro:
+        n_s = sum(place.size for place in places.values() if place.part == "s")
         advice = (
             f"they touch fast bodies and are held on the micro grid, where only {', '.join(fast)} can move; leave one out, or make "
             "more of their bodies fast"
         )
-        _refuse(list(names), np.array(matrix)[:, -n_f:], advice)
+        _refuse(micro, n_s, advice)
 
 
-def _rows(bodies, places, held: Sequence[Placed]) -> list[tuple[str, np.ndarray]]:
-    """Rows of the constraints' Jacobian, slow coordinates first, each with the name of its element."""
+def _rows(bodies, places, part: Placed) -> list[tuple[str, np.ndarray]]:
+    """Rows of the Jacobian of some constraints, slow coordinates first, each with the name of its element."""
     n_s = sum(place.size for place in places.values() if place.part == "s")
     n = sum(place.size for place in places.values())
-    rows = []
-    for part in held:
-        effect = part.effect
-        elements, params = effect.elements(bodies), effect.parameters(bodies)
-        for i in part.elements:
-            own = effect.one(params, i, bodies)
-            jacobian = _jacobian(
-                effect.function, effect.timed, tuple(bodies[name].position for name in elements[i]), own
-            )
-            columns = [
-                (n_s if places[name].part == "f" else 0) + places[name].start + k
-                for name in elements[i]
-                for k in range(places[name].size)
-            ]
-            label = f"{effect.name} {'-'.join(elements[i])}"
-            for j, entries in enumerate(np.asarray(jacobian)):
-                row = np.zeros(n)
-                row[columns] = entries
-                rows.append((label if len(jacobian) == 1 else f"{label} [{j}]", row))
+    effect, rows = part.effect, []
+    elements, params = effect.elements(bodies), effect.parameters(bodies)
+    for i in part.elements:
+        starts = [places[name].start + (n_s if places[name].part == "f" else 0) for name in elements[i]]
+        q = tuple(bodies[name].position for name in elements[i])
+        columns = np.concatenate([start + np.arange(x.size) for start, x in zip(starts, q, strict=True)])
+        jacobian = np.asarray(_jacobian(effect.function, effect.timed, q, effect.one(params, i, bodies)))
+        label = f"{effect.name} {'-'.join(elements[i])}"
+        for j, entries in enumerate(jacobian):
+            row = np.zeros(n)
+            row[columns] = entries
+            rows.append((label if len(jacobian) == 1 else f"{label} [{j}]", row))
     return rows
 
 
@@ -77,15 +65,12 @@ def _jacobian(function, timed: bool, q, params):
     return jax.jacfwd(lambda flat: jnp.reshape(function(*t, unravel(flat), params), (-1,)))(flat)
 
 
-def _refuse(names: list[str], matrix: np.ndarray, advice: str) -> None:
-    """Raise if the rows are dependent, naming those that take part."""
-    size = np.linalg.norm(matrix, axis=1, keepdims=True)
-    left, values, _ = np.linalg.svd(matrix / np.where(size > 0, size, 1.0), full_matrices=True)
-    rank = int(np.sum(values > TOLERANCE * np.sqrt(len(names))))
-    if rank == len(names):
-        return
-    involved = [name for name, part in zip(names, left[:, rank:], strict=True) if np.abs(part).max() > 1e-6]
-    raise ValueError(
-        f"Scene: over-constrained at the start: {', '.join(involved)} are {len(involved)} constraints of rank "
-        f"{len(involved) - (len(names) - rank)}; {advice}."
-    )
+def _refuse(rows: Sequence[tuple[str, np.ndarray]], first: int, advice: str) -> None:
+    """Raise if named rows, from a column on, are dependent, naming those that take part."""
+    names, jacobian = [name for name, _ in rows], np.array([row[first:] for _, row in rows])
+    involved = dependent_rows(jacobian)
+    if involved:
+        raise ValueError(
+            f"Scene: over-constrained at the start: {', '.join(names[i] for i in involved)} are {len(involved)} constraints of rank "
+            f"{row_rank(jacobian[involved])}; {advice}."
+        )

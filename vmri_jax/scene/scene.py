@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
 from vmri_jax.scene import drawing as drawings
@@ -15,7 +16,7 @@ from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect, unknown
 from vmri_jax.scene.layout import Place, join, layout
-from vmri_jax.scene.ledger import Ledger, ledger
+from vmri_jax.scene.ledger import Contents, Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
@@ -39,18 +40,19 @@ class Scene:
 
     Args:
         bodies: `Body` instances; slow ones become q_s and fast ones q_f, in this order.
-        effects: of `vmri_jax.scene`, also one's own: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
+        effects: of `vmri_jax.scene`, also custom ones: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
             summed and constraints joined in this order.
 
     Raises:
         TypeError: something else among them.
-        ValueError: no bodies, names that occur twice, what is wrong with an effect (see there), redundant constraints.
+        ValueError: 64-bit mode is off, no bodies, names that occur twice, what is wrong with an effect (see there), redundant constraints.
     """
 
     bodies: Any
     effects: Any = ()
 
     def __post_init__(self):
+        require_x64()
         for name, kind in (("bodies", Body), ("effects", Effect)):
             items = getattr(self, name)
             if isinstance(items, kind) or not isinstance(items, Iterable):
@@ -162,7 +164,7 @@ class Scene:
             macro_dt: step that is measured; by default micro steps of a tenth of the fastest vibration's radian.
             measure: compile the scene without each effect in turn and time it; without, the ledger costs nothing.
         """
-        return ledger(self, scheme, macro_dt, measure)
+        return ledger(Contents(self.by_name, self.sorting, self.places, self.start), scheme, macro_dt, measure)
 
     def drawing(self) -> dict[str, list]:
         """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.scene.drawing`."""

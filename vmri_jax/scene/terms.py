@@ -7,15 +7,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from vmri_jax.scene.layout import Rows
 
+MASS = "mass"
+"""Where the masses are in params if the kinetic energy is a function."""
+
 
 @dataclass(frozen=True)
-class Term:
+class EffectTerm:
     """The function of an effect on the elements `select` (None: all of them), whose roles lie at `roles`.
 
     `split` names the parameters that have an entry for each element. The function of a `timed` one has the time before its
@@ -29,7 +33,7 @@ class Term:
     split: tuple[str, ...] = ()
     timed: bool = False
 
-    def own(self, params):
+    def params_of(self, params):
         """What the function gets as params."""
         return params[self.name] if self.select is None else choose(params[self.name], self.select, self.split)
 
@@ -39,23 +43,20 @@ class Term:
 
     def value(self, q_s, q_f, params, t=None):
         """Energy or constraint values."""
-        return self.function(*((t,) if self.timed else ()), self.take(q_s, q_f), self.own(params))
+        return self.function(*((t,) if self.timed else ()), self.take(q_s, q_f), self.params_of(params))
 
     def kinetic(self, q_s, q_f, v_s, v_f, params):
         """Velocity-dependent energy."""
-        return self.function(self.take(q_s, q_f), self.take(v_s, v_f), self.own(params))
+        return self.function(self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates, None where there is none."""
-        forces = self.function(t, self.take(q_s, q_f), self.take(v_s, v_f), self.own(params))
-        shapes = [
-            (rows.size,) if rows.single else (sum(run.count for run in rows.runs), rows.size) for rows in self.roles
-        ]
+        forces = self.function(t, self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
         put = [
-            rows.put(jnp.broadcast_to(force, shape), q_s.shape[0], q_f.shape[0])
-            for rows, force, shape in zip(self.roles, forces, shapes, strict=True)
+            rows.put(jnp.broadcast_to(force, rows.shape), q_s.shape[0], q_f.shape[0])
+            for rows, force in zip(self.roles, forces, strict=True)
         ]
-        return tuple(total([part for part in parts if part is not None]) for parts in zip(*put, strict=True))
+        return sums(put)
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class TangentDamping:
     """``F = -beta K v``, K the Hessian of the energy of some terms."""
 
     name: str
-    terms: tuple[Term, ...]
+    terms: tuple[EffectTerm, ...]
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates."""
@@ -76,9 +77,9 @@ class TangentDamping:
         return tuple(-params[self.name]["stiffness"] * rate for rate in rates)
 
 
-def choose(own, select: Sequence[int], split: Sequence[str]):
+def choose(params, select: Sequence[int], split: Sequence[str]):
     """Parameters of some elements: entries of those in `split` that have one for each element."""
-    return own | {name: pick(own[name], select) for name in split if name in own and jnp.ndim(own[name])}
+    return params | {name: pick(params[name], select) for name in split if name in params and jnp.ndim(params[name])}
 
 
 def pick(values, select: Sequence[int]):
@@ -95,63 +96,56 @@ def total(values: Sequence):
     return reduce(add, values) if values else None
 
 
-@dataclass(frozen=True)
-class SlowPotential:
-    """``V(q_s, q_f, params)``, the sum of its terms."""
-
-    terms: tuple[Term, ...]
-
-    def __call__(self, q_s, q_f, params):
-        return total([term.value(q_s, q_f, params) for term in self.terms])
+def sums(pairs: Sequence):
+    """Sums of the first and of the second ones of pairs (slow, fast), without those that are None."""
+    return tuple(total([part for part in parts if part is not None]) for parts in zip(*pairs, strict=True))
 
 
-@dataclass(frozen=True)
-class FastPotential:
-    """``W(q_f, params)``, the sum of its terms."""
-
-    terms: tuple[Term, ...]
-
-    def __call__(self, q_f, params):
-        return total([term.value(None, q_f, params) for term in self.terms])
-
-
-@dataclass(frozen=True)
-class MicroConstraint:
-    """``g(q_s, q_f, params)``, or ``g(t, q_s, q_f, params)``: the values of its terms one after the other."""
-
-    terms: tuple[Term, ...]
-
-    def __call__(self, *arguments):
-        *t, q_s, q_f, params = arguments
-        return join([term.value(q_s, q_f, params, *t) for term in self.terms])
-
-
-@dataclass(frozen=True)
-class MacroConstraint:
-    """``g_s(q_s, params)``, or ``g_s(t, q_s, params)``: the values of its terms one after the other."""
-
-    terms: tuple[Term, ...]
-
-    def __call__(self, *arguments):
-        *t, q_s, params = arguments
-        return join([term.value(q_s, None, params, *t) for term in self.terms])
-
-
-def join(values: Sequence):
+def joined(values: Sequence):
     """One vector of arrays of any shape."""
     vectors = [jnp.reshape(value, (-1,)) for value in values]
     return vectors[0] if len(vectors) == 1 else jnp.concatenate(vectors)
 
 
-MASS = "mass"
-"""Where the masses are in params if the kinetic energy is a function."""
-
-
 @dataclass(frozen=True)
-class KineticEnergy:
-    """``T = sum m v^2 / 2`` and the velocity-dependent terms."""
+class _OfTerms:
+    """A function of a `System` that is made of terms; compared by class and terms."""
 
-    terms: tuple[Term, ...]
+    terms: tuple[Any, ...]
+
+
+class SlowPotential(_OfTerms):
+    """``V(q_s, q_f, params)``, the sum of its terms."""
+
+    def __call__(self, q_s, q_f, params):
+        return total([term.value(q_s, q_f, params) for term in self.terms])
+
+
+class FastPotential(_OfTerms):
+    """``W(q_f, params)``, the sum of its terms."""
+
+    def __call__(self, q_f, params):
+        return total([term.value(None, q_f, params) for term in self.terms])
+
+
+class MicroConstraint(_OfTerms):
+    """``g(q_s, q_f, params)``, or ``g(t, q_s, q_f, params)``: the values of its terms one after the other."""
+
+    def __call__(self, *arguments):
+        *t, q_s, q_f, params = arguments
+        return joined([term.value(q_s, q_f, params, *t) for term in self.terms])
+
+
+class MacroConstraint(_OfTerms):
+    """``g_s(q_s, params)``, or ``g_s(t, q_s, params)``: the values of its terms one after the other."""
+
+    def __call__(self, *arguments):
+        *t, q_s, params = arguments
+        return joined([term.value(q_s, None, params, *t) for term in self.terms])
+
+
+class KineticEnergy(_OfTerms):
+    """``T = sum m v^2 / 2`` and the velocity-dependent terms."""
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
         mass = params[MASS]
@@ -159,13 +153,9 @@ class KineticEnergy:
         return total([constant, *(term.kinetic(q_s, q_f, v_s, v_f, params) for term in self.terms)])
 
 
-@dataclass(frozen=True)
-class TotalForce:
+class TotalForce(_OfTerms):
     """``F(t, q_s, q_f, v_s, v_f, params)``, the sum of its terms."""
 
-    terms: tuple[Term | TangentDamping, ...]
-
     def __call__(self, t, q_s, q_f, v_s, v_f, params):
-        forces = [term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms]
-        slow, fast = (total([part for part in parts if part is not None]) for parts in zip(*forces, strict=True))
+        slow, fast = sums([term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms])
         return jnp.zeros_like(q_s) if slow is None else slow, jnp.zeros_like(q_f) if fast is None else fast

@@ -1,9 +1,8 @@
-"""Fair comparison of run times: programs take turns, and what is reported is a ratio with its spread."""
+"""What is reported of run times: ratios with their spread, and the machine that they belong to."""
 
 import os
 import platform
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -11,15 +10,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-MIN_SECONDS = 0.02
-"""A sample shorter than this is made of several calls; longer than clocks and schedulers disturb."""
+from vmri_jax.running.timing import MIN_SECONDS, Tell, interleaved, seconds_per_call, silent
 
-Tell = Callable[[str], None]
-"""Told what is about to be measured."""
-
-
-def silent(_: str) -> None:
-    """Say nothing."""
+__all__ = ["MIN_SECONDS", "Ratio", "Tell", "interleaved", "machine", "processor", "ratio", "silent", "steps_for"]
 
 
 @dataclass(frozen=True)
@@ -51,38 +44,6 @@ def ratio(above: Sequence[float], below: Sequence[float]) -> Ratio:
     return Ratio(float(np.median(above) / np.median(below)), float(low), float(high))
 
 
-def interleaved(
-    runs: Mapping[str, Callable[[], object]],
-    repeats: int,
-    min_seconds: float = MIN_SECONDS,
-    tell: Tell = silent,
-    clock: Callable[[], float] = time.perf_counter,
-) -> dict[str, list[float]]:
-    """Seconds per call of every run, `repeats` samples each, after one call that is not counted.
-
-    The runs take turns, and every round starts with another one, so that a slow moment of the machine, or what the run
-    before left in the caches, hits all of them alike.
-
-    Args:
-        runs: callables by name; what they return is waited for (`jax.block_until_ready`).
-        repeats: samples of each.
-        min_seconds: a sample is the mean of as many calls as take about so long.
-        tell: told the name of each run before its first call.
-        clock: `time.process_time` where other processes share the core.
-    """
-    calls, seconds = {}, {name: [] for name in runs}
-    for name, run in runs.items():
-        tell(name)
-        _seconds(run, 1, clock)
-        calls[name] = max(1, round(min_seconds / _seconds(run, 1, clock)))
-    names = list(runs)
-    for i in range(repeats):
-        start = i % max(1, len(names))
-        for name in names[start:] + names[:start]:
-            seconds[name].append(_seconds(runs[name], calls[name], clock))
-    return seconds
-
-
 def steps_for(run: Callable[[int], object], seconds: float, unit: int = 1, most: int = 10**9) -> int:
     """A multiple of `unit`, at most `most`, for which ``run(steps)`` takes about `seconds`.
 
@@ -90,20 +51,13 @@ def steps_for(run: Callable[[int], object], seconds: float, unit: int = 1, most:
     """
     steps = unit
     jax.block_until_ready(run(steps))
-    none = _seconds(lambda: run(unit), 2)
+    none = seconds_per_call(lambda: run(unit), 2)
     while True:
-        taken = _seconds(lambda n=steps: run(n), 1)
+        taken = seconds_per_call(lambda n=steps: run(n), 1)
         if (taken >= seconds / 8 and taken > 3 * none) or taken >= seconds or steps * 4 > most:
             break
         steps *= 4
     return max(1, min(round(steps * seconds / taken), most) // unit) * unit
-
-
-def _seconds(run: Callable[[], object], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    start = clock()
-    for _ in range(calls):
-        jax.block_until_ready(run())
-    return (clock() - start) / calls
 
 
 def machine() -> dict:

@@ -1,1 +1,1 @@
-"""Effects, each in a file of its own; `vmri_jax.scene` offers them all."""
+"""The effects that `vmri_jax.scene` offers."""

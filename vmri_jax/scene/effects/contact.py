@@ -1,15 +1,14 @@
 """Smooth penalty contact with planes and spheres."""
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.scene.effect import Effect, each
-from vmri_jax.scene.effects.geometry import check_points
+from vmri_jax.scene.declare import array, common, effect_class, names, number, positive
+from vmri_jax.scene.effect import Effect
 
 
 def penalty(gap, params):
@@ -18,30 +17,18 @@ def penalty(gap, params):
     return jnp.sum(params["stiffness"] / 2 * depth**2)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@effect_class
 class _Contact(Effect):
     """What contacts share: stiffness, smoothing and radius of the bodies."""
 
-    stiffness: Any
-    smoothing: Any
-    radius: Any = 0.0
-    bodies: Any = None
+    _: KW_ONLY
+    stiffness: Any = positive()
+    smoothing: Any = positive()
+    radius: Any = number(default=0.0, sign="at least zero")
+    bodies: Any = names(default=None)
 
     kind = "potential"
-    numbers = ("stiffness", "smoothing", "radius")
-
-    def elements(self, bodies):
-        return each(self.bodies, bodies, self.name)
-
-    def parameters(self, bodies):
-        return {name: jnp.asarray(getattr(self, name), dtype=float) for name in self.numbers}
-
-    def check(self, bodies):
-        super().check(bodies)
-        check_points(self, bodies)
-        self.require_positive(stiffness=self.stiffness, smoothing=self.smoothing)
-        radius = np.asarray(self.radius) if is_concrete(self.radius) else np.zeros(())
-        self.require(radius >= 0, "radius", radius, "it must not be negative")
+    dimensions = (1, 2, 3)
 
     def curvature(self, bodies):
         return self.stiffness
@@ -52,13 +39,7 @@ class _Contact(Effect):
         return {"radii": [[name, float(r)] for (name,), r in zip(elements, radii, strict=True) if r > 0]}
 
 
-def plane_energy(q, params):
-    """`penalty` of ``gap = n . (q - p) - r``."""
-    (q,) = q
-    return penalty(jnp.sum(params["normal"] * (q - params["point"]), axis=-1) - params["radius"], params)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
+@effect_class
 class PlaneContact(_Contact):
     """Contact with the side of a plane that its normal points to: ``V = k/2 sum d^2``, ``d = s log(1 + exp(-gap / s))``.
 
@@ -76,35 +57,33 @@ class PlaneContact(_Contact):
         ValueError: (of the scene) numbers that are not positive, a normal that is zero, vectors of another dimension.
     """
 
-    point: Any
-    normal: Any
+    _: KW_ONLY
+    point: Any = common()
+    normal: Any = common()
 
     default_name = "plane_contact"
-    function = staticmethod(plane_energy)
+
+    @staticmethod
+    def function(q, params):
+        (q,) = q
+        return penalty(jnp.sum(params["normal"] * (q - params["point"]), axis=-1) - params["radius"], params)
 
     def parameters(self, bodies):
-        normal = jnp.atleast_1d(jnp.asarray(self.normal, dtype=float))
-        point = jnp.atleast_1d(jnp.asarray(self.point, dtype=float))
-        return super().parameters(bodies) | {"point": point, "normal": normal / jnp.sqrt(jnp.sum(normal**2))}
+        params = super().parameters(bodies)
+        normal = params["normal"]
+        return params | {"normal": normal / jnp.sqrt(jnp.sum(normal**2))}
 
-    def check(self, bodies):
+    def check_parameters(self, bodies):
         self.require(jnp.any(jnp.asarray(self.normal) != 0), "normal", self.normal, "it must not be zero")
-        super().check(bodies)
-        check_vectors(self, bodies, point=self.point, normal=self.normal)
+        super().check_parameters(bodies)
 
     def drawing(self, bodies):
-        plane = {name: np.asarray(self.parameters(bodies)[name]).tolist() for name in ("point", "normal")}
+        params = self.parameters(bodies)
+        plane = {name: np.asarray(params[name]).tolist() for name in ("point", "normal")}
         return super().drawing(bodies) | {"planes": [plane]}
 
 
-def sphere_energy(q, params):
-    """`penalty` of ``gap = |q - c| - R - r``."""
-    (q,) = q
-    distance = jnp.sqrt(jnp.sum((q - params["center"]) ** 2, axis=-1))
-    return penalty(distance - params["sphere_radius"] - params["radius"], params)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
+@effect_class
 class SphereContact(_Contact):
     """Contact with the outside of a fixed sphere: ``V = k/2 sum d^2``, ``d = s log(1 + exp(-gap / s))``.
 
@@ -119,39 +98,26 @@ class SphereContact(_Contact):
         ValueError: (of the scene) numbers that are not positive, a center of another dimension, a body that starts at it.
     """
 
-    center: Any
-    sphere_radius: Any
+    _: KW_ONLY
+    center: Any = common()
+    sphere_radius: Any = array(sign="positive")
 
     default_name = "sphere_contact"
-    function = staticmethod(sphere_energy)
 
-    def parameters(self, bodies):
-        center = jnp.atleast_1d(jnp.asarray(self.center, dtype=float))
-        return super().parameters(bodies) | {
-            "center": center,
-            "sphere_radius": jnp.asarray(self.sphere_radius, dtype=float),
-        }
+    @staticmethod
+    def function(q, params):
+        (q,) = q
+        distance = jnp.sqrt(jnp.sum((q - params["center"]) ** 2, axis=-1))
+        return penalty(distance - params["sphere_radius"] - params["radius"], params)
 
-    def check(self, bodies):
-        super().check(bodies)
-        self.require_positive(sphere_radius=self.sphere_radius)
-        check_vectors(self, bodies, center=self.center)
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
         for (name,) in self.elements(bodies):
-            away = jnp.any(bodies[name].position != jnp.asarray(self.center))
-            self.require(away, f"the start of {name}", bodies[name].position, "it must not be the center of the sphere")
+            position = bodies[name].position
+            away = jnp.any(position != jnp.asarray(self.center))
+            self.require(away, f"the start of {name}", position, "it must not be the center of the sphere")
 
     def drawing(self, bodies):
-        parameters = self.parameters(bodies)
-        sphere = {"center": np.asarray(parameters["center"]).tolist(), "radius": float(parameters["sphere_radius"])}
+        params = self.parameters(bodies)
+        sphere = {"center": np.asarray(params["center"]).tolist(), "radius": float(params["sphere_radius"])}
         return super().drawing(bodies) | {"spheres": [sphere]}
-
-
-def check_vectors(effect: Effect, bodies, **vectors) -> None:
-    """Refuse vectors that are not of the dimension of all bodies of the effect."""
-    for (body,) in effect.elements(bodies):
-        for name, value in vectors.items():
-            shape = jnp.atleast_1d(jnp.asarray(value)).shape
-            if shape != (bodies[body].size,):
-                raise ValueError(
-                    f"{effect.name}: {name} has shape {shape}, {body} has dimension {bodies[body].size}; they must agree."
-                )

@@ -1,42 +1,23 @@
-"""Forces against motion: linear damping, dashpots between points, quadratic drag."""
+"""Forces against motion: linear damping, quadratic drag, dashpots between points, Rayleigh damping."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.effect import Effect, each, groups
-from vmri_jax.scene.effects.geometry import check_points, norm, require_apart
+from vmri_jax.scene.declare import array, effect_class, names, positive
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.points import BetweenPoints
+from vmri_jax.scene.terms import TangentDamping
 
 
-@dataclass(frozen=True, eq=False)
-class _Resistance(Effect):
-    """What forces against the motion of single bodies share."""
-
-    coefficient: Any
-    bodies: Any = None
-
-    kind = "force"
-    numbers = ("coefficient",)
-
-    def elements(self, bodies):
-        return each(self.bodies, bodies, self.name)
-
-    def parameters(self, bodies):
-        return {"coefficient": jnp.asarray(self.coefficient, dtype=float)}
-
-    def check(self, bodies):
-        super().check(bodies)
-        self.require_positive(coefficient=self.coefficient)
+def norm(v):
+    """``|v|``, with derivative zero at v = 0."""
+    square = jnp.sum(v**2, axis=-1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
-def linear_damping(t, q, v, params):
-    """``F = -c v``."""
-    (v,) = v
-    return (-params["coefficient"][..., None] * v,)
-
-
-class LinearDamping(_Resistance):
+@effect_class
+class LinearDamping(Effect):
     """Damping of bodies against the ground, ``F = -c v``.
 
     Args:
@@ -47,17 +28,20 @@ class LinearDamping(_Resistance):
         ValueError: (of the scene) a coefficient that is not positive.
     """
 
+    coefficient: Any = positive()
+    bodies: Any = names(default=None)
+
+    kind = "force"
     default_name = "damping"
-    function = staticmethod(linear_damping)
+
+    @staticmethod
+    def function(t, q, v, params):
+        (v,) = v
+        return (-params["coefficient"][..., None] * v,)
 
 
-def quadratic_drag(t, q, v, params):
-    """``F = -c |v| v``."""
-    (v,) = v
-    return (-(params["coefficient"] * norm(v))[..., None] * v,)
-
-
-class QuadraticDrag(_Resistance):
+@effect_class
+class QuadraticDrag(Effect):
     """Drag of a resting fluid, ``F = -c |v| v``.
 
     Args:
@@ -68,21 +52,20 @@ class QuadraticDrag(_Resistance):
         ValueError: (of the scene) a coefficient that is not positive.
     """
 
+    coefficient: Any = positive()
+    bodies: Any = names(default=None)
+
+    kind = "force"
     default_name = "drag"
-    function = staticmethod(quadratic_drag)
+
+    @staticmethod
+    def function(t, q, v, params):
+        (v,) = v
+        return (-(params["coefficient"] * norm(v))[..., None] * v,)
 
 
-def dashpot(t, q, v, params):
-    """``F_b = -c ((v_b - v_a) . n) n = -F_a``, n the direction from a to b."""
-    (a, b), (v_a, v_b) = q, v
-    along = b - a
-    rate = jnp.sum((v_b - v_a) * along, axis=-1) / jnp.sum(along**2, axis=-1)
-    force = -(params["coefficient"] * rate)[..., None] * along
-    return -force, force
-
-
-@dataclass(frozen=True, eq=False)
-class Dashpot(Effect):
+@effect_class
+class Dashpot(BetweenPoints):
     """Dampers between points, against the change of their distance: ``F_b = -c ((v_b - v_a) . n) n = -F_a``.
 
     Args:
@@ -93,22 +76,66 @@ class Dashpot(Effect):
         ValueError: (of the scene) a coefficient that is not positive, ends at one point at the start.
     """
 
-    between: Any
-    coefficient: Any
+    coefficient: Any = positive()
 
     kind = "force"
     default_name = "dashpots"
-    numbers = ("coefficient",)
-    function = staticmethod(dashpot)
+
+    @staticmethod
+    def function(t, q, v, params):
+        (a, b), (v_a, v_b) = q, v
+        along = b - a
+        rate = jnp.sum((v_b - v_a) * along, axis=-1) / jnp.sum(along**2, axis=-1)
+        force = -(params["coefficient"] * rate)[..., None] * along
+        return -force, force
+
+
+@effect_class
+class RayleighDamping(Effect):
+    """Rayleigh damping of the whole scene, ``F = -(alpha M + beta K(q)) v``, K the Hessian of potentials.
+
+    A vibration of frequency w is damped by the ratio ``alpha / (2 w) + beta w / 2``. K is taken at the present
+    configuration; where a potential has negative curvature this part gives energy instead.
+
+    Args:
+        mass: alpha, 1/s, positive; None for none.
+        stiffness: beta, s, positive; None for none.
+        of: names of the potentials whose stiffness damps; all of the scene by default.
+
+    Raises:
+        ValueError: (of the scene) neither alpha nor beta, numbers that are not positive, a name in `of` that is no potential.
+    """
+
+    mass: Any = array(default=None, sign="positive")
+    stiffness: Any = array(default=None, sign="positive")
+    of: Any = None
+
+    kind = "force"
+    default_name = "rayleigh_damping"
+
+    @staticmethod
+    def function(t, q, v, params):
+        (v,) = v
+        return (-(params["mass"] * params["mass_of"])[..., None] * v,)
+
+    @property
+    def masses(self):
+        return () if self.mass is None else ("mass_of",)
+
+    @property
+    def refers_to(self):
+        return () if self.of is None else (self.of,) if isinstance(self.of, str) else tuple(self.of)
 
     def elements(self, bodies):
-        return groups(self.between, 2, self.name)
+        return tuple((name,) for name in bodies)
 
-    def parameters(self, bodies):
-        return {"coefficient": jnp.asarray(self.coefficient, dtype=float)}
+    def check_parameters(self, bodies):
+        if self.mass is None and self.stiffness is None:
+            raise ValueError(f"{self.name}: mass and stiffness are both None; give at least one of them.")
+        super().check_parameters(bodies)
 
-    def check(self, bodies):
-        super().check(bodies)
-        check_points(self, bodies)
-        require_apart(self, bodies)
-        self.require_positive(coefficient=self.coefficient)
+    def terms(self, select, bodies, places, potentials):
+        terms = () if self.mass is None else super().terms(select, bodies, places, potentials)
+        names = [name for name in potentials if self.of is None or name in self.refers_to]
+        damped = tuple(term for name in names for term in potentials[name])
+        return terms if self.stiffness is None or not damped else (*terms, TangentDamping(self.name, damped))

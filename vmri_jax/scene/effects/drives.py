@@ -4,56 +4,38 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
-from vmri_jax.scene.effect import Effect, groups
-from vmri_jax.scene.effects.geometry import check_points, require_apart, vector_of
+from vmri_jax.scene.declare import effect_class, names, number, positive, vector
+from vmri_jax.scene.effect import Effect, real_tree
+from vmri_jax.scene.effects.points import BetweenPoints
 
 
-@dataclass(frozen=True, eq=False)
-class _OnBodies(Effect):
-    """What forces on single bodies share."""
-
-    bodies: Any
-
-    kind = "force"
-
-    def elements(self, bodies):
-        return groups(self.bodies, 1, self.name)
-
-
-def constant_force(t, q, v, params):
-    """``F = f``."""
-    return (params["force"],)
-
-
-@dataclass(frozen=True, eq=False)
-class ConstantForce(_OnBodies):
+@effect_class
+class ConstantForce(Effect):
     """A constant force f on bodies.
 
     Args:
         bodies: a name, or a list of names.
         force: f, N, (d,); or one for each body, (n, d).
+
+    Raises:
+        ValueError: (of the scene) a force of another dimension than its body.
     """
 
-    force: Any
+    bodies: Any = names()
+    force: Any = vector()
 
+    kind = "force"
     default_name = "constant_force"
-    vectors = ("force",)
-    function = staticmethod(constant_force)
 
-    def parameters(self, bodies):
-        return {"force": vector_of(self, "force", self.force, bodies)}
-
-
-def harmonic_force(t, q, v, params):
-    """``F = f cos(w t + phi)``."""
-    return (params["amplitude"] * jnp.cos(params["frequency"] * t + params["phase"])[..., None],)
+    @staticmethod
+    def function(t, q, v, params):
+        return (params["force"],)
 
 
-@dataclass(frozen=True, eq=False)
-class HarmonicDrive(_OnBodies):
+@effect_class
+class HarmonicDrive(Effect):
     """A harmonic force ``F = f cos(w t + phi)`` on bodies.
 
     Args:
@@ -63,29 +45,25 @@ class HarmonicDrive(_OnBodies):
         phase: phi, rad; likewise.
 
     Raises:
-        ValueError: (of the scene) a frequency that is not positive.
+        ValueError: (of the scene) a frequency that is not positive, an amplitude of another dimension than its body.
     """
 
-    amplitude: Any
-    frequency: Any
-    phase: Any = 0.0
+    bodies: Any = names()
+    amplitude: Any = vector()
+    frequency: Any = positive()
+    phase: Any = number(default=0.0)
 
+    kind = "force"
     default_name = "harmonic_drive"
-    numbers, vectors = ("frequency", "phase"), ("amplitude",)
-    function = staticmethod(harmonic_force)
 
-    def parameters(self, bodies):
-        numbers = {name: jnp.asarray(getattr(self, name), dtype=float) for name in self.numbers}
-        return numbers | {"amplitude": vector_of(self, "amplitude", self.amplitude, bodies)}
-
-    def check(self, bodies):
-        super().check(bodies)
-        self.require_positive(frequency=self.frequency)
+    @staticmethod
+    def function(t, q, v, params):
+        return (params["amplitude"] * jnp.cos(params["frequency"] * t + params["phase"])[..., None],)
 
 
 @dataclass(frozen=True)
 class OfTime:
-    """``F = f(t)``, the same on all bodies."""
+    """``F = f(t)``, the same on all bodies; compared by value."""
 
     history: Callable
 
@@ -94,19 +72,21 @@ class OfTime:
         return (jnp.broadcast_to(self.history(t, params), q.shape),)
 
 
-@dataclass(frozen=True, eq=False)
-class Drive(_OnBodies):
+@effect_class
+class Drive(Effect):
     """A force ``F = f(t)`` on bodies, any function of time.
 
     Args:
         bodies: a name, or a list of names; each gets this force.
-        history: ``history(t, params) -> (d,)``; define it at module level, it is compared by identity.
+        history: ``history(t, params) -> (d,)``, N; define it at module level, it is compared by identity.
         params: what `history` gets as params; traced.
     """
 
+    bodies: Any = names()
     history: Callable
     params: Any = field(default_factory=dict)
 
+    kind = "force"
     default_name = "drive"
 
     @property
@@ -114,18 +94,11 @@ class Drive(_OnBodies):
         return OfTime(self.history)
 
     def parameters(self, bodies):
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), self.params)
+        return real_tree(f"{self.name}: params", self.params)
 
 
-def follower_force(t, q, v, params):
-    """``F = f (q_b - q_a) / |q_b - q_a|`` on b."""
-    a, b = q
-    direction = (b - a) / jnp.linalg.norm(b - a, axis=-1, keepdims=True)
-    return jnp.zeros_like(a), params["force"][..., None] * direction
-
-
-@dataclass(frozen=True, eq=False)
-class FollowerForce(Effect):
+@effect_class
+class FollowerForce(BetweenPoints):
     """A force on b that turns with the line from a to b: ``F = f (q_b - q_a) / |q_b - q_a|``, a jet at the end of a rod.
 
     Args:
@@ -136,21 +109,13 @@ class FollowerForce(Effect):
         ValueError: (of the scene) ends at one point at the start.
     """
 
-    between: Any
-    force: Any
+    force: Any = number()
 
     kind = "force"
     default_name = "follower_force"
-    numbers = ("force",)
-    function = staticmethod(follower_force)
 
-    def elements(self, bodies):
-        return groups(self.between, 2, self.name)
-
-    def parameters(self, bodies):
-        return {"force": jnp.asarray(self.force, dtype=float)}
-
-    def check(self, bodies):
-        super().check(bodies)
-        check_points(self, bodies)
-        require_apart(self, bodies)
+    @staticmethod
+    def function(t, q, v, params):
+        a, b = q
+        direction = (b - a) / jnp.linalg.norm(b - a, axis=-1, keepdims=True)
+        return jnp.zeros_like(a), params["force"][..., None] * direction

@@ -1,27 +1,21 @@
-"""Rigid links between points."""
+"""Rigid links: between points, to fixed points and to moving ones; a body whose motion is given."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.scene.effect import Effect, groups
-from vmri_jax.scene.effects.geometry import check_points, distances, length_of, require_apart
-
-START = 1e-9
-"""How far, relative to its length, a link may be from its length at the start."""
+from vmri_jax.scene.declare import effect_class, positive
+from vmri_jax.scene.effect import START
+from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
 
 
-def length_defect(q, params):
-    """``g = (|q_b - q_a|^2 - l^2) / 2``."""
-    a, b = q
-    return (jnp.sum((b - a) ** 2, axis=-1) - params["length"] ** 2) / 2
+def length_defect(line, length):
+    """``(|x|^2 - l^2) / 2``, smooth also at x = 0."""
+    return (jnp.sum(line**2, axis=-1) - length**2) / 2
 
 
-@dataclass(frozen=True, eq=False)
-class RigidLink(Effect):
+@effect_class
+class RigidLink(BetweenPoints):
     """Massless rigid links, ``g = (|q_b - q_a|^2 - l^2) / 2 = 0``.
 
     A link between slow bodies is held at the macro nodes, one that touches a fast body at the micro nodes.
@@ -35,32 +29,101 @@ class RigidLink(Effect):
             the start, links that together are redundant.
     """
 
-    between: Any
-    length: Any = None
+    length: Any = positive(default=None, measured=True)
 
     kind = "constraint"
     default_name = "links"
-    numbers = ("length",)
-    function = staticmethod(length_defect)
+    drawn_as = "link"
 
-    def elements(self, bodies):
-        return groups(self.between, 2, self.name)
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        return length_defect(b - a, params["length"])
 
-    def parameters(self, bodies):
-        return {"length": length_of(self, self.length, bodies)}
 
-    def check(self, bodies):
-        super().check(bodies)
-        check_points(self, bodies)
-        require_apart(self, bodies)
-        length, elements = self.parameters(bodies)["length"], self.elements(bodies)
-        self.require_positive(length=length)
-        start = distances(elements, bodies)
-        if is_concrete((length, start)):
-            found = zip(elements, *np.broadcast_arrays(*map(np.atleast_1d, (length, start))), strict=True)
-            for (a, b), given, apart in found:
-                right = abs(given - apart) <= START * given
-                self.require(right, f"the link {a}-{b}", f"{given:g} long", f"{a} and {b} start {apart:.12g} apart")
+@effect_class
+class Anchor(ToFixedPoint):
+    """Rigid links to fixed points, ``g = (|q - a|^2 - l^2) / 2 = 0``: a pendulum's rod.
 
-    def drawing(self, bodies):
-        return {"links": [list(element) for element in self.elements(bodies)]}
+    The points stay where they are; `MovingPivot` is a rigid link to a point that moves.
+
+    Args:
+        bodies: a name, or a list of names.
+        point: a, (d,); or one for each body, (n, d).
+        length: l, positive; one number, or one for each. The distance at the start by default.
+
+    Raises:
+        TypeError: a function as point.
+        ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
+    """
+
+    length: Any = positive(default=None, measured=True)
+
+    kind = "constraint"
+    default_name = "anchors"
+    apart = True
+    dimensions = (1, 2, 3)
+    drawn_as = "link"
+
+    @staticmethod
+    def function(q, params):
+        (q,) = q
+        return length_defect(q - params["point"], params["length"])
+
+
+@effect_class
+class MovingPivot(ToPath):
+    """Rigid links to a moving point, ``g = (|q - a(t)|^2 - l^2) / 2 = 0``: a pendulum on a pivot that is moved.
+
+    Args:
+        bodies: a name, or a list of names.
+        path: ``path(t, params) -> (d,)``, the point; define it at module level.
+        length: l, positive; one number, or one for each. The distance at the start, t = 0, by default.
+        params: what `path` gets as params.
+
+    Raises:
+        TypeError: (of the scene) a path that is no function.
+        ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
+    """
+
+    length: Any = positive(default=None, measured=True)
+
+    kind = "constraint"
+    default_name = "moving_pivots"
+    apart = True
+    advice = "move one of them, or take Guide"
+
+    @staticmethod
+    def formula(point, q, params):
+        (q,) = q
+        return length_defect(q - point, params["length"])
+
+
+@effect_class
+class Guide(ToPath):
+    """A body whose motion is given, ``g = q - a(t) = 0``; what holds it there does the work that is needed.
+
+    Args:
+        bodies: a name.
+        path: ``path(t, params) -> (d,)``, where it is; define it at module level.
+        params: what `path` gets as params.
+
+    Raises:
+        TypeError: (of the scene) a path that is no function.
+        ValueError: (of the scene) a body that does not start there.
+    """
+
+    kind = "constraint"
+    default_name = "guides"
+
+    @staticmethod
+    def formula(point, q, params):
+        (q,) = q
+        return q - point
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        away = self.at_start(bodies, self.parameters(bodies))
+        size = jnp.max(jnp.abs(jnp.stack([bodies[name].position for (name,) in self.elements(bodies)])))
+        what = "the distance of the body from its point at t = 0"
+        self.require(away <= START * jnp.maximum(size, 1.0), what, away, "it must start there")

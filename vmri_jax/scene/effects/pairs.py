@@ -1,35 +1,50 @@
-"""Forces between all pairs of points: Coulomb, Lennard-Jones."""
+"""Forces between all pairs of points: Newton's gravity, Coulomb, Lennard-Jones."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
-from vmri_jax.scene.effect import Effect, all_pairs
-from vmri_jax.scene.effects.geometry import check_points, require_apart, squeeze
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.scene.declare import array, effect_class, names, number, positive, squeeze
+from vmri_jax.scene.effect import Effect, real_tree
+from vmri_jax.scene.effects.points import distance
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs(Effect):
-    """What effects between pairs that must stay apart share."""
+@effect_class
+class NBodyGravity(Effect):
+    """Newton's gravity between bodies, ``V = -G sum_{a<b} m_a m_b / sqrt(|q_a - q_b|^2 + s^2)``.
+
+    Args:
+        constant: G, in the units of the scene: 6.674e-11 N m^2/kg^2 in SI units.
+        between: names of bodies, every pair of which attracts; or a list of pairs. All bodies by default.
+        softening: s, a length; zero for points.
+
+    Raises:
+        ValueError: (of the scene) bodies that start at one point without a softening.
+    """
+
+    constant: Any = array(default=6.674e-11)
+    between: Any = names(2, pairs=True, default=None)
+    softening: Any = number(default=0.0)
 
     kind = "potential"
+    default_name = "nbody_gravity"
+    masses = ("mass_a", "mass_b")
 
-    def check(self, bodies):
-        super().check(bodies)
-        check_points(self, bodies)
-        require_apart(self, bodies)
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        softened = jnp.sqrt(jnp.sum((b - a) ** 2, axis=-1) + params["softening"] ** 2)
+        return -params["constant"] * jnp.sum(params["mass_a"] * params["mass_b"] / softened)
+
+    @property
+    def apart(self):
+        return not (is_concrete(self.softening) and np.all(np.asarray(self.softening) > 0))
 
 
-def coulomb_energy(q, params):
-    """``V = C sum Q_a Q_b / |q_b - q_a|``."""
-    a, b = q
-    distance = jnp.sqrt(jnp.sum((b - a) ** 2, axis=-1))
-    return params["constant"] * jnp.sum(params["charge_a"] * params["charge_b"] / distance)
-
-
-@dataclass(frozen=True, eq=False)
-class Coulomb(_Pairs):
+@effect_class
+class Coulomb(Effect):
     """Coulomb's law between charges, ``V = C sum_{a<b} Q_a Q_b / |q_b - q_a|``.
 
     Args:
@@ -42,40 +57,35 @@ class Coulomb(_Pairs):
     """
 
     charges: Any
-    constant: Any = 8.9875517862e9
-    between: Any = None
+    constant: Any = array(default=8.9875517862e9)
+    between: Any = names(2, pairs=True, default=None)
 
+    kind = "potential"
     default_name = "coulomb"
-    numbers = ("charge_a", "charge_b")
-    function = staticmethod(coulomb_energy)
+    dimensions = (1, 2, 3)
+    apart = True
+    derived = ("charge_a", "charge_b")
+
+    @staticmethod
+    def function(q, params):
+        return params["constant"] * jnp.sum(params["charge_a"] * params["charge_b"] / distance(q))
 
     def elements(self, bodies):
-        pairs = all_pairs(tuple(self.charges) if self.between is None else self.between, bodies, self.name)
-        for pair in pairs:
-            for name in pair:
-                if name not in self.charges:
-                    raise ValueError(
-                        f"{self.name}: {name} has no charge; there are charges of {', '.join(self.charges)}."
-                    )
+        pairs = super().elements(self.charges if self.between is None else bodies)
+        for name in (name for pair in pairs for name in pair):
+            if name not in self.charges:
+                raise ValueError(f"{self.name}: {name} has no charge; there are charges of {', '.join(self.charges)}.")
         return pairs
 
     def parameters(self, bodies):
-        pairs = self.elements(bodies)
-        charges = [
-            squeeze(jnp.stack([jnp.asarray(self.charges[pair[i]], dtype=float) for pair in pairs])) for i in (0, 1)
-        ]
-        return {"constant": jnp.asarray(self.constant, dtype=float), "charge_a": charges[0], "charge_b": charges[1]}
+        charges = real_tree(f"{self.name}: charges", self.charges)
+        roles = zip(self.derived, zip(*self.elements(bodies), strict=True), strict=True)
+        of_roles = {name: squeeze(jnp.stack([charges[body] for body in role])) for name, role in roles}
+        return super().parameters(bodies) | of_roles
 
 
-def lennard_jones_energy(q, params):
-    """``V = 4 eps sum ((s/r)^12 - (s/r)^6)``."""
-    a, b = q
-    sixth = (params["distance"] ** 2 / jnp.sum((b - a) ** 2, axis=-1)) ** 3
-    return jnp.sum(4 * params["depth"] * (sixth**2 - sixth))
-
-
-@dataclass(frozen=True, eq=False)
-class LennardJones(_Pairs):
+@effect_class
+class LennardJones(Effect):
     """Lennard-Jones forces, ``V = 4 eps sum_{a<b} ((s/r)^12 - (s/r)^6)``; the minimum -eps is at ``r = 2^(1/6) s``.
 
     Args:
@@ -87,20 +97,17 @@ class LennardJones(_Pairs):
         ValueError: (of the scene) numbers that are not positive, bodies that start at one point.
     """
 
-    depth: Any
-    distance: Any
-    between: Any = None
+    depth: Any = positive()
+    distance: Any = positive()
+    between: Any = names(2, pairs=True, default=None)
 
+    kind = "potential"
     default_name = "lennard_jones"
-    numbers = ("depth", "distance")
-    function = staticmethod(lennard_jones_energy)
+    dimensions = (1, 2, 3)
+    apart = True
 
-    def elements(self, bodies):
-        return all_pairs(self.between, bodies, self.name)
-
-    def parameters(self, bodies):
-        return {name: jnp.asarray(getattr(self, name), dtype=float) for name in self.numbers}
-
-    def check(self, bodies):
-        super().check(bodies)
-        self.require_positive(depth=self.depth, distance=self.distance)
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        sixth = (params["distance"] ** 2 / jnp.sum((b - a) ** 2, axis=-1)) ** 3
+        return jnp.sum(4 * params["depth"] * (sixth**2 - sixth))

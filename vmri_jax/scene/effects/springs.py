@@ -1,27 +1,25 @@
-"""Springs between points: linear, and with a polynomial law."""
+"""Springs: between points, to fixed points and to moving ones."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.effect import Effect, groups
-from vmri_jax.scene.effects.geometry import check_points, length_of, require_apart
+from vmri_jax.scene.declare import array, effect_class, positive
+from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
 
 
-def elongation(q, params):
-    """``e = |q_b - q_a| - l``."""
-    a, b = q
-    return jnp.linalg.norm(b - a, axis=-1) - params["length"]
+def elastic_energy(stiffness, elongation):
+    """``sum k/2 e^2``."""
+    return jnp.sum(stiffness / 2 * elongation**2)
 
 
-def elastic_energy(q, params):
-    """``V = sum k/2 e^2``."""
-    return jnp.sum(params["stiffness"] / 2 * elongation(q, params) ** 2)
+def elongation(line, length):
+    """``|x| - l``."""
+    return jnp.linalg.norm(line, axis=-1) - length
 
 
-@dataclass(frozen=True, eq=False)
-class Spring(Effect):
+@effect_class
+class Spring(BetweenPoints):
     """Linear springs, ``V = sum k/2 (|q_b - q_a| - l)^2``.
 
     Args:
@@ -33,41 +31,21 @@ class Spring(Effect):
         ValueError: (of the scene) numbers that are not positive, ends at one point at the start.
     """
 
-    between: Any
-    stiffness: Any
-    length: Any = None
+    stiffness: Any = positive()
+    length: Any = positive(default=None, measured=True)
 
     kind = "potential"
+    drawn_as = "spring"
     default_name = "springs"
-    numbers = ("stiffness", "length")
-    function = staticmethod(elastic_energy)
 
-    def elements(self, bodies):
-        return groups(self.between, 2, self.name)
-
-    def parameters(self, bodies):
-        return {"stiffness": jnp.asarray(self.stiffness, dtype=float), "length": length_of(self, self.length, bodies)}
-
-    def check(self, bodies):
-        super().check(bodies)
-        check_points(self, bodies)
-        require_apart(self, bodies)
-        self.require_positive(**self.parameters(bodies))
-
-    def drawing(self, bodies):
-        return {"springs": [list(element) for element in self.elements(bodies)]}
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        return elastic_energy(params["stiffness"], elongation(b - a, params["length"]))
 
 
-def polynomial_energy(q, params):
-    """``V = sum_j k_j e^(j+1) / (j+1)``."""
-    e, energy = elongation(q, params), 0.0
-    for j in range(params["coefficients"].shape[0], 0, -1):
-        energy = (energy + params["coefficients"][j - 1] / (j + 1)) * e
-    return jnp.sum(energy * e)
-
-
-@dataclass(frozen=True, eq=False)
-class NonlinearSpring(Effect):
+@effect_class
+class NonlinearSpring(BetweenPoints):
     """Springs whose force is a polynomial of the elongation ``e = |q_b - q_a| - l``: ``k_1 e + k_2 e^2 + k_3 e^3 + ...``
 
     ``V = sum_j k_j e^(j+1) / (j+1)``; (k, 0, k_3) is a Duffing spring, stiffening for k_3 > 0.
@@ -81,32 +59,85 @@ class NonlinearSpring(Effect):
         ValueError: (of the scene) no coefficients, a length that is not positive, ends at one point at the start.
     """
 
-    between: Any
-    coefficients: Any
-    length: Any = None
+    coefficients: Any = array()
+    length: Any = positive(default=None, measured=True)
 
     kind = "potential"
+    drawn_as = "spring"
     default_name = "nonlinear_springs"
-    numbers = ("length",)
-    function = staticmethod(polynomial_energy)
 
-    def elements(self, bodies):
-        return groups(self.between, 2, self.name)
+    @staticmethod
+    def function(q, params):
+        a, b = q
+        e, energy = elongation(b - a, params["length"]), 0.0
+        for j in range(params["coefficients"].shape[0], 0, -1):
+            energy = (energy + params["coefficients"][j - 1] / (j + 1)) * e
+        return jnp.sum(energy * e)
 
-    def parameters(self, bodies):
-        coefficients = jnp.asarray(self.coefficients, dtype=float)
-        return {"coefficients": coefficients, "length": length_of(self, self.length, bodies)}
-
-    def check(self, bodies):
-        super().check(bodies)
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
         coefficients = self.parameters(bodies)["coefficients"]
         if coefficients.ndim != 1 or not coefficients.size:
             raise ValueError(
                 f"{self.name}: coefficients is {self.coefficients!r}; give (k_1, k_2, ...), at least one number."
             )
-        check_points(self, bodies)
-        require_apart(self, bodies)
-        self.require_positive(length=self.parameters(bodies)["length"])
 
-    def drawing(self, bodies):
-        return {"springs": [list(element) for element in self.elements(bodies)]}
+
+@effect_class
+class SpringAnchor(ToFixedPoint):
+    """Springs to fixed points, ``V = sum k/2 (|q - a| - l)^2``; without a length the well ``sum k/2 |q - a|^2``.
+
+    Args:
+        bodies: a name, or a list of names.
+        point: a, (d,); or one for each body, (n, d).
+        stiffness: k, N/m, positive; one number, or one for each.
+        length: l, at rest, positive; likewise; None for a spring that pulls down to the point itself.
+
+    Raises:
+        TypeError: a function as point.
+        ValueError: (of the scene) numbers that are not positive, bodies that start at the point of a spring with a length.
+    """
+
+    stiffness: Any = positive()
+    length: Any = positive(default=None)
+
+    kind = "potential"
+    default_name = "spring_anchors"
+    drawn_as = "spring"
+
+    @staticmethod
+    def function(q, params):
+        (q,) = q
+        if "length" not in params:
+            return jnp.sum(params["stiffness"] / 2 * jnp.sum((q - params["point"]) ** 2, axis=-1))
+        return elastic_energy(params["stiffness"], elongation(q - params["point"], params["length"]))
+
+    @property
+    def apart(self):
+        return self.length is not None
+
+
+@effect_class
+class MovingAnchor(ToPath):
+    """Springs to a moving point, ``F = k (a(t) - q)``: an elastic hold, and a force, because it does work.
+
+    Args:
+        bodies: a name, or a list of names.
+        path: ``path(t, params) -> (d,)``, the point; define it at module level.
+        stiffness: k, N/m, positive; one number, or one for each body.
+        params: what `path` gets as params.
+
+    Raises:
+        TypeError: (of the scene) a path that is no function.
+        ValueError: (of the scene) a stiffness that is not positive.
+    """
+
+    stiffness: Any = positive()
+
+    kind = "force"
+    default_name = "moving_anchors"
+
+    @staticmethod
+    def formula(point, q, v, params):
+        (q,) = q
+        return (params["stiffness"][..., None] * (point - q),)

@@ -1,4 +1,4 @@
-"""Effects of one's own are a function and one line:
+"""Custom effects are a function and one line:
 
 def magnet(q, params):
     ball, coil = q
@@ -8,21 +8,15 @@ Potential(magnet, ("ball", "coil"), {"strength": 2.0}, drawn_as="spring")
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from dataclasses import field
+from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
-
-from vmri_jax.scene.effect import Effect
-
-DRAWN = {"link": "links", "spring": "springs"}
-"""What joins two bodies in a drawing, and its entry there."""
+from vmri_jax.scene.declare import effect_class
+from vmri_jax.scene.effect import DRAWN, Effect, real_tree
 
 
-@dataclass(frozen=True, eq=False)
-class OwnEffect(Effect):
+@effect_class
+class CustomEffect(Effect):
     """An effect given by a function of one element.
 
     Args:
@@ -40,8 +34,9 @@ class OwnEffect(Effect):
     function: Callable  # pyright: ignore[reportIncompatibleVariableOverride]
     bodies: Any
     params: Any = field(default_factory=dict)
-    drawn_as: Literal["link", "spring"] | None = field(default=None, kw_only=True)
-    same_size: ClassVar[bool] = False
+    drawn_as: Literal["link", "spring"] | None = field(default=None, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    same_size = False
 
     def __post_init__(self):
         if not callable(self.function):
@@ -56,39 +51,34 @@ class OwnEffect(Effect):
         return ((self.bodies,) if isinstance(self.bodies, str) else tuple(self.bodies),)
 
     def parameters(self, bodies):
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), self.params)
+        return real_tree(f"{self.name}: params", self.params)
 
-    def check(self, bodies):
-        super().check(bodies)
+    def check_bodies(self, bodies):
+        super().check_bodies(bodies)
         if self.drawn_as is None:
             return
         (element,) = self.elements(bodies)
-        expected = "it is drawn between bodies, and {} is alone; leave it out"
-        self.require(len(element) > 1, "drawn_as", repr(self.drawn_as), expected.format(*element))
-        expected = "it is drawn between points, and {} has {} coordinates; leave it out"
+        alone = f"it is drawn between bodies, and {element[0]} is alone; leave it out"
+        self.require(len(element) > 1, "drawn_as", repr(self.drawn_as), alone)
         for name in element:
-            sized = expected.format(name, bodies[name].size)
+            sized = f"it is drawn between points, and {name} has {bodies[name].size} coordinates; leave it out"
             self.require(not bodies[name].block, "drawn_as", repr(self.drawn_as), sized)
 
-    def drawing(self, bodies):
-        (element,) = self.elements(bodies)
-        return {DRAWN[self.drawn_as]: [list(pair) for pair in pairwise(element)]} if self.drawn_as else {}
 
+class Potential(CustomEffect):
+    """A custom potential, ``function(q, params) -> ()``.
 
-class Potential(OwnEffect):
-    """A potential of one's own, ``function(q, params) -> ()``.
-
-    Arguments are those of `OwnEffect`.
+    Arguments are those of `CustomEffect`.
     """
 
     kind = "potential"
 
 
-@dataclass(frozen=True, eq=False)
-class Constraint(OwnEffect):
-    """A holonomic constraint of one's own, ``function(q, params) -> (k,)``, kept zero.
+@effect_class
+class Constraint(CustomEffect):
+    """A custom holonomic constraint, ``function(q, params) -> (k,)``, kept zero.
 
-    Arguments are those of `OwnEffect`, and
+    Arguments are those of `CustomEffect`, and
 
     Args:
         timed: it depends on time, ``function(t, q, params)``.
@@ -99,19 +89,19 @@ class Constraint(OwnEffect):
     kind = "constraint"
 
 
-class Kinetic(OwnEffect):
+class Kinetic(CustomEffect):
     """A velocity-dependent part of the Lagrangian, ``function(q, v, params) -> ()``, added to the kinetic energy.
 
-    Arguments are those of `OwnEffect`.
+    Arguments are those of `CustomEffect`.
     """
 
     kind = "kinetic"
 
 
-class Force(OwnEffect):
-    """A force of one's own, ``function(t, q, v, params)`` -> a tuple of one force per body, shaped like q.
+class Force(CustomEffect):
+    """A custom force, ``function(t, q, v, params)`` -> a tuple of one force per body, shaped like q.
 
-    Arguments are those of `OwnEffect`.
+    Arguments are those of `CustomEffect`.
     """
 
     kind = "force"

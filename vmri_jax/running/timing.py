@@ -1,0 +1,56 @@
+"""Fair comparison of run times: programs take turns."""
+
+import time
+from collections.abc import Callable, Mapping
+
+import jax
+
+MIN_SECONDS = 0.02
+"""A sample shorter than this is made of several calls; longer than clocks and schedulers disturb."""
+
+Tell = Callable[[str], None]
+"""Told what is about to be measured."""
+
+
+def silent(_: str) -> None:
+    """Say nothing."""
+
+
+def interleaved(
+    runs: Mapping[str, Callable[[], object]],
+    repeats: int,
+    min_seconds: float = MIN_SECONDS,
+    tell: Tell = silent,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, list[float]]:
+    """Seconds per call of every run, `repeats` samples each, after one call that is not counted.
+
+    The runs take turns, and every round starts with another one, so that a slow moment of the machine, or what the run
+    before left in the caches, hits all of them alike.
+
+    Args:
+        runs: callables by name; what they return is waited for (`jax.block_until_ready`).
+        repeats: samples of each.
+        min_seconds: a sample is the mean of as many calls as take about so long.
+        tell: told the name of each run before its first call.
+        clock: `time.process_time` where other processes share the core.
+    """
+    calls, seconds = {}, {name: [] for name in runs}
+    for name, run in runs.items():
+        tell(name)
+        seconds_per_call(run, 1, clock)
+        calls[name] = max(1, round(min_seconds / seconds_per_call(run, 1, clock)))
+    names = list(runs)
+    for i in range(repeats):
+        start = i % max(1, len(names))
+        for name in names[start:] + names[:start]:
+            seconds[name].append(seconds_per_call(runs[name], calls[name], clock))
+    return seconds
+
+
+def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Mean seconds of so many calls; what they return is waited for."""
+    start = clock()
+    for _ in range(calls):
+        jax.block_until_ready(run())
+    return (clock() - start) / calls

@@ -1,0 +1,133 @@
+"""Terms of three and four points: angles, bending, torsion."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.scene.declare import effect_class, names, number, positive
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.springs import elastic_energy
+
+
+class _AmongPoints(Effect):
+    """What terms of angles share."""
+
+    kind = "potential"
+    dimensions = (2, 3)
+    apart = True
+
+
+def cosine(q):
+    """Cosine of the angle at b between a and c."""
+    a, b, c = q
+    u, w = a - b, c - b
+    return jnp.sum(u * w, axis=-1) / jnp.sqrt(jnp.sum(u**2, axis=-1) * jnp.sum(w**2, axis=-1))
+
+
+def angle_between(q, params=None):
+    """Angle at b between a and c, rad."""
+    return jnp.arccos(cosine(q))
+
+
+@effect_class
+class Angle(_AmongPoints):
+    """Angles with a rest value, ``V = sum k/2 (theta - theta_0)^2``, theta at b between a and c.
+
+    Args:
+        between: names (a, b, c), or a list of such.
+        stiffness: k, N m, positive; one number, or one for each angle.
+        angle: theta_0, rad, between 0 and pi; likewise. The angle at the start by default.
+
+    Raises:
+        ValueError: (of the scene) a stiffness that is not positive; a rest angle that is not between 0 and pi, where this
+            energy is not smooth (take `Bending` for pi); points that coincide.
+    """
+
+    between: Any = names(3)
+    stiffness: Any = positive()
+    angle: Any = number(default=None, measured=True)
+
+    default_name = "angles"
+    rest = staticmethod(angle_between)
+
+    @staticmethod
+    def function(q, params):
+        return elastic_energy(params["stiffness"], angle_between(q) - params["angle"])
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        angle = self.parameters(bodies)["angle"]
+        inside = (angle > 1e-3) & (angle < np.pi - 1e-3)
+        expected = "it must lie between 0 and pi, where the energy is smooth; for pi take Bending"
+        self.require(inside, "angle", angle, expected)
+
+
+@effect_class
+class Bending(_AmongPoints):
+    """Resistance to bending of a straight line of points, ``V = sum k (1 + cos theta)``, theta at b between a and c.
+
+    ``k/2 (pi - theta)^2`` near the straight line, and smooth there.
+
+    Args:
+        between: names (a, b, c), or a list of such.
+        stiffness: k, N m, positive; one number, or one for each.
+
+    Raises:
+        ValueError: (of the scene) a stiffness that is not positive, points that coincide.
+    """
+
+    between: Any = names(3)
+    stiffness: Any = positive()
+
+    default_name = "bending"
+
+    @staticmethod
+    def function(q, params):
+        return jnp.sum(params["stiffness"] * (1 + cosine(q)))
+
+
+@effect_class
+class Torsion(_AmongPoints):
+    """Torsion about the middle one of three bonds, ``V = sum k (1 - cos(m (phi - phi_0)))``, phi the dihedral angle.
+
+    phi is 0 where a and d are on one side of b-c (cis) and pi on opposite ones (trans).
+
+    Args:
+        between: names (a, b, c, d) of points in space, or a list of such.
+        stiffness: k, N m, positive; one number, or one for each.
+        angle: phi_0, rad, of a minimum; likewise.
+        multiplicity: m, number of minima in a turn; likewise.
+
+    Raises:
+        ValueError: (of the scene) a stiffness that is not positive, a multiplicity that is not a positive integer, points
+            that coincide or lie on a line.
+    """
+
+    between: Any = names(4)
+    stiffness: Any = positive()
+    angle: Any = number(default=0.0)
+    multiplicity: Any = positive(default=1)
+
+    default_name = "torsion"
+    dimensions = (3,)
+
+    @staticmethod
+    def function(q, params):
+        a, b, c, d = q
+        first, axis, last = b - a, c - b, d - c
+        left, right = jnp.cross(first, axis), jnp.cross(axis, last)
+        sine = jnp.linalg.norm(axis, axis=-1) * jnp.sum(first * right, axis=-1)
+        phi = jnp.arctan2(sine, jnp.sum(left * right, axis=-1))
+        return jnp.sum(params["stiffness"] * (1 - jnp.cos(params["multiplicity"] * (phi - params["angle"]))))
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        multiplicity = self.parameters(bodies)["multiplicity"]
+        self.require(multiplicity == jnp.round(multiplicity), "multiplicity", multiplicity, "it must be an integer")
+        expected = "they must not start on a line, where there is no dihedral angle"
+        for element in self.elements(bodies):
+            for corner in (element[:3], element[1:]):
+                a, b, c = (bodies[name].position for name in corner)
+                area, size = jnp.linalg.norm(jnp.cross(b - a, c - b)), jnp.linalg.norm(b - a) * jnp.linalg.norm(c - b)
+                self.require(area > 1e-9 * size, f"the area between {', '.join(corner)}", area, expected)

@@ -1,0 +1,120 @@
+"""What effects between two points, or between bodies and a point that is fixed or moves, share."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.scene.declare import effect_class, names, vector
+from vmri_jax.scene.effect import Effect, real_tree
+
+
+def distance(q, params=None):
+    """``|q_b - q_a|`` of the first two roles."""
+    a, b = q
+    return jnp.sqrt(jnp.sum((b - a) ** 2, axis=-1))
+
+
+@effect_class
+class BetweenPoints(Effect):
+    """Between the two points of each pair, which do not start at the same place."""
+
+    between: Any = names(2)
+
+    dimensions = (1, 2, 3)
+    apart = True
+    rest = staticmethod(distance)
+
+
+@effect_class
+class ToPoint(Effect):
+    """Between each body and a point that is given."""
+
+    bodies: Any = names()
+
+    advice: ClassVar[str] = "move one of them"
+    """What to do about bodies that start at the point."""
+
+    def point_at_start(self, params):
+        """Where the point is at t = 0."""
+        return params["point"]
+
+    def rest(self, q, params):
+        """Distance of a body from the point at the start."""
+        (q,) = q
+        return jnp.sqrt(jnp.sum((q - self.point_at_start(params)) ** 2, axis=-1))
+
+    def require_apart(self, bodies):
+        """Refuse bodies that start at the point."""
+        away = self.at_start(bodies, self.parameters(bodies))
+        expected = f"bodies must not start there; {self.advice}"
+        self.require(away > 0, "the distance of a body from its point", away, expected)
+
+
+@effect_class
+class ToFixedPoint(ToPoint):
+    """What anchors to a fixed point share."""
+
+    point: Any = vector()
+
+    def __post_init__(self):
+        super().__post_init__()
+        if callable(self.point):
+            raise TypeError(
+                f"{self.name}: point is {self.point!r}; {type(self).__name__} holds bodies at fixed points, give (d,) or (n, d). For a "
+                "point that moves take MovingPivot (a rigid link), Guide (the point itself) or MovingAnchor (a spring)."
+            )
+
+    def drawing(self, bodies):
+        points = np.atleast_2d(np.asarray(self.parameters(bodies)["point"]))
+        pairs = zip(self.elements(bodies), points, strict=True)
+        drawn = [(name, point) for (name,), point in pairs if not bodies[name].block]
+        return {"anchors": [{"body": name, "point": point.tolist(), "kind": self.drawn_as} for name, point in drawn]}
+
+
+@dataclass(frozen=True)
+class AlongPath:
+    """A formula with the point of a path, ``formula(a(t), q, ..., params)``, as a function of time; compared by value."""
+
+    formula: Callable
+    path: Callable
+
+    def __call__(self, t, *arguments):
+        return self.formula(self.path(t, arguments[-1]["path"]), *arguments)
+
+
+@effect_class
+class ToPath(ToPoint):
+    """What effects between bodies and a moving point share: ``formula(point, q, ..., params)`` at the point of the path."""
+
+    path: Callable
+    params: Any = field(default_factory=dict, kw_only=True)
+
+    formula: ClassVar[Any]
+    dimensions = (1, 2, 3)
+    timed = True
+
+    @property
+    def function(self):
+        return AlongPath(self.formula, self.path)
+
+    def parameters(self, bodies):
+        return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}
+
+    def point_at_start(self, params):
+        return self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
+
+    def check_bodies(self, bodies):
+        if not callable(self.path):
+            raise TypeError(f"{self.name}: path is {self.path!r}; give a function of (t, params).")
+        super().check_bodies(bodies)
+        shape = jax.eval_shape(lambda: jnp.asarray(self.point_at_start({}))).shape
+        for (name,) in self.elements(bodies):
+            needed = (bodies[name].size,)
+            if shape != needed:
+                raise ValueError(
+                    f"{self.name}: path returns shape {shape}; {name} has dimension {needed[0]}, return {needed}."
+                )
