@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks import batch, compilation, cost, floor, fuzz, kills, orders, peers
+from benchmarks import against, batch, compilation, cost, floor, fuzz, kills, orders, peers
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -20,6 +20,7 @@ Only = Annotated[
     list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
 ]
 Peer = Annotated[list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")]
+Groups = Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(against.GROUPS)}; may be repeated.")]
 Table = StrEnum("Table", ("absence", "presence", "orders"))
 Tables = Annotated[list[Table] | None, typer.Option(help="Tables of scenes; may be repeated.")]
 OUT = Path("out/benchmarks")
@@ -65,6 +66,20 @@ def peers_command(full: Full = False, core: Core = None, out: Out = OUT, only: O
     """Time to reach an error, against other integrators; the extra `peers` installs them."""
     prepare(core)
     _measure("peers", peers, full, out, only=only or (), peers=peer or ())
+
+
+@app.command("against")
+def against_command(
+    before: Annotated[Path, typer.Argument(help="Another checkout of this repository, to compare this one with.")],
+    python: Annotated[Path | None, typer.Option(help="Its Python; by default that in its .venv, else this one.")] = None,
+    only: Groups = None,
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+) -> None:
+    """Another checkout and this one, interleaved: runs, batches, calls, first results, gradients."""
+    prepare(core)
+    _measure("against", against, full, out, before=before, python=python, only=only or ())
 
 
 @app.command("kills")

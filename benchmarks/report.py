@@ -5,7 +5,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -51,6 +51,7 @@ class Report:
     rows: one dictionary per program.
     notes: what was left out, and why.
     figures: by file name, functions that draw.
+    about: what else belongs into the file.
     """
 
     name: str
@@ -59,13 +60,14 @@ class Report:
     claims: list[Claim]
     notes: list[str]
     figures: dict[str, Callable[[], Figure]]
+    about: dict = field(default_factory=dict)
 
     def write(self, out: Path) -> Path:
         """Write ``out/name.json`` and the figures; returns the path of the JSON file."""
         out.mkdir(parents=True, exist_ok=True)
         path = out / f"{self.name}.json"
         claims = [asdict(claim) | {"holds": claim.holds} for claim in self.claims]
-        found = {"benchmark": self.name, "size": self.size, "machine": machine(), "claims": claims}
+        found = {"benchmark": self.name, "size": self.size, "machine": machine(), **self.about, "claims": claims}
         found |= {"notes": self.notes, "rows": self.rows}
         path.write_text(json.dumps(_finite(found), indent=1))
         for name, draw in self.figures.items():
