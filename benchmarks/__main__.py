@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks import against, batch, compilation, cost, floor, fuzz, kills, orders, peers
+from benchmarks import against, batch, compilation, cost, floor, fuzz, kills, orders, peers, tricks
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -71,7 +71,9 @@ def peers_command(full: Full = False, core: Core = None, out: Out = OUT, only: O
 @app.command("against")
 def against_command(
     before: Annotated[Path, typer.Argument(help="Another checkout of this repository, to compare this one with.")],
-    python: Annotated[Path | None, typer.Option(help="Its Python; by default that in its .venv, else this one.")] = None,
+    python: Annotated[
+        Path | None, typer.Option(help="Its Python; by default that in its .venv, else this one.")
+    ] = None,
     only: Groups = None,
     full: Full = False,
     core: Core = None,
@@ -80,6 +82,18 @@ def against_command(
     """Another checkout and this one, interleaved: runs, batches, calls, first results, gradients."""
     prepare(core)
     _measure("against", against, full, out, before=before, python=python, only=only or ())
+
+
+@app.command("tricks")
+def tricks_command(
+    only: Annotated[list[str] | None, typer.Option(help="Functions of the kernels; may be repeated.")] = None,
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+) -> None:
+    """What each tuned function of the kernels buys, against its plain form."""
+    prepare(core)
+    _measure("tricks", tricks, full, out, markdown=True, only=only or ())
 
 
 @app.command("kills")

@@ -51,10 +51,10 @@ class Worker:
     """A process in a `Seat`, on the cores of this process and without a cache of programs; close it, or use it as a context."""
 
     def __init__(self, seat: Seat):
-        environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"} | seat.environment
+        environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false", **seat.environment}
         environment.pop("XLA_FLAGS", None)  # each side makes its own
         command = [str(seat.python), str(HERE / "worker.py"), *seat.options]
-        self.errors = tempfile.TemporaryFile("w+")
+        self.errors = tempfile.TemporaryFile("w+")  # noqa: SIM115, open as long as the process
         self.started = time.perf_counter()
         self.process = subprocess.Popen(
             command,

@@ -18,15 +18,17 @@ from typing import Any
 if __name__ == "__main__":
     sys.path[0] = os.getcwd()
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
+import jax
+import jax.numpy as jnp
+import numpy as np
 
-import vmri_jax as vm  # noqa: E402
+import vmri_jax as vm
 
 SYSTEMS = {"FPU": "fermi_pasta_ulam", "TSP": "triple_spherical_pendulum", "SAM": "simple_atomic_model"}
 SPREAD = 0.01
 """Of the velocities in a batch."""
+COMPARED = 8
+"""Macro steps after which two sides are compared: round-off has not grown by then, also where the motion is chaotic."""
 CALLS = 20
 """Calls in a row whose mean is one sample of a short call."""
 
@@ -65,7 +67,12 @@ class Case:
 
 
 class Timed:
-    """A run that takes turns with others. `num_steps` is how much a call does, `end` what it computes, `result` its status."""
+    """A run that takes turns with others.
+
+    num_steps: what a call does.
+    end: what a short call computes.
+    result: status of a call.
+    """
 
     num_steps: int
     end: np.ndarray
@@ -75,36 +82,41 @@ class Timed:
         """Seconds."""
         raise NotImplementedError
 
-    def keep(self, trajectory) -> None:
-        """The end of a run, and its worst status."""
-        q = np.concatenate([np.asarray(trajectory.q_s), np.asarray(trajectory.q_f)], axis=-1)
+    def keep(self, short, whole) -> None:
+        """The end of the first run, the worst status of the second."""
+        q = np.concatenate([np.asarray(short.q_s), np.asarray(short.q_f)], axis=-1)
         self.end = q[..., -1, :]
-        self.result = vm.Result(int(np.max(np.asarray(trajectory.result)))).name
+        self.result = vm.Result(int(np.max(np.asarray(whole.result)))).name
+
+
+def simulator(case: Case):
+    """``simulate(num_steps)`` by `vm.simulate`; it saves the last node only."""
+    problem, scheme = case.problem(), case.made_scheme()
+    state = problem.state()
+
+    def simulate(num_steps: int):
+        steps = {"macro_dt": case.macro_dt, "num_steps": num_steps, "save_every": num_steps}
+        return vm.simulate(problem.system, scheme, state, **steps, throw=False)
+
+    return simulate
 
 
 class Single(Timed):
-    """`vm.simulate`: seconds of the steps, what a call of one step takes being subtracted."""
+    """`vm.simulate`: seconds of the steps, what a call of one step takes at least being subtracted."""
 
     def __init__(self, case: Case):
-        self.simulate = self.prepared(case)
+        self.simulate = self.simulator(case)
         self.num_steps = case.num_steps or _steps_for(self.simulate, case.seconds)
-        self.keep(self.simulate(self.num_steps))
-        self.simulate(1)
+        self.keep(self.simulate(COMPARED), self.simulate(self.num_steps))
+        self.call = min(_seconds(self.simulate, 1) for _ in range(CALLS))
 
-    def prepared(self, case: Case):
-        """``simulate(num_steps)``, which saves the last node only."""
-        problem, scheme = case.problem(), case.made_scheme()
-        state = problem.state()
-
-        def simulate(num_steps: int):
-            steps = {"macro_dt": case.macro_dt, "num_steps": num_steps, "save_every": num_steps}
-            return vm.simulate(problem.system, scheme, state, **steps, throw=False)
-
-        return simulate
+    def simulator(self, case: Case):
+        """``simulate(num_steps)``."""
+        return simulator(case)
 
     def sample(self) -> float:
         """Of `num_steps - 1` steps."""
-        return _seconds(self.simulate, self.num_steps) - _seconds(self.simulate, 1)
+        return _seconds(self.simulate, self.num_steps) - self.call
 
 
 class Call(Single):
@@ -119,12 +131,12 @@ class Call(Single):
 class Prepared(Call):
     """What a call of a prepared run takes besides its steps."""
 
-    def prepared(self, case: Case):
+    def simulator(self, case: Case):
         """The same by `vm.prepare`."""
-        if not hasattr(vm, "prepare"):
+        problem, prepare = case.problem(), getattr(vm, "prepare", None)
+        if prepare is None:
             raise NotImplementedError("there is no vm.prepare")
-        problem = case.problem()
-        run = vm.prepare(problem.system, case.made_scheme(), problem.state(), macro_dt=case.macro_dt, num_steps=1)
+        run = prepare(problem.system, case.made_scheme(), problem.state(), macro_dt=case.macro_dt, num_steps=1)
         return lambda num_steps: run(num_steps=num_steps)
 
 
@@ -140,8 +152,8 @@ class Batch(Timed):
             return vm.simulate_batch(problem.system, scheme, states, **steps)
 
         self.simulate = simulate
-        self.num_steps = case.num_steps or _steps_for(simulate, case.seconds, first=8, factor=16)
-        self.keep(simulate(self.num_steps))
+        self.num_steps = case.num_steps or _steps_for(simulate, case.seconds, first=COMPARED, factor=16)
+        self.keep(simulate(COMPARED), simulate(self.num_steps))
 
     def sample(self) -> float:
         """Of one call."""
@@ -153,7 +165,8 @@ class First(Timed):
 
     def __init__(self, case: Case):
         self.num_steps = case.num_steps
-        self.keep(Single.prepared(self, case)(case.num_steps))
+        run = simulator(case)(case.num_steps)
+        self.keep(run, run)
 
 
 class Gradient(Timed):
@@ -188,7 +201,7 @@ class Readme(Timed):
         exec(compile(lines, "README.md", "exec"), self.names)
         (line,) = (part for part in lines.body if "vm.simulate(" in ast.unparse(part))
         self.line = compile(ast.Module([line], []), "README.md", "exec")
-        self.keep(self.names["run"])
+        self.keep(self.names["run"], self.names["run"])
         self.num_steps = 1000
 
     def sample(self) -> float:
@@ -251,18 +264,17 @@ def main() -> None:
         (vm if hasattr(vm, "configure") else vm.runtime).configure()  # pyright: ignore[reportAttributeAccessIssue]
     for name in options.plain:
         use_plain(name)
-    timed: Timed | None = None
+    timed = Timed()
     for line in sys.stdin:
         question = json.loads(line)
         try:
             if question["do"] == "make":
-                timed = None
+                timed = Timed()  # nothing of the last one stays
                 jax.clear_caches()
                 timed = KINDS[question["case"]["kind"]](Case(**question["case"]))
                 end = np.ravel(timed.end).tolist()
                 answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result}
             else:
-                assert timed is not None
                 answer = {"seconds": timed.sample()}
         except Exception as error:  # the other side goes on
             answer = {"error": f"{type(error).__name__}: {error}"}
