@@ -75,13 +75,14 @@ def against_command(
         Path | None, typer.Option(help="Its Python; by default that in its .venv, else this one.")
     ] = None,
     only: Groups = None,
+    shared: Annotated[bool, typer.Option(help="Count processor time: other processes use the core too.")] = False,
     full: Full = False,
     core: Core = None,
     out: Out = OUT,
 ) -> None:
     """Another checkout and this one, interleaved: runs, batches, calls, first results, gradients."""
     prepare(core)
-    _measure("against", against, full, out, before=before, python=python, only=only or ())
+    _measure("against", against, full, out, before=before, python=python, only=only or (), shared=shared)
 
 
 @app.command("tricks")

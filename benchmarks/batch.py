@@ -16,6 +16,7 @@ from benchmarks.peers import cases, ours
 from benchmarks.peers.compare import OURS, batch_case
 from benchmarks.peers.scan import candidates, scan
 from benchmarks.report import Claim, Report
+from benchmarks.worker import starts
 from vmri_jax import plots
 
 COLUMNS = ("system", "program", "batch", "ns/trajectory/micro step", "low", "high", "to C", "iterations", "result")
@@ -90,7 +91,7 @@ def programs_of(size: Size) -> int:
 
 
 def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, devices: int) -> Callable:
-    states = programs.starts(problem, batch)
+    states = starts(problem, batch)
 
     def run(num_steps: int) -> vm.Trajectory:
         return vm.simulate_batch(
@@ -155,11 +156,11 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
 def _as_accurate(case: Case, problem: str, size: Size, tell: Tell) -> tuple[dict, Claim]:
     """One trajectory of a batch that is as accurate as C, by the cheapest setting of one scheme of high degree."""
     tell(f"{case.system}, as accurate as C")
-    single, (truth, starts) = cases.case(problem), batch_case(problem, HELD)
+    single, (truth, lanes) = cases.case(problem), batch_case(problem, HELD)
     steps = round(single.t_end / case.micro_dt)
     loop = c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, steps // NUM_MICRO)
     error = single.error(np.concatenate(loop()[:2]))
-    ladders = ours.batch_ladders(truth, *starts, schemes={f"Lobatto {DEGREE}": vm.galerkin(1, DEGREE, "lobatto")})
+    ladders = ours.batch_ladders(truth, *lanes, schemes={f"Lobatto {DEGREE}": vm.galerkin(1, DEGREE, "lobatto")})
     found = candidates(scan(OURS, ladders, truth, 1.0, (error,)), error)
     timed = interleaved({point.label: point.run for point in found} | {"C": loop}, size.repeats)
     best = min(found, key=lambda point: np.median(timed[point.label]))
@@ -186,7 +187,7 @@ def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
     run = vm.simulate(problem.system, scheme, state, micro_dt=case.micro_dt, num_steps=steps)
     taken = np.asarray(run.info.iterations)
     for iterations in range(max(1, int(taken.mean())), int(taken.max())):
-        simulate = programs.program(problem, scheme, case.micro_dt, vm.Newton(fixed_iterations=iterations))
+        simulate = programs.program(problem, scheme, vm.Newton(fixed_iterations=iterations), micro_dt=case.micro_dt)
         if not programs.failed(simulate(steps)):
             return iterations
     return max(1, int(taken.max()))

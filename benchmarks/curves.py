@@ -102,8 +102,7 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
     runs, results, total = {}, {}, 0
     for n in case.num_micro:
         tell(f"{case.label}, num_micro {n}")
-        make = programs.program if case.t_end is None else programs.short_program
-        run = make(problem, programs.SCHEMES[case.scheme](n), case.micro_dt)
+        run = programs.program(problem, programs.SCHEMES[case.scheme](n), micro_dt=case.micro_dt)
         if not total:  # of micro steps, one that all num_micro divide
             unit = math.lcm(*case.num_micro)
             if case.t_end is None:
@@ -115,7 +114,8 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
     for n in case.dense_num_micro:
         tell(f"{case.label}, num_micro {n}, dense")
         scheme = programs.SCHEMES[case.scheme](n)
-        run = programs.program(_unstructured(problem, case), scheme, case.micro_dt, vm.Newton(method="dense"))
+        dense = vm.Newton(method="dense")
+        run = programs.program(_unstructured(problem, case), scheme, dense, micro_dt=case.micro_dt)
         num_steps = steps_for(run, seconds / 2, 3, 300)
         runs["dense", n] = partial(run, num_steps), num_steps * n
         results["dense", n] = run(num_steps)

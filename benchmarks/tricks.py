@@ -19,7 +19,7 @@ SCHEMES = {
     "SAM": (0.002, ("fully_explicit 10", "fully_implicit 10", "galerkin 1 8 lobatto")),
 }
 """Macro steps and schemes of order 2; high degrees take steps of LONG."""
-LONG = 0.08
+LONG = 0.032
 CASES = [
     Case(kind, system, scheme, LONG if scheme.startswith("galerkin") else macro_dt, lanes=256 if kind == "batch" else 1)
     for kind in ("single", "batch")

@@ -25,10 +25,15 @@ import numpy as np
 import vmri_jax as vm
 
 SYSTEMS = {"FPU": "fermi_pasta_ulam", "TSP": "triple_spherical_pendulum", "SAM": "simple_atomic_model"}
+PROCESSOR_TIME = "--processor-time"
+"""The option that counts seconds in which this process runs, where others share its core."""
+CLOCK = time.process_time if PROCESSOR_TIME in sys.argv else time.perf_counter
 SPREAD = 0.01
 """Of the velocities in a batch."""
 COMPARED = 8
 """Macro steps after which two sides are compared: round-off has not grown by then, also where the motion is chaotic."""
+COMPILED = "/jax/core/compile/backend_compile_duration"
+"""JAX's own name of that event."""
 CALLS = 20
 """Calls in a row whose mean is one sample of a short call."""
 
@@ -72,11 +77,13 @@ class Timed:
     num_steps: what a call does.
     end: what a short call computes.
     result: status of a call.
+    found: what else it found.
     """
 
     num_steps: int
     end: np.ndarray
     result: str = ""
+    found: dict | None = None
 
     def sample(self) -> float:
         """Seconds."""
@@ -145,7 +152,7 @@ class Batch(Timed):
 
     def __init__(self, case: Case):
         problem, scheme = case.problem(), case.made_scheme()
-        states = _starts(problem, case.lanes)
+        states = starts(problem, case.lanes)
 
         def simulate(num_steps: int):
             steps = {"macro_dt": case.macro_dt, "num_steps": num_steps, "save_every": num_steps}
@@ -167,6 +174,43 @@ class First(Timed):
         self.num_steps = case.num_steps
         run = simulator(case)(case.num_steps)
         self.keep(run, run)
+
+
+class Compile(Timed):
+    """Seconds of the start, of the first call of `vm.simulate` and of a later one; compilations over a sweep.
+
+    The sweep changes number of steps, step size, parameters and start.
+    """
+
+    def __init__(self, case: Case):
+        problem, scheme = case.problem(), case.made_scheme()
+        started, state = _seconds(problem.state), problem.state()
+
+        def call(macro_dt=case.macro_dt, num_steps=case.num_steps, of=problem.system, state=state):
+            steps = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps}
+            return vm.simulate(of, scheme, state, **steps)
+
+        first, later = _seconds(call), _seconds(call)
+        moved = vm.State(state.t + 1.0, state.q_s, state.q_f, 1.01 * state.p_s, 1.01 * state.p_f)
+        heavier = problem.system.replace(params=_heavier(problem.system))
+        compiled = []
+        jax.monitoring.register_event_duration_secs_listener(
+            lambda event, duration_secs, **_: compiled.append(event) if event == COMPILED else None
+        )
+        call(num_steps=case.num_steps + 1)
+        call(macro_dt=1.1 * case.macro_dt)
+        call(of=heavier)
+        run = call(state=moved)
+        self.keep(run, run)
+        self.num_steps = case.num_steps
+        self.found = {"start": started, "first": first, "later": later, "compilations": 1 + len(compiled)}
+
+
+def _heavier(system) -> dict:
+    """Parameters that leave a start where it may be: lengths are parameters of systems with constraints."""
+    if system.constraint is None:
+        return {key: 1.01 * value for key, value in system.params.items()}
+    return system.params | {"gravity": system.params["gravity"] + 1}
 
 
 class Gradient(Timed):
@@ -215,15 +259,16 @@ KINDS = {
     "prepared": Prepared,
     "batch": Batch,
     "first": First,
+    "compile": Compile,
     "gradient": Gradient,
     "readme": Readme,
 }
 
 
 def _seconds(function, *arguments) -> float:
-    start = time.perf_counter()
+    start = CLOCK()
     jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - start
+    return CLOCK() - start
 
 
 def _steps_for(simulate, seconds: float, first: int = 1, factor: int = 4) -> int:
@@ -237,8 +282,8 @@ def _steps_for(simulate, seconds: float, first: int = 1, factor: int = 4) -> int
         steps *= factor
 
 
-def _starts(problem, lanes: int):
-    """Starts that differ in their velocities, batch axis first."""
+def starts(problem, lanes: int):
+    """So many starts that differ in their velocities, consistent with the constraints, batch axis first."""
     random = np.random.default_rng(0)
     v_s, v_f = (jnp.asarray(v + SPREAD * random.normal(size=(lanes, v.size))) for v in (problem.v_s, problem.v_f))
     start = jax.vmap(lambda v_s, v_f: vm.initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f))
@@ -256,6 +301,7 @@ def use_plain(name: str) -> None:
 def main() -> None:
     """Answer until there are no more questions."""
     parser = argparse.ArgumentParser()
+    parser.add_argument(PROCESSOR_TIME, action="store_true", help="do not count seconds of other processes")
     parser.add_argument("--as-imported", action="store_true", help="leave the settings of JAX alone")
     parser.add_argument("--plain", action="append", default=[], help="a function of the kernels in its plain form")
     options = parser.parse_args()
@@ -273,7 +319,8 @@ def main() -> None:
                 jax.clear_caches()
                 timed = KINDS[question["case"]["kind"]](Case(**question["case"]))
                 end = np.ravel(timed.end).tolist()
-                answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result}
+                answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result, "found": timed.found}
+                answer["processor"] = time.process_time()
             else:
                 answer = {"seconds": timed.sample()}
         except Exception as error:  # the other side goes on

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from benchmarks import __main__ as command_line
-from benchmarks import batch, c_loops, compilation, cost, curves, floor, linear, paper, programs, report
+from benchmarks import batch, c_loops, compilation, cost, curves, floor, linear, paper, programs, report, worker
 from benchmarks.curves import Case
 from benchmarks.measure import Ratio, interleaved, ratio, steps_for
 from benchmarks.report import Claim, Report
@@ -236,7 +236,7 @@ def test_unknowns_as_in_the_reference_study():
 @pytest.mark.parametrize("system", ["FPU l=3", "TSP", "SAM"])
 def test_starts_differ_and_keep_to_the_constraints(system):
     problem = programs.problem(system)
-    states = programs.starts(problem, 3)
+    states = worker.starts(problem, 3)
     assert states.q_s.shape == (3, problem.q_s.size)
     assert np.abs(states.p_f[0] - states.p_f[1]).max() > 1e-4
     assert isinstance(problem.system.kinetic, vm.ConstantMass)
