@@ -1,12 +1,13 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
+import json
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from benchmarks import against, batch, compilation, cost, floor, fuzz, kills, orders, peers, tricks
+from benchmarks import against, baseline, batch, compilation, cost, floor, fuzz, kills, orders, peers, tricks
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -97,6 +98,17 @@ def tricks_command(
     _measure("tricks", tricks, full, out, markdown=True, only=only or ())
 
 
+@app.command("baseline")
+def baseline_command(
+    commit: Annotated[str, typer.Argument(help="Of the code that was measured.")],
+    folder: Annotated[Path, typer.Option("--from", help="Folder with what the benchmarks wrote.")] = OUT,
+) -> None:
+    """Put all figures of one commit into benchmarks/baseline.json."""
+    found = baseline.assemble(folder, commit)
+    baseline.FILE.write_text(json.dumps(found, separators=(",", ":")).replace("},{", "},\n{") + "\n")
+    console.print(f"written to {baseline.FILE}")
+
+
 @app.command("kills")
 def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 100, out: Out = OUT) -> None:
     """A streaming run killed at random moments, and resumed to the last bit."""
@@ -124,7 +136,7 @@ def fuzz_command(
             console.print(part)
         return
     path = out / f"fuzz_{seed}.jsonl"
-    with progress("fuzz", count) as tell:
+    with progress("fuzz") as tell:
         found = fuzz.fuzz(count, seed, path, limit, tell)
     fuzz.table(found, console)
     if wrong := fuzz.wrong(found):
@@ -155,7 +167,7 @@ def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, 
     name, report, path = "full" if full else "quick", None, None
     size = module.sizes(name, **options)
     try:
-        with progress(title, module.programs_of(size)) as tell:
+        with progress(title) as tell:
             for report in module.run(size, name, tell):
                 path = report.write(out)
                 if markdown:

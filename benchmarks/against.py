@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measure import Ratio, Tell, ratio, silent
+from benchmarks.measure import Tell, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
 from benchmarks.seats import Outcome, Seat, Worker, first_results, take_turns
 from benchmarks.worker import PROCESSOR_TIME, Case
@@ -143,22 +143,18 @@ def sizes(name: str, before: Path, python: Path | None = None, only: Sequence[st
     return Size(old, new, {g: some[QUICK.get(g, slice(None))] for g, some in groups.items()}, 5, 2, 0.03)
 
 
-def programs_of(size: Size) -> int:
-    """How many cases are compared."""
-    return sum(len(entries) for entries in size.groups.values()) + ("gradient" in size.groups)
-
-
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Compare all of it, a report after each case."""
     seats = {BEFORE: size.before, AFTER: size.after}
-    about = {side: {"commit": seat.commit, "checkout": str(seat.checkout)} for side, seat in seats.items()}
+    about: dict = {side: {"commit": seat.commit, "checkout": str(seat.checkout)} for side, seat in seats.items()}
+    about["clock"] = "processor time" if PROCESSOR_TIME in size.after.options else "wall time"
     rows, claims = [], []
     notes = [", ".join(f"{side}: {seat.commit}" for side, seat in seats.items())]
     for group, entry, outcome in _outcomes(size, seats, tell):
         rows += _rows(group, entry, outcome)
         claims += _claims(group, entry, outcome)
         notes += [f"{group}, {entry.label}: {side} was left out: {why}." for side, why in outcome.refused.items()]
-        yield Report("against", name, rows, claims, notes, {}, about)
+        yield Report("against", name, rows, claims, notes, about=about)
 
 
 def _outcomes(size: Size, seats: dict[str, Seat], tell: Tell) -> Iterator[tuple[str, Entry, Outcome]]:
@@ -218,8 +214,7 @@ def _claims(group: str, entry: Entry, outcome: Outcome) -> list[Claim]:
     if entry.ratio is not None and {BEFORE, AFTER} <= set(samples):
         claims.append(Claim(f"{what} over before", ratio(samples[AFTER], samples[BEFORE]), at_most=entry.ratio))
     if entry.seconds is not None and AFTER in samples:
-        low, middle, high = (float(x) for x in np.quantile(samples[AFTER], (0.25, 0.5, 0.75)))
-        claims.append(Claim(f"{what}, seconds", Ratio(middle, low, high), at_most=entry.seconds))
+        claims.append(Claim(f"{what}, seconds", quartiles(samples[AFTER]), at_most=entry.seconds))
     if group == "readme":
         for side in (BEFORE, AFTER):
             found = ratio(samples[side], samples[f"{side}, configured"])

@@ -3,16 +3,13 @@
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from benchmarks.measure import Ratio, Tell, ratio, silent
+from benchmarks.measure import Ratio, Tell, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
 from benchmarks.seats import Seat, Worker
 from benchmarks.worker import Case
-from vmri_jax import plots
 
 COLUMNS = ("system", "scheme", "num_micro", "first call, s", "later call, s", "start, s", "process, s", "compilations")
 SYSTEMS = ("FPU l=3", "TSP", "SAM")
@@ -50,12 +47,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
                     found[n].append(_fresh(system, scheme, n))
             rows += [_row(system, scheme, n, found[n]) for n in size.num_micro]
             claims += _claims(f"{system}, {scheme}", found)
-            yield Report("compile", name, rows, claims, [], {"compile": partial(draw, rows)})
-
-
-def programs_of(size: Size) -> int:
-    """How many processes are started."""
-    return len(size.systems) * len(size.schemes) * len(size.num_micro) * size.repeats
+            yield Report("compile", name, rows, claims, [])
 
 
 def _fresh(system: str, scheme: str, num_micro: int) -> dict:
@@ -80,29 +72,9 @@ def _row(system: str, scheme: str, num_micro: int, found: list[dict]) -> dict:
 def _claims(label: str, found: dict[int, list[dict]]) -> list[Claim]:
     seconds = {n: [one["first"] for one in some] for n, some in found.items()}
     few, many = min(seconds), max(seconds)
-    low, middle, high = (float(x) for x in np.quantile(seconds[few], (0.25, 0.5, 0.75)))
     most = max(one["compilations"] for some in found.values() for one in some)
     return [
-        Claim(f"{label}: seconds of the first call at num_micro {few}", Ratio(middle, low, high), MOST_SECONDS),
+        Claim(f"{label}: seconds of the first call at num_micro {few}", quartiles(seconds[few]), MOST_SECONDS),
         Claim(f"{label}: first call at {many} over {few}", ratio(seconds[many], seconds[few]), GROWTH),
         Claim(f"{label}: compilations over a sweep of steps, parameters and starts", Ratio(most, most, most), 1.0),
     ]
-
-
-def draw(rows: list[dict]) -> Figure:
-    """Seconds of the first call, one group of bars per system and scheme."""
-    names = list(dict.fromkeys(f"{row['system']}\n{row['scheme']}" for row in rows))
-    num_micro = sorted({row["num_micro"] for row in rows})
-    with plots.style():
-        figure = plots.NotebookFigure(figsize=(7.2, 3.6))
-        axes = figure.subplots()
-        for i, n in enumerate(num_micro):
-            seconds = [row["first call, s"] for row in rows if row["num_micro"] == n]
-            bars = axes.bar(np.arange(len(names)) + 0.38 * i, seconds, 0.36, label=f"num_micro {n}")
-            axes.bar_label(bars, fmt="%.1f", fontsize=8)
-        axes.set_xticks(np.arange(len(names)) + 0.19 * (len(num_micro) - 1), names, fontsize=8)
-        axes.set(ylabel="s, first call")
-        axes.grid(axis="x", visible=False)
-        figure.legend(loc="outside lower center", ncols=2)
-        figure.suptitle("Tracing, compiling and one run", x=0.01, ha="left")
-    return figure

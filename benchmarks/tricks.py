@@ -65,11 +65,6 @@ def sizes(name: str, only: Sequence[str] = ()) -> Size:
     return Size(tuple(only) or known, tuple(CASES), repeats, seconds)
 
 
-def programs_of(size: Size) -> int:
-    """How many cases are timed, all forms of each in turns."""
-    return len(size.cases)
-
-
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Time all of it, a report after each case: over the tuned kernels, what the same run takes without a trick."""
     tuned = Seat(environment={"VMRI_KERNELS": "cpu"})
@@ -87,7 +82,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
             for seat, samples in outcome.samples.items():
                 if seat != TUNED:
                     found[seat][case] = ratio(samples, outcome.samples[TUNED])
-            yield Report("tricks", name, [_row(seat, ratios) for seat, ratios in found.items()], [], notes, {})
+            yield Report("tricks", name, [_row(seat, ratios) for seat, ratios in found.items()], [], notes)
 
 
 def _row(trick: str, ratios: dict[Case, Ratio]) -> dict:

@@ -9,7 +9,7 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.c_loops import NoCompiler
-from benchmarks.measure import Ratio, Tell, interleaved, ratio, silent
+from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent
 from benchmarks.peers import cases, figures
 from benchmarks.peers.cases import BATCH_LEVEL, LEVELS, Case, Ladder, NotRepresentable
 from benchmarks.peers.scan import Point, candidates, scan
@@ -91,12 +91,6 @@ def sizes(name: str, only: Sequence[str] = (), peers: Sequence[str] = ()) -> Siz
 def _chosen(names: Sequence[str], only: Sequence[str]) -> list[str]:
     """Those asked for: by the whole name, else by its beginning."""
     return [name for name in names if not only or name in only or any(name.startswith(f"{x} ") for x in only)]
-
-
-def programs_of(size: Size) -> int:
-    """How many scans and timings there are."""
-    batched = [peer for peer in size.peers if peer in BATCHED]
-    return len(size.cases) * (len(size.peers) + 1) + len(size.batches) * (len(batched) + 1)
 
 
 def load(peer: str):
@@ -239,10 +233,17 @@ def _row(title, peer, points: Sequence[Point], levels, timed, differs) -> dict:
             row[key] = "not reached"
             continue
         at = timed[peer, level]
-        low, middle, high = (1e3 * float(x) for x in np.quantile(at.samples, (0.25, 0.5, 0.75)))
-        row[key] = f"{middle:.3g} ms" + ("" if peer == OURS else f" ({at.to_ours.value:.2g}x)")
+        ms = quartiles(at.samples, 1e3)
+        row[key] = f"{ms.value:.3g} ms" + ("" if peer == OURS else f" ({at.to_ours.value:.2g}x)")
         details.append(
-            {"level": level, "setting": at.point.label, "error": at.point.error, "ms": middle, "low": low, "high": high}
+            {
+                "level": level,
+                "setting": at.point.label,
+                "error": at.point.error,
+                "ms": ms.value,
+                "low": ms.low,
+                "high": ms.high,
+            }
         )
         details[-1] |= {"to ours": at.to_ours.value, "build, s": at.point.build + at.point.compile}
     row["best error"] = min((p.settled for p in points), default=np.inf)
