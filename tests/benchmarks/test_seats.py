@@ -46,7 +46,10 @@ def test_what_a_side_cannot_do_is_said(workers):
 
 
 def test_a_worker_that_ends_is_an_error(tmp_path):
-    with Worker(Seat(checkout=tmp_path, options=("--no-such-option",))) as lost, pytest.raises(RuntimeError, match="ended"):
+    with (
+        Worker(Seat(checkout=tmp_path, options=("--no-such-option",))) as lost,
+        pytest.raises(RuntimeError, match="ended"),
+    ):
         lost.make(SHORT)
 
 
