@@ -1,12 +1,13 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
+import json
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from benchmarks import batch, compilation, cost, floor, fuzz, kills, orders, peers
+from benchmarks import against, baseline, batch, compilation, cost, floor, fuzz, kills, orders, peers, tricks
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -20,6 +21,7 @@ Only = Annotated[
     list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
 ]
 Peer = Annotated[list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")]
+Groups = Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(against.GROUPS)}; may be repeated.")]
 Table = StrEnum("Table", ("absence", "presence", "orders"))
 Tables = Annotated[list[Table] | None, typer.Option(help="Tables of scenes; may be repeated.")]
 OUT = Path("out/benchmarks")
@@ -67,6 +69,46 @@ def peers_command(full: Full = False, core: Core = None, out: Out = OUT, only: O
     _measure("peers", peers, full, out, only=only or (), peers=peer or ())
 
 
+@app.command("against")
+def against_command(
+    before: Annotated[Path, typer.Argument(help="Another checkout of this repository, to compare this one with.")],
+    python: Annotated[
+        Path | None, typer.Option(help="Its Python; by default that in its .venv, else this one.")
+    ] = None,
+    only: Groups = None,
+    shared: Annotated[bool, typer.Option(help="Count processor time: other processes use the core too.")] = False,
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+) -> None:
+    """Another checkout and this one, interleaved: runs, batches, calls, first results, gradients."""
+    prepare(core)
+    _measure("against", against, full, out, before=before, python=python, only=only or (), shared=shared)
+
+
+@app.command("tricks")
+def tricks_command(
+    only: Annotated[list[str] | None, typer.Option(help="Functions of the kernels; may be repeated.")] = None,
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+) -> None:
+    """What each tuned function of the kernels buys, against its plain form."""
+    prepare(core)
+    _measure("tricks", tricks, full, out, markdown=True, only=only or ())
+
+
+@app.command("baseline")
+def baseline_command(
+    commit: Annotated[str, typer.Argument(help="Of the code that was measured.")],
+    folder: Annotated[Path, typer.Option("--from", help="Folder with what the benchmarks wrote.")] = OUT,
+) -> None:
+    """Put all figures of one commit into benchmarks/baseline.json."""
+    found = baseline.assemble(folder, commit)
+    baseline.FILE.write_text(json.dumps(found, separators=(",", ":")).replace("},{", "},\n{") + "\n")
+    console.print(f"written to {baseline.FILE}")
+
+
 @app.command("kills")
 def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 100, out: Out = OUT) -> None:
     """A streaming run killed at random moments, and resumed to the last bit."""
@@ -94,7 +136,7 @@ def fuzz_command(
             console.print(part)
         return
     path = out / f"fuzz_{seed}.jsonl"
-    with progress("fuzz", count) as tell:
+    with progress("fuzz") as tell:
         found = fuzz.fuzz(count, seed, path, limit, tell)
     fuzz.table(found, console)
     if wrong := fuzz.wrong(found):
@@ -143,7 +185,7 @@ def _measure(title: str, module, full: bool, out: Path, markdown: bool = False, 
     name, report, path = "full" if full else "quick", None, None
     size = module.sizes(name, **options)
     try:
-        with progress(title, module.programs_of(size)) as tell:
+        with progress(title) as tell:
             for report in module.run(size, name, tell):
                 path = report.write(out)
                 if markdown:

@@ -5,18 +5,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 import vmri_jax as vm
 from benchmarks import c_loops, programs
 from benchmarks.floor import c_loop
-from benchmarks.measure import Tell, interleaved, ratio, silent, steps_for
+from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent, steps_for
 from benchmarks.peers import cases, ours
 from benchmarks.peers.compare import OURS, batch_case
 from benchmarks.peers.scan import candidates, scan
 from benchmarks.report import Claim, Report
-from vmri_jax import plots
+from benchmarks.worker import starts
 
 COLUMNS = ("system", "program", "batch", "ns/trajectory/micro step", "low", "high", "to C", "iterations", "result")
 NUM_MICRO = 10
@@ -70,9 +68,7 @@ def sizes(name: str, devices: int = 1) -> Size:
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each case."""
-    rows, claims, notes = [], [], []
-    if c_loops.compiler() is None:
-        notes.append("No C compiler (cc, gcc or clang) on the PATH: nothing was held against C. Install one for that.")
+    rows, claims, notes = [], [], c_loops.missing()
     for case in size.cases:
         some_rows, some_claims = _measure(case, size, tell)
         rows += some_rows
@@ -81,16 +77,11 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
             row, claim = _as_accurate(case, case.as_accurate, size, tell)
             rows.append(row)
             claims.append(claim)
-        yield Report("batch", name, rows, claims, notes, {"batch": partial(draw, rows, size.devices)})
-
-
-def programs_of(size: Size) -> int:
-    """How many programs are timed."""
-    return sum(len(size.batches) * (1 + case.fixed) + bool(case.as_accurate) for case in size.cases)
+        yield Report("batch", name, rows, claims, notes)
 
 
 def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, devices: int) -> Callable:
-    states = programs.starts(problem, batch)
+    states = starts(problem, batch)
 
     def run(num_steps: int) -> vm.Trajectory:
         return vm.simulate_batch(
@@ -131,7 +122,7 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     rows, claims = [], []
     for key, sample in ns.items():
         option, _, batch = key.partition(" ")
-        low, middle, high = (float(x) for x in np.quantile(sample, (0.25, 0.5, 0.75)))
+        spread = quartiles(sample)
         info = _info(results[key]) if key in results else {"iterations": None, "result": ""}
         to_c = ratio(sample, ns["C"]) if "C" in ns else None
         rows.append(
@@ -140,9 +131,9 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
                 "program": option,
                 "batch": int(batch or 1),
                 "micro_dt": case.micro_dt,
-                "ns/trajectory/micro step": middle,
-                "low": low,
-                "high": high,
+                "ns/trajectory/micro step": spread.value,
+                "low": spread.low,
+                "high": spread.high,
                 "to C": to_c and to_c.value,
                 **info,
             }
@@ -155,19 +146,19 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
 def _as_accurate(case: Case, problem: str, size: Size, tell: Tell) -> tuple[dict, Claim]:
     """One trajectory of a batch that is as accurate as C, by the cheapest setting of one scheme of high degree."""
     tell(f"{case.system}, as accurate as C")
-    single, (truth, starts) = cases.case(problem), batch_case(problem, HELD)
+    single, (truth, lanes) = cases.case(problem), batch_case(problem, HELD)
     steps = round(single.t_end / case.micro_dt)
     loop = c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, steps // NUM_MICRO)
     error = single.error(np.concatenate(loop()[:2]))
-    ladders = ours.batch_ladders(truth, *starts, schemes={f"Lobatto {DEGREE}": vm.galerkin(1, DEGREE, "lobatto")})
+    ladders = ours.batch_ladders(truth, *lanes, schemes={f"Lobatto {DEGREE}": vm.galerkin(1, DEGREE, "lobatto")})
     found = candidates(scan(OURS, ladders, truth, 1.0, (error,)), error)
     timed = interleaved({point.label: point.run for point in found} | {"C": loop}, size.repeats)
     best = min(found, key=lambda point: np.median(timed[point.label]))
     per_lane = [s / HELD for s in timed[best.label]]
     to_c = ratio(per_lane, timed["C"])
-    low, middle, high = (1e9 / steps * float(x) for x in np.quantile(per_lane, (0.25, 0.5, 0.75)))
+    ns = quartiles(per_lane, 1e9 / steps)
     row = {"system": case.system, "program": "as accurate as C", "batch": HELD, "micro_dt": case.micro_dt}
-    row |= {"ns/trajectory/micro step": middle, "low": low, "high": high, "to C": to_c.value}
+    row |= {"ns/trajectory/micro step": ns.value, "low": ns.low, "high": ns.high, "to C": to_c.value}
     row |= {"iterations": None, "result": best.label, "error": best.error, "error of C": error}
     what = f"{case.system}, batch of {HELD}, as accurate as C (error {error:.0e}): over C"
     return row, Claim(what, to_c, at_most=case.target)
@@ -186,7 +177,7 @@ def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
     run = vm.simulate(problem.system, scheme, state, micro_dt=case.micro_dt, num_steps=steps)
     taken = np.asarray(run.info.iterations)
     for iterations in range(max(1, int(taken.mean())), int(taken.max())):
-        simulate = programs.program(problem, scheme, case.micro_dt, vm.Newton(fixed_iterations=iterations))
+        simulate = programs.program(problem, scheme, vm.Newton(fixed_iterations=iterations), micro_dt=case.micro_dt)
         if not programs.failed(simulate(steps)):
             return iterations
     return max(1, int(taken.max()))
@@ -195,36 +186,3 @@ def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
 def _info(trajectory: vm.Trajectory) -> dict:
     worst = int(np.max(np.asarray(trajectory.result)))
     return {"iterations": int(np.max(np.asarray(trajectory.info.iterations))), "result": vm.Result(worst).name}
-
-
-def draw(rows: list[dict], devices: int) -> Figure:
-    """One panel per system; the C loop is a line."""
-    names = list(dict.fromkeys(row["system"] for row in rows))
-    theme = plots.LIGHT
-    with plots.style():
-        figure = plots.NotebookFigure(figsize=(0.8 + 2.8 * len(names), 3.6))
-        panels = figure.subplots(1, len(names), squeeze=False)[0]
-        for axes, name in zip(panels, names, strict=True):
-            here = [row for row in rows if row["system"] == name]
-            for i, option in enumerate(("default", "fixed")):
-                points = [(r["batch"], r["ns/trajectory/micro step"]) for r in here if r["program"] == option]
-                if points:
-                    label = "fixed iterations" if option == "fixed" else option
-                    axes.loglog(*zip(*points, strict=True), marker=plots.MARKERS[i], color=theme.curves[i], label=label)
-            for row in here:
-                if row["program"] == "as accurate as C":
-                    point = {"marker": plots.MARKERS[2], "color": theme.curves[2], "label": row["program"]}
-                    axes.plot(row["batch"], row["ns/trajectory/micro step"], linestyle="none", **point)
-                if row["program"] == "C":
-                    line = {"color": theme.ink, "linestyle": "--", "linewidth": 1.0, "label": "C, one trajectory"}
-                    axes.axhline(row["ns/trajectory/micro step"], **line)
-            axes.set(title=f"{name}, fully explicit", xlabel="batch size")
-            axes.xaxis.set_major_locator(FixedLocator(sorted({row["batch"] for row in here})))
-            axes.xaxis.set_major_formatter("{x:.0f}")
-            axes.xaxis.set_minor_locator(NullLocator())
-            axes.yaxis.set_minor_formatter(NullFormatter())
-        panels[0].set(ylabel="ns per trajectory and micro step")
-        handles = {label: h for axes in panels for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
-        figure.suptitle("Batches on one core" if devices == 1 else f"Batches on {devices} cores", x=0.01, ha="left")
-    return figure

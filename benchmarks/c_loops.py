@@ -43,6 +43,13 @@ def compiler() -> str | None:
     return next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
 
 
+def missing() -> list[str]:
+    """A note for reports where there is no compiler."""
+    if compiler() is not None:
+        return []
+    return ["No C compiler (cc, gcc or clang) on the PATH: nothing was held against C. Install one for that."]
+
+
 @dataclasses.dataclass(frozen=True)
 class CLoop:
     """A C loop and its data; call it to run from the initial data: (q_s, q_f, p_s, p_f) at the end."""

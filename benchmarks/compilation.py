@@ -1,24 +1,15 @@
 """Cold compile and first run, each in a fresh process without a cache, and compilations over a sweep."""
 
-import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 
-import jax
 import numpy as np
-from matplotlib.figure import Figure
 
-import vmri_jax as vm
-from benchmarks import programs
-from benchmarks.measure import Ratio, Tell, prepare, ratio, silent
+from benchmarks.measure import Ratio, Tell, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
-from vmri_jax import plots
+from benchmarks.seats import Seat, Worker
+from benchmarks.worker import Case
 
 COLUMNS = ("system", "scheme", "num_micro", "first call, s", "later call, s", "start, s", "process, s", "compilations")
 SYSTEMS = ("FPU l=3", "TSP", "SAM")
@@ -56,67 +47,15 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
                     found[n].append(_fresh(system, scheme, n))
             rows += [_row(system, scheme, n, found[n]) for n in size.num_micro]
             claims += _claims(f"{system}, {scheme}", found)
-            yield Report("compile", name, rows, claims, [], {"compile": partial(draw, rows)})
-
-
-def programs_of(size: Size) -> int:
-    """How many processes are started."""
-    return len(size.systems) * len(size.schemes) * len(size.num_micro) * size.repeats
+            yield Report("compile", name, rows, claims, [])
 
 
 def _fresh(system: str, scheme: str, num_micro: int) -> dict:
-    """What `child` measures, in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.compilation", system, scheme, str(num_micro)]
-    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-    begin = time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1], env=environment)
-    if done.returncode:
-        raise RuntimeError(f"compile: {' '.join(command)} failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1]) | {"process": time.perf_counter() - begin}
-
-
-def child(system: str, scheme: str, num_micro: int) -> dict:
-    """Seconds of the start, of the first call of `simulate` and of a later one; compilations over a sweep.
-
-    The sweep changes number of steps, step size, parameters and start.
-    """
-    problem, make = programs.problem(system), programs.SCHEMES[scheme](num_micro)
-    begin = time.perf_counter()
-    state = jax.block_until_ready(problem.state())
-    started = time.perf_counter()
-
-    def call(dt=MICRO_DT, num_steps=2, of=problem.system, state=state):
-        step = {"micro_dt": dt, "num_steps": num_steps, "save_every": num_steps}
-        return jax.block_until_ready(vm.simulate(of, make, state, **step))
-
-    call()
-    first = time.perf_counter()
-    call()
-    second = time.perf_counter()
-
-    heavier = problem.system.replace(params={key: 1.01 * value for key, value in problem.system.params.items()})
-    moved = vm.State(state.t + 1.0, state.q_s, state.q_f, 1.01 * state.p_s, 1.01 * state.p_f)
-    if problem.system.constraint is not None:  # the lengths are parameters: other starts only
-        heavier = problem.system.replace(
-            params=problem.system.params | {"gravity": problem.system.params["gravity"] + 1}
-        )
-    compiled = []
-
-    def count(event: str, duration_secs: float, **_) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(duration_secs)
-
-    jax.monitoring.register_event_duration_secs_listener(count)
-    call(num_steps=3)
-    call(dt=1.1 * MICRO_DT)
-    call(of=heavier)
-    call(state=moved)
-    return {
-        "start": started - begin,
-        "first": first - started,
-        "later": second - first,
-        "compilations": 1 + len(compiled),
-    }
+    """What a worker finds in a process of its own."""
+    words = f"{scheme.replace(' ', '_')} {num_micro}"
+    with Worker(Seat()) as worker:
+        made = worker.make(Case("compile", system, words, macro_dt=num_micro * MICRO_DT, num_steps=2))
+        return made["found"] | {"process": time.perf_counter() - worker.started}
 
 
 def _row(system: str, scheme: str, num_micro: int, found: list[dict]) -> dict:
@@ -133,40 +72,9 @@ def _row(system: str, scheme: str, num_micro: int, found: list[dict]) -> dict:
 def _claims(label: str, found: dict[int, list[dict]]) -> list[Claim]:
     seconds = {n: [one["first"] for one in some] for n, some in found.items()}
     few, many = min(seconds), max(seconds)
-    low, middle, high = (float(x) for x in np.quantile(seconds[few], (0.25, 0.5, 0.75)))
     most = max(one["compilations"] for some in found.values() for one in some)
     return [
-        Claim(f"{label}: seconds of the first call at num_micro {few}", Ratio(middle, low, high), MOST_SECONDS),
+        Claim(f"{label}: seconds of the first call at num_micro {few}", quartiles(seconds[few]), MOST_SECONDS),
         Claim(f"{label}: first call at {many} over {few}", ratio(seconds[many], seconds[few]), GROWTH),
         Claim(f"{label}: compilations over a sweep of steps, parameters and starts", Ratio(most, most, most), 1.0),
     ]
-
-
-def draw(rows: list[dict]) -> Figure:
-    """Seconds of the first call, one group of bars per system and scheme."""
-    names = list(dict.fromkeys(f"{row['system']}\n{row['scheme']}" for row in rows))
-    num_micro = sorted({row["num_micro"] for row in rows})
-    with plots.style():
-        figure = plots.NotebookFigure(figsize=(7.2, 3.6))
-        axes = figure.subplots()
-        for i, n in enumerate(num_micro):
-            seconds = [row["first call, s"] for row in rows if row["num_micro"] == n]
-            bars = axes.bar(np.arange(len(names)) + 0.38 * i, seconds, 0.36, label=f"num_micro {n}")
-            axes.bar_label(bars, fmt="%.1f", fontsize=8)
-        axes.set_xticks(np.arange(len(names)) + 0.19 * (len(num_micro) - 1), names, fontsize=8)
-        axes.set(ylabel="s, first call")
-        axes.grid(axis="x", visible=False)
-        figure.legend(loc="outside lower center", ncols=2)
-        figure.suptitle("Tracing, compiling and one run", x=0.01, ha="left")
-    return figure
-
-
-def main() -> None:
-    """``python -m benchmarks.compilation system scheme num_micro``, started by `run`."""
-    prepare(cache=False)
-    system, scheme, num_micro = sys.argv[1:]
-    print(json.dumps(child(system, scheme, int(num_micro))))
-
-
-if __name__ == "__main__":
-    main()

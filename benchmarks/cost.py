@@ -118,9 +118,7 @@ def _report(size: Size, name: str, parts: Mapping[str, list[Curves]], once: list
     claims = [claim for curves in everything for claim in _claims(curves)]
     claims += [claim for line in lines for claim in line.claims]
     rows = [row for curves in everything for row in curves.rows] + [row for line in lines for row in line.rows]
-    figures: dict = {file: partial(_draw, file, part) for file, part in parts.items()}
-    if lines:
-        figures["cost_linear"] = partial(linear.draw, lines)
+    figures = {file: partial(_draw, file, part) for file, part in parts.items()}
     return Report("cost", name, rows, claims, _notes(size, everything), figures)
 
 
@@ -130,14 +128,6 @@ def _draw(file: str, part: list[Curves]) -> Figure:
         return draw(part, paper.TITLES[file], per_scheme)
     dt = " and ".join(f"{h:g}" for h in dict.fromkeys(curves.case.micro_dt for curves in part))
     return draw(part, f"Computing time does not turn up (micro steps {dt})", len(SCHEMES))
-
-
-def programs_of(size: Size) -> int:
-    """How many programs are timed."""
-    cases = [case for part in (*size.turning.values(), *size.paper.values()) for case in part]
-    return sum(c.affordable(size.most_unknowns).programs for c in cases) + sum(
-        c.programs for c in (*size.once, *size.linear)
-    )
 
 
 def _claims(curves: Curves) -> list[Claim]:

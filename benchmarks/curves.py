@@ -12,7 +12,7 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 import vmri_jax as vm
 from benchmarks import programs
-from benchmarks.measure import Ratio, Tell, interleaved, ratio, silent, steps_for
+from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent, steps_for
 from vmri_jax import plots
 from vmri_jax.study.reference import kinetic_energy
 
@@ -58,11 +58,6 @@ class Case:
             dense_num_micro=tuple(n for n in self.dense_num_micro if programs.unknowns(problem, n) <= most_unknowns),
         )
 
-    @property
-    def programs(self) -> int:
-        """How many are timed."""
-        return len(self.num_micro) + len(self.dense_num_micro)
-
 
 @dataclass(frozen=True)
 class Curves:
@@ -102,8 +97,7 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
     runs, results, total = {}, {}, 0
     for n in case.num_micro:
         tell(f"{case.label}, num_micro {n}")
-        make = programs.program if case.t_end is None else programs.short_program
-        run = make(problem, programs.SCHEMES[case.scheme](n), case.micro_dt)
+        run = programs.program(problem, programs.SCHEMES[case.scheme](n), micro_dt=case.micro_dt)
         if not total:  # of micro steps, one that all num_micro divide
             unit = math.lcm(*case.num_micro)
             if case.t_end is None:
@@ -115,7 +109,8 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
     for n in case.dense_num_micro:
         tell(f"{case.label}, num_micro {n}, dense")
         scheme = programs.SCHEMES[case.scheme](n)
-        run = programs.program(_unstructured(problem, case), scheme, case.micro_dt, vm.Newton(method="dense"))
+        dense = vm.Newton(method="dense")
+        run = programs.program(_unstructured(problem, case), scheme, dense, micro_dt=case.micro_dt)
         num_steps = steps_for(run, seconds / 2, 3, 300)
         runs["dense", n] = partial(run, num_steps), num_steps * n
         results["dense", n] = run(num_steps)
@@ -139,7 +134,7 @@ def _unstructured(problem: vm.Problem, case: Case) -> vm.Problem:
 
 def _row(curves: Curves, problem, method: str, n: int, micro_steps: int, trajectory: vm.Trajectory) -> dict:
     case, us = curves.case, curves.samples.get((method, n))
-    low, middle, high = (float(x) for x in np.quantile(us, (0.25, 0.5, 0.75))) if us else (math.nan,) * 3
+    spread = quartiles(us or [math.nan])
     _, all_of_them = curves.curve(method)
     return {
         "case": case.label,
@@ -148,10 +143,10 @@ def _row(curves: Curves, problem, method: str, n: int, micro_steps: int, traject
         "unknowns": programs.unknowns(problem, n),
         "micro_dt": case.micro_dt,
         "micro steps": micro_steps,
-        "µs/micro step": middle,
-        "low": low,
-        "high": high,
-        "to cheapest": middle / float(all_of_them.min()) if us else math.nan,
+        "µs/micro step": spread.value,
+        "low": spread.low,
+        "high": spread.high,
+        "to cheapest": spread.value / float(all_of_them.min()) if us else math.nan,
         "iterations": int(np.max(np.asarray(trajectory.info.iterations))),
         "result": vm.Result(int(trajectory.result)).name,
     }

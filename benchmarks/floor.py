@@ -5,13 +5,11 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import vmri_jax as vm
 from benchmarks import c_loops, programs
-from benchmarks.measure import Ratio, Tell, interleaved, ratio, silent, steps_for
+from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent, steps_for
 from benchmarks.report import Claim, Report
-from vmri_jax import plots
 
 COLUMNS = ("system", "program", "num_micro", "micro steps", "ns/micro step", "low", "high", "to C", "result")
 NUM_MICRO = 10
@@ -73,20 +71,12 @@ def c_loop(system: str, problem: vm.Problem, num_micro: int, micro_dt: float, nu
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each pair; without a compiler only the implicit schemes are held against the explicit one."""
-    rows, claims, notes = [], [], []
-    if c_loops.compiler() is None:
-        notes.append("No C compiler (cc, gcc or clang) on the PATH: nothing was held against C. Install one for that.")
+    rows, claims, notes = [], [], c_loops.missing()
     for pair in size.pairs:
         some_rows, some_claims = _measure(pair, size, tell)
         rows += some_rows
         claims += some_claims
-        figures = {} if notes else {"floor": partial(draw, rows)}
-        yield Report("floor", name, rows, claims, notes, figures)
-
-
-def programs_of(size: Size) -> int:
-    """How many programs are timed."""
-    return sum(len(pair.schemes) for pair in size.pairs)
+        yield Report("floor", name, rows, claims, notes)
 
 
 def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
@@ -94,7 +84,7 @@ def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     runs, steps, results = {}, {}, {}
     for scheme in pair.schemes:
         tell(f"{pair.label}, {scheme}")
-        simulate = programs.program(problem, programs.SCHEMES[scheme](pair.num_micro), pair.micro_dt)
+        simulate = programs.program(problem, programs.SCHEMES[scheme](pair.num_micro), micro_dt=pair.micro_dt)
         steps[scheme] = steps_for(simulate, size.seconds, 10)
         runs[scheme] = partial(simulate, steps[scheme])
         results[scheme] = vm.Result(int(np.asarray(runs[scheme]().result))).name
@@ -113,34 +103,16 @@ def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
 
 
 def _row(pair: Pair, name: str, steps: int, ns: list[float], to_c: Ratio | None, result: str) -> dict:
-    low, middle, high = (float(x) for x in np.quantile(ns, (0.25, 0.5, 0.75)))
+    spread = quartiles(ns)
     return {
         "system": pair.system,
         "program": name,
         "num_micro": pair.num_micro,
         "micro_dt": pair.micro_dt,
         "micro steps": steps * pair.num_micro,
-        "ns/micro step": middle,
-        "low": low,
-        "high": high,
+        "ns/micro step": spread.value,
+        "low": spread.low,
+        "high": spread.high,
         "to C": None if to_c is None else to_c.value,
         "result": result,
     }
-
-
-def draw(rows: list[dict]) -> Figure:
-    """Time over that of C, one bar per program."""
-    theme, rows = plots.LIGHT, [row for row in rows if row["program"] != "C"][::-1]
-    colors = dict(zip(programs.SCHEMES, theme.curves, strict=False))
-    with plots.style():
-        figure = plots.NotebookFigure(figsize=(7.2, 1.2 + 0.28 * len(rows)))
-        axes = figure.subplots()
-        labels = [f"{row['system']}, num_micro {row['num_micro']}, {row['program']}" for row in rows]
-        bars = axes.barh(labels, [row["to C"] for row in rows], color=[colors[row["program"]] for row in rows])
-        axes.bar_label(bars, fmt="%.2f", padding=3, fontsize=8)
-        axes.axvline(1.0, color=theme.ink, linewidth=1.0)
-        axes.set(xlabel="time over that of the C loop (the line at 1)", xscale="log")
-        axes.margins(x=0.15)
-        axes.grid(axis="y", visible=False)
-        figure.suptitle("One run on one core against C", x=0.01, ha="left")
-    return figure

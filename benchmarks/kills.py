@@ -36,11 +36,6 @@ def sizes(name: str, count: int = 100) -> Size:
     return Size(count)
 
 
-def programs_of(size: Size) -> int:
-    """How many processes are killed."""
-    return size.count
-
-
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Kill, look at what is there, resume, kill ..., each completed run compared with one that nobody killed."""
     with TemporaryDirectory() as folder:
@@ -52,7 +47,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         f"{len(rows)} kills ({counts}), each resumed: {identical} times everything on disk identical to the uninterrupted run.",
         f"{sum(runs)} of {len(runs)} completed runs identical in every array.",
     ]
-    yield Report("kills", name, rows, [], notes, {})
+    yield Report("kills", name, rows, [], notes)
 
 
 def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict], list[bool]]:

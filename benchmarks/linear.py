@@ -4,15 +4,12 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 import vmri_jax as vm
 from benchmarks import curves, programs
 from benchmarks.curves import Case
 from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim
-from vmri_jax import plots
 
 MEMORY_FROM = 100
 """Below so many micro steps what does not depend on num_micro counts as well."""
@@ -76,27 +73,3 @@ def temporary_bytes(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float) -> 
     step = jax.jit(vm.macro_step)
     compiled = step.lower(problem.system, scheme, problem.state(), scheme.num_micro * micro_dt).compile()
     return compiled.memory_analysis().temp_size_in_bytes  # pyright: ignore[reportOptionalMemberAccess]
-
-
-def draw(lines: list[Line]) -> Figure:
-    """Time and memory of a macro step, with a line of slope one."""
-    with plots.style():
-        figure = plots.NotebookFigure(figsize=(7.6, 3.8))
-        panels = figure.subplots(1, 2)
-        for i, line in enumerate(lines):
-            look = {"marker": plots.MARKERS[i], "color": plots.LIGHT.curves[i], "label": line.case.label}
-            panels[0].loglog(line.num_micro, np.median(line.us, axis=1), **look)
-            panels[1].loglog(line.num_micro[-len(line.bytes) :], line.bytes / 1024, **look)
-        for axes in panels:
-            (left, _), (bottom, _) = axes.get_xlim(), axes.get_ylim()
-            x = np.array([left, lines[0].num_micro.max()])
-            guide = {"color": plots.LIGHT.ink, "linestyle": ":", "linewidth": 1.0, "label": "slope 1"}
-            axes.loglog(x, bottom * x / left, **guide)
-            axes.set(xlabel="micro steps per macro step")
-            axes.xaxis.set_minor_formatter(NullFormatter())
-        panels[0].set(ylabel="µs per macro step")
-        panels[1].set(ylabel="temporary memory, KiB")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8)
-        figure.suptitle("Linear in num_micro", x=0.01, ha="left")
-    return figure

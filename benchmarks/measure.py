@@ -1,11 +1,20 @@
 """Before anything is measured: the process keeps to one core, and JAX is told how to compile."""
 
 import os
+from collections.abc import Sequence
+
+import numpy as np
 
 from vmri_jax.configure import cache_folder, configure
 from vmri_jax.study.timing import Ratio, Tell, interleaved, machine, ratio, silent, steps_for
 
-__all__ = ["Ratio", "Tell", "interleaved", "machine", "pin", "prepare", "ratio", "silent", "steps_for"]
+__all__ = ["Ratio", "Tell", "interleaved", "machine", "pin", "prepare", "quartiles", "ratio", "silent", "steps_for"]
+
+
+def quartiles(samples: Sequence[float], scale: float = 1.0) -> Ratio:
+    """Median and quartiles of samples, times `scale`."""
+    low, middle, high = (scale * float(x) for x in np.quantile(samples, (0.25, 0.5, 0.75)))
+    return Ratio(middle, low, high)
 
 
 def pin(core: int | None) -> int | None:

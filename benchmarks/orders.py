@@ -65,11 +65,6 @@ def sizes(name: str) -> Size:
     return Size(tuple(cases))
 
 
-def programs_of(size: Size) -> int:
-    """How many schemes are run."""
-    return len(size.cases)
-
-
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each scheme."""
     rows = []
@@ -78,7 +73,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         rows.append(measure(case))
         good = sum(row["holds"] != "no" for row in rows)
         notes = [f"{good} of {len(rows)} orders of q and p are within {TOLERANCE} of the order expected."]
-        yield Report("orders", name, rows, [], notes, {})
+        yield Report("orders", name, rows, [], notes)
 
 
 def truth(system: str) -> ReferenceSolution:

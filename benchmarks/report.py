@@ -5,12 +5,11 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from benchmarks.measure import Ratio, Tell, machine
@@ -38,6 +37,11 @@ class Claim:
         return below and (self.at_least is None or self.seen.value >= self.at_least)
 
     @property
+    def verdict(self) -> str:
+        """Whether it keeps its target, if it has one."""
+        return "" if not self.target else "yes" if self.holds else "no"
+
+    @property
     def target(self) -> str:
         """In words."""
         parts = [f"≥ {self.at_least:.3g}"] if self.at_least is not None else []
@@ -51,6 +55,7 @@ class Report:
     rows: one dictionary per program.
     notes: what was left out, and why.
     figures: by file name, functions that draw.
+    about: what else belongs into the file.
     """
 
     name: str
@@ -58,14 +63,15 @@ class Report:
     rows: list[dict]
     claims: list[Claim]
     notes: list[str]
-    figures: dict[str, Callable[[], Figure]]
+    figures: dict[str, Callable[[], Figure]] = field(default_factory=dict)
+    about: dict = field(default_factory=dict)
 
     def write(self, out: Path) -> Path:
         """Write ``out/name.json`` and the figures; returns the path of the JSON file."""
         out.mkdir(parents=True, exist_ok=True)
         path = out / f"{self.name}.json"
         claims = [asdict(claim) | {"holds": claim.holds} for claim in self.claims]
-        found = {"benchmark": self.name, "size": self.size, "machine": machine(), "claims": claims}
+        found = {"benchmark": self.name, "size": self.size, "machine": machine(), **self.about, "claims": claims}
         found |= {"notes": self.notes, "rows": self.rows}
         path.write_text(json.dumps(_finite(found), indent=1))
         for name, draw in self.figures.items():
@@ -76,58 +82,36 @@ class Report:
 
     def markdown(self, columns: Sequence[str]) -> str:
         """Rows (these columns of them), claims and notes as Markdown."""
-        tables = [[columns, *([_cell(row.get(name)) for name in columns] for row in self.rows)]]
-        if self.claims:
-            claims = [(c.what, str(c.seen), c.target, "yes" if c.holds else "no") for c in self.claims]
-            tables.append([("ratio", "seen (quartiles)", "target", "holds"), *claims])
         lines = [f"## {self.name}, {self.size}"]
-        for head, *body in tables:
+        for head, *body in self._tables(columns):
             lines += ["", *(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body))]
         return "\n".join([*lines, "", *(f"- {note}" for note in self.notes), ""])
 
     def show(self, columns: Sequence[str]) -> None:
         """Print the rows (these columns of them), the claims and the notes."""
-        if self.rows:
-            console.print(_rows_table(f"{self.name}, {self.size}", self.rows, columns))
-        if self.claims:
-            console.print(_claims_table(self.claims))
+        console.print(f"{self.name}, {self.size}", style="bold")
+        for head, *body in self._tables(columns):
+            table = Table(*head, box=None, pad_edge=False)
+            for row in body:
+                table.add_row(*row)
+            console.print(table, "")
         for note in self.notes:
             console.print(note, style="dim")
 
+    def _tables(self, columns: Sequence[str]) -> Iterator[list[Sequence[str]]]:
+        """Rows and claims as text, the heads first; those that are empty are left out."""
+        if self.rows:
+            yield [columns, *([_cell(row.get(name)) for name in columns] for row in self.rows)]
+        if self.claims:
+            claims = [(c.what, str(c.seen), c.target, c.verdict) for c in self.claims]
+            yield [("ratio", "seen (quartiles)", "target", "holds"), *claims]
+
 
 @contextmanager
-def progress(title: str, total: int) -> Iterator[Tell]:
-    """A bar of `total` parts; yields the function that is told each part before it starts."""
-    columns = (
-        TextColumn(title),
-        BarColumn(30),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[at]}"),
-    )
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(title, total=total, completed=-1, at="")
-        yield lambda at: bar.update(task, advance=1, at=at)
-
-
-def _rows_table(title: str, rows: Sequence[dict], columns: Sequence[str]) -> Table:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
-    for name in columns:
-        text = all(isinstance(row.get(name), str | None) for row in rows)
-        table.add_column(name, justify="left" if text else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*(_cell(row.get(name)) for name in columns))
-    return table
-
-
-def _claims_table(claims: Sequence[Claim]) -> Table:
-    table = Table(title="\nratios (quartiles)", title_justify="left", box=None, pad_edge=False, header_style="bold")
-    for name in ("what", "seen", "target", ""):
-        table.add_column(name)
-    for claim in claims:
-        verdict = "[green]yes[/green]" if claim.holds else "[red]no[/red]"
-        table.add_row(claim.what, str(claim.seen), claim.target, verdict if claim.target else "")
-    return table
+def progress(title: str) -> Iterator[Tell]:
+    """A line that shows what is being measured; yields the function that is told each part before it starts."""
+    with console.status(title) as status:
+        yield lambda at: status.update(f"{title}: {at}")
 
 
 def _cell(value) -> str:

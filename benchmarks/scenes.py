@@ -11,7 +11,7 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks import programs
-from benchmarks.measure import Tell, interleaved, ratio, silent
+from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent
 from benchmarks.report import Claim, Report
 from tests.scene.effect_scenes import BASE, EFFECTS, base_by_hand, scene_with
 from tests.scene.forced_bodies import EFFECT_OF, convergence
@@ -67,7 +67,6 @@ class Part:
     """One table of the report, with the functions that `python -m benchmarks` asks for."""
 
     COLUMNS: tuple[str, ...]
-    programs_of: Callable[[Size], int]
     run: Callable[..., Iterator[Report]]
     sizes: Callable[[str], Size] = sizes
 
@@ -111,7 +110,7 @@ def absence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         f"{sum(row['calls without'] == 0 < row['calls with'] for row in rows)} of {len(rows)}: called with it, never without.",
         *(f"{what}: operations {a[0]}, bytes {a[1]}; by hand {b[0]}, {b[1]}." for what, (a, b) in by_hand.items()),
     ]
-    yield Report("scene_absence", name, rows, [], notes, {})
+    yield Report("scene_absence", name, rows, [], notes)
 
 
 def _by_hand(scheme: vm.Scheme, tell: Tell) -> dict[str, tuple]:
@@ -171,13 +170,13 @@ def presence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
             runs = {key: partial(compiled[key], *some) for key, some in arguments.items()}
             seconds = interleaved(runs, size.repeats, clock=time.process_time)
             for key, program in compiled.items():
-                us = 1e6 / size.num_steps / size.num_micro * np.quantile(seconds[key], (0.25, 0.5, 0.75))
-                row = {"system": system, "scheme": scheme, "program": key, "µs/micro step": float(us[1])}
-                row |= {"quartiles": f"{us[0]:.3g} to {us[2]:.3g}", "operations": sum(operations(program).values())}
+                us = quartiles(seconds[key], 1e6 / size.num_steps / size.num_micro)
+                row = {"system": system, "scheme": scheme, "program": key, "µs/micro step": us.value}
+                row |= {"quartiles": f"{us.low:.3g} to {us.high:.3g}", "operations": sum(operations(program).values())}
                 rows.append(row | {"bytes": temporary_bytes(program)})
             label = f"{system}, {scheme}: scene over by hand"
             claims.append(Claim(label, ratio(seconds["scene"], seconds["by hand"]), MOST))
-            yield Report("scene_presence", name, rows, claims, [], {})
+            yield Report("scene_presence", name, rows, claims, [])
 
 
 # --- orders ----------------------------------------------------------------------------------------------------------
@@ -199,7 +198,7 @@ def orders(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         notes = [
             f"{good} of {len(rows)}: error within {error} and energy balance within {balance} of the order expected."
         ]
-        yield Report("scene_orders", name, rows, [], notes, {})
+        yield Report("scene_orders", name, rows, [], notes)
 
 
 PARTS = {
@@ -208,17 +207,14 @@ PARTS = {
             *("effect", "ops with", "bytes with", "ops without", "bytes without", "ops never", "bytes never"),
             *("same", "compiled", "unknowns", "formula", "calls with", "calls without"),
         ),
-        lambda size: len(EFFECTS) + 2,
         absence,
     ),
     "presence": Part(
         ("system", "scheme", "program", "µs/micro step", "quartiles", "operations", "bytes"),
-        lambda size: len(SCENES) * len(size.schemes),
         presence,
     ),
     "orders": Part(
         ("effect", "scheme", "order", "of q, p", "of balance", "finest error", "finest balance", "holds"),
-        lambda size: len(size.orders),
         orders,
     ),
 }

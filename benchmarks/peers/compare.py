@@ -8,21 +8,23 @@ from functools import partial
 import numpy as np
 
 import vmri_jax as vm
-from benchmarks import programs
 from benchmarks.c_loops import NoCompiler
-from benchmarks.measure import Ratio, Tell, interleaved, ratio, silent
+from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent
 from benchmarks.peers import cases, figures
 from benchmarks.peers.cases import BATCH_LEVEL, LEVELS, Case, Ladder, NotRepresentable
 from benchmarks.peers.scan import Point, candidates, scan
 from benchmarks.peers.targets import target
 from benchmarks.report import Claim, Report
+from benchmarks.worker import starts
 
 OURS = "vmri_jax"
 PEERS = {
     OURS: "ours",
     "heyoka": "heyoka",
     "diffrax": "diffrax",
+    "diffrax, autodiff": "diffrax_autodiff",
     "scipy": "scipy",
+    "scipy, autodiff": "scipy_autodiff",
     "OpenMM": "openmm",
     "Exudyn": "exudyn",
     "MuJoCo": "mujoco",
@@ -31,7 +33,7 @@ PEERS = {
     "C by hand": "c",
 }
 """Modules of this package by the name of the integrator."""
-BATCHED = (OURS, "heyoka", "diffrax")
+BATCHED = (OURS, "heyoka", "diffrax", "diffrax, autodiff")
 BATCH = 1024
 FINE_STEPS = 1000
 """Of the reference of a batch, whose error is then 1e-7, far below the level that is asked for."""
@@ -78,10 +80,10 @@ def sizes(name: str, only: Sequence[str] = (), peers: Sequence[str] = ()) -> Siz
     batches = _chosen([f"{case}, batch" for case in BATCH_CASES], only)
     if not chosen and not batches:
         raise ValueError(f"peers: there is no case {' or '.join(only)}; there are {', '.join(cases.NAMES)}.")
-    unknown = [peer for peer in peers if peer not in PEERS]
-    if unknown:
-        raise ValueError(f"peers: there is no {', '.join(unknown)}; there are {', '.join(PEERS)}.")
-    named = tuple(peer for peer in PEERS if not peers or peer in peers or peer == OURS)
+    known = {peer.partition(",")[0] for peer in PEERS}
+    if unknown := [peer for peer in peers if peer not in known]:
+        raise ValueError(f"peers: there is no {', '.join(unknown)}; there are {', '.join(sorted(known))}.")
+    named = tuple(peer for peer in PEERS if not peers or peer.partition(",")[0] in (OURS, *peers))
     seconds, repeats, slow = (1.0, 7, 2) if name == "quick" else (30.0, 15, 3)
     return Size(tuple(chosen), tuple(batches), named, seconds, repeats, slow)
 
@@ -89,12 +91,6 @@ def sizes(name: str, only: Sequence[str] = (), peers: Sequence[str] = ()) -> Siz
 def _chosen(names: Sequence[str], only: Sequence[str]) -> list[str]:
     """Those asked for: by the whole name, else by its beginning."""
     return [name for name in names if not only or name in only or any(name.startswith(f"{x} ") for x in only)]
-
-
-def programs_of(size: Size) -> int:
-    """How many scans and timings there are."""
-    batched = [peer for peer in size.peers if peer in BATCHED]
-    return len(size.cases) * (len(size.peers) + 1) + len(size.batches) * (len(batched) + 1)
 
 
 def load(peer: str):
@@ -122,10 +118,10 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         found[title] = _one(title, case, ladders, LEVELS, size, tell, rows, claims, notes)
         yield report()
     for title in size.batches:
-        case, starts = batch_case(title.removesuffix(", batch"), size.batch)
+        case, lanes = batch_case(title.removesuffix(", batch"), size.batch)
         peers = [peer for peer in size.peers if peer in BATCHED]
         ladders = _ladders(
-            title, case, peers, notes, lambda m, case=case, starts=starts: (m.batch_ladders(case, *starts), None)
+            title, case, peers, notes, lambda m, case=case, lanes=lanes: (m.batch_ladders(case, *lanes), None)
         )
         found[title] = _one(title, case, ladders, (BATCH_LEVEL,), size, tell, rows, claims, notes)
         yield report()
@@ -134,7 +130,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 def batch_case(name: str, lanes: int) -> tuple[Case, tuple]:
     """A case with `lanes` starts, and these: ``(states, q, v)``; the reference is a Gauss scheme of order 4."""
     case = cases.case(name)
-    states = programs.starts(case.problem, lanes)
+    states = starts(case.problem, lanes)
     steps = {"macro_dt": case.t_end / FINE_STEPS, "num_steps": FINE_STEPS, "save_every": FINE_STEPS}
     end = vm.simulate_batch(case.problem.system, vm.galerkin(1, 2, "gauss"), states, **steps)
     q_end = np.concatenate([end.q_s[:, -1], end.q_f[:, -1]], axis=1)
@@ -237,10 +233,17 @@ def _row(title, peer, points: Sequence[Point], levels, timed, differs) -> dict:
             row[key] = "not reached"
             continue
         at = timed[peer, level]
-        low, middle, high = (1e3 * float(x) for x in np.quantile(at.samples, (0.25, 0.5, 0.75)))
-        row[key] = f"{middle:.3g} ms" + ("" if peer == OURS else f" ({at.to_ours.value:.2g}x)")
+        ms = quartiles(at.samples, 1e3)
+        row[key] = f"{ms.value:.3g} ms" + ("" if peer == OURS else f" ({at.to_ours.value:.2g}x)")
         details.append(
-            {"level": level, "setting": at.point.label, "error": at.point.error, "ms": middle, "low": low, "high": high}
+            {
+                "level": level,
+                "setting": at.point.label,
+                "error": at.point.error,
+                "ms": ms.value,
+                "low": ms.low,
+                "high": ms.high,
+            }
         )
         details[-1] |= {"to ours": at.to_ours.value, "build, s": at.point.build + at.point.compile}
     row["best error"] = min((p.settled for p in points), default=np.inf)

@@ -8,7 +8,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from benchmarks.peers import equations
+from benchmarks.peers import equations as by_hand
 from benchmarks.peers.cases import Case, Ladder, step_counts, tolerances
 
 CHUNK = 64
@@ -18,19 +18,23 @@ MOST_STEPS = 20_000
 SOLVERS: tuple[Any, ...] = (diffrax.Dopri8, diffrax.Tsit5)
 
 
-def ladders(case: Case) -> list[Ladder]:
-    """Tolerances for the adaptive methods; steps for the semi-implicit one, which wants forces without velocities."""
+def ladders(case: Case, equations=by_hand) -> list[Ladder]:
+    """Tolerances for the adaptive methods; steps for the semi-implicit one, which wants forces without velocities.
+
+    Args:
+        equations: a module with `acceleration`.
+    """
     start = (jnp.asarray(case.q), jnp.asarray(case.v))
 
     def adaptive(solver) -> Ladder:
-        solve = jax.jit(solution(case, solver()))
+        solve = jax.jit(solution(case, solver(), equations))
         return Ladder(
             solver.__name__, "tol", tolerances(1e-2, 1e-14), lambda tol: partial(solve, start, jnp.asarray(tol))
         )
 
     found = [adaptive(solver) for solver in SOLVERS]
     if case.is_chain:
-        solve = jax.jit(semi_implicit(case))
+        solve = jax.jit(semi_implicit(case, equations))
         settings = step_counts(32 * case.t_end, 1e7 * case.t_end)
         found.append(
             Ladder("SemiImplicitEuler", "steps", settings, lambda n: partial(solve, start, jnp.asarray(case.t_end / n)))
@@ -38,7 +42,7 @@ def ladders(case: Case) -> list[Ladder]:
     return found
 
 
-def solution(case: Case, solver):
+def solution(case: Case, solver, equations):
     """``solve(y, tol)``: positions at the end from ``y = (q, v)``, with relative and absolute tolerance tol."""
     accelerate = equations.acceleration(case)
     term: Any = diffrax.ODETerm(lambda t, y, args: (y[1], accelerate(*y)))
@@ -52,7 +56,7 @@ def solution(case: Case, solver):
     return solve
 
 
-def semi_implicit(case: Case):
+def semi_implicit(case: Case, equations):
     """``solve(y, dt)``: the same by the symplectic Euler method, the velocity first."""
     accelerate = equations.acceleration(case)
     drift: Any = diffrax.ODETerm(lambda t, v, args: v)
@@ -70,15 +74,15 @@ def _end(terms, solver, y, t_end: float, dt, **options):
     return jnp.where(found.result == diffrax.RESULTS.successful, ys[0][-1], jnp.nan)
 
 
-energy = equations.energy
+energy = by_hand.energy
 
 
-def batch_ladders(case: Case, states, q, v) -> list[Ladder]:
+def batch_ladders(case: Case, states, q, v, equations=by_hand) -> list[Ladder]:
     """The adaptive methods under ``jax.vmap``, all lanes at once or in chunks."""
     starts = (jnp.asarray(q), jnp.asarray(v))
 
     def ladder(solver, chunk: int | None) -> Ladder:
-        solve = solution(case, solver())
+        solve = solution(case, solver(), equations)
 
         @jax.jit
         def run(starts, tol):

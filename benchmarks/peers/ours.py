@@ -1,17 +1,13 @@
-"""vmri_jax itself: every scheme is compiled once as a program that only steps, for all numbers of steps."""
+"""vmri_jax itself: every scheme as a prepared run, which is checked and compiled once for all numbers of steps."""
 
 import dataclasses
-from functools import partial
+from functools import cache
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks import programs
 from benchmarks.peers.cases import Case, Ladder, step_counts, tolerances
-from vmri_jax.running.simulate import run, run_memory
-from vmri_jax.runtime import OPTIONS, in_one_kernel
 from vmri_jax.schemes.composition import stage_scheme
 
 COMPOSED = {"kahan-li8": (1, 2, 4), "kahan-li6": (1, 2, 4), "suzuki4": (1, 2, 4, 8)}
@@ -59,44 +55,36 @@ def loose(case: Case, scheme: vm.Scheme | vm.Composition) -> tuple[float, ...]:
     return LOOSE_HIGH if stage_scheme(scheme).degree > 1 else LOOSE
 
 
-def program(case: Case, scheme: vm.Scheme | vm.Composition):
-    """``run(start, t_end, num_steps, tolerance)``: positions at the end, NaN where a step failed; compiled once for all.
-
-    It is what `vm.simulate` compiles, without the checks around it, which take a millisecond per call.
-    """
-    system, newton, n_s, n_f = case.problem.system, MARCH, case.problem.q_s.size, case.problem.q_f.size
-
-    @partial(jax.jit, compiler_options=OPTIONS)
-    @in_one_kernel
-    def steps(start, t_end, num_steps, tolerance):
-        q_s, q_f, p_s, p_f = jnp.split(start, np.cumsum([n_s, n_f, n_s]))
-        state, macro_dt = vm.State(jnp.zeros(()), q_s, q_f, p_s, p_f), t_end / num_steps
-        to_tolerance = eqx.tree_at(lambda newton: newton.tolerance, newton, tolerance)
-        memory = run_memory(system, scheme, state, macro_dt, to_tolerance)
-        last, _ = run(system, scheme, to_tolerance, macro_dt, state.t, state, memory, 0, 1, num_steps, False)
-        return jnp.concatenate([last.q_s[-1], last.q_f[-1]])
-
-    return steps
-
-
 def ladders(case: Case) -> list[Ladder]:
-    """One per scheme and tolerance of Newton's iteration: numbers of macro steps."""
-    start, t_end = jnp.concatenate([jnp.asarray(case.q), jnp.asarray(case.masses * case.v)]), jnp.asarray(case.t_end)
+    """One per scheme and tolerance of Newton's iteration: numbers of macro steps of a prepared run."""
 
-    def of_scheme(name: str, scheme) -> list[Ladder]:
-        steps = program(case, scheme)
-        settings = step_counts(max(2, 2 * case.t_end), 1e6 * case.t_end)
+    def ladder(name: str, scheme, tolerance: float) -> Ladder:
+        @cache
+        def prepared():
+            newton = dataclasses.replace(MARCH, tolerance=tolerance)
+            return programs.program(case.problem, scheme, newton, macro_dt=case.t_end)
 
-        def ladder(name: str, tolerance: float) -> Ladder:
-            def build(num_steps: int):
-                return partial(steps, start, t_end, jnp.asarray(num_steps), jnp.asarray(tolerance))
+        def build(num_steps: int):
+            simulate, macro_dt = prepared(), case.t_end / num_steps
 
-            return Ladder(name, "steps", settings, build)
+            def run():
+                end = simulate(num_steps, macro_dt=macro_dt)
+                return np.concatenate([np.asarray(end.q_s)[-1], np.asarray(end.q_f)[-1]])
 
-        looser = [ladder(f"{name}, tolerance {tol:.1e}", tol) for tol in loose(case, scheme)]
-        return [ladder(name, MARCH.tolerance), *looser]
+            return run
 
-    return [found for name, scheme in schemes(case).items() for found in of_scheme(name, scheme)]
+        return Ladder(name, "steps", step_counts(max(2, 2 * case.t_end), 1e6 * case.t_end), build)
+
+    return [ladder(*found) for found in _with_tolerances(case, schemes(case))]
+
+
+def _with_tolerances(case: Case, schemes) -> list[tuple[str, vm.Scheme | vm.Composition, float]]:
+    """Name, scheme and tolerance: to round-off, and the looser ones."""
+    found = []
+    for name, scheme in schemes.items():
+        found.append((name, scheme, MARCH.tolerance))
+        found += [(f"{name}, tolerance {tol:.1e}", scheme, tol) for tol in loose(case, scheme)]
+    return found
 
 
 def energy(case: Case) -> float:
@@ -122,8 +110,4 @@ def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladd
 
         return Ladder(name, "steps", step_counts(2 * case.t_end, 4000 * case.t_end), build)
 
-    def by_name(scheme):
-        return {"": MARCH.tolerance} | {f", tolerance {tol:.1e}": tol for tol in loose(case, scheme)}
-
-    schemes = batch_schemes() if schemes is None else schemes
-    return [ladder(a + b, scheme, tol) for a, scheme in schemes.items() for b, tol in by_name(scheme).items()]
+    return [ladder(*found) for found in _with_tolerances(case, schemes or batch_schemes())]

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks.peers import equations
+from benchmarks.peers import equations as by_hand
 from benchmarks.peers.cases import Case, Ladder, tolerances
 
 
-def ladders(case: Case) -> list[Ladder]:
+def ladders(case: Case, equations=by_hand) -> list[Ladder]:
     """One: relative and absolute tolerance alike; below 1e-13 the relative one stays, scipy allows no less."""
     start, n, accelerate = np.concatenate([case.q, case.v]), case.q.size, equations.acceleration(case)
 
@@ -30,4 +30,4 @@ def ladders(case: Case) -> list[Ladder]:
     return [Ladder("DOP853", "tol", tolerances(1e-1, 1e-13), build)]
 
 
-energy = equations.energy
+energy = by_hand.energy

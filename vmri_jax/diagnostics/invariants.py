@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.kernels.cpu import largest
+from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.state import State, project_momentum
 from vmri_jax.mechanics.system import System
 
@@ -48,7 +48,7 @@ def constraint_residual(system: System, state: State):
         system: its constraints; without any both are zero.
         state: time, positions and momenta.
     """
-    return jax.vmap(largest)(jnp.stack(all_constraints(system, state)))
+    return jax.vmap(max_abs)(jnp.stack(all_constraints(system, state)))
 
 
 def all_constraints(system: System, state: State):

@@ -11,7 +11,6 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton, dense
-from vmri_jax.steppers.newton.linearization import linearize
 from vmri_jax.steppers.step import macro_step
 
 
@@ -100,4 +99,4 @@ def _newton_matrix(system, scheme, state, macro_dt):
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     x = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
-    return dense.assemble(linearize(equations, x), x)
+    return dense.matrix(equations, x)

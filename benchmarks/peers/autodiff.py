@@ -1,0 +1,62 @@
+"""Equations of motion made by automatic differentiation from the Lagrangian and the constraints that ours is given.
+
+Index-reduced: accelerations and multipliers solve
+
+    [M  G^T] [  a   ]   [ -grad(V + W)     ]
+    [G   0 ] [lambda] = [ -(d/dt G) v      ]
+
+with G the Jacobian of the constraints. Nothing is eliminated by hand. Masses are constant in these systems, so that M is made once.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks.peers.cases import Case
+
+
+def acceleration(case: Case):
+    """``a(q, v)``, arrays (n,), slow coordinates first; without constraints ``-grad(V + W)`` over the masses per coordinate."""
+    system, n_s = case.problem.system, case.problem.q_s.size
+    mass, force = mass_matrix(case), jax.grad(lambda q: -potential(case, q))
+
+    def constraints(q):
+        return system.constraints(0.0, q[:n_s], q[n_s:])
+
+    def along(q, v):
+        """``(d/dt G) v``: the second derivative of the constraints in the direction of v."""
+        return jax.jvp(lambda q: jax.jvp(constraints, (q,), (v,))[1], (q,), (v,))[1]
+
+    def free(q, v):
+        return force(q) / jnp.diagonal(mass)
+
+    def held(q, v):
+        g = jax.jacfwd(constraints)(q)
+        matrix = jnp.block([[mass, g.T], [g, jnp.zeros((len(g), len(g)))]])
+        return jnp.linalg.solve(matrix, jnp.concatenate([force(q), -along(q, v)]))[: q.size]
+
+    return held if system.is_constrained else free
+
+
+def potential(case: Case, q):
+    """``V + W``."""
+    system, (q_s, q_f) = case.problem.system, jnp.split(q, [case.problem.q_s.size])
+    slow = 0.0 if system.slow_potential is None else system.slow_potential(q_s, q_f, system.params)
+    return slow + (0.0 if system.fast_potential is None else system.fast_potential(q_f, system.params))
+
+
+def kinetic(case: Case, q, v):
+    """T."""
+    system, splits = case.problem.system, [case.problem.q_s.size]
+    (q_s, q_f), (v_s, v_f) = jnp.split(q, splits), jnp.split(v, splits)
+    return system.kinetic(q_s, q_f, v_s, v_f, system.params)
+
+
+def mass_matrix(case: Case):
+    """Second derivatives of the kinetic energy by the velocities, (n, n)."""
+    return jax.hessian(lambda v: kinetic(case, jnp.asarray(case.q), v))(jnp.asarray(case.v))
+
+
+def energy(case: Case) -> float:
+    """Of the start, from the functions that are differentiated."""
+    q, v = jnp.asarray(case.q), jnp.asarray(case.v)
+    return float(kinetic(case, q, v) + potential(case, q))

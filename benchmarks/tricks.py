@@ -1,0 +1,102 @@
+"""What each tuned function of the kernels buys: the tuned kernels against the same with one function in its plain form."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+
+from benchmarks.measure import Ratio, Tell, ratio, silent
+from benchmarks.report import Report
+from benchmarks.seats import Seat, Worker, take_turns
+from benchmarks.worker import Case
+
+TUNED, ALL_PLAIN = "cpu", "all plain"
+KEEP = 1.3
+"""A trick that buys less on every run is to be deleted."""
+SCHEMES = {
+    "FPU l=3": (0.01, ("fully_explicit 10", "fully_implicit 10")),
+    "FPU l=50": (0.01, ("fully_explicit 10", "fully_implicit 10")),
+    "TSP": (0.002, ("fully_explicit 10", "fully_implicit 10", "galerkin 1 8 lobatto")),
+    "SAM": (0.002, ("fully_explicit 10", "fully_implicit 10", "galerkin 1 8 lobatto")),
+}
+"""Macro steps and schemes of order 2; high degrees take steps of LONG."""
+LONG = 0.032
+CASES = [
+    Case(kind, system, scheme, LONG if scheme.startswith("galerkin") else macro_dt, lanes=256 if kind == "batch" else 1)
+    for kind in ("single", "batch")
+    for system, (macro_dt, schemes) in SCHEMES.items()
+    for scheme in schemes
+    if kind == "single" or scheme != "fully_implicit 10"
+]
+BATCH = ", batch"
+COLUMNS = ("trick", *SCHEMES, *(f"{system}{BATCH}" for system in SCHEMES), "most", "keep")
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is run: names of functions, cases, samples, seconds of a run."""
+
+    tricks: tuple[str, ...]
+    cases: tuple[Case, ...]
+    repeats: int
+    seconds: float
+
+
+def names() -> tuple[str, ...]:
+    """Public names that both forms of the kernels define, as functions or constants."""
+    from vmri_jax.kernels import cpu, plain  # pyright: ignore[reportAttributeAccessIssue]
+
+    def own(module) -> set[str]:
+        return {key for key, value in vars(module).items() if getattr(value, "__module__", None) == module.__name__}
+
+    constants = {key for key in vars(cpu) if key.isupper() and key in vars(plain)}
+    return tuple(sorted(name for name in (own(cpu) & own(plain)) | constants if not name.startswith("_")))
+
+
+def sizes(name: str, only: Sequence[str] = ()) -> Size:
+    """ "quick" or "full"; `only` these functions.
+
+    Raises:
+        ValueError: no such function in both forms.
+    """
+    known = names()
+    if unknown := [trick for trick in only if trick not in known]:
+        raise ValueError(f"tricks: the kernels do not share {', '.join(unknown)}; they share {', '.join(known)}.")
+    repeats, seconds = (5, 0.03) if name == "quick" else (15, 0.1)
+    return Size(tuple(only) or known, tuple(CASES), repeats, seconds)
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """Time all of it, a report after each case: over the tuned kernels, what the same run takes without a trick."""
+    tuned = Seat(environment={"VMRI_KERNELS": "cpu"})
+    seats = {TUNED: tuned, ALL_PLAIN: Seat(environment={"VMRI_KERNELS": "plain"})}
+    seats |= {trick: replace(tuned, options=("--plain", trick)) for trick in size.tricks}
+    found: dict[str, dict[Case, Ratio]] = {seat: {} for seat in seats if seat != TUNED}
+    notes = [f"commit {tuned.commit}; time without the trick over time with it, the median of samples taken in turns"]
+    with ExitStack() as stack:
+        workers = {seat: stack.enter_context(Worker(of)) for seat, of in seats.items()}
+        for case in size.cases:
+            head = f"{case.system}, {case.scheme}" + (f", {case.lanes} lanes" if case.lanes > 1 else "")
+            tell(head)
+            outcome = take_turns(workers, replace(case, seconds=size.seconds), size.repeats)
+            notes += [f"{head}: {seat} was left out: {why}." for seat, why in outcome.refused.items()]
+            for seat, samples in outcome.samples.items():
+                if seat != TUNED:
+                    found[seat][case] = ratio(samples, outcome.samples[TUNED])
+            yield Report("tricks", name, [_row(seat, ratios) for seat, ratios in found.items()], [], notes)
+
+
+def _row(trick: str, ratios: dict[Case, Ratio]) -> dict:
+    """The most that a trick buys on each system, over the schemes; by the lower quartile of the most it stays or goes."""
+    row: dict = {"trick": trick}
+    for column in COLUMNS[1:-2]:
+        of_column = [found.value for case, found in ratios.items() if _column(case) == column]
+        row[column] = max(of_column, default=None)
+    row["most"] = max((found.value for found in ratios.values()), default=None)
+    surely = max((found.low for found in ratios.values()), default=0.0)
+    row["keep"] = "" if trick == ALL_PLAIN else "yes" if surely >= KEEP else "no"
+    row["ratios"] = [{"column": _column(c), "scheme": c.scheme} | asdict(found) for c, found in ratios.items()]
+    return row
+
+
+def _column(case: Case) -> str:
+    return case.system + (BATCH if case.lanes > 1 else "")

@@ -1,0 +1,332 @@
+"""One side of a comparison: a process that runs what it is told, when it is its turn.
+
+Started by its path with a checkout as current directory, ``python .../benchmarks/worker.py``: it imports the `vmri_jax` of that checkout and
+nothing of this folder. A line of JSON on standard input is a question, a line on standard output the answer; `benchmarks.seats` asks.
+"""
+
+import argparse
+import ast
+import importlib
+import json
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+if __name__ == "__main__":
+    sys.path[0] = os.getcwd()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vmri_jax as vm
+
+SYSTEMS = {"FPU": "fermi_pasta_ulam", "TSP": "triple_spherical_pendulum", "SAM": "simple_atomic_model"}
+PROCESSOR_TIME = "--processor-time"
+"""The option that counts seconds in which this process runs, where others share its core."""
+CLOCK = time.process_time if PROCESSOR_TIME in sys.argv else time.perf_counter
+SPREAD = 0.01
+"""Of the velocities in a batch."""
+COMPARED = 8
+"""Macro steps after which two sides are compared: round-off has not grown by then, also where the motion is chaotic."""
+COMPILED = "/jax/core/compile/backend_compile_duration"
+"""JAX's own name of that event."""
+CALLS = 20
+"""Calls in a row whose mean is one sample of a short call."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is run.
+
+    kind: a key of `KINDS`.
+    system: ``"TSP"``, ``"SAM"`` or ``"FPU l=3"``.
+    scheme: a constructor and its arguments, ``"galerkin 1 8 lobatto"``, after the name of a composition if it is one,
+        ``"kahan-li8 of fully_explicit 2"``.
+    num_steps: macro steps; 0 to find how many take `seconds`.
+    lanes: of a batch.
+    """
+
+    kind: str
+    system: str = ""
+    scheme: str = ""
+    macro_dt: float = 0.0
+    num_steps: int = 0
+    seconds: float = 0.1
+    lanes: int = 1
+
+    def problem(self):
+        """System and start."""
+        name, _, springs = self.system.partition(" l=")
+        return getattr(vm.systems, SYSTEMS[name])(*([int(springs)] if springs else []))
+
+    def made_scheme(self):
+        """The scheme that the words stand for."""
+        composition, _, words = self.scheme.rpartition(" of ")
+        name, *arguments = words.split()
+        scheme = getattr(vm, name)(*(int(a) if a.isdigit() else a for a in arguments))
+        return vm.compose(scheme, composition) if composition else scheme
+
+
+class Timed:
+    """A run that takes turns with others.
+
+    num_steps: what a call does.
+    end: what a short call computes.
+    result: status of a call.
+    found: what else it found.
+    """
+
+    num_steps: int
+    end: np.ndarray
+    result: str = ""
+    found: dict | None = None
+
+    def sample(self) -> float:
+        """Seconds."""
+        raise NotImplementedError
+
+    def keep(self, short, whole) -> None:
+        """The end of the first run, the worst status of the second."""
+        q = np.concatenate([np.asarray(short.q_s), np.asarray(short.q_f)], axis=-1)
+        self.end = q[..., -1, :]
+        self.result = vm.Result(int(np.max(np.asarray(whole.result)))).name
+
+
+def simulator(case: Case):
+    """``simulate(num_steps)`` by `vm.simulate`; it saves the last node only."""
+    problem, scheme = case.problem(), case.made_scheme()
+    state = problem.state()
+
+    def simulate(num_steps: int):
+        steps = {"macro_dt": case.macro_dt, "num_steps": num_steps, "save_every": num_steps}
+        return vm.simulate(problem.system, scheme, state, **steps, throw=False)
+
+    return simulate
+
+
+class Single(Timed):
+    """`vm.simulate`: seconds of the steps, what a call of one step takes at least being subtracted."""
+
+    def __init__(self, case: Case):
+        self.simulate = self.simulator(case)
+        self.num_steps = case.num_steps or _steps_for(self.simulate, case.seconds)
+        self.keep(self.simulate(COMPARED), self.simulate(self.num_steps))
+        self.call = min(_seconds(self.simulate, 1) for _ in range(CALLS))
+
+    def simulator(self, case: Case):
+        """``simulate(num_steps)``."""
+        return simulator(case)
+
+    def sample(self) -> float:
+        """Of `num_steps - 1` steps."""
+        return _seconds(self.simulate, self.num_steps) - self.call
+
+
+class Call(Single):
+    """What a call of `vm.simulate` takes besides its steps."""
+
+    def sample(self) -> float:
+        """A call of one step, less a step."""
+        one = np.mean([_seconds(self.simulate, 1) for _ in range(CALLS)])
+        return float(one - (_seconds(self.simulate, self.num_steps) - one) / (self.num_steps - 1))
+
+
+class Prepared(Call):
+    """What a call of a prepared run takes besides its steps."""
+
+    def simulator(self, case: Case):
+        """The same by `vm.prepare`."""
+        problem, prepare = case.problem(), getattr(vm, "prepare", None)
+        if prepare is None:
+            raise NotImplementedError("there is no vm.prepare")
+        run = prepare(problem.system, case.made_scheme(), problem.state(), macro_dt=case.macro_dt, num_steps=1)
+        return lambda num_steps: run(num_steps=num_steps)
+
+
+class Batch(Timed):
+    """`vm.simulate_batch`: seconds of a call."""
+
+    def __init__(self, case: Case):
+        problem, scheme = case.problem(), case.made_scheme()
+        states = starts(problem, case.lanes)
+
+        def simulate(num_steps: int):
+            steps = {"macro_dt": case.macro_dt, "num_steps": num_steps, "save_every": num_steps}
+            return vm.simulate_batch(problem.system, scheme, states, **steps)
+
+        self.simulate = simulate
+        self.num_steps = case.num_steps or _steps_for(simulate, case.seconds, first=COMPARED, factor=16)
+        self.keep(simulate(COMPARED), simulate(self.num_steps))
+
+    def sample(self) -> float:
+        """Of one call."""
+        return _seconds(self.simulate, self.num_steps)
+
+
+class First(Timed):
+    """The first result of a process."""
+
+    def __init__(self, case: Case):
+        self.num_steps = case.num_steps
+        run = simulator(case)(case.num_steps)
+        self.keep(run, run)
+
+
+class Compile(Timed):
+    """Seconds of the start, of the first call of `vm.simulate` and of a later one; compilations over a sweep.
+
+    The sweep changes number of steps, step size, parameters and start.
+    """
+
+    def __init__(self, case: Case):
+        problem, scheme = case.problem(), case.made_scheme()
+        started, state = _seconds(problem.state), problem.state()
+
+        def call(macro_dt=case.macro_dt, num_steps=case.num_steps, of=problem.system, state=state):
+            steps = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps}
+            return vm.simulate(of, scheme, state, **steps)
+
+        first, later = _seconds(call), _seconds(call)
+        moved = vm.State(state.t + 1.0, state.q_s, state.q_f, 1.01 * state.p_s, 1.01 * state.p_f)
+        heavier = problem.system.replace(params=_heavier(problem.system))
+        compiled = []
+        jax.monitoring.register_event_duration_secs_listener(
+            lambda event, duration_secs, **_: compiled.append(event) if event == COMPILED else None
+        )
+        call(num_steps=case.num_steps + 1)
+        call(macro_dt=1.1 * case.macro_dt)
+        call(of=heavier)
+        run = call(state=moved)
+        self.keep(run, run)
+        self.num_steps = case.num_steps
+        self.found = {"start": started, "first": first, "later": later, "compilations": 1 + len(compiled)}
+
+
+def _heavier(system) -> dict:
+    """Parameters that leave a start where it may be: lengths are parameters of systems with constraints."""
+    if system.constraint is None:
+        return {key: 1.01 * value for key, value in system.params.items()}
+    return system.params | {"gravity": system.params["gravity"] + 1}
+
+
+class Gradient(Timed):
+    """Reverse-mode derivative of the squared fast positions at the end by the momenta of the start."""
+
+    def __init__(self, case: Case):
+        problem, scheme = case.problem(), case.made_scheme()
+        state = problem.state()
+        steps = {"macro_dt": case.macro_dt, "num_steps": case.num_steps, "save_every": case.num_steps}
+
+        @jax.jit
+        @jax.grad
+        def gradient(p_f):
+            start = vm.State(state.t, state.q_s, state.q_f, state.p_s, p_f)
+            return jnp.sum(vm.simulate(problem.system, scheme, start, **steps).q_f[-1] ** 2)
+
+        self.gradient, self.at, self.num_steps = gradient, state.p_f, case.num_steps
+        self.end = np.asarray(gradient(state.p_f))
+
+    def sample(self) -> float:
+        """Of one call."""
+        return _seconds(self.gradient, self.at)
+
+
+class Readme(Timed):
+    """The first program of README.md: its line with `vm.simulate` again."""
+
+    def __init__(self, case: Case):
+        text = Path("README.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+        lines = ast.parse(text)
+        self.names: dict[str, Any] = {}
+        exec(compile(lines, "README.md", "exec"), self.names)
+        (line,) = (part for part in lines.body if "vm.simulate(" in ast.unparse(part))
+        self.line = compile(ast.Module([line], []), "README.md", "exec")
+        self.keep(self.names["run"], self.names["run"])
+        self.num_steps = 1000
+
+    def sample(self) -> float:
+        """Of one call."""
+        return _seconds(exec, self.line, self.names)
+
+
+KINDS = {
+    "single": Single,
+    "call": Call,
+    "prepared": Prepared,
+    "batch": Batch,
+    "first": First,
+    "compile": Compile,
+    "gradient": Gradient,
+    "readme": Readme,
+}
+
+
+def _seconds(function, *arguments) -> float:
+    start = CLOCK()
+    jax.block_until_ready(function(*arguments))
+    return CLOCK() - start
+
+
+def _steps_for(simulate, seconds: float, first: int = 1, factor: int = 4) -> int:
+    """How many steps take about so long; few numbers are tried, since a batch is compiled for each."""
+    steps = first
+    while True:
+        jax.block_until_ready(simulate(steps))
+        taken = _seconds(simulate, steps)
+        if taken >= seconds / (2 * factor):
+            return max(2, round(steps * seconds / taken))
+        steps *= factor
+
+
+def starts(problem, lanes: int):
+    """So many starts that differ in their velocities, consistent with the constraints, batch axis first."""
+    random = np.random.default_rng(0)
+    v_s, v_f = (jnp.asarray(v + SPREAD * random.normal(size=(lanes, v.size))) for v in (problem.v_s, problem.v_f))
+    start = jax.vmap(lambda v_s, v_f: vm.initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f))
+    return jax.jit(start)(v_s, v_f)
+
+
+def use_plain(name: str) -> None:
+    """Take this function of ``vmri_jax.kernels`` from its plain form, wherever it has been imported."""
+    tuned, plain = (getattr(importlib.import_module(f"vmri_jax.kernels.{form}"), name) for form in ("cpu", "plain"))
+    for module in [m for key, m in sys.modules.items() if key.split(".")[0] == "vmri_jax"]:
+        if getattr(module, name, None) is tuned:
+            setattr(module, name, plain)
+
+
+def main() -> None:
+    """Answer until there are no more questions."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument(PROCESSOR_TIME, action="store_true", help="do not count seconds of other processes")
+    parser.add_argument("--as-imported", action="store_true", help="leave the settings of JAX alone")
+    parser.add_argument("--plain", action="append", default=[], help="a function of the kernels in its plain form")
+    options = parser.parse_args()
+    answers, sys.stdout = sys.stdout, sys.stderr
+    if not options.as_imported:
+        (vm if hasattr(vm, "configure") else vm.runtime).configure()  # pyright: ignore[reportAttributeAccessIssue]
+    for name in options.plain:
+        use_plain(name)
+    timed = Timed()
+    for line in sys.stdin:
+        question = json.loads(line)
+        try:
+            if question["do"] == "make":
+                timed = Timed()  # nothing of the last one stays
+                jax.clear_caches()
+                timed = KINDS[question["case"]["kind"]](Case(**question["case"]))
+                end = np.ravel(timed.end).tolist()
+                answer: dict = {"num_steps": timed.num_steps, "end": end, "result": timed.result, "found": timed.found}
+                answer["processor"] = time.process_time()
+            else:
+                answer = {"seconds": timed.sample()}
+        except Exception as error:  # the other side goes on
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""Workers take turns, and what is compared is what both sides compute."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from benchmarks import against, baseline, seats, tricks, worker
+from benchmarks.seats import Seat, Worker, take_turns
+from benchmarks.worker import Case
+
+ROOT = Path(__file__).parents[2]
+SHORT = Case("single", "FPU l=3", "fully_explicit 2", 0.01, seconds=1e-3)
+
+
+def test_schemes_in_words():
+    assert Case("", scheme="galerkin 1 8 lobatto").made_scheme().degree == 8
+    composed = Case("", scheme="kahan-li8 of fully_explicit 2").made_scheme()
+    assert composed.order == 8
+    assert composed.num_micro == vm.compose(vm.fully_explicit(2), "kahan-li8").num_micro
+
+
+@pytest.fixture(scope="module")
+def workers():
+    with Worker(Seat()) as one, Worker(Seat(options=(worker.PROCESSOR_TIME,))) as other:
+        yield {"one": one, "other": other}
+
+
+def test_two_sides(workers):
+    """The same number of steps on both, the same end."""
+    found = take_turns(workers, SHORT, 3)
+    assert [len(samples) for samples in found.samples.values()] == [3, 3]
+    assert found.made["one"]["num_steps"] == found.made["other"]["num_steps"] > 1
+    assert found.made["one"]["result"] == "CONVERGED"
+    assert found.difference("one", "other") == 0
+
+
+def test_what_a_side_cannot_do_is_said(workers):
+    found = take_turns(workers, replace(SHORT, scheme="no_such_scheme 2"), 3)
+    assert not found.samples
+    assert "no_such_scheme" in found.refused["one"]
+    assert found.difference("one", "other") is None
+    assert take_turns(workers, SHORT, 1).samples  # it goes on
+
+
+def test_a_worker_that_ends_is_an_error(tmp_path):
+    with (
+        Worker(Seat(checkout=tmp_path, options=("--no-such-option",))) as lost,
+        pytest.raises(RuntimeError, match="ended"),
+    ):
+        lost.make(SHORT)
+
+
+def test_turns():
+    assert seats._rotated(["a", "b", "c"], 4) == ["b", "c", "a"]
+
+
+def test_every_group_of_a_comparison():
+    """With itself, one case of each kind."""
+    size = against.sizes("quick", ROOT, only=["single", "gradient"])
+    entries = [replace(against.GROUPS["single"][0], case=SHORT)]
+    gradient = replace(against.GRADIENTS[0].case, system="FPU l=3", scheme="fully_explicit 2", num_steps=2)
+    groups = {"single": entries, "gradient": [replace(against.GRADIENTS[0], case=gradient)]}
+    *_, report = against.run(replace(size, groups=groups, repeats=2, fresh=1, seconds=1e-3), "quick")
+    assert [row["group"] for row in report.rows] == ["single", "gradient, cold", "gradient"]
+    assert all(row["differs"] == 0 for row in report.rows)
+    assert [claim.what.split(":")[1] for claim in report.claims] == [" after over before", " after, seconds"]
+    assert report.about["before"]["commit"] == report.about["after"]["commit"]
+
+
+def test_sizes_of_a_comparison(tmp_path):
+    assert set(against.sizes("full", ROOT).groups) == set(against.GROUPS)
+    with pytest.raises(ValueError, match="has no folder vmri_jax"):
+        against.sizes("quick", tmp_path)
+    with pytest.raises(ValueError, match="there is no group one; there are single"):
+        against.sizes("quick", ROOT, only=["one"])
+
+
+def test_every_case_names_a_scheme_and_a_system():
+    cases = [entry.case for entries in against.GROUPS.values() for entry in entries] + tricks.CASES
+    for case in cases:
+        if case.kind != "readme":
+            assert case.made_scheme().num_micro >= 1
+            assert case.problem().q_s.size
+
+
+def test_baseline():
+    found = baseline._rounded({"rows": [{"us": 1.23456789, "what": "one"}]})
+    assert found == {"rows": [{"us": 1.2346, "what": "one"}]}
+    with pytest.raises(ValueError, match="has no floor, batch"):
+        baseline.assemble(Path("nowhere"), "b597b06")
+
+
+def test_starts_of_a_batch():
+    states = worker.starts(Case("", "TSP").problem(), 3)
+    assert np.asarray(states.q_f).shape == (3, 6)
