@@ -16,9 +16,13 @@ from vmri_jax.steppers.step import macro_step
 
 def tangents(system: System, t, z, splits):
     """Orthonormal basis, one row each, of the tangent vectors of the constraint manifold at ``z = (q_s, q_f, p_s, p_f)``."""
-    if not system.is_constrained:
-        return jnp.eye(z.size)
-    normals = jax.jacfwd(lambda z: jnp.concatenate(all_constraints(system, State(t, *jnp.split(z, splits)))))(z)
+    return _across(jax.jacfwd(lambda z: jnp.concatenate(all_constraints(system, State(t, *jnp.split(z, splits)))))(z))
+
+
+def _across(normals):
+    """Orthonormal basis, one row each, of the vectors that are orthogonal to independent rows."""
+    if not normals.shape[0]:
+        return jnp.eye(normals.shape[1])
     return jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :]
 
 
@@ -41,8 +45,7 @@ def frequencies(system: System, state: State):
         return sum(potentials(system, q[:n_s], q[n_s:]))
 
     mass = jax.hessian(lambda v: system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params))(v)
-    normals = np.asarray(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q))
-    basis = np.linalg.svd(normals)[2][len(normals) :] if normals.size else np.eye(len(q))
+    basis = np.asarray(_across(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q)))
     half = np.linalg.cholesky(basis @ np.asarray(mass) @ basis.T)
     stiffness = basis @ np.asarray(jax.hessian(potential)(q)) @ basis.T
     inner = np.linalg.solve(half, np.linalg.solve(half, stiffness).T)

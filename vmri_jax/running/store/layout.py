@@ -11,6 +11,8 @@ A store is a folder, a zarr group of format 3 that any zarr library reads:
 The checkpoint is what commits a chunk: it is replaced as a whole after the files of the chunk are on disk. What lies beyond
 it does not count and is written again. A new store is made beside its place and moved there when it is complete, so a kill at
 any moment leaves a valid store or none.
+
+zarr takes seconds to import: only the functions that need it do so.
 """
 
 import io
