@@ -1,7 +1,7 @@
 """Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -109,7 +109,9 @@ def prepare(
     if not run.is_concrete:
         raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
-    jax.block_until_ready(run.engine.whole(run.leaves, run.start_arrays, run.macro_dt, 0))  # no steps: it only compiles
+    leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
+    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start)
+    jax.block_until_ready(run.engine.whole(leaves, run.start_arrays, macro_dt, 0))  # no steps: it only compiles
     return run
 
 
@@ -167,6 +169,10 @@ class Simulation:
         if throw and int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, arguments[2], arguments[3])
         return trajectory
+
+    def compiled(self) -> jax.stages.Compiled:
+        """The program of the run without the fallback, to look into."""
+        return self.engine.whole.lower(*self._arguments(None, None, None, None)).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that makes such a run and waits for it, for a clock.
