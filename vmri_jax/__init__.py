@@ -5,6 +5,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.one_step import macro_step
 from vmri_jax.running.simulate import Simulation, prepare, simulate
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
@@ -23,7 +24,7 @@ from vmri_jax.schemes.scheme import (
 )
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result, SimulationError
-from vmri_jax.steppers.step import StepInfo, macro_step
+from vmri_jax.steppers.step import StepInfo
 
 from vmri_jax import systems  # isort: skip  (written with the names above)
 

@@ -84,7 +84,9 @@ def simulate_batch(
     trajectory = _in_chunks(run, run.engine, batch, width, devices)
     failed = np.flatnonzero(np.asarray(trajectory.failed_at) >= 0)
     if failed.size and first_method(run.newton, system, scheme) is not run.newton:
-        exact = replace(run.engine, structure=jax.tree.structure((replace(run.newton, method="arrowhead"), scheme, system)))
+        exact = replace(
+            run.engine, structure=jax.tree.structure((replace(run.newton, method="arrowhead"), scheme, system))
+        )
         again = _in_chunks(run, exact, jax.tree.map(lambda a: a[failed], batch), width, devices)
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b), trajectory, again)
     return trajectory

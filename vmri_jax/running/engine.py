@@ -52,7 +52,9 @@ class Engine:
     @cached_property
     def start(self):
         """``start(leaves, state, macro_dt)``: what the stepper takes along into the first step."""
-        return jax.jit(lambda leaves, state, macro_dt: self._stepper(leaves, State(*state)).init(State(*state), macro_dt))
+        return jax.jit(
+            lambda leaves, state, macro_dt: self._stepper(leaves, State(*state)).init(State(*state), macro_dt)
+        )
 
     @cached_property
     def onwards(self):

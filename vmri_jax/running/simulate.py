@@ -6,14 +6,13 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.checks import check_arrays, check_flags, check_system
+from vmri_jax.mechanics.checks import check_flags, check_system
 from vmri_jax.mechanics.state import State, check_constraints
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import check_counts, check_run
+from vmri_jax.running.arguments import check_run
 from vmri_jax.running.engine import Engine, engine, first_method
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.traced import traced_run
@@ -221,10 +220,10 @@ class Simulation:
         """Whether there are only numbers, no tracers of a transformation."""
         return is_concrete((self.leaves, self.start_arrays, self.macro_dt))
 
-    @cached_property
+    @property
     def start_arrays(self) -> tuple:
         """The arrays of the start."""
-        return _arrays(self.state)
+        return tuple(vars(self.state).values())
 
     @cached_property
     def engine(self) -> Engine:
@@ -267,7 +266,7 @@ class Simulation:
     def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
         program = self.engine_for(at.fell_back, saves).onwards
         numbers = self.start_arrays[0], self.macro_dt, at.step, self.save_every
-        piece, state, memory = program(self.leaves, _arrays(at.state), at.memory, *numbers)
+        piece, state, memory = program(self.leaves, tuple(vars(at.state).values()), at.memory, *numbers)
         return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
@@ -290,14 +289,12 @@ class Simulation:
         return join(pieces)
 
 
-def simulation(
-    system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro
-) -> Simulation:
+def simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro) -> Simulation:
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
     newton = newton or Newton()
     leaves, structure = jax.tree.flatten((newton, scheme, system))
-    leaves = [leaf if isinstance(leaf, jax.Array) else np.asarray(leaf) for leaf in leaves]
+    leaves = [np.asarray(leaf) if is_concrete(leaf) else leaf for leaf in leaves]  # of one type wherever they are from
     state = State(*_arrays(state))
     return Simulation(
         system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, leaves, structure
@@ -309,10 +306,8 @@ def _arrays(state: State) -> tuple:
 
 
 def _float(value):
-    """Numbers as an array of float64, of JAX if they are."""
-    if isinstance(value, jax.Array):
-        return value if value.dtype == float else value.astype(float)
-    return np.asarray(value, dtype=float)
+    """Numbers as an array of float64, of NumPy unless they are traced."""
+    return np.asarray(value, dtype=float) if is_concrete(value) else jnp.asarray(value, dtype=float)
 
 
 @dataclass(frozen=True)
