@@ -18,7 +18,7 @@ from tests.scene.forced_bodies import EFFECT_OF, convergence
 from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax.diagnostics import fit_order
 from vmri_jax.scene import Effect, Scene
-from vmri_jax.scene.ledger import compile_run, operations, temporary_bytes
+from vmri_jax.scene.ledger import operations, prepare_steps, temporary_bytes
 
 MACRO_DT = 0.01
 SCENES = {
@@ -133,7 +133,7 @@ def _program(system: vm.System, scheme: vm.Scheme, scene: Scene) -> tuple:
     """(operations in all, temporary bytes, operations by name) of a compiled run from the scene's start."""
     start = scene.problem()
     state = vm.initial_state(system, start.q_s, start.q_f, start.v_s, start.v_f)
-    compiled = compile_run(system, scheme, state, MACRO_DT)
+    compiled = prepare_steps(system, scheme, state, MACRO_DT).compiled()
     counts = operations(compiled)
     return sum(counts.values()), temporary_bytes(compiled), counts
 
@@ -166,9 +166,10 @@ def presence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
             problems = {"scene": scene().problem(), "by hand": programs.problem(system)}
             made, macro_dt = programs.SCHEMES[scheme](size.num_micro), size.num_micro * size.micro_dt
             arguments = {key: (problem.system, made, problem.state(), macro_dt) for key, problem in problems.items()}
-            compiled = {key: compile_run(*some, num_steps=size.num_steps) for key, some in arguments.items()}
-            runs = {key: partial(compiled[key], *some) for key, some in arguments.items()}
-            seconds = interleaved(runs, size.repeats, clock=time.process_time)
+            prepared = {key: prepare_steps(*some, num_steps=size.num_steps) for key, some in arguments.items()}
+            compiled = {key: run.compiled() for key, run in prepared.items()}
+            timed = {key: run.timed() for key, run in prepared.items()}
+            seconds = interleaved(timed, size.repeats, clock=time.process_time)
             for key, program in compiled.items():
                 us = quartiles(seconds[key], 1e6 / size.num_steps / size.num_micro)
                 row = {"system": system, "scheme": scheme, "program": key, "µs/micro step": us.value}

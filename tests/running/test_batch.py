@@ -79,19 +79,16 @@ def test_lanes_that_the_march_does_not_solve_are_solved_exactly(fpu):
     assert np.any(np.asarray(run.info.method) == Method.ARROWHEAD)
 
 
-def test_chunks_in_several_calls_or_one_by_one(fpu, monkeypatch):
-    """Eighteen chunks of two lanes: sixteen in a first call, two in a second one that has room for more."""
+def test_chunks_of_a_batch_do_not_change_it(fpu):
+    """Eighteen chunks of two lanes, the last of them half full."""
     states = spread(fpu, 35)
     run = {"macro_dt": 0.02, "num_steps": 12, "save_every": 4}
     whole = simulate_batch(fpu.system, fully_explicit(3), states, **run)
-    together = simulate_batch(fpu.system, fully_explicit(3), states, chunk=2, **run)
-    monkeypatch.setattr("vmri_jax.running.batch.RESULTS", 0)
-    one_by_one = simulate_batch(fpu.system, fully_explicit(3), states, chunk=2, **run)
-    assert together.q_f.shape == whole.q_f.shape == (35, 4, 3)
+    in_chunks = simulate_batch(fpu.system, fully_explicit(3), states, chunk=2, **run)
+    assert in_chunks.q_f.shape == whole.q_f.shape == (35, 4, 3)
     for name in ("q_s", "p_f", "energy"):
-        assert largest_difference(getattr(together, name), getattr(whole, name)) < 1e-13
-        assert largest_difference(getattr(together, name), getattr(one_by_one, name)) < 1e-13
-    assert np.array_equal(together.failed_at, np.full(35, -1))
+        assert largest_difference(getattr(in_chunks, name), getattr(whole, name)) < 1e-13
+    assert np.array_equal(in_chunks.failed_at, np.full(35, -1))
 
 
 def test_one_compilation_for_all_chunks_and_step_sizes(fpu):

@@ -8,7 +8,7 @@ import pytest
 from tests.scene.effect_scenes import BASE, EFFECTS, base_by_hand, scene_with
 from vmri_jax import fully_explicit, initial_state
 from vmri_jax import scene as sc
-from vmri_jax.scene.ledger import compile_run, operations, temporary_bytes
+from vmri_jax.scene.ledger import operations, prepare_steps, temporary_bytes
 
 
 def test_every_effect_is_in_the_list():
@@ -36,6 +36,6 @@ def test_what_is_taken_out_was_never_there(effect):
 
 def test_program_is_that_of_the_system_written_by_hand():
     scheme, state = fully_explicit(5), BASE.state()
-    ours, theirs = (compile_run(system, scheme, state, 0.01) for system in (BASE.system(), base_by_hand()))
+    ours, theirs = (prepare_steps(system, scheme, state, 0.01).compiled() for system in (BASE.system(), base_by_hand()))
     assert operations(ours) == operations(theirs)
     assert temporary_bytes(ours) == temporary_bytes(theirs)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from vmri_jax.steppers.step import macro_step
 
 from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax import ConstantMass, compose, fully_explicit, fully_implicit, galerkin, initial_state
@@ -32,7 +33,6 @@ from vmri_jax.scene import (
     Spring,
     SpringAnchor,
 )
-from vmri_jax.steppers.step import macro_step
 
 TSP = gallery_scene("triple_spherical_pendulum")
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from vmri_jax.steppers.step import averaging
 
 from tests.support import compiled_step, largest_difference, without_fallback
 from vmri_jax import (
@@ -23,7 +24,6 @@ from vmri_jax import (
 )
 from vmri_jax.diagnostics import momentum_map, observed_order, rotation_about, symplectic_defect
 from vmri_jax.schemes.quadrature import midpoint, mollified, trapezoidal
-from vmri_jax.steppers.step import averaging
 
 
 def soft(q_s, q_f, params):

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from vmri_jax.steppers.split import split
+from vmri_jax.steppers.step import LARGE
 
 from tests.support import compiled_step, largest_difference, relative_difference, without_fallback
 from tests.user_systems import bent_force, bent_system, double_pendulum, two_oscillators
@@ -23,8 +25,6 @@ from vmri_jax import (
     quadrature,
     systems,
 )
-from vmri_jax.steppers.split import split
-from vmri_jax.steppers.step import LARGE
 
 
 def step(problem, scheme, macro_dt):

@@ -1,5 +1,6 @@
 """`vmri simulate`: one run and how it went."""
 
+import math
 import shlex
 import sys
 import time
@@ -194,5 +195,6 @@ def default_save_every(steps: int) -> int:
     """The divisor of `steps` that saves a number of nodes nearest to SAVED_NODES, every node of a short run."""
     if steps <= SAVED_NODES:
         return 1
-    divisors = [d for d in range(1, steps + 1) if steps % d == 0]
+    small = [d for d in range(1, math.isqrt(steps) + 1) if steps % d == 0]
+    divisors = [*small, *(steps // d for d in reversed(small))]
     return min(divisors, key=lambda d: abs(np.log(steps / d / SAVED_NODES)))

@@ -15,14 +15,14 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import Engine
 from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory, from_arrays
-from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 
-WORKING_SET = 40_000
-"""Variables times micro steps that the lanes of a chunk may have together."""
-FEWEST, MOST = 16, 1024
-"""Lanes of a chunk."""
+WORKING_SET = 8192
+"""Fast and slow variables at all nodes of a macro step that the lanes of a chunk may have together, 64 kB."""
+FEWEST, MOST = 64, 1024
+"""Lanes of a chunk. With fewer of them a lane takes longer, even where 64 do not fit into the cache."""
 
 
 def simulate_batch(
@@ -79,7 +79,7 @@ def simulate_batch(
     batch = {
         "params": None if params is None else [np.asarray(leaf) for leaf in jax.tree.leaves(params)],
         "state": tuple(np.asarray(a, dtype=float) for a in vars(states).values()),
-        "macro_dt": None if dt.ndim == 0 else run.macro_dt / dt[0] * dt,
+        "macro_dt": None if dt.ndim == 0 else dt * (scheme.num_micro if micro_dt is not None else 1),
     }
     trajectory = _in_chunks(run, run.engine, batch, width, devices)
     failed = np.flatnonzero(np.asarray(trajectory.failed_at) >= 0)
@@ -141,8 +141,9 @@ def _check_devices(devices, chunk) -> None:
 
 
 def _chunk(run: Simulation) -> int:
-    """A power of two of lanes: those whose unknowns fit into the working set, but not too few."""
-    size = run.scheme.num_micro * (run.state.q_s.size + run.state.q_f.size)
+    """A power of two of lanes: those that fit into the working set, but not too few."""
+    nodes = run.scheme.num_micro * stage_scheme(run.scheme).degree
+    size = nodes * (run.state.q_s.size + run.state.q_f.size)
     return 2 ** int(np.log2(np.clip(WORKING_SET / size, FEWEST, MOST)))
 
 

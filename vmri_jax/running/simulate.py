@@ -1,7 +1,7 @@
 """Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -109,7 +109,9 @@ def prepare(
     if not run.is_concrete:
         raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
-    jax.block_until_ready(run.engine.whole(run.leaves, run.start_arrays, run.macro_dt, 0))  # no steps: it only compiles
+    leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
+    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start)
+    jax.block_until_ready(run.engine.whole(leaves, run.start_arrays, macro_dt, 0))  # no steps: it only compiles
     return run
 
 
@@ -168,6 +170,10 @@ class Simulation:
             raise simulation_error(trajectory, arguments[2], arguments[3])
         return trajectory
 
+    def compiled(self) -> jax.stages.Compiled:
+        """The program of the run without the fallback, to look into."""
+        return self.engine.whole.lower(*self._arguments(None, None, None, None)).compile()
+
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that makes such a run and waits for it, for a clock.
 
@@ -223,7 +229,7 @@ class Simulation:
     @cached_property
     def start_arrays(self) -> tuple:
         """The arrays of the start."""
-        return _arrays(self.state)
+        return tuple(vars(self.state).values())
 
     @cached_property
     def engine(self) -> Engine:
@@ -266,7 +272,7 @@ class Simulation:
     def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
         program = self.engine_for(at.fell_back, saves).onwards
         numbers = self.start_arrays[0], self.macro_dt, at.step, self.save_every
-        piece, state, memory = program(self.leaves, _arrays(at.state), at.memory, *numbers)
+        piece, state, memory = program(self.leaves, tuple(vars(at.state).values()), at.memory, *numbers)
         return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
@@ -290,7 +296,7 @@ def simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, sav
     macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
     newton = newton or Newton()
     leaves, structure = jax.tree.flatten((newton, scheme, system))
-    leaves = [leaf if isinstance(leaf, jax.Array) else np.asarray(leaf) for leaf in leaves]
+    leaves = [np.asarray(leaf) if is_concrete(leaf) else leaf for leaf in leaves]  # of one type wherever they are from
     state = State(*_arrays(state))
     return Simulation(
         system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, leaves, structure
@@ -302,10 +308,8 @@ def _arrays(state: State) -> tuple:
 
 
 def _float(value):
-    """Numbers as an array of float64, of JAX if they are."""
-    if isinstance(value, jax.Array):
-        return value if value.dtype == float else value.astype(float)
-    return np.asarray(value, dtype=float)
+    """Numbers as an array of float64, of NumPy unless they are traced."""
+    return np.asarray(value, dtype=float) if is_concrete(value) else jnp.asarray(value, dtype=float)
 
 
 @dataclass(frozen=True)

@@ -4,17 +4,15 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
-import jax
 import numpy as np
 from rich.table import Table
 
 from vmri_jax.diagnostics import frequencies
 from vmri_jax.mechanics.state import initial_state
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.simulate import simulate
+from vmri_jax.running.simulate import Simulation, prepare
 from vmri_jax.running.timing import interleaved
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
@@ -22,7 +20,6 @@ from vmri_jax.scene.layout import Place
 from vmri_jax.scene.sorting import Placed, Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
 
 HOMES = {
     "kinetic": "kinetic energy T",
@@ -161,12 +158,15 @@ def _measure(contents: Contents, scheme, macro_dt) -> tuple[Program, Program, di
         fastest = float(frequencies(systems[whole], states[whole])[0])
         macro_dt = scheme.num_micro * 0.1 / fastest if fastest > 0 else 0.01
     arguments = {key: (system, scheme, states[key], macro_dt) for key, system in systems.items()}
-    compiled = {key: compile_run(*some) for key, some in arguments.items()}
-    times = interleaved({key: partial(compiled[key], *some) for key, some in arguments.items()}, 5)
-    of = {}
-    for key, program in compiled.items():
+    runs = {key: prepare_steps(*some) for key, some in arguments.items()}
+    times = interleaved({key: run.timed() for key, run in runs.items()}, 5)
+
+    def program(key: str) -> Program:
         us = 1e6 * float(np.median(times[key])) / STEPS
-        of[key] = Program(sum(operations(program).values()), temporary_bytes(program), us)
+        compiled = runs[key].compiled()
+        return Program(sum(operations(compiled).values()), temporary_bytes(compiled), us)
+
+    of = {key: program(key) for key in systems}
     shares = {
         name: (1 - of[key].operations / of[whole].operations, 1 - of[key].microseconds / of[whole].microseconds)
         for name, key in names.items()
@@ -174,17 +174,9 @@ def _measure(contents: Contents, scheme, macro_dt) -> tuple[Program, Program, di
     return of[whole], of[bare], shares
 
 
-def compile_run(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS):
-    """The compiled program of so many macro steps, a function of (system, scheme, state, macro_dt)."""
-    return (
-        jax.jit(_run, static_argnames="num_steps").lower(system, scheme, state, macro_dt, num_steps=num_steps).compile()
-    )
-
-
-def _run(system, scheme, state, macro_dt, *, num_steps):
-    newton = Newton().alone(system, scheme)  # `simulate` compiles the fallback only where a step needs it
-    step = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps}
-    return simulate(system, scheme, state, **step, newton=newton, throw=False).final_state
+def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:
+    """So many macro steps, prepared; `operations` and `temporary_bytes` look into ``.compiled()``."""
+    return prepare(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps)
 
 
 NO_OPERATION = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast"}

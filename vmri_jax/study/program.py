@@ -1,11 +1,13 @@
-"""One problem under one scheme for every number of steps: what studies run and time."""
+"""One problem under one scheme, compiled once for every number of steps: what studies run and time."""
 
 import time
+from functools import cached_property
 
 import numpy as np
 
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.simulate import simulation
+from vmri_jax.running.arguments import check_run
+from vmri_jax.running.simulate import Simulation, prepare
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -15,10 +17,8 @@ from vmri_jax.steppers.newton import Newton
 class Program:
     """``program(num_steps)`` simulates `problem` over `t_end` in so many macro steps.
 
-    Compiled when first called, once for all problems of the same structure.
-
-    A call costs some ten microseconds besides its steps. As in `vmri_jax.running.simulate`, "auto" takes the nested march and
-    compiles its fallback only when a step needs it. A run that fails is seen in the trajectory; nothing is raised.
+    It is a `vmri_jax.prepare` whose step size follows from the number of steps, compiled when first called, once for all
+    problems of the same structure. A run that fails is seen in the trajectory; nothing is raised.
 
     Args:
         problem: system and start.
@@ -26,6 +26,9 @@ class Program:
         t_end: simulated time.
         num_saves: saved nodes, equally spaced; numbers of steps must be multiples of it.
         newton: how implicit equations are solved.
+
+    Attributes:
+        compile_seconds: time of compiling, NaN before the first call.
     """
 
     def __init__(
@@ -37,11 +40,22 @@ class Program:
         newton: Newton | None = None,
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
-        macro_dt = self.t_end / num_saves
-        state = problem.state()
-        self.run = simulation(problem.system, scheme, state, newton, macro_dt, None, num_saves, 1, False)
-        self.newton, self.state = self.run.newton, state
+        self.newton, self.state = newton or Newton(), problem.state()
+        check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, 1)
         self.compile_seconds = float("nan")
+
+    @cached_property
+    def _run(self) -> Simulation:
+        start = time.perf_counter()
+        steps = {"macro_dt": self.t_end / self.num_saves, "num_steps": self.num_saves}
+        run = prepare(self.problem.system, self.scheme, self.state, **steps, newton=self.newton)
+        self.compile_seconds = time.perf_counter() - start
+        return run
+
+    def _steps(self, num_steps: int) -> dict:
+        if num_steps < 1 or num_steps % self.num_saves:
+            raise ValueError(f"Program: num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
+        return {"macro_dt": self.t_end / num_steps, "num_steps": num_steps}
 
     def __call__(self, num_steps: int) -> Trajectory:
         """The trajectory with `num_saves` + 1 nodes.
@@ -49,15 +63,11 @@ class Program:
         Raises:
             ValueError: num_steps is not a positive multiple of num_saves.
         """
-        if np.isnan(self.compile_seconds):
-            start = time.perf_counter()
-            self.run()
-            self.compile_seconds = time.perf_counter() - start  # and a run of the fewest steps
-        return self.run(macro_dt=self.t_end / num_steps, num_steps=num_steps)
+        return self._run(**self._steps(num_steps))
 
     def timed(self, num_steps: int):
         """A function without arguments that runs and waits, for a clock; takes the fallback if the run needs it."""
-        return self.run.timed(macro_dt=self.t_end / num_steps, num_steps=num_steps)
+        return self._run.timed(**self._steps(num_steps))
 
 
 def joined(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,106 @@
+"""Prepared runs: the same as `simulate`, compiled once for other starts, steps, parameters and numbers of steps."""
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.support import largest_difference
+from vmri_jax import (
+    Method,
+    Newton,
+    Result,
+    SimulationError,
+    State,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    prepare,
+    simulate,
+)
+
+CALLS = Counter()
+STEPS = {"macro_dt": 0.03, "num_steps": 8, "save_every": 2}
+
+
+def watched(q_f, params):
+    CALLS.update(["W"])
+    return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
+
+
+def moved(state: State) -> State:
+    return State(state.t, state.q_s, state.q_f, 1.5 * state.p_s, state.p_f)
+
+
+def test_it_runs_what_simulate_runs(fpu):
+    run = prepare(fpu.system, explicit_slow(3), fpu.state(), **STEPS, save_micro=True)
+    expected = simulate(fpu.system, explicit_slow(3), fpu.state(), **STEPS, save_micro=True)
+    for name in ("t", "q_s", "q_f", "p_s", "p_f", "energy", "t_micro", "q_f_micro"):
+        assert np.array_equal(getattr(run(), name), getattr(expected, name)), name
+
+
+def test_numbers_change_without_compiling_again(fpu):
+    system = fpu.system.replace(fast_potential=watched)
+    run = prepare(system, fully_implicit(3), fpu.state(), **STEPS)
+    params = {"omega": jnp.asarray(30.0)}
+    CALLS.clear()
+    changed = run(moved(fpu.state()), macro_dt=0.01, params=params, num_steps=20)
+    assert Counter() == CALLS
+    expected = simulate(
+        system.replace(params=params), fully_implicit(3), moved(fpu.state()), macro_dt=0.01, num_steps=20, save_every=5
+    )
+    assert Counter() == CALLS  # the same program
+    assert largest_difference(changed.q_f, expected.q_f) == 0
+    assert largest_difference(changed.t, expected.t) == 0
+    assert largest_difference(changed.q_f, run().q_f) > 1e-3
+
+
+def test_the_fallback_takes_over(fpu):
+    newton = Newton(max_iterations=8)
+    run = prepare(fpu.system, fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=5, newton=newton)
+    trajectory = run()
+    assert trajectory.success
+    assert np.any(np.asarray(trajectory.info.method) == Method.ARROWHEAD)
+    run.timed()()
+
+
+def test_failures_are_in_the_trajectory_or_raised(fpu):
+    run = prepare(fpu.system, fully_explicit(3), fpu.state(), **STEPS)
+    bad = State(fpu.state().t, 1e200 * fpu.state().q_s, *(getattr(fpu.state(), name) for name in ("q_f", "p_s", "p_f")))
+    trajectory = run(bad)
+    assert trajectory.result == Result.NON_FINITE
+    assert trajectory.failed_at == 0
+    with pytest.raises(SimulationError, match="macro step 0"):
+        run(bad, throw=True)
+
+
+def test_a_start_off_the_constraints_has_failed(tsp):
+    run = prepare(tsp.system, fully_explicit(2), tsp.state(), macro_dt=0.01, num_steps=2)
+    state = tsp.state()
+    trajectory = run(State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f))
+    assert trajectory.result == Result.CONSTRAINT_VIOLATED
+    assert np.isnan(trajectory.q_f).all()
+    off = State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f)
+    with pytest.raises(ValueError, match="simulate: the state violate the constraints by"):
+        simulate(tsp.system, fully_explicit(2), off, macro_dt=0.01, num_steps=2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_steps": 7}, "num_steps is 7; it must be a positive multiple of 4"),
+        ({"params": {"omega": np.ones(2)}}, "give the pytree of system.params"),
+        ({"state": State(0.0, *4 * [np.zeros(2)])}, "the run was prepared for"),
+    ],
+)
+def test_bad_changes_are_refused(fpu, changes, message):
+    run = prepare(fpu.system, fully_explicit(3), fpu.state(), **STEPS)
+    with pytest.raises(ValueError, match=message):
+        run(**changes)
+
+
+def test_tracers_are_refused(fpu):
+    with pytest.raises(ValueError, match="prepare: arguments are tracers"):
+        jax.jit(lambda state: prepare(fpu.system, fully_explicit(3), state, **STEPS)().q_f)(fpu.state())
