@@ -9,12 +9,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.constraints import rank_of
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.layout import Place
 from vmri_jax.scene.sorting import Placed
-
-TOLERANCE = 1e-8
-"""Singular values below this, of rows scaled to length one, are zero."""
 
 
 def check_constraints(bodies: Mapping[str, Body], places: Mapping[str, Place], placed: Sequence[Placed]) -> None:
@@ -79,12 +77,10 @@ def _jacobian(function, timed: bool, q, params):
 
 def _refuse(names: list[str], matrix: np.ndarray, advice: str) -> None:
     """Raise if the rows are dependent, naming those that take part."""
-    size = np.linalg.norm(matrix, axis=1, keepdims=True)
-    left, values, _ = np.linalg.svd(matrix / np.where(size > 0, size, 1.0), full_matrices=True)
-    rank = int(np.sum(values > TOLERANCE * np.sqrt(len(names))))
-    if rank == len(names):
+    rank, dependent = rank_of(matrix)
+    if not dependent:
         return
-    involved = [name for name, part in zip(names, left[:, rank:], strict=True) if np.abs(part).max() > 1e-6]
+    involved = [names[row] for row in dependent]
     raise ValueError(
         f"Scene: over-constrained at the start: {', '.join(involved)} are {len(involved)} constraints of rank "
         f"{len(involved) - (len(names) - rank)}; {advice}."
