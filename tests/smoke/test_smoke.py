@@ -83,7 +83,7 @@ def test_a_store(tmp_path):
     how = {"macro_dt": 0.01, "num_steps": 6}
     stored = vm.stream(problem.system, vm.fully_explicit(2), state, out=tmp_path / "run", chunk=3, **how)
     run = vm.simulate(problem.system, vm.fully_explicit(2), state, **how)
-    np.testing.assert_allclose(np.asarray(stored.q_f), run.q_f, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(stored.load().q_f, run.q_f, rtol=0, atol=1e-14)
 
 
 def test_the_command_line(tmp_path):
