@@ -1,8 +1,11 @@
 # Two commands do all: `make reproduce` and `make test`. Both build .venv from the lock of versions first.
 PYTHON ?= python3
 BIN := .venv/bin
+ENVIRONMENT ?= .venv
+OLDER ?= python3.11
+NEWER ?= python3.13
 
-.PHONY: reproduce test bench lint lock clean
+.PHONY: reproduce test smoke bench lint lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/vmri reproduce --quick --out out
@@ -10,14 +13,17 @@ reproduce: .venv/installed  ## the quick reference study: figures, tables and ou
 test: .venv/installed  ## the whole test suite
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
+smoke:  ## a few minutes: every kind of step, with another environment, make smoke ENVIRONMENT=/path/to/venv
+	$(ENVIRONMENT)/bin/python -m pytest tests/smoke
+
 bench: .venv/installed  ## the quick measurements: time, memory, against C; out/benchmarks
 	$(BIN)/python -m benchmarks all
 
 lint: .venv/installed  ## format, lint and types, as pre-commit runs them
 	$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/pyright
 
-lock: .venv/installed  ## pin the versions that are installed now
-	$(BIN)/python -m pip freeze --exclude-editable > requirements.lock
+lock:  ## pin the newest versions for both: make lock OLDER=python3.11 NEWER=python3.13; see .ci/lock
+	$(OLDER) .ci/lock $(OLDER) $(NEWER)
 
 .venv/installed: pyproject.toml requirements.lock
 	$(PYTHON) -m venv .venv

@@ -4,8 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Primitive
 
-from vmri_jax.mechanics.structure import curved_directions, has_constant_hessian, has_diagonal_hessian, reached
+from vmri_jax.mechanics.structure import (
+    curved_directions,
+    depends_on,
+    has_constant_hessian,
+    has_diagonal_hessian,
+    reached,
+)
 
 Q = jnp.linspace(0.5, 1.5, 4)
 
@@ -106,3 +113,31 @@ def loops(a, b, n, flag):
 def test_what_an_argument_reaches_through_loops(changed, reaches):
     jaxpr = jax.make_jaxpr(jax.jit(loops))(1.0, 2.0, 3, True)
     assert reached(jaxpr.eqns[0], [k == changed for k in range(4)]) == reaches
+
+
+NEW = Primitive("operation_of_a_later_version")
+NEW.def_abstract_eval(lambda x: x)
+
+
+@jax.custom_jvp
+def new(x):
+    return NEW.bind(x)
+
+
+@new.defjvp
+def _(primals, tangents):
+    return new(*primals), new(*primals) * tangents[0]
+
+
+def printing(q):
+    jax.debug.print("{}", q[0])
+    return jnp.sum(q**2)
+
+
+@pytest.mark.parametrize("function", [lambda q: jnp.sum(new(q)), printing])
+def test_what_is_not_known_gets_the_safe_answer(function):
+    """Operations that a later version may bring, and effects."""
+    assert not has_diagonal_hessian(function, Q)
+    assert not has_constant_hessian(function, Q)
+    assert np.linalg.matrix_rank(curved_directions(function, Q)) == 4
+    assert depends_on(lambda q, other: function(q), Q, Q)[0]

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import ConstantMass, System
+from vmri_jax.mechanics.functions import traced_once
 from vmri_jax.mechanics.structure import depends_on
 
 
@@ -36,7 +37,7 @@ def double_well(q_s, q_f, params):
 def test_replace_changes_one_field_only():
     system = System(ConstantMass([1.0], [1.0]), slow_potential=double_well, params={"a": jnp.asarray(1.0)})
     changed = system.replace(params={"a": jnp.asarray(2.0)})
-    assert changed.slow_potential.function is double_well
+    assert changed.slow_potential == traced_once(double_well)
     assert float(changed.params["a"]) == 2.0
     assert float(system.params["a"]) == 1.0
     assert jax.tree.structure(system) == jax.tree.structure(changed)

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.kernels import max_abs
-from vmri_jax.mechanics.state import State, project_momentum
+from vmri_jax.mechanics.projection import project_momentum
+from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
 

@@ -10,7 +10,7 @@ ADVICE = "give float64: lists of numbers, NumPy arrays by .astype(float), JAX ar
 
 def is_concrete(tree) -> bool:
     """Whether a pytree holds values, rather than tracers of jit, vmap or grad."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def require_x64() -> None:

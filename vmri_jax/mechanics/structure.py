@@ -1,7 +1,8 @@
 """What a function's jaxpr tells about it: what depends on what, and the structure of its Hessian.
 
 All answers are structural and conservative: what is called dependent may happen not to be (``0 * x`` counts), what is
-called independent, constant or diagonal is so.
+called independent, constant or diagonal is so. An operation that is not known here mixes all that it is given, and nothing is
+known about functions with effects.
 """
 
 from collections.abc import Callable
@@ -46,7 +47,7 @@ def _outputs_reached(jaxpr, inputs: list[bool]) -> list[bool]:
     return [known.get(id(v), False) for v in jaxpr.outvars]
 
 
-def _by_while(inputs, *, cond_jaxpr, body_jaxpr, cond_nconsts, body_nconsts) -> list[bool]:
+def _by_while(inputs, *, cond_jaxpr, body_jaxpr, cond_nconsts, body_nconsts, **_) -> list[bool]:
     """Everything where the end of the loop is."""
     cond_consts, body_consts = inputs[:cond_nconsts], inputs[cond_nconsts : cond_nconsts + body_nconsts]
 
@@ -82,6 +83,8 @@ _LOOPS = {"while": _by_while, "scan": _by_scan, "cond": _by_cond}
 def depends_on(function: Callable, *args) -> tuple[bool, ...]:
     """Whether the outputs of ``function(*args)`` can depend on each argument."""
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
+    if jaxpr.effects:
+        return (True,) * len(args)
     _, needed = _needed(jaxpr, jaxpr.outvars)
     leaves = [jax.tree.structure(a).num_leaves for a in args]
     stops = np.cumsum(leaves)
@@ -100,8 +103,8 @@ def has_constant_hessian(function: Callable, *args) -> bool:
 
 def has_diagonal_hessian(function: Callable, q) -> bool:
     """Whether ``function(q) -> ()`` is a sum over the elements of the vector q: each gradient entry sees its own alone."""
-    closed = jax.make_jaxpr(jax.grad(function))(q)
-    return _classes(closed.jaxpr, [_ELEMENT])[0] <= _ELEMENT
+    jaxpr = jax.make_jaxpr(jax.grad(function))(q).jaxpr
+    return not jaxpr.effects and _classes(jaxpr, [_ELEMENT])[0] <= _ELEMENT
 
 
 def curved_directions(function: Callable, q) -> np.ndarray:
@@ -116,6 +119,8 @@ def curved_directions(function: Callable, q) -> np.ndarray:
 
     found: list[np.ndarray] = []
     jaxpr, n = jax.make_jaxpr(product)(q, q).jaxpr, q.size
+    if jaxpr.effects:
+        return np.eye(n)
     found += _combinations(n, jaxpr, [np.zeros((n, n)), np.eye(n)], jaxpr.outvars, found)
     rows = [np.zeros((1, n)), *(a.reshape(-1, n) for a in found if a is not None)]
     return _independent(np.unique(np.concatenate(rows), axis=0))

@@ -40,7 +40,7 @@ class System(eqx.Module):
     like the function itself, which is ``system.force.function``.
     """
 
-    kinetic: ConstantMass | KineticFunction
+    kinetic: Any
     slow_potential: TracedOnce | None = eqx.field(static=True, default=None)
     fast_potential: TracedOnce | None = eqx.field(static=True, default=None)
     constraint: TracedOnce | Rheonomic | None = eqx.field(static=True, default=None)

@@ -6,11 +6,13 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_flags, check_system
-from vmri_jax.mechanics.state import State, check_constraints
+from vmri_jax.mechanics.constraints import check_constraints
+from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import check_run
 from vmri_jax.running.engine import Engine, engine

@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.state import dependent_rows, row_rank
+from vmri_jax.mechanics.constraints import rank_of
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.layout import Place
 from vmri_jax.scene.sorting import Placed
@@ -68,9 +68,9 @@ def _jacobian(function, timed: bool, q, params):
 def _refuse(rows: Sequence[tuple[str, np.ndarray]], first: int, advice: str) -> None:
     """Raise if named rows, from a column on, are dependent, naming those that take part."""
     names, jacobian = [name for name, _ in rows], np.array([row[first:] for _, row in rows])
-    involved = dependent_rows(jacobian)
+    involved = rank_of(jacobian).dependent
     if involved:
         raise ValueError(
             f"Scene: over-constrained at the start: {', '.join(names[i] for i in involved)} are {len(involved)} constraints of rank "
-            f"{row_rank(jacobian[involved])}; {advice}."
+            f"{rank_of(jacobian[involved]).rank}; {advice}."
         )

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.kernels import max_abs
+from vmri_jax.mechanics.constraints import is_rank_deficient
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.newton import Newton, arrowhead, dense
 from vmri_jax.steppers.results import RUNNING, Method, Result
@@ -197,14 +198,5 @@ def has_dependent_constraints(equations: StepEquations):
     """
     system, q_s, q_f = equations.system, equations.q_s, equations.q_f
     g_s, g_f = jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f)
-    return _is_dependent(g_f, g_s) | _is_dependent(jax.jacrev(system.g_slow, argnums=1)(equations.t, q_s))
-
-
-def _is_dependent(jacobian, others=None):
-    """Whether rows (k, n) have rank less than k, each over its length (together with other columns)."""
-    if jacobian.shape[0] == 0:
-        return jnp.asarray(False)
-    whole = jacobian if others is None else jnp.concatenate([jacobian, others], axis=1)
-    rows = jacobian / jnp.maximum(jnp.linalg.norm(whole, axis=1, keepdims=True), jnp.finfo(float).tiny)
-    gram = rows @ rows.T
-    return jnp.isfinite(gram).all() & (jnp.linalg.eigvalsh(gram)[0] < RANK**2)
+    g_slow = jax.jacrev(system.g_slow, argnums=1)(equations.t, q_s)
+    return is_rank_deficient(g_f, g_s, RANK) | is_rank_deficient(g_slow, tolerance=RANK)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
-from vmri_jax.mechanics.state import State, project_momentum
+from vmri_jax.mechanics.projection import project_momentum
+from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns, physical_multipliers
 from vmri_jax.schemes.scheme import Scheme

@@ -1,0 +1,167 @@
+"""Constraints at one configuration: kept or not, independent or not, and the nearest positions that keep them."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
+from vmri_jax.mechanics.projection import legendre
+from vmri_jax.mechanics.system import System
+
+RANK = 1e-8
+"""Rows of length one are dependent where a singular value is not above this."""
+TAKES_PART = 1e-6
+"""Smallest coefficient of a row, in dependences of length one, with which it takes part in them."""
+FAST_PART = 1e-12
+"""Part of its length up to which a row of a constraint does not depend on the fast variables."""
+PROJECTION_STEPS = 20
+"""Steps of Gauss and Newton onto the constraints."""
+MICRO_GRID = (
+    "A constraint held on the micro grid must be satisfiable by the fast variables: the slow ones have one value per macro step, "
+    "so that a slow-only constraint held at every micro node is over-determined (rank deficit num_micro - 1)."
+)
+
+
+class Rank(NamedTuple):
+    """What the rank test found.
+
+    rank: number of independent rows.
+    dependent: numbers of the rows that take part in a linear dependence.
+    """
+
+    rank: int
+    dependent: list[int]
+
+
+def rank_of(rows) -> Rank:
+    """The rank of rows (k, n), each scaled to length one, and those that are dependent."""
+    rows = np.asarray(rows)
+    size = np.linalg.norm(rows, axis=1, keepdims=True)
+    left, values, _ = np.linalg.svd(rows / np.where(size > 0, size, 1))
+    rank = int(np.count_nonzero(values > RANK))
+    return Rank(rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > TAKES_PART).tolist())
+
+
+def is_rank_deficient(rows, others=None, tolerance: float = RANK):
+    """The same test in a compiled program: whether rows (k, n) are dependent; False of no rows, and of NaN.
+
+    Args:
+        others: (k, m) further columns that count for the lengths by which rows are scaled.
+        tolerance: singular values up to it are zero.
+    """
+    if rows.shape[0] == 0:
+        return jnp.asarray(False)
+    whole = rows if others is None else jnp.concatenate([rows, others], axis=1)
+    size = jnp.linalg.norm(whole, axis=1, keepdims=True)
+    values = jnp.linalg.svd(rows / jnp.where(size > 0, size, 1), compute_uv=False)
+    too_many = rows.shape[0] > rows.shape[1]
+    return jnp.isfinite(whole).all() & (too_many | (values[-1] <= tolerance))
+
+
+def project_positions(system: System, t, q_s, q_f):
+    """Positions moved onto the constraints at a time, along ``M^-1 G^T`` (the nearest point in the mass metric)."""
+    n_s = q_s.shape[0]
+    q0 = jnp.concatenate([q_s, q_f])
+
+    def constraints(q):
+        return system.constraints(t, q[:n_s], q[n_s:])
+
+    def momentum(v):
+        return jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
+
+    mass = jax.jacfwd(momentum)(jnp.zeros_like(q0))
+    directions = jnp.linalg.solve(mass, jax.jacrev(constraints)(q0).T)
+    q = q0
+    for _ in range(PROJECTION_STEPS):
+        g = constraints(q)
+        q = q - directions @ jnp.linalg.lstsq(jax.jacrev(constraints)(q) @ directions, g)[0]
+    return q[:n_s], q[n_s:]
+
+
+def check_constraints(
+    system: System,
+    state,
+    what: str,
+    tolerance: float = CONSTRAINT_TOLERANCE,
+    advice: str = "start from initial_state(...).",
+) -> None:
+    """Refuse positions off the constraints, and constraints that cannot be kept where they are held.
+
+    Args:
+        state: a `State`.
+        what: the words for its positions in messages.
+        tolerance: largest constraint value, in the constraint's own unit, that counts as satisfied.
+        advice: what to do where it is larger.
+
+    Raises:
+        ValueError: constraints that are not finite, not satisfied, too many, or dependent.
+    """
+    if not system.is_constrained:
+        return
+    values, slow, fast, alone = _values_and_jacobians(system, state.t, state.q_s, state.q_f)
+    _check_values(values, what, tolerance, advice)
+    _check_counts(fast, alone)
+    if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
+        raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
+    size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
+    slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= FAST_PART * size)
+    if slow_only.size:
+        raise ValueError(
+            f"System: row(s) {slow_only.tolist()} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
+            "Pass them as slow_constraint(q_s, params), which is held at the macro nodes."
+        )
+    if rank_of(alone).dependent or rank_of(fast).dependent:
+        # At a singular configuration (a linkage folded flat) rows are dependent at that place alone: runs pass it.
+        _, _, fast, alone = _values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f))
+        _check_rank("slow_constraint", alone, "slow variables.")
+        _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}")
+
+
+def _values_and_jacobians(system, t, q_s, q_f) -> tuple[np.ndarray, ...]:
+    return tuple(np.asarray(a) for a in _constraint_values(system, t, q_s, q_f))
+
+
+@jax.jit
+def _constraint_values(system, t, q_s, q_f):
+    """All constraints, and the Jacobians of g by q_s, of g by q_f and of g_slow by q_s."""
+    jacobians = *jax.jacrev(system.g, argnums=(1, 2))(t, q_s, q_f), jax.jacrev(system.g_slow, argnums=1)(t, q_s)
+    return system.constraints(t, q_s, q_f), *jacobians
+
+
+def _check_values(values, what: str, tolerance: float, advice: str) -> None:
+    if not np.isfinite(values).all():
+        raise ValueError(f"{what}: the constraints are {values} there, which is not finite.")
+    worst = np.abs(values).max()
+    if worst > tolerance:
+        raise ValueError(
+            f"{what} violate the constraints by {worst:.3e} (row {np.abs(values).argmax()} of {values.size}, tolerance "
+            f"{tolerance:.0e}); {advice}"
+        )
+
+
+def _check_counts(fast, alone) -> None:
+    (n_g, n_f), (n_gs, n_s) = fast.shape, alone.shape
+    if n_gs > n_s:
+        raise ValueError(
+            f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
+        )
+    if n_g > n_f:
+        raise ValueError(f"System: constraint returns {n_g} values for {n_f} fast variables. {MICRO_GRID} Remove rows.")
+
+
+def _check_rank(name: str, jacobian, of: str) -> None:
+    rank, dependent = rank_of(jacobian)
+    if dependent:
+        raise ValueError(
+            f"System: rows {dependent} of {name} depend on each other: {len(jacobian)} rows have rank {rank} in the {of} Remove "
+            "redundant ones of these rows, or make the variables they need fast."
+        )
+
+
+def _nearby(q_s, q_f):
+    """A generic configuration about a hundredth of the size of these positions away, always the same."""
+    random = np.random.default_rng(0)
+    size = 1e-2 * max(1e-3, *(float(np.abs(q).max(initial=0.0)) for q in (q_s, q_f)))
+    return tuple(q + size * random.normal(size=q.shape) for q in (q_s, q_f))

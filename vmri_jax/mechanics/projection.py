@@ -1,0 +1,112 @@
+"""Momenta on the hidden constraints ``G v + dg/dt = 0``, and the velocities that belong to them."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax import kernels
+from vmri_jax.mechanics.system import System
+
+MAX_ITERATIONS = 50
+"""Newton's iterations for the velocities of a kinetic energy that is not quadratic."""
+ON_CONSTRAINTS = 1e-9
+"""Part of the velocities by which Newton's iterates may miss the hidden constraints when they are compared."""
+CONVERGED = 1e-6
+"""Part of the velocities that the last of two more steps may change at most."""
+
+
+def legendre(system: System, q_s, q_f, v_s, v_f):
+    """Continuous Legendre transform ``p = dT/dv``: (p_s, p_f)."""
+    if system.has_constant_mass:
+        return system.kinetic.momentum(v_s, v_f)
+    return jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
+
+
+def project_momentum(system: System, state, guess=None):
+    """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their velocities.
+
+    v is the velocity of the projected momentum, ``p - G^T mu = dT/dv``: of all v with ``G v + dg/dt = 0`` the one that
+    minimises ``T(v) - p . v``. For constant masses that is one linear solve. Else it is Newton's iteration with a line search,
+    and the kinetic energy must be convex in the velocities.
+
+    Args:
+        state: a `State`: time, positions and momenta.
+        guess: velocities (v_s, v_f) where Newton's iteration starts, by default at rest.
+
+    Returns:
+        (p_s, p_f, v_s, v_f); NaN where Newton's iteration does not converge.
+    """
+    if system.has_constant_mass:
+        return _by_one_solve(system, state.t, state.q_s, state.q_f, state.p_s, state.p_f)
+    return _by_newton(system, state.t, state.q_s, state.q_f, state.p_s, state.p_f, guess)
+
+
+def _by_one_solve(system: System, t, q_s, q_f, p_s, p_f):
+    """``G M^-1 G^T mu = G M^-1 p + dg/dt``."""
+    velocity = system.kinetic.velocity
+    constraints = partial(system.constraints, t)
+    g, pull = jax.vjp(constraints, q_s, q_f)
+    if g.size:
+        push = jax.linearize(constraints, q_s, q_f)[1]
+        matrix = jax.vmap(lambda unit: push(*velocity(*pull(unit))))(jnp.eye(g.size))  # G M^-1 G^T
+        rates = push(*velocity(p_s, p_f))
+        if system.is_rheonomic:
+            rates = rates + _own_rates(system, t, q_s, q_f)
+        mu = kernels.solve(kernels.regularized(matrix), rates[:, None])[:, 0]
+        pull_s, pull_f = pull(mu)
+        p_s, p_f = p_s - pull_s, p_f - pull_f
+    return p_s, p_f, *velocity(p_s, p_f)
+
+
+def _by_newton(system: System, t, q_s, q_f, p_s, p_f, guess):
+    n_s = q_s.shape[0]
+    jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
+    own = _own_rates(system, t, q_s, q_f)
+    p = jnp.concatenate([p_s, p_f])
+    v = _velocity(system, q_s, q_f, jacobian, own, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
+    v_s, v_f = v[:n_s], v[n_s:]
+    if jacobian.shape[0]:
+        p_s, p_f = legendre(system, q_s, q_f, v_s, v_f)
+    return p_s, p_f, v_s, v_f
+
+
+def _own_rates(system: System, t, q_s, q_f):
+    """``dg/dt`` of all constraints (n_g + n_gs,) at fixed positions."""
+    if not system.is_rheonomic:
+        return jnp.zeros(sum(system.num_constraints(q_s, q_f)))
+    return system.constraint_rates(t, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
+
+
+def _velocity(system: System, q_s, q_f, jacobian, own, p, guess):
+    """The v that minimises ``T(v) - p . v`` over ``jacobian v + own = 0``; NaN where Newton's iteration does not converge."""
+
+    def kinetic(system, q_s, q_f, v):
+        return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
+
+    def direction(at, v):
+        system, q_s, q_f, jacobian, own, p = at
+        hessian, gradient = (d(lambda v: kinetic(system, q_s, q_f, v))(v) for d in (jax.hessian, jax.grad))
+        matrix = kernels.saddle(hessian, jacobian.T, jacobian)
+        return jnp.linalg.solve(matrix, jnp.concatenate([p - gradient, -(jacobian @ v + own)]))[: v.size]
+
+    def search(carry):
+        v, k, _ = carry
+        system, q_s, q_f, jacobian, own, p = fixed
+        d = direction(fixed, v)
+        small = kernels.max_abs(d) <= 1e-9 * kernels.max_abs(v)  # the two steps at the end do the rest
+        merit = jax.vmap(lambda v: kinetic(system, q_s, q_f, v) - p @ v)(v + fractions[:, None] * d)
+        on_constraints = kernels.max_abs(jacobian @ v + own) <= ON_CONSTRAINTS * kernels.max_abs(v)
+        better = jnp.isfinite(merit) & ((merit < merit[-1]) | ~on_constraints)
+        stop = small | ~jnp.any(better)
+        return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
+
+    at = (system, q_s, q_f, jacobian, own, p)
+    fixed, guess = jax.lax.stop_gradient((at, guess))
+    fractions = jnp.append(0.5 ** jnp.arange(12.0), 0.0)
+    start = (guess, 0, jnp.asarray(False))
+    v = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < MAX_ITERATIONS), search, start)[0]
+    for _ in range(2):  # Newton's map is flat at its fixed point: these two carry first and second derivatives
+        d = direction(at, v)
+        v = v + d
+    return jnp.where(kernels.max_abs(d) <= CONVERGED * kernels.max_abs(v) + 1e-300, v, jnp.nan)
