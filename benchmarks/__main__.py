@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 
 from benchmarks import batch, compilation, cost, floor, fuzz, kills, orders, peers
+from benchmarks.gail2014.command import gail2014
+from benchmarks.hard_cases.command import hard
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -23,6 +25,9 @@ Peer = Annotated[list[str] | None, typer.Option(help="Integrators, e.g. heyoka; 
 Table = StrEnum("Table", ("absence", "presence", "orders"))
 Tables = Annotated[list[Table] | None, typer.Option(help="Tables of scenes; may be repeated.")]
 OUT = Path("out/benchmarks")
+
+app.command()(gail2014)
+app.command()(hard)
 
 
 @app.command("cost")

@@ -1,18 +1,16 @@
-"""Hard cases: where multirate variational integrators break, how each is set up, and what counts as a pass."""
+"""The 28 hard cases: where multirate variational integrators break, how each is set up, and what counts as a pass."""
 
-from vmri_jax.hard.case import Case, Outcome
-from vmri_jax.hard.chains import CHAINS
-from vmri_jax.hard.constraints import CONSTRAINTS
-from vmri_jax.hard.encounters import CONTACT, ENCOUNTERS
-from vmri_jax.hard.guards import GUARDS
-from vmri_jax.hard.large_steps import EXPLICIT_LIMIT, LARGE_STEPS, SCALES_OF_STEPS
-from vmri_jax.hard.long_runs import CHAOS, LONG_RUNS
-from vmri_jax.hard.own_system import cases_for
-from vmri_jax.hard.report import Report, Row, run_cases
-from vmri_jax.hard.resonance import RESONANCES, SWAPPED
-from vmri_jax.hard.scales import SCALES
+from benchmarks.hard_cases.chains import CHAINS
+from benchmarks.hard_cases.constraints import CONSTRAINTS
+from benchmarks.hard_cases.encounters import CONTACT, ENCOUNTERS
+from benchmarks.hard_cases.guards import GUARDS
+from benchmarks.hard_cases.large_steps import EXPLICIT_LIMIT, LARGE_STEPS, SCALES_OF_STEPS
+from benchmarks.hard_cases.long_runs import CHAOS, LONG_RUNS
+from benchmarks.hard_cases.resonance import RESONANCES, SWAPPED
+from benchmarks.hard_cases.scales import SCALES
+from vmri_jax.check import Case
 
-__all__ = ["Case", "Outcome", "Report", "Row", "cases_for", "catalogue", "run_cases"]
+__all__ = ["catalogue"]
 
 
 def catalogue() -> tuple[Case, ...]:

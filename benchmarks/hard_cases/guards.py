@@ -1,79 +1,15 @@
 """Cases 27 and 28: single precision, one bad lane in a batch."""
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
-from vmri_jax import systems
-from vmri_jax.hard.case import Case, Outcome
-from vmri_jax.hard.measures import difference
-from vmri_jax.mechanics.state import Problem, State, initial_state
-from vmri_jax.running.batch import simulate_batch
-from vmri_jax.running.simulate import simulate
-from vmri_jax.schemes.scheme import fully_implicit
-from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.results import Result
-
-
-def single_precision(problem: Problem, macro_dt: float = 0.01) -> Outcome:
-    """What a run says with the 64-bit mode off, and the start to positions in float32."""
-    state = problem.state()
-    with jax.enable_x64(False):
-        off = _refusal(lambda: simulate(problem.system, fully_implicit(2), state, macro_dt=macro_dt, num_steps=1))
-    q_s, q_f = (np.asarray(q, np.float32) for q in (problem.q_s, problem.q_f))
-    data = _refusal(lambda: initial_state(problem.system, q_s, q_f, problem.v_s, problem.v_f))
-    fix = 'jax.config.update("jax_enable_x64", True)' in off
-    cast = "float32" in data and "astype(float)" in data
-    return Outcome(
-        f"64-bit mode off: {'refused with the line to add' if fix else off or 'accepted'}; float32 positions: "
-        f"{'refused with the cast' if cast else data or 'accepted'}",
-        fix and cast,
-        {"mode_refused": fix, "data_refused": cast},
-    )
-
-
-def _refusal(call) -> str:
-    try:
-        call()
-    except ValueError as error:
-        return str(error)
-    return ""
-
-
-def bad_lane(
-    problem: Problem, scheme, macro_dt, num_steps: int, newton: Newton, lanes: int = 256, compared: int = 4
-) -> Outcome:
-    """A batch of starts beside each other in velocity, one of them absurd, against single runs of some lanes."""
-    bad = lanes // 3
-    faster = 1 + 0.1 * np.linspace(-1, 1, lanes)
-    faster[bad] = 1e160  # its kinetic energy overflows
-    start = problem.state()
-    scaled = {name: jnp.asarray(faster)[:, None] * getattr(start, name) for name in ("p_s", "p_f")}
-    still = {name: jnp.tile(getattr(start, name), (lanes, 1)) for name in ("q_s", "q_f")}
-    states = State(jnp.full(lanes, start.t), **still, **scaled)
-    options = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps, "newton": newton}
-    batch = simulate_batch(problem.system, scheme, states, **options)
-    failed = np.flatnonzero(np.asarray(batch.failed_at) >= 0)
-    apart = 0.0
-    for lane in sorted({*np.linspace(0, lanes - 1, compared, dtype=int), bad - 1, bad + 1} - {bad}):
-        state = jax.tree.map(lambda a, lane=lane: a[lane], states)
-        single = simulate(problem.system, scheme, state, throw=False, **options)
-        for name in ("q_s", "q_f"):
-            size = max(float(jnp.max(jnp.abs(getattr(single, name)), initial=0.0)), 1e-300)
-            apart = max(apart, difference(getattr(batch, name)[lane], getattr(single, name)) / size)
-    result = Result(int(batch.result[bad])).name
-    return Outcome(
-        f"{lanes} lanes: lane {bad} {result}, {len(failed)} failed in all; others within {apart:.0e} of their single runs",
-        list(failed) == [bad] and apart < 1e-12,
-        {"failed": len(failed), "apart": apart},
-    )
+import vmri_jax as vm
+from vmri_jax.check import Case, Outcome
+from vmri_jax.check.guards import bad_lane, single_precision
 
 
 def one_bad_lane(full: bool) -> Outcome:
     """One absurd start among those of a batch of the FPU chain."""
-    problem = systems.fermi_pasta_ulam()
-    newton = Newton() if full else Newton(method="march")  # by default a lane that fails is tried again, exactly
-    return bad_lane(problem, fully_implicit(5), 0.01, 100, newton, compared=256 if full else 4)
+    problem = vm.systems.fermi_pasta_ulam()
+    newton = vm.Newton() if full else vm.Newton(method="march")  # by default a lane that fails is tried again, exactly
+    return bad_lane(problem, vm.fully_implicit(5), 0.01, 100, newton, compared=256 if full else 4)
 
 
 GUARDS = (
@@ -82,7 +18,7 @@ GUARDS = (
         "float32",
         "64-bit mode off, and float32 data",
         "refused with the one-line fix",
-        lambda full: single_precision(systems.fermi_pasta_ulam()),
+        lambda full: single_precision(vm.systems.fermi_pasta_ulam()),
     ),
     Case(
         28,

@@ -2,11 +2,11 @@
 
 import jax.numpy as jnp
 import pytest
+from vmri_jax.hard.own_system import own_system
 
 from tests.user_systems import two_oscillators
 from vmri_jax import ConstantMass, Problem, System
 from vmri_jax.hard import cases_for, run_cases
-from vmri_jax.hard.own_system import own_system
 
 
 def weight(q_s, q_f, params):

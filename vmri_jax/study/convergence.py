@@ -162,9 +162,15 @@ class ConvergenceStudy(ResultTable):
     def _summary(self, scheme: str, case: str) -> SchemeSummary:
         rows = [row for row in self.rows if (row.scheme, row.case) == (scheme, case)]
         ran = [row for row in rows if np.isfinite(row.error_q)]
-        fits = [self.fit(scheme, quantity, case=case) for quantity in "qp"]
-        finest = min(ran, key=lambda row: row.macro_dt, default=None)
-        return SchemeSummary(scheme, case, *fits, finest, len(rows) - len(ran), len(rows))
+        return SchemeSummary(
+            scheme=scheme,
+            case=case,
+            fit_q=self.fit(scheme, "q", case=case),
+            fit_p=self.fit(scheme, "p", case=case),
+            finest=min(ran, key=lambda row: row.macro_dt, default=None),
+            num_failed=len(rows) - len(ran),
+            num_runs=len(rows),
+        )
 
     def content(self) -> dict[str, Any]:
         """The rows, and how accurate the references are."""

@@ -1,0 +1,77 @@
+"""What must not slip through: single precision, one bad lane in a batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.check.case import Outcome
+from vmri_jax.check.measures import difference, run
+from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.running.batch import simulate_batch
+from vmri_jax.running.simulate import simulate
+from vmri_jax.schemes.scheme import fully_implicit
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Result
+
+ABSURD = 1e160
+"""A momentum whose kinetic energy overflows."""
+
+
+def single_precision(problem: Problem, macro_dt: float = 0.01) -> Outcome:
+    """What a run says with the 64-bit mode off, and the start to positions in float32."""
+    state = problem.state()
+    with jax.enable_x64(False):
+        off = _refusal(lambda: simulate(problem.system, fully_implicit(2), state, macro_dt=macro_dt, num_steps=1))
+    q_s, q_f = (np.asarray(q, np.float32) for q in (problem.q_s, problem.q_f))
+    data = _refusal(lambda: initial_state(problem.system, q_s, q_f, problem.v_s, problem.v_f))
+    fix = 'jax.config.update("jax_enable_x64", True)' in off
+    cast = "float32" in data and "astype(float)" in data
+    return Outcome(
+        f"64-bit mode off: {'refused with the line to add' if fix else off or 'accepted'}; float32 positions: "
+        f"{'refused with the cast' if cast else data or 'accepted'}",
+        fix and cast,
+        {"mode_refused": fix, "data_refused": cast},
+    )
+
+
+def _refusal(call) -> str:
+    try:
+        call()
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def bad_lane(
+    problem: Problem, scheme, macro_dt, num_steps: int, newton: Newton, lanes: int = 256, compared: int = 4
+) -> Outcome:
+    """A batch whose lanes start along one run, one of them with absurd momenta, against single runs of some lanes."""
+    bad = lanes // 3
+    states = _with_absurd_lane(_states_along(problem, scheme, macro_dt, lanes, newton), bad)
+    options = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps, "newton": newton}
+    batch = simulate_batch(problem.system, scheme, states, **options)
+    failed = np.flatnonzero(np.asarray(batch.failed_at) >= 0)
+    apart = 0.0
+    for lane in sorted({*np.linspace(0, lanes - 1, compared, dtype=int), bad - 1, bad + 1} - {bad}):
+        state = jax.tree.map(lambda a, lane=lane: a[lane], states)
+        single = simulate(problem.system, scheme, state, throw=False, **options)
+        for name in ("q_s", "q_f"):
+            size = max(float(jnp.max(jnp.abs(getattr(single, name)), initial=0.0)), 1e-300)
+            apart = max(apart, difference(getattr(batch, name)[lane], getattr(single, name)) / size)
+    result = Result(int(batch.result[bad])).name
+    return Outcome(
+        f"{lanes} lanes: lane {bad} {result}, {len(failed)} failed in all; others within {apart:.0e} of their single runs",
+        list(failed) == [bad] and apart < 1e-12,
+        {"failed": len(failed), "apart": apart},
+    )
+
+
+def _states_along(problem: Problem, scheme, macro_dt, lanes: int, newton: Newton) -> State:
+    """The first nodes of a run: so many consistent states, whether the system starts at rest or is driven."""
+    nodes = run(problem, scheme, macro_dt, lanes - 1, newton=newton)
+    return State(nodes.t, nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f)
+
+
+def _with_absurd_lane(states: State, lane: int) -> State:
+    p_s, p_f = (jnp.asarray(p).at[lane].set(ABSURD) for p in (states.p_s, states.p_f))
+    return State(states.t, states.q_s, states.q_f, p_s, p_f)
