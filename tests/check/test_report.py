@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from benchmarks.__main__ import app
 from vmri_jax.check import Case, Outcome, run_cases
+from vmri_jax.check.pictures import draw_energy
 
 RAISES = "bad | luck"
 
