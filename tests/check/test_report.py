@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from benchmarks.__main__ import app
 from vmri_jax.check import Case, Outcome, run_cases
 from vmri_jax.check.pictures import draw_energy
+from vmri_jax.cli import app as vmri
 
 RAISES = "bad | luck"
 
@@ -94,3 +95,13 @@ def test_the_command_runs_a_case_and_writes_files(tmp_path):
     assert result.exit_code == 0, result.output
     assert "1 of 1 criteria met" in result.output
     assert (tmp_path / "out" / "cases.md").read_text().count("\n") == 3
+
+
+def test_vmri_check_judges_a_system_of_ones_own(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("from tests.user_systems import two_oscillators as mine\n")
+    result = CliRunner().invoke(vmri, ["check", f"{file}:mine", "--case", "2", "--case", "10"])
+    assert result.exit_code == 0, result.output
+    assert "does not apply" in result.output
+    assert "1 of 1 criteria met" in result.output
+    assert CliRunner().invoke(vmri, ["check", f"{file}:mine", "--case", "12"]).exit_code == 2
