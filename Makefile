@@ -8,7 +8,7 @@ NEWER ?= python3.13
 .PHONY: reproduce test smoke bench lint lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
-	$(BIN)/vmri reproduce --quick --out out
+	$(BIN)/python -m benchmarks gail2014 --quick --out out
 
 test: .venv/installed  ## the whole test suite
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder

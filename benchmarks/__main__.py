@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from benchmarks import against, baseline, batch, compilation, cost, floor, fuzz, kills, orders, peers, tricks
+from benchmarks.gail2014.command import gail2014
+from benchmarks.hard_cases.command import hard
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
 
@@ -25,6 +27,9 @@ Groups = Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(against.G
 Table = StrEnum("Table", ("absence", "presence", "orders"))
 Tables = Annotated[list[Table] | None, typer.Option(help="Tables of scenes; may be repeated.")]
 OUT = Path("out/benchmarks")
+
+app.command()(gail2014)
+app.command()(hard)
 
 
 @app.command("cost")

@@ -12,9 +12,9 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 import vmri_jax as vm
 from benchmarks import programs
+from benchmarks.gail2014.reference import kinetic_energy
 from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent, steps_for
 from vmri_jax import plots
-from vmri_jax.study.reference import kinetic_energy
 
 FROM = 10
 """From so many micro steps on the default solve is held against the dense one."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from benchmarks.curves import Case
-from vmri_jax.study.reference import PAPER_MINIMA
+from benchmarks.gail2014.reference import PAPER_MINIMA
 
 TITLES = {
     "cost_fig4": "Fig. 4 of the reference study redone",

@@ -1,6 +1,5 @@
 """The command line: what it prints, what it writes, and how it refuses."""
 
-import dataclasses
 import errno
 import os
 import re
@@ -14,7 +13,7 @@ import vmri_jax as vm
 from vmri_jax import cli
 from vmri_jax.cli.catalogue import SCHEMES, find_problem, find_scheme
 from vmri_jax.running.simulate import Simulation
-from vmri_jax.study import families, reference, reference_solution
+from vmri_jax.study import families, reference_solution
 
 USER_FILE = """
 import jax.numpy as jnp
@@ -252,50 +251,11 @@ def test_about_a_thousand_nodes_are_saved(steps, save_every):
     assert cli.run.default_save_every(steps) == save_every
 
 
-def test_reproduce_one_figure(vmri, tmp_path, monkeypatch):
-    few = dataclasses.replace(reference.SIZES["quick"], fpu_steps=(0.01, 0.005, 0.002, 0.001))
-    monkeypatch.setitem(reference.SIZES, "quick", few)
-    code, text = vmri("reproduce", "--only", "fig6", "--out", "study")
-    assert code == 0
-    assert "fig6 4 of 4" in text
-    assert "Report: study/report.html" in text
-    assert {path.name for path in (tmp_path / "study").iterdir()} == {
-        "report.html",
-        "fig6.csv",
-        "fig6.png",
-        "fig6.svg",
-    }
-
-
-def test_reproduce_refuses_unknown_figures(vmri, tmp_path):
-    code, text = vmri("reproduce", "--only", "fig11")
-    assert code == 2
-    assert "no figure 'fig11'; there are fig4, fig5" in text
-    assert not (tmp_path / "out").exists()
-
-
-def test_reproduce_refuses_a_file_as_its_folder(vmri):
-    code, text = vmri("reproduce", "--only", "fig6", "--out", "user.py")
-    assert code == 2
-    assert "--out user.py: File exists" in text
-
-
-def test_reproduce_keeps_the_other_figures(vmri, tmp_path, monkeypatch):
-    def fail(*_, **__):
-        raise RuntimeError("out of luck")
-
-    monkeypatch.setattr("vmri_jax.study.figures.convergence_study", fail)
-    code, text = vmri("reproduce", "--only", "fig6", "--out", "study")
-    assert code == 1
-    assert "fig6: RuntimeError: out of luck" in text
-    assert "out of luck" in (tmp_path / "study" / "report.html").read_text()
-
-
 @pytest.fixture
 def short_menu(monkeypatch):
     """The search chooses among few schemes."""
     menu = [family for family in families() if family.name in ("fully explicit", "explicit slow")]
-    for module in ("advisor", "page"):
+    for module in ("advisor", "cost_report"):
         monkeypatch.setattr(f"vmri_jax.study.{module}.families", lambda: menu)
 
 

@@ -12,14 +12,14 @@ from tests.study.test_convergence import PROBLEM
 from vmri_jax.study import (
     Program,
     ReferenceSolution,
-    cost_page,
+    cost_report,
     families,
     recommend,
     reference_solution,
     work_precision,
 )
 from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search
-from vmri_jax.study.page import default_t_end
+from vmri_jax.study.cost_report import default_t_end
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
 
@@ -184,16 +184,16 @@ def test_ladders_end_by_themselves(reference):
     assert len(errors) < 12
 
 
-def test_cost_page(tmp_path):
-    page = cost_page(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-5, 1e-3), menu=SHORT_MENU)
-    text = page.path.read_text()
-    assert [answer.error for answer in page.answers] == [1e-3, 1e-5]
+def test_cost_report(tmp_path):
+    report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-5, 1e-3), menu=SHORT_MENU)
+    text = report.path.read_text()
+    assert [answer.error for answer in report.answers] == [1e-3, 1e-5]
     assert "What accuracy costs" in text
-    setting = page.answers[1].setting
+    setting = report.answers[1].setting
     assert setting is not None
     assert setting.command("spring") in text.replace("&#34;", '"')
-    assert sum(page.shares.values()) == pytest.approx(1)
+    assert sum(report.shares.values()) == pytest.approx(1)
     assert {"cost.html", "cost.png", "cost.csv"} <= {path.name for path in tmp_path.iterdir()}
     assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)
     with pytest.raises(ValueError, match="positive"):
-        cost_page(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))
+        cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))

@@ -1,4 +1,4 @@
-"""The command line ``vmri``: systems, schemes, one run, what accuracy costs, the reference study.
+"""The command line ``vmri``: systems, schemes, one run, what accuracy costs, hard cases.
 
 Each module has an ``app`` of its own with its commands; here they become one.
 """
@@ -10,7 +10,7 @@ import typer
 
 from vmri_jax.cli import lists, run, scenes, stability, study
 from vmri_jax.cli.animate import animate
-from vmri_jax.cli.hard import hard
+from vmri_jax.cli.check import check
 from vmri_jax.configure import cache_folder, configure
 
 app = typer.Typer(
@@ -21,7 +21,7 @@ app = typer.Typer(
 )
 for part in (lists, run, stability, study, scenes):
     app.add_typer(part.app)
-app.command()(hard)
+app.command()(check)
 app.command()(animate)
 
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from vmri_jax.study.table import Progress as StudyProgress
+from vmri_jax.study.progress import Progress as StudyProgress
 
 console = Console()
 

@@ -6,7 +6,6 @@ from typing import Annotated
 import numpy as np
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from vmri_jax import plots
 from vmri_jax.cli import options
@@ -14,6 +13,8 @@ from vmri_jax.cli.catalogue import find_problem, find_scheme
 from vmri_jax.cli.common import BadInput, check_target_file, console
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
+from vmri_jax.stability.map import windows_text
+from vmri_jax.study.table import Column, rich_table
 
 app = typer.Typer()
 
@@ -90,12 +91,12 @@ def stability(
             maps = {name: stability_map(problem, schemes, grid) for name, schemes in chosen.items()}
     except (ValueError, TypeError) as error:
         raise BadInput(str(error)) from error
-    table = Table("scheme", "num_micro", "unstable where omega H / pi is in", box=None, pad_edge=False)
-    for name, found in maps.items():
-        for n in numbers:
-            windows = [f"{w.start / np.pi:.4g} to {w.stop / np.pi:.4g}" for w in found.windows(n)]
-            table.add_row(name, str(n), ", ".join(windows) or "nowhere")
-    console.print(table)
+    columns = (
+        Column("scheme", lambda row: row[0]),
+        Column("num_micro", lambda row: str(row[1])),
+        Column("unstable where omega H / pi is in", lambda row: windows_text(row[2])),
+    )
+    console.print(rich_table(columns, [(name, *shown) for name, found in maps.items() for shown in found.shown()]))
     if out is not None:
         plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
         console.print(f"Figure: [bold]{escape(str(out))}[/bold]", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`vmri tune`, `vmri cost` and `vmri reproduce`: what accuracy costs, and the reference study."""
+"""`vmri tune` and `vmri cost`: what accuracy costs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,20 +10,14 @@ from rich.markup import escape
 from vmri_jax.cli.catalogue import find_problem
 from vmri_jax.cli.common import BadInput, check_target_file, console, print_failure, progress_bar
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study import (
-    Recommendation,
-    WorkPrecision,
-    WorkRow,
-    choose_figures,
-    cost_page,
-    recommend,
-    reference_figures,
-    reproduce,
-)
+from vmri_jax.study import WorkPrecision, cost_report, recommend
 from vmri_jax.study.advisor import NothingReached, check_target
-from vmri_jax.study.work import rows_table
+from vmri_jax.study.table import rich_table
 
 app = typer.Typer()
+
+SHOWN = 5
+"""Settings that `vmri tune` lists for the error asked for."""
 
 
 @app.command(
@@ -55,7 +49,8 @@ def tune(
         raise BadInput(str(wrong)) from wrong
     _write_runs(found.runs, out)
     console.print("[bold]Errors against time[/bold], the best of all runs\n", found.runs.table())
-    console.print(f"\n[bold]For an error of {error:g}[/bold], the fastest\n", rows_table(_rows_of(found)))
+    fastest = [setting.row for setting in (found.setting, *found.others)[:SHOWN]]
+    console.print(f"\n[bold]For an error of {error:g}[/bold], the fastest\n", rich_table(found.runs.columns, fastest))
     seen = found.verification
     if seen is not None:
         console.print(
@@ -83,7 +78,7 @@ def cost(
             check_target(asked, 1.0 if t_end is None else t_end, problem)
         out.mkdir(parents=True, exist_ok=True)
         with progress_bar() as tell:
-            page = cost_page(problem, system, out, t_end=t_end, errors=error, progress=tell)
+            report = cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
     except OSError as wrong:
         raise BadInput(f"--out {out}: {wrong.strerror}; give a folder that can be written.") from wrong
     except SimulationError as failure:
@@ -91,52 +86,8 @@ def cost(
         raise typer.Exit(1) from failure
     except (ValueError, TypeError) as wrong:
         raise BadInput(str(wrong)) from wrong
-    console.print(rows_table([answer.setting.row for answer in page.answers if answer.setting is not None]))
-    console.print(f"\nPage: [bold]{escape(str(page.path))}[/bold]", soft_wrap=True)
-
-
-@app.command(
-    name="reproduce",
-    epilog="Examples:\n\nvmri reproduce\n\nvmri reproduce --only fig6 --only fig9 --out study\n\nvmri reproduce --full",
-)
-def reproduce_command(
-    full: Annotated[
-        bool, typer.Option("--full/--quick", help="The lists of the paper (an hour), or few values.")
-    ] = False,
-    only: Annotated[list[str] | None, typer.Option(help="Only this figure, e.g. fig6; may be repeated.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for figures, tables and the report.")] = Path("out"),
-) -> None:
-    """Run the reference study: figures, tables and out/report.html."""
-    size = "full" if full else "quick"
-    try:
-        choose_figures(reference_figures(size), only or [])
-    except ValueError as error:
-        raise BadInput(str(error)) from error
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInput(f"--out {out}: {error.strerror}; give a folder that can be written.") from error
-    with progress_bar() as show:
-
-        def figure_done(result) -> None:
-            mark = (
-                "[red]failed[/red]"
-                if result.error
-                else f"{sum(c.agrees for c in result.checks)} of {len(result.checks)}"
-            )
-            console.print(f"{result.name:<11} {mark}  {result.title}  [dim]{result.seconds:.0f} s[/dim]")
-
-        report = reproduce(out, size, only or [], show, figure_done)
-    console.print(f"\nReport: [bold]{escape(str(report.path))}[/bold]", soft_wrap=True)
-    if report.failed:
-        reasons = "\n".join(f"{figure.name}: {figure.error}" for figure in report.failed)
-        print_failure("Figures that failed", reasons)
-        raise typer.Exit(1)
-
-
-def _rows_of(found: Recommendation, count: int = 5) -> list[WorkRow]:
-    """The setting recommended and the next ones."""
-    return [setting.row for setting in (found.setting, *found.others)[:count]]
+    console.print(report.table())
+    console.print(f"\nPage: [bold]{escape(str(report.path))}[/bold]", soft_wrap=True)
 
 
 def _write_runs(runs: WorkPrecision, out: Path | None) -> None:

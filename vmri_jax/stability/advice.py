@@ -1,8 +1,10 @@
 """Advice before a long run: is a step stable at this state, what is wrong where it is not, and which step is."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from rich.table import Table
 
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import State
@@ -13,6 +15,7 @@ from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
+from vmri_jax.study.table import Column, ResultTable, rich_table
 
 SCAN = (0.5, 1.25)
 """Macro steps that are looked at, in units of the one in question; further ones if none of them is safe."""
@@ -52,7 +55,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Advice:
+class Advice(ResultTable):
     """What `advise` found.
 
     macro_dt: the step in question.
@@ -64,6 +67,11 @@ class Advice:
     fast_frequencies, slow_frequencies: (d,) of the fast and the slow potential at the state, the largest first.
     """
 
+    columns = (
+        Column("", lambda finding: finding.severity),
+        Column("", lambda finding: finding.kind),
+        Column("finding", lambda finding: finding.sentence),
+    )
     macro_dt: float
     growth: float
     findings: tuple[Finding, ...]
@@ -88,14 +96,21 @@ class Advice:
             return f"macro_dt = {self.macro_dt:.6g} is {state}, and no safe step was found; take another scheme."
         return f"macro_dt = {self.macro_dt:.6g} is {state}; the nearest safe step is {self.safe_macro_dt:.6g}."
 
-    def table(self):
-        """Findings as a `rich.table.Table`."""
-        from rich.table import Table
+    @property
+    def rows(self) -> tuple[Finding, ...]:
+        """The findings."""
+        return self.findings
 
-        table = Table("", "", "finding", box=None, pad_edge=False, header_style="bold", caption=self.verdict)
-        for finding in self.findings:
-            table.add_row(finding.severity, finding.kind, finding.sentence)
-        return table
+    def content(self) -> dict[str, Any]:
+        """Findings, windows and frequencies."""
+        known = {"macro_dt": self.macro_dt, "growth": self.growth, "safe_macro_dt": self.safe_macro_dt}
+        known |= {"scanned": self.scanned, "windows": [window._asdict() for window in self.windows]}
+        frequencies = {name: getattr(self, name).tolist() for name in ("fast_frequencies", "slow_frequencies")}
+        return {"verdict": self.verdict, **known, **frequencies, **super().content()}
+
+    def table(self) -> Table:
+        """Findings, and the verdict below them."""
+        return rich_table(self.columns, self.findings, caption=self.verdict)
 
     def __rich__(self):
         return self.table()

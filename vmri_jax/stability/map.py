@@ -1,9 +1,8 @@
 """Stability maps: where a step with a scheme is stable, over ``omega H`` and over schemes or coupling strengths."""
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.windows import find_windows
+from vmri_jax.study.table import Column, ResultTable
 
 TOLERANCE = 1e-6
 """Growth per step that counts as instability.
@@ -38,8 +38,13 @@ class Window(NamedTuple):
     growth: float
 
 
+def windows_text(windows: Sequence[Window]) -> str:
+    """Windows of omega H in units of pi."""
+    return ", ".join(f"{w.start / np.pi:.4g} to {w.stop / np.pi:.4g}" for w in windows) or "nowhere"
+
+
 @dataclass(frozen=True)
-class StabilityMap:
+class StabilityMap(ResultTable):
     """Largest multipliers of a macro step over a grid, and the windows of instability.
 
     axis: "scheme" or "kappa", what the rows are.
@@ -52,6 +57,10 @@ class StabilityMap:
     tolerance: growth per step that counts.
     """
 
+    columns = (
+        Column("row", lambda shown: str(shown[0])),
+        Column("unstable where omega H / pi is in", lambda shown: windows_text(shown[1])),
+    )
     axis: str
     rows: tuple
     omega: float
@@ -82,32 +91,29 @@ class StabilityMap:
         """Smallest unstable omega H of one row (the first by default); infinite where there is none on the grid."""
         return next((window.start for window in self.windows(row)), np.inf)
 
-    def to_json(self, path: str | Path) -> None:
-        """Write everything to a JSON file; `from_json` reads it."""
-        content = asdict(replace(self, omega_H=self.omega_H.tolist(), radius=self.radius.tolist()))  # pyright: ignore[reportArgumentType]
-        Path(path).write_text(json.dumps(content, indent=1))
+    def shown(self) -> list[tuple[Any, list[Window]]]:
+        """The label of every row and its windows."""
+        return list(zip(self.rows, map(list, self.found), strict=True))
+
+    def records(self) -> list[dict[str, Any]]:
+        """One per row and grid point."""
+        return [
+            {self.axis: label, "omega_H": float(x), "macro_dt": float(dt), "radius": float(value)}
+            for label, radius in zip(self.rows, self.radius, strict=True)
+            for x, dt, value in zip(self.omega_H, self.macro_dt, radius, strict=True)
+        ]
+
+    def content(self) -> dict[str, Any]:
+        """Everything; `from_json` reads what `to_json` writes."""
+        return asdict(self) | {"omega_H": self.omega_H.tolist(), "radius": self.radius.tolist()}
 
     @classmethod
     def from_json(cls, path: str | Path) -> "StabilityMap":
         """A map written by `to_json`."""
         content = json.loads(Path(path).read_text())
         found = tuple(tuple(Window(*window) for window in row) for row in content.pop("found"))
-        arrays = {name: np.array(content.pop(name)) for name in ("omega_H", "radius")}
+        arrays = {name: np.array(content.pop(name), dtype=float) for name in ("omega_H", "radius")}
         return cls(**content | arrays | {"rows": tuple(content["rows"]), "found": found})
-
-    def to_csv(self, path: str | Path) -> None:
-        """Write one line per row and grid point: label, omega_H, macro_dt, radius."""
-        with open(path, "w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow([self.axis, "omega_H", "macro_dt", "radius"])
-            for label, radius in zip(self.rows, self.radius, strict=True):
-                writer.writerows(zip([label] * len(radius), self.omega_H, self.macro_dt, radius, strict=True))
-
-    def plot(self, title: str = ""):
-        """Stable and unstable regions, see `vmri_jax.stability.plot_stability`."""
-        from vmri_jax.stability.figures import plot_stability
-
-        return plot_stability({"": self}, title)
 
 
 def stability_map(
@@ -189,10 +195,10 @@ def measure(
     """Spectral radius (n,) at each of n increasing macro steps, and the unstable windows between first and last."""
 
     def label(macro_dt):
-        return multipliers(motions, scheme, macro_dt).words(tolerance)
+        return multipliers(motions, scheme, macro_dt).krein_signatures(tolerance)
 
     found = multipliers(motions, scheme, macro_dt)
-    edges = find_windows(label, macro_dt, found.words(tolerance), resolution * (macro_dt[-1] - macro_dt[0]))
+    edges = find_windows(label, macro_dt, found.krein_signatures(tolerance), resolution * (macro_dt[-1] - macro_dt[0]))
     if not edges:
         return found.radius, []
     inside = np.array([a + (b - a) * INSIDE for a, b in edges])

@@ -48,19 +48,19 @@ class Multipliers:
         sizes = np.where(self.own, 0.0, np.abs(self.values))
         return np.where(np.isnan(sizes).any(axis=1), np.inf, sizes.max(axis=1, initial=0.0))
 
-    def words(self, tolerance: float) -> list[bytes | None]:
+    def krein_signatures(self, tolerance: float) -> list[bytes | None]:
         """Krein signatures along the upper half circle, by angle; None where a multiplier has left the circle outwards."""
         d = self.values.shape[1] // 2
-        words: list[bytes | None] = []
+        signatures: list[bytes | None] = []
         for values, x, radius in zip(self.values, self.vectors, self.radius, strict=True):
             if radius > 1 + tolerance:
-                words.append(None)
+                signatures.append(None)
                 continue
             signs = np.sign(np.imag(np.sum(np.conj(x[:d]) * x[d:], axis=0)))
             angles = np.angle(values)
             upper = np.flatnonzero((angles > AT_ONE) & (np.abs(np.abs(values) - 1) <= tolerance))
-            words.append(np.take(signs, upper[np.argsort(angles[upper])]).tobytes())
-        return words
+            signatures.append(np.take(signs, upper[np.argsort(angles[upper])]).tobytes())
+        return signatures
 
 
 def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -> Multipliers:

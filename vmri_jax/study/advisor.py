@@ -1,6 +1,6 @@
 """The cheapest setting for the error one can accept: a staged search over schemes, num_micro and macro steps.
 
-Stage 1 takes every family of `menu.families` with its first num_micro and finds the largest macro step that keeps the
+Stage 1 takes every family of `families.families` with its first num_micro and finds the largest macro step that keeps the
 error, giving up on a family as soon as it is much slower than the best so far. Stage 2 varies num_micro of the best
 families, uphill from where they stand, and tries them with one micro step. Stage 3 times the best settings in turn.
 """
@@ -14,10 +14,10 @@ import numpy as np
 from vmri_jax import diagnostics
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.study.menu import Family, families
+from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
-from vmri_jax.study.solutions import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Progress, silent
+from vmri_jax.study.progress import Progress, silent
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.timing import interleaved
 from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
 

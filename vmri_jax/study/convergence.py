@@ -5,17 +5,15 @@ The error of a run is the largest difference over all saved nodes and all coordi
     error_q = max |q - q_ref|        error_p = max |p - p_ref|.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import diagnostics
+from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.batch import simulate_batch
@@ -25,8 +23,9 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
-from vmri_jax.study.solutions import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Progress, silent, write_csv
+from vmri_jax.study.progress import Progress, silent
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.table import Column, ResultTable
 
 FLOOR_FACTOR = 100.0
 """Errors below this many times the error of the reference say nothing about the scheme and are not fitted."""
@@ -63,12 +62,52 @@ class ConvergenceRow:
 
 
 @dataclass(frozen=True)
-class ConvergenceStudy:
+class SchemeSummary:
+    """What a reader wants to know about one scheme with one set of parameters.
+
+    fit_q, fit_p: observed orders of positions and momenta.
+    finest: the run with the smallest step that did not fail, None if all failed.
+    num_failed, num_runs: how many of the runs failed.
+    """
+
+    scheme: str
+    case: str
+    fit_q: OrderFit
+    fit_p: OrderFit
+    finest: ConvergenceRow | None
+    num_failed: int
+    num_runs: int
+
+
+def _order(fit: OrderFit) -> str:
+    if not np.isfinite(fit.order):
+        return "-"
+    return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
+
+
+def _of_finest(name: str, form: str = ".1e") -> Callable[[SchemeSummary], str]:
+    """The text of a number of the finest run."""
+    return lambda summary: "-" if summary.finest is None else format(getattr(summary.finest, name), form)
+
+
+@dataclass(frozen=True)
+class ConvergenceStudy(ResultTable):
     """Rows of a convergence study, schemes one after the other, then cases, and macro steps as given.
 
     references: reference solutions by case.
     """
 
+    columns = (
+        Column("scheme", lambda summary: summary.scheme),
+        Column("case", lambda summary: summary.case),
+        Column("order of q", lambda summary: _order(summary.fit_q), right=True),
+        Column("order of p", lambda summary: _order(summary.fit_p), right=True),
+        Column("smallest H", _of_finest("macro_dt", "g"), right=True),
+        Column("error of q", _of_finest("error_q"), right=True),
+        Column("error of p", _of_finest("error_p"), right=True),
+        Column("energy", _of_finest("energy_error"), right=True),
+        Column("failed", lambda s: f"{s.num_failed} of {s.num_runs}" if s.num_failed else "", right=True),
+    )
     rows: tuple[ConvergenceRow, ...]
     references: Mapping[str, ReferenceSolution]
 
@@ -116,47 +155,31 @@ class ConvergenceStudy:
         """Observed order: that of `fit`."""
         return self.fit(scheme, quantity, points, case).order
 
-    def table(self):
-        """Observed orders and the errors at the smallest step that did not fail, as a `rich.table.Table`."""
-        from rich.table import Table
+    def shown(self) -> list[SchemeSummary]:
+        """Observed orders, and the errors at the smallest step that did not fail."""
+        return [self._summary(scheme, case) for scheme in self.schemes for case in self.cases]
 
-        table = Table(box=None, pad_edge=False, header_style="bold")
-        for name in ("scheme", *(("case",) if len(self.cases) > 1 else ())):
-            table.add_column(name)
-        for name in ("order of q", "order of p", "smallest H", "error of q", "error of p", "energy", "failed"):
-            table.add_column(name, justify="right")
-        for scheme in self.schemes:
-            for case in self.cases:
-                rows = [r for r in self.rows if (r.scheme, r.case) == (scheme, case)]
-                ran = [row for row in rows if np.isfinite(row.error_q)]
-                last = min(ran, key=lambda row: row.macro_dt, default=None)
-                fits = [self.fit(scheme, quantity, case=case) for quantity in "qp"]
-                numbers = ["-"] * 4
-                if last is not None:
-                    numbers = [
-                        f"{last.macro_dt:g}",
-                        *(f"{x:.1e}" for x in (last.error_q, last.error_p, last.energy_error)),
-                    ]
-                labels = (scheme, case) if len(self.cases) > 1 else (scheme,)
-                failed = f"{len(rows) - len(ran)} of {len(rows)}" if len(ran) < len(rows) else ""
-                table.add_row(*labels, *(_order(fit) for fit in fits), *numbers, failed)
-        return table
+    def _summary(self, scheme: str, case: str) -> SchemeSummary:
+        rows = [row for row in self.rows if (row.scheme, row.case) == (scheme, case)]
+        ran = [row for row in rows if np.isfinite(row.error_q)]
+        return SchemeSummary(
+            scheme=scheme,
+            case=case,
+            fit_q=self.fit(scheme, "q", case=case),
+            fit_p=self.fit(scheme, "p", case=case),
+            finest=min(ran, key=lambda row: row.macro_dt, default=None),
+            num_failed=len(rows) - len(ran),
+            num_runs=len(rows),
+        )
+
+    def content(self) -> dict[str, Any]:
+        """The rows, and how accurate the references are."""
+        references = {case: {"error_q": r.error_q, "error_p": r.error_p} for case, r in self.references.items()}
+        return {"references": references, **super().content()}
 
     def plot(self, orders: Sequence[int] = (), title: str = ""):
         """Errors against the macro step, see `vmri_jax.plots.plot_convergence`."""
-        from vmri_jax import plots
-
         return plots.plot_convergence(self, orders, title)
-
-    def to_csv(self, path: str | Path) -> None:
-        """Write the rows to a CSV file."""
-        write_csv(path, self.rows)
-
-    def to_json(self, path: str | Path) -> None:
-        """Write the rows, and how accurate the references are, to a JSON file; NaN becomes null."""
-        references = {case: {"error_q": r.error_q, "error_p": r.error_p} for case, r in self.references.items()}
-        rows = [{k: None if v != v else v for k, v in asdict(row).items()} for row in self.rows]
-        Path(path).write_text(json.dumps({"references": references, "rows": rows}, indent=1))
 
     def to_xarray(self):
         """An `xarray.Dataset` over (scheme, case, macro_dt); needs the extra ``vmri_jax[xarray]``."""
@@ -175,12 +198,6 @@ class ConvergenceStudy:
             for name, array in data.items():
                 array[at] = getattr(row, name)
         return xarray.Dataset({name: (tuple(axes), array) for name, array in data.items()}, coords=axes)
-
-
-def _order(fit: OrderFit) -> str:
-    if not np.isfinite(fit.order):
-        return "-"
-    return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
 
 
 def convergence_study(

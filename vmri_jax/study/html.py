@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: templates of this folder, figures embedded in light and dark, the machine in words."""
+"""Self-contained HTML pages: one style, figures embedded in light and dark, the machine in words."""
 
 import base64
 import os
@@ -16,13 +16,14 @@ from matplotlib.figure import Figure
 from vmri_jax import plots
 from vmri_jax.study.timing import processor
 
+HERE = Path(__file__).parent
 
-def write_page(path: Path, template: str, **values) -> None:
-    """Render a template of this folder; it also knows the date, the machine and the versions."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("vmri_jax.study", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    text = environment.get_template(template).render(
+
+def write_page(path: Path, template: Path, **values) -> None:
+    """Render a template, which may include ``style.css``; it also knows the date, the machine and the versions."""
+    loader = jinja2.FileSystemLoader([template.parent, HERE])
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    text = environment.get_template(template.name).render(
         date=datetime.now().strftime("%-d %B %Y, %H:%M"),
         machine=_machine(),
         versions=f"vmri_jax {version('vmri_jax')}, JAX {jax.__version__}, Python {platform.python_version()}",

@@ -1,32 +1,110 @@
-"""Small helpers that both studies share: rows to CSV, and who listens to progress."""
+"""Result tables: the base of everything that a study, a stability map or a check hands back as rows."""
 
 import csv
-import dataclasses
-from collections.abc import Callable, Sequence
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-Progress = Callable[[str, int, int], None]
-"""Called as ``progress(what, done, total)`` before every piece of work and once at the end."""
-
-
-def silent(what: str, done: int, total: int) -> None:
-    """A `Progress` that shows nothing."""
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
 
 
-def part(progress: Progress, index: int, count: int, name: str = "") -> Progress:
-    """Progress of part `index` of `count` equal parts of a longer work, with `name` before what it says."""
+@dataclass(frozen=True)
+class Column:
+    """One column that a reader sees: its heading, the text of a row in it, and whether it is flush right."""
 
-    def within(what: str, done: int, total: int) -> None:
-        progress(f"{name}{what}", 1000 * index + 1000 * done // max(total, 1), 1000 * count)
+    name: str
+    text: Callable[[Any], str | Text]
+    right: bool = False
 
-    return within
+
+class ResultTable:
+    """Rows that can be shown, and written as CSV, JSON and Markdown.
+
+    A subclass is a frozen dataclass with a field `rows`, whose items are dataclasses. It says which `columns` a reader
+    sees; a column that is empty in all rows is left out. Files hold every field of every row.
+    """
+
+    rows: Any
+    columns: ClassVar[tuple[Column, ...]]
+
+    def shown(self) -> Sequence[Any]:
+        """What `table` and `markdown` show, one item per line: the rows, unless a subclass chooses among them."""
+        return self.rows
+
+    def records(self) -> list[dict[str, Any]]:
+        """The rows as dictionaries of plain values."""
+        return [asdict(row) for row in self.rows]
+
+    def lines(self) -> list[dict[str, Any]]:
+        """The lines of the CSV file: the records, unless a subclass needs longer lists."""
+        return self.records()
+
+    def content(self) -> dict[str, Any]:
+        """What the JSON file holds; a subclass adds what it knows besides the rows."""
+        return {"rows": self.records()}
+
+    def table(self) -> Table:
+        """A table for the terminal and for notebooks."""
+        return rich_table(self.columns, self.shown())
+
+    def markdown(self) -> str:
+        """The same table in Markdown."""
+        return markdown_table(self.columns, self.shown())
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write a CSV file."""
+        lines = self.lines()
+        names = list(dict.fromkeys(name for line in lines for name in line))
+        with open(path, "w", newline="") as file:
+            writer = csv.DictWriter(file, names)
+            writer.writeheader()
+            writer.writerows(lines)
+
+    def to_json(self, path: str | Path) -> None:
+        """Write a JSON file. NaN becomes null, infinite numbers become "inf" and "-inf"."""
+        Path(path).write_text(json.dumps(_plain(self.content()), indent=1))
 
 
-def write_csv(path: str | Path, rows: Sequence[Any]) -> None:
-    """Write rows (dataclasses of one type) as a CSV file, one column per field."""
-    names = [field.name for field in dataclasses.fields(rows[0])]
-    with open(path, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        writer.writerows([getattr(row, name) for name in names] for row in rows)
+def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = "", ruled: bool = False) -> Table:
+    """Rows as a `rich.table.Table`, with lines between them if it is `ruled`."""
+    columns, cells = _filled(columns, rows)
+    table = Table(header_style="bold", caption=caption or None, show_lines=ruled)
+    if not ruled:
+        table.box, table.pad_edge = None, False
+    for column in columns:
+        table.add_column(column.name, justify="right" if column.right else "left")
+    for line in cells:
+        table.add_row(*(escape(cell) if isinstance(cell, str) else cell for cell in line))
+    return table
+
+
+def markdown_table(columns: Sequence[Column], rows: Sequence[Any]) -> str:
+    """Rows as a table in Markdown."""
+    columns, cells = _filled(columns, rows)
+    body = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in line] for line in cells]
+    head = [column.name for column in columns]
+    rule = ["---:" if column.right else "---" for column in columns]
+    return "".join(f"| {' | '.join(line)} |\n" for line in (head, rule, *body))
+
+
+def _filled(columns: Sequence[Column], rows: Sequence[Any]) -> tuple[list[Column], list[list[str | Text]]]:
+    """The columns that are not empty in all rows, and the cells of each row."""
+    cells = [[column.text(row) for column in columns] for row in rows]
+    kept = [i for i in range(len(columns)) if not cells or any(str(line[i]) for line in cells)]
+    return [columns[i] for i in kept], [[line[i] for i in kept] for line in cells]
+
+
+def _plain(value: Any) -> Any:
+    """The same with nothing that JSON does not know."""
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value

@@ -1,21 +1,21 @@
 """Work and precision: what an error costs in time and in evaluations, run by run, and the best of all runs."""
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from vmri_jax import diagnostics
+from vmri_jax import diagnostics, plots
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
-from vmri_jax.study.solutions import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Progress, silent, write_csv
+from vmri_jax.study.progress import Progress, silent
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.timing import interleaved, machine
 
 FINEST_ERROR = 1e-10
@@ -54,10 +54,28 @@ class WorkRow:
     result: str
 
 
-@dataclass(frozen=True)
-class WorkPrecision:
-    """Rows of one comparison and the reference they were held against."""
+def duration(seconds: float) -> str:
+    """With a unit: 12 µs, 3.4 ms, 1.2 s."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 1e-6:.2g} µs"
 
+
+@dataclass(frozen=True)
+class WorkPrecision(ResultTable):
+    """Rows of one comparison and the reference they were held against; its table is the Pareto front."""
+
+    columns = (
+        Column("scheme", lambda row: row.scheme),
+        Column("H", lambda row: f"{row.macro_dt:.4g}", right=True),
+        Column("steps", lambda row: f"{row.num_steps:,}", right=True),
+        Column("error of q", lambda row: f"{row.error_q:.1e}", right=True),
+        Column("time", lambda row: duration(row.seconds), right=True),
+        Column("grad V", lambda row: f"{row.slow_evaluations:,}", right=True),
+        Column("grad W", lambda row: f"{row.fast_evaluations:,}", right=True),
+        Column("solves", lambda row: f"{row.solves:,}", right=True),
+    )
     rows: tuple[WorkRow, ...]
     t_end: float
     reference: ReferenceSolution
@@ -88,49 +106,18 @@ class WorkPrecision:
         rows = [r for r in self.rows if r.error_q <= error and scheme in (None, r.scheme)]
         return min(rows, key=lambda row: row.seconds, default=None)
 
-    def table(self):
-        """The Pareto front as a `rich.table.Table`."""
-        return rows_table(self.pareto())
+    def shown(self) -> list[WorkRow]:
+        """The Pareto front."""
+        return self.pareto()
+
+    def content(self) -> dict[str, Any]:
+        """Rows, error of the reference, machine and versions."""
+        known = {"error_q": self.reference.error_q, "error_p": self.reference.error_p}
+        return {"t_end": self.t_end, "reference": known, "machine": machine(), **super().content()}
 
     def plot(self, title: str = "", work: str = "seconds"):
         """Error against work, see `vmri_jax.plots.plot_work_precision`."""
-        from vmri_jax import plots
-
         return plots.plot_work_precision(self, title, work)
-
-    def to_csv(self, path: str | Path) -> None:
-        """Write the rows to a CSV file."""
-        write_csv(path, self.rows)
-
-    def to_json(self, path: str | Path) -> None:
-        """Write rows, error of the reference, machine and versions to a JSON file; NaN becomes null."""
-        rows = [{k: None if v != v else v for k, v in asdict(row).items()} for row in self.rows]
-        known = {"error_q": self.reference.error_q, "error_p": self.reference.error_p}
-        found = {"t_end": self.t_end, "reference": known, "machine": machine(), "rows": rows}
-        Path(path).write_text(json.dumps(found, indent=1))
-
-
-def rows_table(rows: Sequence[WorkRow]):
-    """Runs as a `rich.table.Table`."""
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("scheme")
-    for name in ("H", "steps", "error of q", "time", "grad V", "grad W", "solves"):
-        table.add_column(name, justify="right")
-    for row in rows:
-        counts = (f"{n:,}" for n in (row.slow_evaluations, row.fast_evaluations, row.solves))
-        numbers = f"{row.macro_dt:.4g}", f"{row.num_steps:,}", f"{row.error_q:.1e}", duration(row.seconds)
-        table.add_row(row.scheme, *numbers, *counts)
-    return table
-
-
-def duration(seconds: float) -> str:
-    """With a unit: 12 µs, 3.4 ms, 1.2 s."""
-    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 1e-6:.2g} µs"
 
 
 def work_row(label: str, program: Program, num_steps: int, reference: ReferenceSolution, seconds=(np.nan,)) -> WorkRow:

@@ -2,10 +2,11 @@
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +17,15 @@ from matplotlib.ticker import NullFormatter
 from vmri_jax import diagnostics, plots
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.study.advisor import MARGIN, Search, Setting
+from vmri_jax.study.families import Family, families
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.menu import Family, families
-from vmri_jax.study.solutions import reference_solution
-from vmri_jax.study.table import Progress, part, silent
+from vmri_jax.study.progress import Progress, part, silent
+from vmri_jax.study.reference_solution import reference_solution
+from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.timing import interleaved
-from vmri_jax.study.work import WorkPrecision, duration
+from vmri_jax.study.work import WorkPrecision, WorkRow, duration
 
+TEMPLATE = Path(__file__).parent / "cost.html.j2"
 PERIODS = 30
 """Simulated by default: so many periods of the fastest vibration."""
 RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
@@ -43,21 +46,42 @@ class Answer:
     all: tuple[Setting, ...] = ()
 
 
+def _of_setting(form: Callable[[WorkRow], str]) -> Callable[[Answer], str]:
+    """The text of the setting of an answer, empty if there is none."""
+    return lambda answer: "" if answer.setting is None else form(answer.setting.row)
+
+
 @dataclass(frozen=True)
-class CostPage:
-    """What was found, and where the page lies.
+class CostReport(ResultTable):
+    """What was found, and where the page lies; its table has a line per answer.
 
     answers: by error, the largest first.
     runs: every run of the search.
     shares: parts of the time of the middle answer by what it is spent on.
     """
 
+    columns = (
+        Column("error", lambda answer: f"{answer.error:.0e}", right=True),
+        Column("scheme", lambda answer: "not reached" if answer.setting is None else answer.setting.row.scheme),
+        Column("macro step", _of_setting(lambda row: f"{row.macro_dt:.4g}"), right=True),
+        Column("reached", _of_setting(lambda row: f"{row.error_q:.1e}"), right=True),
+        Column("time", _of_setting(lambda row: duration(row.seconds)), right=True),
+    )
     path: Path
     name: str
     t_end: float
     answers: tuple[Answer, ...]
     runs: WorkPrecision
     shares: dict[str, float]
+
+    @property
+    def rows(self) -> tuple[Answer, ...]:
+        """The answers."""
+        return self.answers
+
+    def records(self) -> list[dict[str, Any]]:
+        """Errors and the runs that answer them."""
+        return [{"error": a.error, **(asdict(a.setting.row) if a.setting else {})} for a in self.answers]
 
 
 def default_t_end(problem: Problem) -> float:
@@ -69,7 +93,7 @@ def default_t_end(problem: Problem) -> float:
     return float(f"{t_end:.0e}")
 
 
-def cost_page(
+def cost_report(
     problem: Problem,
     name: str,
     out: str | Path,
@@ -78,7 +102,7 @@ def cost_page(
     errors: Sequence[float] | None = None,
     menu: Sequence[Family] | None = None,
     progress: Progress = silent,
-) -> CostPage:
+) -> CostReport:
     """Search for the cheapest settings for a few errors and write ``cost.html``, ``cost.png`` and ``cost.csv``.
 
     The page is rewritten after every error, so that what is found is kept whatever happens later.
@@ -104,25 +128,27 @@ def cost_page(
         motion = 10.0 ** math.floor(math.log10(max(np.abs(reference.q[-1] - reference.q[0]).max(), 1e-300)))
         errors = [motion * error for error in RELATIVE_ERRORS if motion * error > MARGIN * reference.error_q]
     if not errors or min(errors) <= 0:
-        raise ValueError(f"cost_page: errors are {list(errors)}; give positive numbers, in the unit of the positions.")
+        raise ValueError(
+            f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions."
+        )
     search = Search(problem, t_end, families() if menu is None else menu, reference)
-    answers, page, deadline = [], None, time.monotonic() + BUDGET
+    answers, report, deadline = [], None, time.monotonic() + BUDGET
     for i, error in enumerate(sorted(errors, reverse=True)):
         left = deadline - time.monotonic()
         found = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
         answers.append(Answer(error, found[0] if found else None, tuple(found)))
-        page = _write(search, answers, problem, name, out)
+        report = _write(search, answers, problem, name, out)
     progress("measuring times", 1, 1)
     search.time_again(_shown(answers))
-    page = _write(search, answers, problem, name, out)
+    report = _write(search, answers, problem, name, out)
     progress("done", 1, 1)
-    return page  # pyright: ignore[reportReturnType]
+    return report  # pyright: ignore[reportReturnType]
 
 
-def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: str, out: Path) -> CostPage:
+def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: str, out: Path) -> CostReport:
     """The page of what is known so far."""
     runs, shares = search.rows(), _shares(problem, answers[len(answers) // 2].setting)
-    page = CostPage(out / "cost.html", name, search.t_end, tuple(answers), runs, shares)
+    report = CostReport(out / "cost.html", name, search.t_end, tuple(answers), runs, shares)
     labels = _shown(answers)
     shown = replace(runs, rows=tuple(row for label in labels for row in runs.rows if row.scheme == label))
     runs.to_csv(out / "cost.csv")
@@ -131,19 +157,19 @@ def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: st
     n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
     reached = [answer for answer in answers if answer.setting is not None]
     write_page(
-        page.path,
-        "cost.html.j2",
-        page=page,
+        report.path,
+        TEMPLATE,
+        report=report,
         sizes={"slow variables": problem.q_s.size, "fast variables": problem.q_f.size, "constraints": n_g + n_gs},
         reached=reached,
         growth=_growth(reached),
-        multirate=_multirate(page),
+        multirate=_multirate(report),
         duration=duration,
         work_precision=embedded(partial(plots.plot_work_precision, shown, "", "seconds")),
-        by_num_micro=embedded(partial(_draw_num_micro, page)),
-        shares_figure=embedded(partial(_draw_shares, page)),
+        by_num_micro=embedded(partial(_draw_num_micro, report)),
+        shares_figure=embedded(partial(_draw_shares, report)),
     )
-    return page
+    return report
 
 
 def _shown(answers: Sequence[Answer]) -> list[str]:
@@ -166,10 +192,10 @@ def _growth(reached: Sequence[Answer]) -> float:
     return times ** (math.log(100) / math.log(first.error / last.error))
 
 
-def _multirate(page: CostPage) -> list[tuple[float, str, int, float]]:
+def _multirate(report: CostReport) -> list[tuple[float, str, int, float]]:
     """By error: the family of the answer, its best num_micro, and how much faster than one micro step that is."""
     gains = []
-    for answer in page.answers:
+    for answer in report.answers:
         if answer.setting is None:
             continue
         family = answer.setting.family.name
@@ -221,9 +247,9 @@ def _seconds_each(function, q, count: int = 2000) -> float:
     return float(np.median(seconds)) / count
 
 
-def _draw_num_micro(page: CostPage, theme: plots.Theme) -> Figure:
+def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
     """Time against num_micro of the families that were varied, at each error, one panel per error."""
-    answers = [answer for answer in page.answers if answer.all]
+    answers = [answer for answer in report.answers if answer.all]
     names = list(dict.fromkeys(s.family.name for answer in answers for s in answer.all[: 2 * SHOWN]))
     colors = {name: theme.curves[i % len(theme.curves)] for i, name in enumerate(names)}
     with plots.style(theme):
@@ -246,13 +272,13 @@ def _draw_num_micro(page: CostPage, theme: plots.Theme) -> Figure:
     return figure
 
 
-def _draw_shares(page: CostPage, theme: plots.Theme) -> Figure:
+def _draw_shares(report: CostReport, theme: plots.Theme) -> Figure:
     """One bar, cut by what the time is spent on."""
     with plots.style(theme):
         figure = plots.NotebookFigure(figsize=(7.2, 1.1))
         axes = figure.subplots()
         left = 0.0
-        for i, (name, share) in enumerate(page.shares.items()):
+        for i, (name, share) in enumerate(report.shares.items()):
             last = name == "everything else"
             axes.barh([0], [share], left=left, color=theme.faint if last else theme.curves[i % len(theme.curves)])
             if share > 0.06:

@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+import vmri_jax as vm
+from benchmarks.gail2014.figures import ConvergenceFigure, CostFigure, CostPanel
 from vmri_jax import systems
-from vmri_jax.mechanics.state import Problem
-from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin
-from vmri_jax.study.figures import ConvergenceFigure, CostFigure, CostPanel
 
 PAPER_STEPS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
 DEGREE_STEPS = (0.05, 0.025, 0.02, 0.0125, 0.01, 0.005, 0.002, 0.001)
@@ -24,9 +23,9 @@ PAPER_MINIMA = {  # cheapest num_micro by scheme: (smallest l, largest l, num_mi
     "fully explicit": ((70, 130, 8), (140, 200, 4)),
 }
 SCHEMES = {
-    "fully implicit": fully_implicit,
-    "explicit slow": partial(explicit_slow, alpha=0.0),
-    "fully explicit": partial(fully_explicit, alpha=0.0),
+    "fully implicit": vm.fully_implicit,
+    "explicit slow": partial(vm.explicit_slow, alpha=0.0),
+    "fully explicit": partial(vm.fully_explicit, alpha=0.0),
 }
 
 
@@ -99,7 +98,7 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
         title="FPU, l = 3",
         dense=systems.fermi_pasta_ulam,
         structured=systems.fermi_pasta_ulam,
-        scheme=fully_implicit,
+        scheme=vm.fully_implicit,
         paper_minimum=60,
         dense_num_micro=size.fpu_num_micro,
         num_micro=size.fpu_num_micro,
@@ -163,13 +162,13 @@ def kinetic_energy(q_s, q_f, v_s, v_f, params):
     return (v_s @ v_s + v_f @ v_f) / 2
 
 
-def unstructured_chain(num_springs: int) -> Problem:
+def unstructured_chain(num_springs: int) -> vm.Problem:
     """The FPU chain with T as a plain function: every scheme then solves for all unknowns of a macro step at once."""
     problem = systems.fermi_pasta_ulam(num_springs)
     return replace(problem, system=problem.system.replace(kinetic=kinetic_energy))
 
 
-def _both(scheme, **arguments) -> dict[str, Scheme]:
+def _both(scheme, **arguments) -> dict[str, vm.Scheme]:
     return {f"{n} micro steps": scheme(n, **arguments) for n in (5, 10)}
 
 
@@ -186,13 +185,13 @@ def _fpu_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
     saw = "order {} in positions and momenta, with 5 and with 10 micro steps."
     half = {
         f"{name}, {label}": scheme
-        for name, family in (("explicit slow", explicit_slow), ("fully explicit", fully_explicit))
+        for name, family in (("explicit slow", vm.explicit_slow), ("fully explicit", vm.fully_explicit))
         for label, scheme in _both(family, alpha=0.5).items()
     }
     return (
-        figure("fig6", "FPU, fully explicit", saw.format(1), _both(fully_explicit, alpha=0.0), 1),
-        figure("fig7", "FPU, explicit slow", saw.format(1), _both(explicit_slow, alpha=0.0), 1),
-        figure("fig8", "FPU, fully implicit", saw.format(2), _both(fully_implicit), 2),
+        figure("fig6", "FPU, fully explicit", saw.format(1), _both(vm.fully_explicit, alpha=0.0), 1),
+        figure("fig7", "FPU, explicit slow", saw.format(1), _both(vm.explicit_slow, alpha=0.0), 1),
+        figure("fig8", "FPU, fully implicit", saw.format(2), _both(vm.fully_implicit), 2),
         figure("fpu-half", "FPU, explicit schemes with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
         finer("fpu-degree", "FPU, degree 2 and 3", _NOT_IN_PAPER, *_degrees(size.degree_num_micro), "theory"),
     )
@@ -202,10 +201,10 @@ def _tsp_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
     figure = partial(_convergence_figure, systems.triple_spherical_pendulum, size.tsp_steps)
     finer = partial(_convergence_figure, systems.triple_spherical_pendulum, DEGREE_STEPS)
     tsp = "Triple spherical pendulum"
-    half = _both(fully_explicit, alpha=0.5)
+    half = _both(vm.fully_explicit, alpha=0.5)
     return (
-        figure("fig9", f"{tsp}, fully implicit", "order 2.", _both(fully_implicit), 2),
-        figure("fig10", f"{tsp}, fully explicit", "order 1.", _both(fully_explicit, alpha=0.0), 1),
+        figure("fig9", f"{tsp}, fully implicit", "order 2.", _both(vm.fully_implicit), 2),
+        figure("fig10", f"{tsp}, fully explicit", "order 1.", _both(vm.fully_explicit, alpha=0.0), 1),
         figure("tsp-half", f"{tsp}, fully explicit with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
         finer("tsp-degree", f"{tsp}, degree 2 and 3", _NOT_IN_PAPER, *_degrees(size.degree_num_micro), "theory"),
     )
@@ -214,9 +213,9 @@ def _tsp_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
 _NOT_IN_PAPER = "not in the paper; the theory says order min(2 × degree, order of the quadrature)."
 
 
-def _degrees(num_micro: tuple[int, ...]) -> tuple[dict[str, Scheme], dict[str, int]]:
+def _degrees(num_micro: tuple[int, ...]) -> tuple[dict[str, vm.Scheme], dict[str, int]]:
     """Galerkin schemes of degree 2 and 3 with Gauss quadrature, and their orders 4 and 6."""
     schemes = {
-        f"degree {degree}, {n} micro steps": galerkin(n, degree, "gauss") for degree in (2, 3) for n in num_micro
+        f"degree {degree}, {n} micro steps": vm.galerkin(n, degree, "gauss") for degree in (2, 3) for n in num_micro
     }
     return schemes, {label: scheme.order for label, scheme in schemes.items()}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from vmri_jax.hard import catalogue
+from benchmarks.hard_cases import catalogue
 
 CASES = catalogue()
 

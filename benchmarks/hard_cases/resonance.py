@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from vmri_jax import systems
-from vmri_jax.hard.case import Case, Outcome
-from vmri_jax.hard.measures import energy, long_run, status
-from vmri_jax.hard.systems import cubic_chain, swapped_chain
-from vmri_jax.schemes.scheme import explicit_slow, fully_implicit
+import vmri_jax as vm
+from benchmarks.hard_cases.pictures import draw_windows
+from benchmarks.hard_cases.systems import cubic_chain, swapped_chain
+from vmri_jax.check import Case, Outcome
+from vmri_jax.check.measures import energy, long_run, status
 from vmri_jax.stability import advise, linear_model, stability_map
 
 FIRST_UNSTABLE = {2: 1.248, 3: 1.089, 5: 1.025, 10: 0.999, 20: 0.993}
@@ -22,11 +22,11 @@ def impulse_resonance(full: bool) -> Outcome:
     model = linear_model(omega=50.0, kappa=25.0)
     expected = FIRST_UNSTABLE if full else {n: FIRST_UNSTABLE[n] for n in (2, 5)}
     omega_H = np.linspace(0.05, 4 * np.pi, 250)
-    found = stability_map(model, {n: explicit_slow(n) for n in expected}, omega_H)
+    found = stability_map(model, {n: vm.explicit_slow(n) for n in expected}, omega_H)
     first = {n: found.first_unstable(n) / np.pi for n in expected}
     first_window = found.windows(5)[0]
     macro_dt = (first_window.start + first_window.stop) / 2 / found.omega
-    warned = not advise(model.system, explicit_slow(5), model.state(), macro_dt).ok
+    warned = not advise(model.system, vm.explicit_slow(5), model.state(), macro_dt).ok
     words = ", ".join(f"{value:.3f} ({n})" for n, value in first.items())
     return Outcome(
         f"first unstable omega H / pi (num_micro): {words}; a step in the window is {'advised against' if warned else 'let pass'}",
@@ -38,11 +38,11 @@ def impulse_resonance(full: bool) -> Outcome:
 
 def chain_at_half_period(full: bool) -> Outcome:
     """The chain where omega H is pi: what advice says, and what the implicit scheme does."""
-    problem, macro_dt, num_micro = systems.fermi_pasta_ulam(), 0.0628, 30
+    problem, macro_dt, num_micro = vm.systems.fermi_pasta_ulam(), 0.0628, 30
     steps = round((200 if full else 50) / macro_dt)
-    implicit = long_run(problem, fully_implicit(num_micro), macro_dt, steps)
-    kicked = long_run(problem, explicit_slow(num_micro), macro_dt, round(200 / macro_dt))
-    advice = advise(problem.system, explicit_slow(num_micro), problem.state(), macro_dt)
+    implicit = long_run(problem, vm.fully_implicit(num_micro), macro_dt, steps)
+    kicked = long_run(problem, vm.explicit_slow(num_micro), macro_dt, round(200 / macro_dt))
+    advice = advise(problem.system, vm.explicit_slow(num_micro), problem.state(), macro_dt)
     error = energy(implicit, steps).band
     return Outcome(
         f"explicit_slow {'advised against' if not advice.ok else 'let pass'} (it ends in {status(kicked)}); fully_implicit: largest "
@@ -54,7 +54,7 @@ def chain_at_half_period(full: bool) -> Outcome:
 
 def combination_resonance(full: bool) -> Outcome:
     """A slow growth of the implicit scheme: in the multipliers, in a run, in the advice."""
-    model, scheme, num_micro = linear_model(omega=50.0, kappa=25.0), fully_implicit(57), 57
+    model, scheme, num_micro = linear_model(omega=50.0, kappa=25.0), vm.fully_implicit(57), 57
     at = 0.1 * num_micro
     found = stability_map(model, scheme, [0.99 * at, at])
     growth = found.radius[0, -1] - 1
@@ -77,7 +77,7 @@ def nonlinear_resonance(full: bool) -> Outcome:
     The motion is chaotic and its energy wanders up and down in a wide band, at random in a single run: the drift is the median of
     runs whose starts differ by round-off.
     """
-    problem, scheme, steps = cubic_chain(), explicit_slow(10), 100_000
+    problem, scheme, steps = cubic_chain(), vm.explicit_slow(10), 100_000
     starts = [replace(problem, q_s=problem.q_s * (1 + k * 1e-14)) for k in range(STARTS)]
     values, said, fine = {}, [], True
     for name, phase in {"2 pi / 3": 2 * np.pi / 3, "pi / 2": np.pi / 2}.items():
@@ -94,7 +94,7 @@ def nonlinear_resonance(full: bool) -> Outcome:
 
 def swapped_labels(full: bool) -> Outcome:
     """The chain with slow and fast exchanged: bounded, and noticed by the advice."""
-    problem, scheme, macro_dt = swapped_chain(), fully_implicit(10), 0.03
+    problem, scheme, macro_dt = swapped_chain(), vm.fully_implicit(10), 0.03
     steps = 100_000 if full else 10_000
     trajectory = long_run(problem, scheme, macro_dt, steps)
     band = energy(trajectory, steps, abs(float(trajectory.energy[0]))).band
@@ -117,6 +117,7 @@ RESONANCES = (
         + ", ".join(f"{v} ({n})" for n, v in FIRST_UNSTABLE.items())
         + "; advice",
         impulse_resonance,
+        draw_windows,
     ),
     Case(
         2,

@@ -1,42 +1,13 @@
-"""Pictures of the cases where one helps: energy over long runs, unstable omega H, linkages at their singularity."""
-
-from collections.abc import Callable, Mapping
+"""Pictures of the cases where one helps: unstable omega H, linkages at their singularity, three scales."""
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from vmri_jax import plots
-
-Details = Mapping[str, np.ndarray]
-
-
-def pictures(details: Mapping[str, Details], theme: plots.Theme = plots.LIGHT) -> dict[str, Figure]:
-    """Figures by name of the cases, given by title, whose details are there."""
-    return {name: draw(details[title], theme) for title, (name, draw) in PICTURES.items() if details.get(title)}
+from vmri_jax.check.case import Details
 
 
-def _energy(details: Details, theme: plots.Theme) -> Figure:
-    """Energy error against time, one curve per run; every curve as the band that it fills."""
-    runs = [name.removeprefix("t") for name in details if name == "t" or name.startswith("t ")]
-    with plots.style(theme):
-        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
-        axes = figure.subplots()
-        for name, color in zip(runs, theme.curves, strict=False):
-            t, e = details[f"t{name}"], details[f"energy error{name}"]
-            size = max(1, len(t) // 400)
-            count = len(t) // size
-            e = e[: count * size].reshape(count, size)
-            label = f"tolerance {name.strip()}" if name else None
-            axes.fill_between(
-                t[: count * size : size], e.min(axis=1), e.max(axis=1), color=color, alpha=0.8, lw=0.6, label=label
-            )
-        axes.set(xlabel="time", ylabel=r"energy error $E - E_0$", xlim=(0, details[f"t{runs[0]}"][-1]))
-        if len(runs) > 1:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
-
-
-def _windows(details: Details, theme: plots.Theme) -> Figure:
+def draw_windows(details: Details, theme: plots.Theme) -> Figure:
     """Unstable intervals of omega H / pi of the linear model, one line per num_micro; narrow ones at least a hairline."""
     with plots.style(theme):
         figure = plots.NotebookFigure(figsize=(7.2, 2.6))
@@ -50,7 +21,7 @@ def _windows(details: Details, theme: plots.Theme) -> Figure:
     return figure
 
 
-def _singular(details: Details, theme: plots.Theme) -> Figure:
+def draw_singular(details: Details, theme: plots.Theme) -> Figure:
     """Height of the crank through the collinear position, and the falling chain, started straight."""
     with plots.style(theme):
         figure = plots.NotebookFigure(figsize=(7.2, 3.2))
@@ -67,7 +38,7 @@ def _singular(details: Details, theme: plots.Theme) -> Figure:
     return figure
 
 
-def _oscillatory_energies(details: Details, theme: plots.Theme) -> Figure:
+def draw_oscillatory_energies(details: Details, theme: plots.Theme) -> Figure:
     """Oscillatory energies of the three stiff springs, large steps over resolved ones."""
     with plots.style(theme):
         figure = plots.NotebookFigure(figsize=(7.2, 3.2))
@@ -78,14 +49,3 @@ def _oscillatory_energies(details: Details, theme: plots.Theme) -> Figure:
         axes.set(xlabel="time", ylabel="oscillatory energy", xlim=(0, details["t"][-1]))
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
-
-
-PICTURES: dict[str, tuple[str, Callable[[Details, plots.Theme], Figure]]] = {
-    "impulse resonance": ("impulse_resonance", _windows),
-    "singular configuration": ("singular_configuration", _singular),
-    "constraints for long": ("energy_triple_pendulum", _energy),
-    "energy for long": ("energy_long_run", _energy),
-    "loose Newton tolerance": ("energy_tolerance", _energy),
-    "three scales": ("three_scales", _oscillatory_energies),
-}
-"""By title of the case: name of the picture, and how it is drawn."""

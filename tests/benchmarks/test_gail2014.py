@@ -2,13 +2,19 @@
 
 import base64
 import csv
+import dataclasses
 import re
 
 import pytest
+from typer.testing import CliRunner
 
 import vmri_jax as vm
-from vmri_jax.study import Check, ConvergenceFigure, CostFigure, CostPanel, choose_figures, reference_figures, reproduce
-from vmri_jax.study import report as report_module
+from benchmarks.__main__ import app
+from benchmarks.gail2014 import reference
+from benchmarks.gail2014 import report as report_module
+from benchmarks.gail2014.figures import Check, ConvergenceFigure, CostFigure, CostPanel
+from benchmarks.gail2014.reference import reference_figures
+from benchmarks.gail2014.report import choose_figures, reproduce
 
 ALL = ["fig4", "fig5", "fig6", "fig7", "fig8", "fpu-half", "fpu-degree", "fig9", "fig10", "tsp-half", "tsp-degree"]
 
@@ -152,3 +158,57 @@ def test_progress_runs_over_all_figures(made):
     assert total == {4000}
     assert done == sorted(done)
     assert done[-1] == 4000
+
+
+@pytest.fixture
+def gail2014(tmp_path, monkeypatch):
+    """Runs ``python -m benchmarks gail2014`` in an empty folder: (exit code, everything printed)."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("benchmarks.gail2014.command.prepare", lambda: None)
+    (tmp_path / "a_file").write_text("")
+
+    def run(*arguments):
+        result = CliRunner().invoke(app, ["gail2014", *arguments])
+        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+        return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
+
+    return run
+
+
+def test_the_command_one_figure(gail2014, tmp_path, monkeypatch):
+    few = dataclasses.replace(reference.SIZES["quick"], fpu_steps=(0.01, 0.005, 0.002, 0.001))
+    monkeypatch.setitem(reference.SIZES, "quick", few)
+    code, text = gail2014("--only", "fig6", "--out", "study")
+    assert code == 0
+    assert "fig6 4 of 4" in text
+    assert "Report: study/report.html" in text
+    assert {path.name for path in (tmp_path / "study").iterdir()} == {
+        "report.html",
+        "fig6.csv",
+        "fig6.png",
+        "fig6.svg",
+    }
+
+
+def test_the_command_refuses_unknown_figures(gail2014, tmp_path):
+    code, text = gail2014("--only", "fig11")
+    assert code == 2
+    assert "no figure 'fig11'; there are fig4, fig5" in text
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_refuses_a_file_as_its_folder(gail2014):
+    code, text = gail2014("--only", "fig6", "--out", "a_file")
+    assert code == 2
+    assert "--out a_file: File exists" in text
+
+
+def test_the_command_keeps_the_other_figures(gail2014, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr("benchmarks.gail2014.figures.convergence_study", fail)
+    code, text = gail2014("--only", "fig6", "--out", "study")
+    assert code == 1
+    assert "fig6: RuntimeError: out of luck" in text
+    assert "out of luck" in (tmp_path / "study" / "report.html").read_text()

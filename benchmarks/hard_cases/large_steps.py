@@ -4,28 +4,23 @@ import time
 
 import numpy as np
 
-from vmri_jax import systems
+import vmri_jax as vm
+from vmri_jax.check import Case, Outcome
+from vmri_jax.check.measures import constraints, difference, energy, iterations, nodes, run, status
 from vmri_jax.diagnostics import step_condition
-from vmri_jax.hard.case import Case, Outcome
-from vmri_jax.hard.measures import constraints, difference, energy, iterations, nodes, run, status
-from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.scheme import fully_explicit, fully_implicit
-from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.results import Result
 
-EXACT = Newton(method="arrowhead")
+EXACT = vm.Newton(method="arrowhead")
 """Newton's iteration with the exact matrix, whose iterations are counted."""
 
 
 def explicit_limit(full: bool) -> Outcome:
     """The explicit chain below, at and above omega h = 2."""
-    problem, num_micro, steps = systems.fermi_pasta_ulam(), 2, 20_000 if full else 5_000
-    scheme = fully_explicit(num_micro)  # with more micro steps omega h = 1.9 meets an impulse resonance
+    problem, num_micro, steps = vm.systems.fermi_pasta_ulam(), 2, 20_000 if full else 5_000
+    scheme = vm.fully_explicit(num_micro)  # with more micro steps omega h = 1.9 meets an impulse resonance
     below, at, beyond = (run(problem, scheme, num_micro * wh / 50.0, steps, save_every=20) for wh in (1.9, 2.0, 2.1))
     e = np.abs(np.asarray(below.energy - below.energy[0]))
     first, second = e[: len(e) // 2].max(), e[len(e) // 2 :].max()
-    clean = beyond.result == Result.NON_FINITE and not np.isfinite(beyond.energy[-1])
+    clean = beyond.result == vm.Result.NON_FINITE and not np.isfinite(beyond.energy[-1])
     return Outcome(
         f"1.9: energy error up to {first:.1f} in the first half, {second:.1f} in the second; 2.0: {status(at)}; 2.1: "
         f"{status(beyond)}, NaN from there",
@@ -36,7 +31,7 @@ def explicit_limit(full: bool) -> Outcome:
 
 def large_macro_step(full: bool) -> Outcome:
     """Newton's iterations where the macro step is many fast periods long."""
-    problem, scheme, steps = systems.fermi_pasta_ulam(), fully_implicit(100), 100 if full else 20
+    problem, scheme, steps = vm.systems.fermi_pasta_ulam(), vm.fully_implicit(100), 100 if full else 20
     one, two = (run(problem, scheme, h, steps, newton=EXACT) for h in (1.0, 2.0))
     at_first = int(np.max(np.asarray(one.info.iterations)[:20]))
     later = f", {status(one)}" if not one.success else ""
@@ -48,17 +43,17 @@ def large_macro_step(full: bool) -> Outcome:
     )
 
 
-PENDULUM = fully_implicit(5)
+PENDULUM = vm.fully_implicit(5)
 
 
-def _pendulum_run(problem: Problem, macro_dt: float, num_steps: int) -> Trajectory:
+def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int) -> vm.Trajectory:
     """With 20 saved nodes, so that one program does all of them."""
     return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, newton=EXACT)
 
 
 def large_constrained_step(full: bool) -> Outcome:
     """Newton's iterations of the pendulum at steps far above the usual ones."""
-    problem = systems.triple_spherical_pendulum()
+    problem = vm.systems.triple_spherical_pendulum()
     usual, large = (_pendulum_run(problem, h, 400 if full else 40) for h in (0.05, 0.2))
     kept = float(np.nanmax(np.asarray(large.constraint_residual)[:, 0]))
     return Outcome(
@@ -72,7 +67,7 @@ def mass_ratios(full: bool) -> Outcome:
     """Iterations and condition as the slow mass grows against the fast ones."""
     values = {}
     for ratio in (1e4, 1e6, 1e8):
-        problem = systems.triple_spherical_pendulum(masses=(ratio, 1.0, 1.0))
+        problem = vm.systems.triple_spherical_pendulum(masses=(ratio, 1.0, 1.0))
         trajectory = _pendulum_run(problem, 0.01, 1000 if full else 100)
         values[f"iterations_{ratio:.0e}"] = iterations(trajectory) if trajectory.success else np.inf
         values[f"condition_{ratio:.0e}"] = step_condition(problem.system, PENDULUM, problem.state(), 0.01)
@@ -87,7 +82,7 @@ def mass_ratios(full: bool) -> Outcome:
 
 def tiny_steps(full: bool) -> Outcome:
     """Condition and round-off as the macro step shrinks to 1e-6."""
-    problem = systems.triple_spherical_pendulum()
+    problem = vm.systems.triple_spherical_pendulum()
     state, steps = problem.state(), 10.0 ** -np.arange(1.0, 7.0)
     conditions = np.array([step_condition(problem.system, PENDULUM, state, h) for h in steps])
     floor = _pendulum_run(problem, 1e-6, 10_000 if full else 1_000)
@@ -103,10 +98,10 @@ def tiny_steps(full: bool) -> Outcome:
 
 def many_micro_steps(full: bool) -> Outcome:
     """Time per macro step against num_micro, and the dense solve as an oracle."""
-    problem, macro_dt, micro = systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
+    problem, macro_dt, micro = vm.systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
 
     def end(num_micro, steps, newton=None):  # one saved node: one program for each num_micro
-        scheme = fully_implicit(num_micro)
+        scheme = vm.fully_implicit(num_micro)
         return nodes(run(problem, scheme, macro_dt, steps, save_every=steps, newton=newton))[-1]
 
     steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
@@ -119,7 +114,7 @@ def many_micro_steps(full: bool) -> Outcome:
             end(n, steps[n])
             best[n] = min(best[n], (time.process_time() - start) / steps[n])
     slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
-    apart = difference(end(micro[0], 3), end(micro[0], 3, Newton(method="dense")))
+    apart = difference(end(micro[0], 3), end(micro[0], 3, vm.Newton(method="dense")))
     return Outcome(
         f"time over num_micro {micro[0]} to {micro[-1]}: slope {slope:.2f}; from the dense solve at 200: {apart:.0e}",
         abs(slope - 1) <= 0.15 and apart < 1e-11,

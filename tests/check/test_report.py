@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from vmri_jax.cli.hard import hard
-from vmri_jax.hard import Case, Outcome, run_cases
+from benchmarks.__main__ import app
+from vmri_jax.check import Case, Outcome, run_cases
+from vmri_jax.check.pictures import draw_energy
+from vmri_jax.cli import app as vmri
 
 RAISES = "bad | luck"
 
@@ -26,7 +27,7 @@ CASES = (Case(1, "steady", "a set-up", "a criterion", steady), Case(2, "broken",
 
 def test_a_case_that_raises_is_a_failed_row_with_the_reason():
     told = []
-    report = run_cases(cases=CASES, full=True, progress=lambda *a: told.append(a))
+    report = run_cases(CASES, full=True, progress=lambda *a: told.append(a))
     assert [row.outcome.passed for row in report.rows] == [True, False]
     assert report.rows[1].outcome.measured == f"raised RuntimeError: {RAISES}"
     assert report.rows[0].outcome.values == {"band": 0.5, "full": 1.0}
@@ -35,15 +36,15 @@ def test_a_case_that_raises_is_a_failed_row_with_the_reason():
 
 
 def test_numbers_choose_cases_and_unknown_ones_are_refused():
-    report = run_cases([1], cases=CASES)
+    report = run_cases(CASES, [1])
     assert [row.case.number for row in report.rows] == [1]
     assert report.passed
     with pytest.raises(ValueError, match=r"there is no case 3, 7; they go from 1 to 2"):
-        run_cases([1, 7, 3], cases=CASES)
+        run_cases(CASES, [1, 7, 3])
 
 
 def test_files_say_what_the_table_says(tmp_path):
-    report = run_cases(cases=CASES)
+    report = run_cases(CASES)
     names = [path.name for path in report.write(tmp_path / "new")]
     assert names == ["cases.md", "cases.csv", "cases.json"]
     lines = (tmp_path / "new" / "cases.md").read_text().splitlines()
@@ -61,26 +62,46 @@ def test_pictures_are_drawn_from_details():
     def run(full: bool) -> Outcome:
         return Outcome("", True, {}, {"t": t, "energy error": np.sin(50 * t)})
 
-    report = run_cases(cases=[Case(1, "energy for long", "", "", run), CASES[0]])
+    report = run_cases([Case(1, "energy for long", "", "", run, draw_energy), CASES[0]])
     [(name, figure)] = report.pictures().items()
-    assert name == "energy_long_run"
+    assert name == "energy for long"
     low, high = figure.axes[0].get_ylim()
     assert low < -0.9
     assert high > 0.9
 
 
+def test_a_case_that_does_not_apply_says_why_and_is_not_missed():
+    case = Case(1, "reversal", "", "", broken, does_not_apply="it is driven")
+    report = run_cases([case])
+    assert report.passed
+    assert report.rows[0].verdict == "does not apply"
+    assert "it is driven | does not apply" in report.markdown()
+
+
+@pytest.fixture(autouse=True)
+def _prepared(monkeypatch):
+    """JAX runs already in this process."""
+    monkeypatch.setattr("benchmarks.hard_cases.command.prepare", lambda: None)
+
+
 def test_the_command_refuses_an_unknown_case():
-    app = typer.Typer()
-    app.command()(hard)
-    result = CliRunner().invoke(app, ["--case", "99"])
+    result = CliRunner().invoke(app, ["hard", "--case", "99"])
     assert result.exit_code == 2
     assert "there is no case 99" in result.output
 
 
 def test_the_command_runs_a_case_and_writes_files(tmp_path):
-    app = typer.Typer()
-    app.command()(hard)
-    result = CliRunner().invoke(app, ["--case", "27", "--out", str(tmp_path / "out")])
+    result = CliRunner().invoke(app, ["hard", "--case", "27", "--out", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     assert "1 of 1 criteria met" in result.output
     assert (tmp_path / "out" / "cases.md").read_text().count("\n") == 3
+
+
+def test_vmri_check_judges_a_system_of_ones_own(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("from tests.user_systems import two_oscillators as mine\n")
+    result = CliRunner().invoke(vmri, ["check", f"{file}:mine", "--case", "2", "--case", "10"])
+    assert result.exit_code == 0, result.output
+    assert "does not apply" in result.output
+    assert "1 of 1 criteria met" in result.output
+    assert CliRunner().invoke(vmri, ["check", f"{file}:mine", "--case", "12"]).exit_code == 2

@@ -2,18 +2,23 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import reduce
+from operator import add
 
 import numpy as np
 from matplotlib.figure import Figure
 
+import vmri_jax as vm
 from vmri_jax import plots
-from vmri_jax.mechanics.state import Problem
-from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.study.convergence import ConvergenceStudy, convergence_study
-from vmri_jax.study.cost import CostStudy, cost_study
-from vmri_jax.study.solutions import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Progress, part, write_csv
+from vmri_jax.study import (
+    ConvergenceStudy,
+    CostStudy,
+    ReferenceSolution,
+    convergence_study,
+    cost_study,
+    reference_solution,
+)
+from vmri_jax.study.progress import Progress, part
 
 ORDER_TOLERANCE = 0.2
 UPTURN = 1.5
@@ -43,17 +48,13 @@ class Findings:
     seen: one line, made from the numbers.
     checks: numbers against expectations.
     draw: ``draw(title, theme)`` makes the figure.
-    rows: the numbers, one dataclass per CSV row.
+    study: the numbers.
     """
 
     seen: str
     checks: tuple[Check, ...]
     draw: Callable[[str, plots.Theme], Figure]
-    rows: tuple
-
-    def to_csv(self, path: str | Path) -> None:
-        """Write the numbers to a CSV file."""
-        write_csv(path, self.rows)
+    study: ConvergenceStudy | CostStudy
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,8 @@ class ConvergenceFigure:
     name: str
     title: str
     paper: str
-    problem: Callable[[], Problem]
-    schemes: Mapping[str, Scheme]
+    problem: Callable[[], vm.Problem]
+    schemes: Mapping[str, vm.Scheme]
     orders: Mapping[str, int]
     source: str
     macro_dt: tuple[float, ...]
@@ -94,7 +95,7 @@ class ConvergenceFigure:
             seen=self._seen(study),
             checks=self._checks(study),
             draw=lambda title, theme: plots.plot_convergence(study, orders, title, theme),
-            rows=study.rows,
+            study=study,
         )
 
     def _seen(self, study: ConvergenceStudy) -> str:
@@ -128,9 +129,9 @@ class CostPanel:
     """
 
     title: str
-    dense: Callable[[], Problem]
-    structured: Callable[[], Problem]
-    scheme: Callable[[int], Scheme]
+    dense: Callable[[], vm.Problem]
+    structured: Callable[[], vm.Problem]
+    scheme: Callable[[int], vm.Scheme]
     paper_minimum: int | None
     dense_num_micro: tuple[int, ...]
     num_micro: tuple[int, ...]
@@ -158,7 +159,7 @@ class CostPanel:
             )
             for i, (solver, problem, num_micro, t_end) in enumerate(runs)
         ]
-        return sum(studies[1:], studies[0])
+        return reduce(add, studies)
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class CostFigure:
             seen="; ".join(_seen_cost(panel, studies[panel.title]) for panel in self.panels) + ".",
             checks=tuple(check for panel in self.panels for check in _cost_checks(panel, studies[panel.title])),
             draw=lambda title, theme: plots.plot_cost(studies, minima, title, theme),
-            rows=tuple(row for study in studies.values() for row in study.rows),
+            study=reduce(add, studies.values()),
         )
 
 

@@ -5,6 +5,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+
+from vmri_jax.plots import Theme
+
+Details = Mapping[str, np.ndarray]
+"""Arrays that a picture is drawn from, by name."""
 
 
 @dataclass(frozen=True)
@@ -13,18 +19,18 @@ class Outcome:
 
     Args:
         measured: the figures in a sentence.
-        passed: whether the criterion is met.
+        passed: whether the criterion is met; None if the case does not apply.
         values: the figures by name.
-        details: arrays that pictures are drawn from, by name.
+        details: arrays that the picture of the case is drawn from.
     """
 
     measured: str
-    passed: bool | np.bool
+    passed: bool | np.bool | None
     values: Mapping[str, Any] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
-        object.__setattr__(self, "passed", bool(self.passed))
+        object.__setattr__(self, "passed", None if self.passed is None else bool(self.passed))
         object.__setattr__(self, "values", {name: float(value) for name, value in self.values.items()})
         object.__setattr__(self, "details", {name: np.asarray(value) for name, value in self.details.items()})
 
@@ -34,10 +40,12 @@ class Case:
     """One hard case.
 
     Args:
-        number: its place in the catalogue.
+        number: its place in the list.
         title: a few words.
         setup, criterion: a sentence each: what is run, and what counts as a pass.
         run: ``run(full) -> Outcome``, a quick form or the full one.
+        draw: ``draw(details, theme)`` makes its picture, if it has one.
+        does_not_apply: why the case has no sense for the system; empty where it has.
     """
 
     number: int
@@ -45,3 +53,5 @@ class Case:
     setup: str
     criterion: str
     run: Callable[[bool], Outcome]
+    draw: Callable[[Details, Theme], Figure] | None = None
+    does_not_apply: str = ""

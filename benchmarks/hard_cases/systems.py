@@ -6,8 +6,7 @@ Factories of `Problem`, written as a user would write them: functions at module 
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.state import Problem
-from vmri_jax.mechanics.system import ConstantMass, System
+import vmri_jax as vm
 from vmri_jax.systems.fermi_pasta_ulam import fermi_pasta_ulam, soft_springs
 
 
@@ -37,13 +36,13 @@ def nearly_slow(q_s, q_f, params):
     return jnp.stack([(jnp.sum(q_s**2) + params["eps"] * q_f[2] ** 2 - params["square"]) / 2])
 
 
-def nearly_slow_constraint(eps: float) -> Problem:
+def nearly_slow_constraint(eps: float) -> vm.Problem:
     """A slow and a fast point in R^3 with ``|q_1|^2 + eps z_2^2 = l^2``: the fast Jacobian vanishes with eps."""
     q_s, q_f = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0])
     params = {"kappa": 1.0, "omega": 50.0, "anchor": q_f, "eps": eps, "square": 1.0 + eps}
     params = {name: jnp.asarray(value) for name, value in params.items()}
-    system = System(ConstantMass([10.0] * 3, [1.0] * 3), tether, stiff_cage, nearly_slow, params=params)
-    return Problem(system, q_s, q_f, jnp.array([0.0, 0.3, 0.0]), jnp.array([0.2, 0.0, 0.0]))
+    system = vm.System(vm.ConstantMass([10.0] * 3, [1.0] * 3), tether, stiff_cage, nearly_slow, params=params)
+    return vm.Problem(system, q_s, q_f, jnp.array([0.0, 0.3, 0.0]), jnp.array([0.2, 0.0, 0.0]))
 
 
 # --- linkages and chains ---------------------------------------------------------------------------------------------
@@ -65,7 +64,7 @@ def four_bars_and_one_again(q_s, q_f, params):
     return jnp.concatenate([rows, rows[1:2]])
 
 
-def four_bar(angle: float = 1.0, speed: float = 1.0, kappa: float = 0.0, redundant: bool = False) -> Problem:
+def four_bar(angle: float = 1.0, speed: float = 1.0, kappa: float = 0.0, redundant: bool = False) -> vm.Problem:
     """Parallelogram linkage (fast), with a heavy slide (slow) on a spring; collinear, hence singular, at angle 0.
 
     Args:
@@ -74,8 +73,8 @@ def four_bar(angle: float = 1.0, speed: float = 1.0, kappa: float = 0.0, redunda
         redundant: give one of the three constraints twice.
     """
     crank, base = 1.0, 2.0
-    system = System(
-        ConstantMass([50.0], [1.0] * 4),
+    system = vm.System(
+        vm.ConstantMass([50.0], [1.0] * 4),
         slow_potential=pull_on_crank,
         constraint=four_bars_and_one_again if redundant else four_bars,
         params={name: jnp.asarray(v) for name, v in {"crank": crank, "base": base, "kappa": kappa}.items()},
@@ -83,7 +82,7 @@ def four_bar(angle: float = 1.0, speed: float = 1.0, kappa: float = 0.0, redunda
     tip = crank * np.array([np.cos(angle), np.sin(angle)])
     velocity = speed * crank * np.array([-np.sin(angle), np.cos(angle)])
     q_f, v_f = np.concatenate([tip, [tip[0] + base, tip[1]]]), np.tile(velocity, 2)
-    return Problem(system, jnp.array([-1.0]), jnp.asarray(q_f), jnp.array([0.0]), jnp.asarray(v_f))
+    return vm.Problem(system, jnp.array([-1.0]), jnp.asarray(q_f), jnp.array([0.0]), jnp.asarray(v_f))
 
 
 def chain_weight(q_s, q_f, params):
@@ -97,7 +96,7 @@ def rigid_links(q_s, q_f, params):
     return links_of(points, params["length"])
 
 
-def link_chain(num_links: int = 20, bend: float = 0.0) -> Problem:
+def link_chain(num_links: int = 20, bend: float = 0.0) -> vm.Problem:
     """Chain of rigid links in the plane (fast), from a rolling trolley (slow); started to the side.
 
     Args:
@@ -109,10 +108,10 @@ def link_chain(num_links: int = 20, bend: float = 0.0) -> Problem:
     params = {name: jnp.asarray(v) for name, v in params.items()}
     signs = np.where(np.arange(num_links) % 2, -1.0, 1.0)
     steps = length * np.stack([np.full(num_links, np.cos(bend)), signs * np.sin(bend)], axis=1)
-    masses = ConstantMass([10.0], np.full(2 * num_links, mass))
-    system = System(masses, chain_weight, constraint=rigid_links, params=params)
+    masses = vm.ConstantMass([10.0], np.full(2 * num_links, mass))
+    system = vm.System(masses, chain_weight, constraint=rigid_links, params=params)
     q_f = jnp.asarray(np.cumsum(steps, axis=0).reshape(-1))
-    return Problem(system, jnp.zeros(1), q_f, jnp.array([0.1]), jnp.zeros(2 * num_links))
+    return vm.Problem(system, jnp.zeros(1), q_f, jnp.array([0.1]), jnp.zeros(2 * num_links))
 
 
 def hung_weight(q_s, q_f, params):
@@ -128,7 +127,7 @@ def stiff_links(q_f, params):
     return params["stiffness"] / 2 * jnp.sum(stretch**2)
 
 
-def stiff_chain(num_masses: int = 50, stiffness: float = 1e6) -> Problem:
+def stiff_chain(num_masses: int = 50, stiffness: float = 1e6) -> vm.Problem:
     """Near-inextensible chain of unit masses in the plane (fast) with a load on a soft spring (slow), let go sideways."""
     length, angle = 0.2, 0.3
     params = {"length": length, "mass": 1.0, "stiffness": stiffness, "gravity": 9.81}
@@ -136,9 +135,9 @@ def stiff_chain(num_masses: int = 50, stiffness: float = 1e6) -> Problem:
     params = {name: jnp.asarray(v) for name, v in params.items()}
     down = np.array([np.sin(angle), -np.cos(angle)])
     points = length * np.arange(1, num_masses + 1)[:, None] * down
-    system = System(ConstantMass([100.0] * 2, np.ones(2 * num_masses)), hung_weight, stiff_links, params=params)
+    system = vm.System(vm.ConstantMass([100.0] * 2, np.ones(2 * num_masses)), hung_weight, stiff_links, params=params)
     q_s = jnp.asarray(points[-1] + 1.0 * down)
-    return Problem(system, q_s, jnp.asarray(points.reshape(-1)), jnp.zeros(2), jnp.zeros(2 * num_masses))
+    return vm.Problem(system, q_s, jnp.asarray(points.reshape(-1)), jnp.zeros(2), jnp.zeros(2 * num_masses))
 
 
 # --- contact, a close encounter --------------------------------------------------------------------------------------
@@ -152,11 +151,11 @@ def floor_contact(q_f, params):
     return params["stiffness"] / 2 * jnp.minimum(q_f[0], 0.0) ** 2
 
 
-def bouncing_ball(stiffness: float = 1e8, height: float = 1.0) -> Problem:
+def bouncing_ball(stiffness: float = 1e8, height: float = 1.0) -> vm.Problem:
     """A ball of unit mass dropped on a stiff floor: x slow, height z fast."""
     params = {"stiffness": jnp.asarray(stiffness), "gravity": jnp.asarray(9.81)}
-    system = System(ConstantMass([1.0], [1.0]), ball_weight, floor_contact, params=params)
-    return Problem(system, jnp.zeros(1), jnp.array([height]), jnp.ones(1), jnp.zeros(1))
+    system = vm.System(vm.ConstantMass([1.0], [1.0]), ball_weight, floor_contact, params=params)
+    return vm.Problem(system, jnp.zeros(1), jnp.array([height]), jnp.ones(1), jnp.zeros(1))
 
 
 def trap(q_s, q_f, params):
@@ -169,16 +168,16 @@ def gravitation(q_f, params):
     return -params["mu"] / jnp.sqrt(jnp.sum(q_f**2))
 
 
-def two_body(eccentricity: float = 0.9) -> Problem:
+def two_body(eccentricity: float = 0.9) -> vm.Problem:
     """Two bodies that attract each other: centre of mass in a soft trap (slow), relative position (fast); period 2 pi.
 
     Started at the apocentre; the pericentre is at 1 - e.
     """
     params = {"kappa": jnp.asarray(0.01), "mu": jnp.asarray(1.0)}
-    system = System(ConstantMass([4.0] * 2, [1.0] * 2), trap, gravitation, params=params)
+    system = vm.System(vm.ConstantMass([4.0] * 2, [1.0] * 2), trap, gravitation, params=params)
     speed = np.sqrt((1 - eccentricity) / (1 + eccentricity))
     q_f, v_f = jnp.array([1.0 + eccentricity, 0.0]), jnp.array([0.0, speed])
-    return Problem(system, jnp.array([1.0, 0.0]), q_f, jnp.zeros(2), v_f)
+    return vm.Problem(system, jnp.array([1.0, 0.0]), q_f, jnp.zeros(2), v_f)
 
 
 # --- variants of the Fermi-Pasta-Ulam chain --------------------------------------------------------------------------
@@ -187,12 +186,12 @@ def three_stiff_springs(q_f, params):
     return jnp.sum(params["omega"] ** 2 * q_f**2) / 2
 
 
-def three_scales(omega=(50.0, 70.0, 5000.0)) -> Problem:
+def three_scales(omega=(50.0, 70.0, 5000.0)) -> vm.Problem:
     """FPU chain with a frequency of its own for every stiff spring; all but the first at rest."""
     problem = fermi_pasta_ulam(len(omega), omega[0])
     system = problem.system.replace(fast_potential=three_stiff_springs, params={"omega": jnp.asarray(omega)})
     second = jnp.zeros(len(omega)).at[1].set(1.0)
-    return Problem(system, problem.q_s, problem.q_f + second / omega[1], problem.v_s, problem.v_f + second)
+    return vm.Problem(system, problem.q_s, problem.q_f + second / omega[1], problem.v_s, problem.v_f + second)
 
 
 def soft_and_cubic_springs(q_s, q_f, params):
@@ -200,12 +199,12 @@ def soft_and_cubic_springs(q_s, q_f, params):
     return soft_springs(q_s, q_f, params) + params["beta"] / 3 * jnp.sum((q_s - q_f) ** 3)
 
 
-def cubic_chain(beta: float = 1.0) -> Problem:
+def cubic_chain(beta: float = 1.0) -> vm.Problem:
     """FPU chain with a cubic soft coupling, which excites the resonances of third order."""
     problem = fermi_pasta_ulam()
     params = problem.system.params | {"beta": jnp.asarray(beta)}
     system = problem.system.replace(slow_potential=soft_and_cubic_springs, params=params)
-    return Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f)
+    return vm.Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f)
 
 
 def everything_slow(q_s, q_f, params):
@@ -213,10 +212,10 @@ def everything_slow(q_s, q_f, params):
     return soft_springs(q_f, q_s, params) + params["omega"] ** 2 / 2 * jnp.sum(q_s**2)
 
 
-def swapped_chain() -> Problem:
+def swapped_chain() -> vm.Problem:
     """FPU chain whose slow and fast variables have been exchanged by mistake."""
     problem = fermi_pasta_ulam()
     kinetic = problem.system.kinetic
-    assert isinstance(kinetic, ConstantMass)
-    system = System(ConstantMass(kinetic.fast, kinetic.slow), everything_slow, params=problem.system.params)
-    return Problem(system, problem.q_f, problem.q_s, problem.v_f, problem.v_s)
+    assert isinstance(kinetic, vm.ConstantMass)
+    system = vm.System(vm.ConstantMass(kinetic.fast, kinetic.slow), everything_slow, params=problem.system.params)
+    return vm.Problem(system, problem.q_f, problem.q_s, problem.v_f, problem.v_s)

@@ -6,15 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import systems
-from vmri_jax.hard.case import Case, Outcome
-from vmri_jax.hard.measures import energy, long_run, run, status
-from vmri_jax.hard.systems import bouncing_ball, two_body
-from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.simulate import simulate
-from vmri_jax.schemes.composition import compose
-from vmri_jax.schemes.scheme import fully_explicit, fully_implicit
-from vmri_jax.steppers.newton import Newton
+import vmri_jax as vm
+from benchmarks.hard_cases.systems import bouncing_ball, two_body
+from vmri_jax.check import Case, Outcome
+from vmri_jax.check.measures import energy, long_run, run, status
 from vmri_jax.study.timing import interleaved
 
 
@@ -24,7 +19,7 @@ def penalty_contact(full: bool) -> Outcome:
     period = 2 * np.sqrt(2 * 1.0 / 9.81)
     steps = int((bounces + 0.5) * period / macro_dt) // 20 * 20
     heights, jumps, lost = [], [], []
-    for scheme in (fully_explicit(20), fully_implicit(20)):
+    for scheme in (vm.fully_explicit(20), vm.fully_implicit(20)):
         trajectory = run(problem, scheme, macro_dt, steps, save_every=2)  # a contact takes 4.5 steps
         z, e = np.asarray(trajectory.q_f)[:, 0], np.asarray(trajectory.energy) / float(trajectory.energy[0])
         flying = z > 1e-3  # contact sinks in by 4e-4
@@ -44,21 +39,21 @@ def penalty_contact(full: bool) -> Outcome:
 
 def norm_at_zero(full: bool) -> Outcome:
     """A spring of nearly no length: derivatives stay finite, coincident points fail plainly."""
-    problem = systems.triple_spherical_pendulum(lengths=(10.0, 2.0, 0.01))
-    steps, scheme, newton = 500 if full else 50, fully_explicit(2), Newton(method="march")
+    problem = vm.systems.triple_spherical_pendulum(lengths=(10.0, 2.0, 0.01))
+    steps, scheme, newton = 500 if full else 50, vm.fully_explicit(2), vm.Newton(method="march")
 
     @jax.jit
     @partial(jax.jacfwd, has_aux=True)
     def reached(stiffness, state):
         system = problem.system.replace(params=problem.system.params | {"stiffness": stiffness})
-        run = simulate(system, scheme, state, macro_dt=1e-3, num_steps=steps, save_every=steps, newton=newton)
+        run = vm.simulate(system, scheme, state, macro_dt=1e-3, num_steps=steps, save_every=steps, newton=newton)
         return run.q_f[-1], run
 
     values, said = {}, []
     for distance in (1e-2, 1e-4, 1e-8, 0.0):
         q_f = jnp.array([10.0, 2.0, 0.0, 10.0, 2.0, 0.0]).at[5].add(distance)
         v_f = jnp.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.5 if distance else 0.0])  # coincident points: also at rest
-        state = Problem(problem.system, problem.q_s, q_f, problem.v_s, v_f).state()
+        state = vm.Problem(problem.system, problem.q_s, q_f, problem.v_s, v_f).state()
         gradient, trajectory = reached(problem.system.params["stiffness"], state)
         largest = float(jnp.max(jnp.abs(gradient)) * problem.system.params["stiffness"])
         values[f"gradient_{distance:g}"] = largest if trajectory.success else np.nan
@@ -77,8 +72,8 @@ def close_encounter(full: bool) -> Outcome:
     """A Kepler orbit of high eccentricity: energy error, and what it costs."""
     problem, orbits = two_body(0.9), 100 if full else 5
     settings = {
-        "impulse, kahan-li8": (compose(fully_explicit(10), "kahan-li8"), 200),
-        "impulse": (fully_explicit(10), 200),
+        "impulse, kahan-li8": (vm.compose(vm.fully_explicit(10), "kahan-li8"), 200),
+        "impulse": (vm.fully_explicit(10), 200),
     }
     values, said = {}, []
     for name, (scheme, per_orbit) in settings.items():

@@ -3,16 +3,14 @@
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import systems
-from vmri_jax.hard.case import Case, Outcome
-from vmri_jax.hard.measures import constraints, difference, iterations, nodes, run, status
-from vmri_jax.hard.systems import four_bar, nearly_slow_constraint
-from vmri_jax.mechanics.state import Problem
-from vmri_jax.schemes.scheme import fully_implicit
+import vmri_jax as vm
+from benchmarks.hard_cases.systems import four_bar, nearly_slow_constraint
+from vmri_jax.check import Case, Outcome
+from vmri_jax.check.measures import constraints, difference, iterations, nodes, run, status
 from vmri_jax.systems.triple_spherical_pendulum import first_rod, second_rod
 
 
-def refusal(problem: Problem) -> str:
+def refusal(problem: vm.Problem) -> str:
     """What the start of a run says against a problem; empty if it accepts it."""
     try:
         problem.state()
@@ -28,9 +26,9 @@ def both_rods(q_s, q_f, params):
 
 def slow_only_constraint(full: bool) -> Outcome:
     """A constraint of slow variables alone on the micro grid is refused, with what to do instead."""
-    problem = systems.triple_spherical_pendulum()
+    problem = vm.systems.triple_spherical_pendulum()
     system = problem.system.replace(constraint=both_rods, slow_constraint=None)
-    said = refusal(Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f))
+    said = refusal(vm.Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f))
     parts = {"row": "row(s) [0]", "reason": "rank deficit num_micro - 1", "fix": "slow_constraint(q_s, params)"}
     found = {name: text in said for name, text in parts.items()}
     words = ", ".join(name for name, there in found.items() if there)
@@ -41,7 +39,7 @@ def weak_fast_jacobian(full: bool) -> Outcome:
     """A constraint that the fast variables enter ever more weakly."""
     macro_dt, values, said = 1e-3, {}, {}
     for eps in (1.0, 1e-2, 1e-4, 1e-6, 1e-8):
-        trajectory = run(nearly_slow_constraint(eps), fully_implicit(5), macro_dt, 10_000 if full else 1_000)
+        trajectory = run(nearly_slow_constraint(eps), vm.fully_implicit(5), macro_dt, 10_000 if full else 1_000)
         values[f"constraint_{eps:.0e}"] = constraints(trajectory)[0]
         values[f"iterations_{eps:.0e}"] = iterations(trajectory)
         said[eps] = status(trajectory)
@@ -68,7 +66,7 @@ def redundant_constraints(full: bool) -> Outcome:
             named,
             {"named": named},
         )
-    runs = [run(problem, fully_implicit(5), 0.05, 1000 if full else 200) for problem in (once, twice)]
+    runs = [run(problem, vm.fully_implicit(5), 0.05, 1000 if full else 200) for problem in (once, twice)]
     apart = difference(*(nodes(trajectory) for trajectory in runs))
     return Outcome(
         f"positions with and without differ by {apart:.1e}; {status(runs[1])}",

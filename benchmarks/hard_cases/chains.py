@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from vmri_jax.hard.case import Case, Outcome
-from vmri_jax.hard.measures import constraints, energy, run, status
-from vmri_jax.hard.systems import four_bar, link_chain, stiff_chain
-from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.scheme import fully_explicit, fully_implicit
+import vmri_jax as vm
+from benchmarks.hard_cases.pictures import draw_singular
+from benchmarks.hard_cases.systems import four_bar, link_chain, stiff_chain
+from vmri_jax.check import Case, Outcome
+from vmri_jax.check.measures import constraints, energy, run, status
 
 
 def singular_configuration(full: bool) -> Outcome:
     """A four-bar linkage through its collinear position, alone and sprung, and a chain of links that starts straight."""
-    scheme, steps = fully_implicit(5), 2_000 if full else 200
+    scheme, steps = vm.fully_implicit(5), 2_000 if full else 200
     micro = 2 * np.arcsin(0.01 / 2)  # what the crank turns in a micro step of 0.01 without forces
     met = {
         "turning": run(
@@ -60,8 +60,8 @@ def stiff_springs_in_a_chain(full: bool) -> Outcome:
     params = problem.system.params
     weight = params["gravity"] * (params["load"] + 50 * params["mass"])
     at_rest = float(weight / params["stiffness"] / params["length"])
-    implicit = run(problem, fully_implicit(20), 0.02, steps, save_every=steps // 50)
-    explicit = run(problem, fully_explicit(20), 0.001, 100_000, save_every=100)
+    implicit = run(problem, vm.fully_implicit(20), 0.02, steps, save_every=steps // 50)
+    explicit = run(problem, vm.fully_explicit(20), 0.001, 100_000, save_every=100)
     strain = {name: _strain(trajectory) / at_rest for name, trajectory in (("2", implicit), ("0.1", explicit))}
     half = len(strain["0.1"]) // 2
     growth = strain["0.1"][half:].max() / strain["0.1"][:half].max()
@@ -80,7 +80,7 @@ def stiff_springs_in_a_chain(full: bool) -> Outcome:
     )
 
 
-def _strain(trajectory: Trajectory) -> np.ndarray:
+def _strain(trajectory: vm.Trajectory) -> np.ndarray:
     """Largest strain of the links at every saved node."""
     points = np.asarray(trajectory.q_f).reshape(len(trajectory.t), -1, 2)
     points = np.concatenate([np.zeros_like(points[:, :1]), points], axis=1)
@@ -94,6 +94,7 @@ CHAINS = (
         "four-bar linkage through its collinear position, straight 20-link chain",
         "no NaN, constraint below 1e-10, energy error at most 10 x that of a generic start, or round-off",
         singular_configuration,
+        draw_singular,
     ),
     Case(
         12,

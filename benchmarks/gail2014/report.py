@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.gail2014.figures import Check, ConvergenceFigure, CostFigure
+from benchmarks.gail2014.reference import reference_figures
 from vmri_jax import plots
-from vmri_jax.study.figures import Check, ConvergenceFigure, CostFigure
 from vmri_jax.study.html import embedded, svg, write_page
-from vmri_jax.study.reference import reference_figures
-from vmri_jax.study.table import Progress, part, silent
+from vmri_jax.study.progress import Progress, part, silent
+
+TEMPLATE = Path(__file__).parent / "report.html.j2"
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def _run_figure(figure, out: Path, references: dict, progress: Progress) -> Figu
     start = time.perf_counter()
     try:
         findings = figure.measure(progress, references)
-        findings.to_csv(out / f"{figure.name}.csv")
+        findings.study.to_csv(out / f"{figure.name}.csv")
         plots.save(findings.draw(figure.title, plots.LIGHT), out / f"{figure.name}.png")
         (out / f"{figure.name}.svg").write_bytes(svg(findings.draw("", plots.LIGHT), plots.LIGHT))
         images = embedded(lambda theme: findings.draw("", theme))
@@ -108,7 +110,7 @@ def _write_html(path: Path, results: list[FigureResult], size: str, seconds: flo
     checks = [check for figure in results for check in figure.checks]
     write_page(
         path,
-        "report.html.j2",
+        TEMPLATE,
         figures=results,
         agreeing=sum(check.agrees for check in checks),
         num_checks=len(checks),

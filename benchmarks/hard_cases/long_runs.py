@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import diagnostics, systems
-from vmri_jax.hard.case import Case, Outcome
-from vmri_jax.hard.measures import (
+import vmri_jax as vm
+from vmri_jax.check import Case, Outcome
+from vmri_jax.check.measures import (
     constraints,
     difference,
     energy,
@@ -16,29 +16,26 @@ from vmri_jax.hard.measures import (
     smooth_shift,
     status,
 )
-from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.trajectory import Trajectory
-from vmri_jax.schemes.scheme import fully_implicit
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.check.pictures import draw_energy
 
 CHAIN_DT = 0.03
 
 
-def hanging_pendulum() -> Problem:
+def hanging_pendulum() -> vm.Problem:
     """The triple pendulum hanging at rest but for small velocities: quasi-periodic motion."""
-    problem = systems.triple_spherical_pendulum()
+    problem = vm.systems.triple_spherical_pendulum()
     params = {name: np.asarray(value) for name, value in problem.system.params.items()}
     l_1, l_2, l_3 = params["lengths"] + [0.0, 0.0, params["gravity"] * params["masses"][2] / params["stiffness"]]
     q_f = jnp.array([0.0, 0.0, -l_1 - l_2, 0.0, 0.0, -l_1 - l_2 - l_3])
     v_s, v_f = jnp.array([0.5, 0.3, 0.0]), jnp.array([0.5, 0.3, 0.0, 0.7, 0.4, 0.1])
-    return Problem(problem.system, jnp.array([0.0, 0.0, -l_1]), q_f, v_s, v_f)
+    return vm.Problem(problem.system, jnp.array([0.0, 0.0, -l_1]), q_f, v_s, v_f)
 
 
 def constraints_for_long(full: bool) -> Outcome:
     """Constraints and energy of a pendulum, from a hanging start and from one that becomes chaotic."""
     steps = 1_000_000 if full else 200_000  # in fewer chaotic motion alone may move the mean by half of the band
-    wild, calm = systems.triple_spherical_pendulum(), hanging_pendulum()
-    trajectory, regular = (long_run(problem, fully_implicit(5), 0.01, steps) for problem in (wild, calm))
+    wild, calm = vm.systems.triple_spherical_pendulum(), hanging_pendulum()
+    trajectory, regular = (long_run(problem, vm.fully_implicit(5), 0.01, steps) for problem in (wild, calm))
     position, velocity = (max(a) for a in zip(constraints(trajectory), constraints(regular), strict=True))
     change = energy(trajectory, steps, energy_scale(wild, trajectory))
     shift = smooth_shift(regular, steps, energy_scale(calm, regular))
@@ -60,7 +57,7 @@ def constraints_for_long(full: bool) -> Outcome:
 def energy_for_long(full: bool) -> Outcome:
     """The energy band of the whole run against that of its first tenth."""
     steps = 1_000_000 if full else 100_000
-    trajectory = long_run(systems.fermi_pasta_ulam(), fully_implicit(10), CHAIN_DT, steps)
+    trajectory = long_run(vm.systems.fermi_pasta_ulam(), vm.fully_implicit(10), CHAIN_DT, steps)
     e = np.abs(np.asarray(trajectory.energy) - trajectory.energy[0])
     whole, tenth = e.max(), e[: len(e) // 10 + 1].max()
     change = energy(trajectory, steps)
@@ -75,11 +72,11 @@ def energy_for_long(full: bool) -> Outcome:
 
 def loose_tolerance(full: bool) -> Outcome:
     """The drift of the energy against the tolerance, where the matrix of Newton's iteration is a crude one."""
-    steps, problem = 1_000_000 if full else 100_000, systems.fermi_pasta_ulam()
+    steps, problem = 1_000_000 if full else 100_000, vm.systems.fermi_pasta_ulam()
     changes, details = {}, {}
-    newtons = {name: Newton("decoupled", tolerance=float(name)) for name in ("1e-4", "1e-8", "1e-12")}
-    for name, newton in (newtons | {"the default": Newton()}).items():
-        trajectory = long_run(problem, fully_implicit(10), CHAIN_DT, steps, newton=newton)
+    newtons = {name: vm.Newton("decoupled", tolerance=float(name)) for name in ("1e-4", "1e-8", "1e-12")}
+    for name, newton in (newtons | {"the default": vm.Newton()}).items():
+        trajectory = long_run(problem, vm.fully_implicit(10), CHAIN_DT, steps, newton=newton)
         changes[name] = energy(trajectory, steps)
         details |= {f"{key} {name}": value for key, value in _energy_picture(trajectory).items()}
     loose, middle, _, default = changes.values()
@@ -94,12 +91,12 @@ def loose_tolerance(full: bool) -> Outcome:
 
 def chaotic_pendulum(full: bool) -> Outcome:
     """The fall from nearly upright: constraints and energy; the order before chaos sets in."""
-    problem = systems.triple_spherical_pendulum()
+    problem = vm.systems.triple_spherical_pendulum()
     lengths = np.asarray(problem.system.params["lengths"])
     tilt = np.array([np.sin(1e-3), 0.0, np.cos(1e-3)])
     q = np.cumsum(lengths)[:, None] * tilt
-    problem = Problem(problem.system, jnp.asarray(q[0]), jnp.asarray(q[1:].reshape(-1)), jnp.zeros(3), jnp.zeros(6))
-    scheme, t_end = fully_implicit(5), 100.0 if full else 10.0
+    problem = vm.Problem(problem.system, jnp.asarray(q[0]), jnp.asarray(q[1:].reshape(-1)), jnp.zeros(3), jnp.zeros(6))
+    scheme, t_end = vm.fully_implicit(5), 100.0 if full else 10.0
     macro_dt = 0.005
     trajectory = run(problem, scheme, macro_dt, round(t_end / macro_dt), save_every=10)
     scale = 2 * abs(float(trajectory.energy[0]))  # from upright to hanging
@@ -107,7 +104,7 @@ def chaotic_pendulum(full: bool) -> Outcome:
     steps, ends = 0.02 / 2.0 ** np.arange(5 if full else 4), []
     for h in steps:
         ends.append(nodes(run(problem, scheme, h, round(1 / h), save_every=round(1 / h)))[-1])
-    order = diagnostics.observed_order(steps[:-2], [difference(a, ends[-1]) for a in ends[:-2]])
+    order = vm.diagnostics.observed_order(steps[:-2], [difference(a, ends[-1]) for a in ends[:-2]])
     return Outcome(
         f"t = {t_end:g}: {status(trajectory)}, |g| {position:.1e}, energy error {change.band:.1e} of the fall; order {order:.2f} "
         "on t <= 1",
@@ -116,7 +113,7 @@ def chaotic_pendulum(full: bool) -> Outcome:
     )
 
 
-def _energy_picture(trajectory: Trajectory) -> dict:
+def _energy_picture(trajectory: vm.Trajectory) -> dict:
     e = np.asarray(trajectory.energy)
     return {"t": trajectory.t, "energy error": e - e[0]}
 
@@ -128,6 +125,7 @@ LONG_RUNS = (
         "triple pendulum, fully_implicit, num_micro 5, H = 0.01, 1e6 steps",
         "position constraint below 1e-12, relative energy shift below 1e-6 per 1e5 steps; no drift seen in chaotic motion",
         constraints_for_long,
+        draw_energy,
     ),
     Case(
         17,
@@ -135,6 +133,7 @@ LONG_RUNS = (
         "FPU chain, fully_implicit, num_micro 10, H = 0.03, 1e6 steps",
         "energy band of the whole run at most twice that of its first tenth",
         energy_for_long,
+        draw_energy,
     ),
     Case(
         18,
@@ -142,6 +141,7 @@ LONG_RUNS = (
         "case 17 with tolerance 1e-4, 1e-8, 1e-12 (method decoupled), and by default",
         "drift shrinks with the tolerance, the default shows none",
         loose_tolerance,
+        draw_energy,
     ),
 )
 CHAOS = Case(

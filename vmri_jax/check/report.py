@@ -1,0 +1,146 @@
+"""Running cases, and what came out: a table, files, pictures."""
+
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from vmri_jax import plots
+from vmri_jax.check.case import Case, Outcome
+from vmri_jax.study.progress import Progress, silent
+from vmri_jax.study.table import Column, ResultTable, rich_table
+
+VERDICTS = {True: ("pass", "green"), False: ("fail", "red"), None: ("does not apply", "dim")}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case that was run: what came out, and how long it took."""
+
+    case: Case
+    outcome: Outcome
+    seconds: float
+
+    @property
+    def verdict(self) -> str:
+        """Whether the criterion is met, or the case does not apply."""
+        return VERDICTS[self.outcome.passed][0]
+
+    @property
+    def missed(self) -> bool:
+        """Whether the criterion is not met."""
+        return self.outcome.passed is False
+
+
+NUMBER = Column("#", lambda row: str(row.case.number))
+TITLE = Column("case", lambda row: row.case.title)
+SETUP = Column("set-up", lambda row: row.case.setup)
+CRITERION = Column("criterion", lambda row: row.case.criterion)
+MEASURED = Column("measured", lambda row: row.outcome.measured)
+VERDICT = Column("", lambda row: Text(*VERDICTS[row.outcome.passed]))
+SECONDS = Column("s", lambda row: f"{row.seconds:.1f}", right=True)
+
+
+@dataclass(frozen=True)
+class Report(ResultTable):
+    """Cases that were run, in order."""
+
+    columns = (NUMBER, TITLE, SETUP, CRITERION, MEASURED, VERDICT)
+    rows: tuple[Row, ...]
+    full: bool
+
+    @property
+    def passed(self) -> bool:
+        """Whether every criterion is met."""
+        return not any(row.missed for row in self.rows)
+
+    def records(self) -> list[dict[str, Any]]:
+        """Everything but the arrays."""
+        return [
+            {
+                "number": row.case.number,
+                "title": row.case.title,
+                "setup": row.case.setup,
+                "criterion": row.case.criterion,
+                "measured": row.outcome.measured,
+                "passed": row.outcome.passed,
+                "values": dict(row.outcome.values),
+                "seconds": row.seconds,
+            }
+            for row in self.rows
+        ]
+
+    def lines(self) -> list[dict[str, Any]]:
+        """One line per value of a case."""
+        return [
+            {"number": row.case.number, "case": row.case.title, "verdict": row.verdict, "value": name, "size": size}
+            for row in self.rows
+            for name, size in row.outcome.values.items()
+        ]
+
+    def content(self) -> dict[str, Any]:
+        """The rows, and whether these are the full forms."""
+        return {"full": self.full, **super().content()}
+
+    def table(self) -> Table:
+        """One line per case, for the terminal."""
+        return rich_table((NUMBER, TITLE, CRITERION, MEASURED, VERDICT, SECONDS), self.rows, ruled=True)
+
+    def pictures(self, theme: plots.Theme = plots.LIGHT) -> dict:
+        """Figures by title of the case, of the cases that have one."""
+        drawn = [(row.case.title, row.case.draw, row.outcome.details) for row in self.rows]
+        return {title: draw(details, theme) for title, draw, details in drawn if draw is not None and details}
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Write cases.md, cases.csv, cases.json and the pictures into a folder, which is made; returns what was written."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "cases.md").write_text(self.markdown(), encoding="utf-8")
+        self.to_csv(folder / "cases.csv")
+        self.to_json(folder / "cases.json")
+        names = ["cases.md", "cases.csv", "cases.json"]
+        for title, figure in self.pictures().items():
+            names.append(f"{title.lower().replace(' ', '_')}.png")
+            plots.save(figure, folder / names[-1])
+        return [folder / name for name in names]
+
+
+def run_cases(
+    cases: Sequence[Case], numbers: Collection[int] = (), full: bool = False, progress: Progress = silent
+) -> Report:
+    """Run cases one after the other; one that raises is a failed row with the reason.
+
+    Args:
+        cases: e.g. ``cases_for(problem)``.
+        numbers: which of them; all by default.
+        full: the full form instead of the quick one.
+        progress: called before every case and at the end.
+
+    Raises:
+        ValueError: a number that no case has.
+    """
+    known = [case.number for case in cases]
+    unknown = sorted(set(numbers) - set(known))
+    if unknown:
+        raise ValueError(f"run_cases: there is no case {', '.join(map(str, unknown))}; they go from 1 to {max(known)}.")
+    chosen, rows = [case for case in cases if not numbers or case.number in numbers], []
+    for k, case in enumerate(chosen):
+        progress(f"{case.number} {case.title}", k, len(chosen))
+        start = time.perf_counter()
+        outcome = _outcome(case, full)
+        rows.append(Row(case, outcome, time.perf_counter() - start))
+    progress("done", len(chosen), len(chosen))
+    return Report(tuple(rows), full)
+
+
+def _outcome(case: Case, full: bool) -> Outcome:
+    if case.does_not_apply:
+        return Outcome(case.does_not_apply, None)
+    try:
+        return case.run(full)
+    except Exception as error:  # whatever it is, the other cases are worth having
+        return Outcome(f"raised {type(error).__name__}: {error}", False)
