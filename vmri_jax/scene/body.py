@@ -6,7 +6,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, require_x64
 
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3
@@ -32,7 +32,7 @@ class Body:
 
     Raises:
         ValueError: an empty name, a mass or radius that is not positive, numbers that are not finite, shapes that do not
-            match, another pace.
+            match, another pace, 64-bit mode off.
     """
 
     name: str
@@ -44,6 +44,7 @@ class Body:
     block: bool = False
 
     def __post_init__(self):
+        require_x64()
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"Body: name is {self.name!r}; it must be a string that is not empty.")
         if self.pace not in ("slow", "fast", "auto"):
