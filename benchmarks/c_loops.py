@@ -84,7 +84,12 @@ def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int)
     """
     kinetic = problem.system.kinetic
     unit = all(np.array_equal(np.asarray(m), np.ones(len(problem.q_s))) for m in (kinetic.slow, kinetic.fast))  # pyright: ignore[reportAttributeAccessIssue]
-    _check("fpu", unit and problem.system.slow_potential.function is soft_springs, num_micro, num_macro_steps)
+    _check(
+        "fpu",
+        unit and getattr(problem.system.slow_potential, "function", None) is soft_springs,
+        num_micro,
+        num_macro_steps,
+    )
     omega = float(problem.system.params["omega"])
     return _loop("fpu", problem, len(problem.q_s), omega, num_micro, micro_dt, num_macro_steps)
 
@@ -99,13 +104,13 @@ def tsp(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e
         NoCompiler: there is no C compiler.
         ValueError: another system, or less than one step.
     """
-    _check("tsp", problem.system.fast_potential.function is spring, num_steps)
+    _check("tsp", getattr(problem.system.fast_potential, "function", None) is spring, num_steps)
     return _rattle("tsp", problem, ("lengths", "stiffness", "gravity"), micro_dt, num_steps, tolerance)
 
 
 def sam(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:
     """RATTLE, `fully_explicit(1)`, on a `simple_atomic_model`; arguments and errors as for `tsp`."""
-    _check("sam", problem.system.slow_potential.function is slow_forces, num_steps)
+    _check("sam", getattr(problem.system.slow_potential, "function", None) is slow_forces, num_steps)
     return _rattle("sam", problem, ("stiffness", "length", "gravity"), micro_dt, num_steps, tolerance)
 
 

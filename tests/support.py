@@ -21,7 +21,9 @@ compiled_step = jax.jit(macro_step)
 
 def without_fallback(system, scheme) -> Newton:
     """The default iteration; where it is the nested march, without the exact solve behind it, which takes long to compile."""
-    return Newton().alone(system, scheme)
+    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
+    local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
+    return Newton("nested") if system.has_constant_mass and local else Newton()
 
 
 def relative_difference(value, expected) -> float:

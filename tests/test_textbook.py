@@ -17,7 +17,7 @@ STRUCTURES = {
     "slow and fast apart": rs.Structure(
         2, 1, 2, **SPRINGS, constraint="anchored", slow_constraint="sphere", scheme="explicit slow", num_micro=3
     ),
-    "march": rs.Structure(
+    "nested": rs.Structure(
         2, 1, 2, "matrix", **SPRINGS, constraint="rod", slow_constraint="norm", scheme="fully explicit", num_micro=4
     ),
     "march that moves": rs.Structure(

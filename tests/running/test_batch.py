@@ -155,7 +155,7 @@ print("same")
 def test_a_lane_off_the_constraints_has_failed(tsp):
     states = jax.tree.map(lambda a: jnp.stack([a, a]), tsp.state())
     states = eqx.tree_at(lambda s: s.q_f, states, states.q_f.at[1].multiply(1.01))
-    march = Newton("march")  # spares the arrowhead, which would fail too
+    march = Newton("nested")  # spares the arrowhead, which would fail too
     run = simulate_batch(tsp.system, fully_implicit(2), states, macro_dt=0.01, num_steps=2, newton=march)
     assert run.result.tolist() == [Result.CONVERGED, Result.CONSTRAINT_VIOLATED]
     assert run.failed_at.tolist() == [-1, 0]

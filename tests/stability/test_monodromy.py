@@ -8,7 +8,7 @@ from tests.stability.systems import double_pendulum
 from vmri_jax import Newton, fully_explicit, initial_state
 from vmri_jax.stability import linear_model, monodromy, multipliers, small_motions, stability_map
 
-MARCH = Newton(method="march")
+MARCH = Newton(method="nested")
 
 
 def test_powers_of_a_linear_step():

@@ -166,7 +166,7 @@ def test_saddles_solve_the_matrix_that_is_written_down(name, request):
 def test_it_solves_the_equations_of_the_step(name, scheme, macro_dt, request):
     system, state = start_of(name, request)
     (found, info), (expected, _) = (
-        phases(system, scheme, state, Newton(method), macro_dt) for method in ("march", "arrowhead")
+        phases(system, scheme, state, Newton(method), macro_dt) for method in ("nested", "arrowhead")
     )
     assert int(info.method.max()) == Method.MARCH
     assert largest_difference(found, expected) / np.abs(expected).max() < 1e-12  # measured 1e-14
@@ -182,7 +182,7 @@ def test_what_is_accepted_is_within_the_tolerance(name, request):
 
     exact = positions(Newton("arrowhead"))
     for tolerance in (1e-3, 1e-9):
-        found = positions(Newton("march", tolerance))
+        found = positions(Newton("nested", tolerance))
         assert largest_difference(found, exact) < tolerance * np.abs(np.diff(exact, axis=0)).max()
 
 
@@ -198,7 +198,7 @@ def test_where_it_fails_the_whole_equations_are_asked(tsp):
     fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)
     step = {"macro_dt": 0.2, "num_steps": 1, "throw": False}
     march, auto = (
-        simulate(tsp.system, galerkin(1, 2), fast, newton=Newton(method), **step) for method in ("march", "auto")
+        simulate(tsp.system, galerkin(1, 2), fast, newton=Newton(method), **step) for method in ("nested", "auto")
     )
     assert not Result(int(march.result)).success
     assert int(auto.info.method[0]) == Method.ARROWHEAD

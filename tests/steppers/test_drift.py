@@ -57,7 +57,7 @@ def started(name, request) -> tuple[System, State]:
 def test_it_solves_the_equations_of_the_step(name, composed, request):
     system, start = started(name, request)
     scheme = compose(fully_explicit(1), "suzuki4") if composed else fully_explicit(1)
-    (found, info), (expected, _) = (phases(system, Newton(method), scheme, start) for method in ("march", "arrowhead"))
+    (found, info), (expected, _) = (phases(system, Newton(method), scheme, start) for method in ("nested", "arrowhead"))
     assert int(info.method.max()) == Method.MARCH
     assert largest_difference(found, expected) / np.abs(expected).max() < 1e-13  # measured 1.4e-14
 
@@ -67,7 +67,7 @@ def test_it_solves_the_equations_of_the_step(name, composed, request):
 def test_what_is_accepted_is_within_the_tolerance(name, tolerance, request):
     problem = request.getfixturevalue(name)
     n = problem.q_s.size + problem.q_f.size
-    exact, found = (phases(problem, newton)[0][:, :n] for newton in (Newton("arrowhead"), Newton("march", tolerance)))
+    exact, found = (phases(problem, newton)[0][:, :n] for newton in (Newton("arrowhead"), Newton("nested", tolerance)))
     motion = np.abs(np.diff(exact, axis=0)).max()
     assert largest_difference(found, exact) < tolerance * motion
 
@@ -99,7 +99,7 @@ def test_where_it_fails_the_whole_equations_are_asked(tsp):
     fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)
     step = {"macro_dt": 0.2, "num_steps": 1, "throw": False}
     march, auto = (
-        simulate(tsp.system, fully_explicit(1), fast, newton=Newton(method), **step) for method in ("march", "auto")
+        simulate(tsp.system, fully_explicit(1), fast, newton=Newton(method), **step) for method in ("nested", "auto")
     )
     assert Result(int(march.result)) is Result.NON_FINITE
     assert Result(int(auto.result)) is Result.STAGNATED

@@ -80,7 +80,7 @@ def test_solution_does_not_depend_on_the_method(tsp):
     [
         (
             {"method": "sparse"},
-            "method is 'sparse'; it must be one of auto, march, frozen, decoupled, arrowhead, dense",
+            "method is 'sparse'; it must be one of auto, nested, arrowhead, dense",
         ),
         ({"tolerance": 0.0}, "tolerance is 0.0; it must be positive"),
         ({"max_iterations": 0}, "max_iterations is 0; it must be positive"),

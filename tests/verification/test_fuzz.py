@@ -31,7 +31,7 @@ STRUCTURES = {
         constraint="chain",
         scheme="fully explicit",
         num_micro=3,
-        method="march",
+        method="nested",
     ),
     "a constraint that crosses itself": rs.Structure(
         dimension=2, fast_potential="finitely extensible", constraint="product", num_micro=2, method="arrowhead"

@@ -19,7 +19,7 @@ def scheme_of(case):
     )
 
 
-OTHERS = ("march", "frozen", "decoupled", "arrowhead")
+OTHERS = ("nested", "arrowhead")
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def simulate(
     save_every: Annotated[
         int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
     ] = None,
-    method: Annotated[str, typer.Option(help="auto, march, frozen, decoupled, arrowhead or dense.")] = "auto",
+    method: Annotated[str, typer.Option(help="auto, nested, arrowhead or dense.")] = "auto",
     out: Annotated[
         Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr all along the run.")
     ] = None,

@@ -1,6 +1,6 @@
 """What a discrete trajectory should keep, and how to see whether it does."""
 
-from vmri_jax.diagnostics.invariants import (
+from vmri_jax.mechanics.invariants import (
     all_constraints,
     constraint_residual,
     energy,

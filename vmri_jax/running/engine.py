@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import diagnostics
+from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -142,7 +142,7 @@ def _node(system: System, tolerance, at: _At):
     """
     state = at.state
     phase = state.q_s, state.q_f, state.p_s, state.p_f
-    energy, residual = diagnostics.energy(system, *phase), diagnostics.constraint_residual(system, state)
+    energy, residual = invariants.energy(system, *phase), invariants.constraint_residual(system, state)
     finite, kept = jnp.isfinite(energy), residual[0] <= jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
     breaks = (at.failed_at < 0) & ~(finite & kept)
     cause = jnp.where(finite, Result.CONSTRAINT_VIOLATED, Result.NON_FINITE)
