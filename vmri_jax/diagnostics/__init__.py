@@ -1,5 +1,7 @@
 """What a discrete trajectory should keep, and how to see whether it does."""
 
+from vmri_jax.diagnostics.linear import frequencies, step_condition, symplectic_defect, tangents
+from vmri_jax.diagnostics.orders import OrderFit, fit_order, observed_order
 from vmri_jax.mechanics.invariants import (
     all_constraints,
     constraint_residual,
@@ -11,8 +13,6 @@ from vmri_jax.mechanics.invariants import (
     translation_along,
     velocity,
 )
-from vmri_jax.diagnostics.linear import frequencies, step_condition, symplectic_defect, tangents
-from vmri_jax.diagnostics.orders import OrderFit, fit_order, observed_order
 
 __all__ = [
     "OrderFit",

@@ -7,11 +7,11 @@ import numpy as np
 from vmri_jax.mechanics.invariants import all_constraints, potentials, velocity
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton, dense
-from vmri_jax.running.macro_step import macro_step
 
 
 def tangents(system: System, t, z, splits):
