@@ -139,16 +139,19 @@ def test_equal_masses_converge():
 
 
 @pytest.mark.parametrize(
-    ("scheme", "method"),
+    ("scheme", "force", "method"),
     [
-        (fully_explicit(4), Method.EXPLICIT),
-        (explicit_slow(4), Method.LINEAR),
-        (fully_implicit(4), Method.MARCH),
+        (fully_explicit(4), None, Method.EXPLICIT),
+        (explicit_slow(4), None, Method.LINEAR),
+        (fully_implicit(4), None, Method.MARCH),
+        (explicit_slow(4), drag, Method.MARCH),
     ],
 )
-def test_info_says_how_a_step_was_solved(fpu, scheme, method):
-    run = simulate(fpu.system, scheme, fpu.state(), macro_dt=0.01, num_steps=20)
+def test_info_says_how_a_step_was_solved(fpu, scheme, force, method):
+    """Only kicks by V let slow and fast variables go their own ways; a force couples them."""
+    run = simulate(fpu.system.replace(force=force), scheme, fpu.state(), macro_dt=0.01, num_steps=20)
     assert np.all(run.info.method == method)
+    assert method != Method.EXPLICIT or np.all(run.info.iterations == 0)
 
 
 def test_terms_inside_the_macro_interval_take_the_arrowhead(fpu):

@@ -7,7 +7,7 @@ import pytest
 
 from tests.support import largest_difference
 from tests.user_systems import stiff_spring, two_oscillators
-from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, macro, micro, quadrature, simulate
+from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, macro, micro, quadrature, simulate, systems
 
 H, STEPS = 0.02, 25
 
@@ -85,6 +85,36 @@ def test_many_explicit_micro_steps_are_the_impulse_method(fpu):
         p = p - H / 2 * np.asarray(gradient(q))
         assert largest_difference(joined(run)[0][k + 1], q) < 1e-12
         assert largest_difference(joined(run)[1][k + 1], p) < 1e-12
+
+
+@pytest.mark.parametrize(("springs", "num_micro"), [(3, 4), (200, 1), (200, 2), (200, 5), (200, 6)])
+def test_implicit_micro_steps_of_linear_springs(springs, num_micro):
+    """Kick by V, num_micro steps of the midpoint rule for W, kick by V: also where the chain is long."""
+    problem, omega = systems.fermi_pasta_ulam(springs), 50.0
+    run = simulate(problem.system, explicit_slow(num_micro), problem.state(), macro_dt=H, num_steps=5, save_micro=True)
+    gradient = jax.jit(jax.grad(lambda q: problem.system.slow_potential(q[:springs], q[springs:], None)))
+    q, p = start_of(problem)
+    h, stiff = H / num_micro, np.repeat([0.0, omega**2], springs)
+    for k in range(5):
+        p = p - H / 2 * np.asarray(gradient(q))
+        for m in range(num_micro):
+            middle = (q + h / 2 * p) / (1 + h**2 / 4 * stiff)
+            q, p = 2 * middle - q, p - h * stiff * middle
+            assert largest_difference(run.q_f_micro[k, m], q[springs:]) < 1e-12
+        p = p - H / 2 * np.asarray(gradient(q))
+        assert largest_difference(joined(run)[0][k + 1], q) < 1e-12
+        assert largest_difference(joined(run)[1][k + 1], p) < 1e-11
+
+
+def test_derivative_of_linear_micro_steps_of_a_long_chain():
+    problem = systems.fermi_pasta_ulam(200)
+
+    def end(macro_dt):
+        run = simulate(problem.system, explicit_slow(6), problem.state(), macro_dt=macro_dt, num_steps=2)
+        return jnp.sum(run.p_f[-1][:3])
+
+    slope = float(jax.jit(jax.grad(end))(H))
+    assert slope == pytest.approx(float(end(H + 1e-6) - end(H - 1e-6)) / 2e-6, rel=1e-7)
 
 
 def test_one_explicit_micro_step_with_constraints_is_rattle(tsp):
