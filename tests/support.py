@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import Newton, macro_step, simulate, systems
+from vmri_jax import Newton, State, macro_step, simulate, systems
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -21,6 +22,18 @@ NUM_SAVES = 50
 
 compiled_step = jax.jit(macro_step)
 """``(system, scheme, state, macro_dt, newton) -> (state, info)``, compiled once per structure."""
+
+
+@jax.jit
+def step_matrix(system, scheme, macro_dt):
+    """Derivative of a macro step of one slow and one fast variable by ``(q_s, q_f, p_s, p_f)``, at rest."""
+
+    def step(z):
+        state = State(jnp.zeros(()), *jnp.split(z, 4))
+        end, _ = macro_step(system, scheme, state, macro_dt, without_fallback(system, scheme))
+        return jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
+
+    return jax.jacfwd(step)(jnp.zeros(4))
 
 
 def without_fallback(system, scheme) -> Newton:
