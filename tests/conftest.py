@@ -1,26 +1,75 @@
-"""64-bit floats before anything else, and what many tests share."""
+"""JAX set up as users set it up, before anything else, and what many tests share."""
 
 import os
 import signal
-
-# Most of the time goes into compiling; with the older code generator of XLA it takes three quarters of it.
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+import sys
+from pathlib import Path
 
 import jax
 import pytest
 from hypothesis import settings
 
-jax.config.update("jax_enable_x64", True)
-
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=50)
 settings.load_profile("repeatable")
+
+MANY_MAPS = 20_000
+"""Memory maps of a process from which on compiled programs are forgotten; Linux allows 65 530."""
+LONGEST = ("verification", "steppers")
+"""Folders whose files take longest come first, so that workers end together."""
+
+
+def pytest_addoption(parser):
+    parser.addoption("--full", action="store_true", help="also the tests that take long")
+    parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
+    parser.addoption(
+        "--kernels", choices=["plain", "cpu"], help="which small dense algebra; default: the package's own"
+    )
+
+
+def pytest_configure(config):
+    kernels = config.getoption("--kernels")
+    if kernels is not None:
+        if "vmri_jax" in sys.modules:
+            raise pytest.UsageError(
+                "--kernels: vmri_jax is imported already; import it in fixtures of conftest.py only"
+            )
+        os.environ["VMRI_KERNELS"] = kernels  # read where the package is imported, also in processes of tests
+    from vmri_jax import runtime
+
+    runtime.configure()
+
+
+def pytest_collection_modifyitems(config, items):
+    items.sort(key=lambda item: item.path.parent.name not in LONGEST)
+    if not config.getoption("--full"):
+        for item in items:
+            if item.get_closest_marker("full"):
+                item.add_marker(pytest.mark.skip(reason="takes long; run with --full"))
 
 
 @pytest.fixture(scope="module", autouse=True)
 def forget_programs():
-    """Compiled programs of a module go when it is done: each holds memory maps, of which a process has only so many."""
+    """Compiled programs go when they hold too many memory maps; until then other modules share them."""
     yield
-    jax.clear_caches()
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_text().splitlines()) > MANY_MAPS:
+        jax.clear_caches()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def default_method(request):
+    """`Newton()` with the method of the command line: the tests hold for every method."""
+    from vmri_jax import Newton
+
+    method = request.config.getoption("--method")
+    if method is None:
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        defaults = Newton.__init__.__defaults__ or ()
+        patch.setattr(Newton.__init__, "__defaults__", (method, *defaults[1:]))
+        assert Newton().method == method
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -53,31 +102,3 @@ def ctrl_c():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
-
-
-def pytest_collection_modifyitems(config, items):
-    if not config.getoption("--full"):
-        for item in items:
-            if item.get_closest_marker("full"):
-                item.add_marker(pytest.mark.skip(reason="takes long; run with --full"))
-
-
-def pytest_addoption(parser):
-    parser.addoption("--full", action="store_true", help="also the tests that take long")
-    parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
-
-
-@pytest.fixture(scope="session", autouse=True)
-def default_method(request):
-    """`Newton()` with the method of the command line: the tests hold for every method."""
-    from vmri_jax import Newton
-
-    method = request.config.getoption("--method")
-    if method is None:
-        yield
-        return
-    with pytest.MonkeyPatch.context() as patch:
-        defaults = Newton.__init__.__defaults__ or ()
-        patch.setattr(Newton.__init__, "__defaults__", (method, *defaults[1:]))
-        assert Newton().method == method
-        yield

@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import Newton, macro_step, simulate, systems
+from vmri_jax import Newton, State, macro_step, simulate, systems
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -15,8 +16,24 @@ PROBLEMS = {
 }
 
 
+NUM_SAVES = 50
+"""Saved intervals of most runs: of one number, so that tests share compiled runs."""
+
+
 compiled_step = jax.jit(macro_step)
 """``(system, scheme, state, macro_dt, newton) -> (state, info)``, compiled once per structure."""
+
+
+@jax.jit
+def step_matrix(system, scheme, macro_dt):
+    """Derivative of a macro step of one slow and one fast variable by ``(q_s, q_f, p_s, p_f)``, at rest."""
+
+    def step(z):
+        state = State(jnp.zeros(()), *jnp.split(z, 4))
+        end, _ = macro_step(system, scheme, state, macro_dt, without_fallback(system, scheme))
+        return jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
+
+    return jax.jacfwd(step)(jnp.zeros(4))
 
 
 def without_fallback(system, scheme) -> Newton:
@@ -48,19 +65,20 @@ def masses(problem) -> np.ndarray:
     return np.concatenate([np.asarray(kinetic.slow), np.asarray(kinetic.fast)])
 
 
-def convergence(problem, scheme, truth: dict, steps, num_saves: int):
-    """Step sizes, and sup over the saved nodes of the largest error of the positions and of the momenta.
+def convergence(problem, scheme, truth: dict, steps, num_saves: int = NUM_SAVES, only_end: bool = False):
+    """Step sizes, and largest errors of the positions and of the momenta over the saved nodes, or at the end alone.
 
     `steps` are numbers of macro steps up to the end of the truth, multiples of `num_saves`, which divides 100.
     """
     every = 100 // num_saves
     length = truth["t"][-1]
     q_true, p_true = truth["q"][::every], masses(problem) * truth["v"][::every]
+    nodes = slice(-1, None) if only_end else slice(None)
     errors = []
     for n in steps:
         run = simulate(
             problem.system, scheme, problem.state(), macro_dt=length / n, num_steps=n, save_every=n // num_saves
         )
         q, p = np.concatenate([run.q_s, run.q_f], axis=1), np.concatenate([run.p_s, run.p_f], axis=1)
-        errors.append((np.abs(q - q_true).max(), np.abs(p - p_true).max()))
+        errors.append((np.abs(q - q_true)[nodes].max(), np.abs(p - p_true)[nodes].max()))
     return length / np.asarray(steps), *np.transpose(errors)

@@ -49,26 +49,27 @@ def test_float32_data(fpu):
         )
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
+def test_64_bit_mode_off():
+    calls = [
         "vmri_jax.systems.fermi_pasta_ulam()",
         "vmri_jax.initial_state(None, [1.0], [1.0], [0.0], [0.0])",
         "vmri_jax.simulate(None, vmri_jax.fully_implicit(2), None, macro_dt=0.1, num_steps=1)",
-    ],
-)
-def test_64_bit_mode_off(call):
+    ]
     program = f"""
 import vmri_jax
-try:
-    {call}
-except ValueError as error:
-    print(error)
+for call in {calls}:
+    try:
+        eval(call)
+    except ValueError as error:
+        print(str(error).replace(chr(10), " "))
 """
     environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True)
-    assert "needs 64-bit floats" in done.stdout
-    assert 'jax.config.update("jax_enable_x64", True)' in done.stdout
+    messages = done.stdout.splitlines()
+    assert len(messages) == len(calls)
+    for message in messages:
+        assert "needs 64-bit floats" in message
+        assert 'jax.config.update("jax_enable_x64", True)' in message
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from vmri_jax import ConstantMass, Problem, System
+from vmri_jax import ConstantMass, Problem, Rheonomic, State, System, initial_state
 
 
 # --- one slow and one fast oscillator, coupled by a soft spring ------------------------------------------------------
@@ -96,3 +96,30 @@ def lifted(t, q_s, q_f, params):
 def sphere(q_s, params):
     """The slow variables on a circle."""
     return jnp.sum(q_s**2, keepdims=True) - 1.0
+
+
+# --- a full mass matrix and constraints of all kinds -----------------------------------------------------------------
+def tilted(q_s, q_f, params):
+    return params * (q_s[1] + q_f[1]) + jnp.sum(q_s) * jnp.sum(q_f) / 5
+
+
+def tied_system() -> tuple[System, State]:
+    """Coupling constraints, one of them moved, and slow ones; and a consistent start."""
+    system = System(FULL_MASS, tilted, constraint=Rheonomic(lifted), slow_constraint=sphere, params=jnp.asarray(3.0))
+    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1])
+
+
+# --- a pendulum on a cart at a spring --------------------------------------------------------------------------------
+def cart_spring(q_s, q_f, params):
+    return params * jnp.sum(q_s**2) + 9.81 * q_f[1]
+
+
+def rod(q_s, q_f, params):
+    return (jnp.sum((q_f - jnp.append(q_s, 0.0)) ** 2, keepdims=True) - 0.25) / 2
+
+
+def cart() -> Problem:
+    """The cart is slow, the bob fast; the parameter is the stiffness of the spring."""
+    system = System(ConstantMass([3.0], [1.0, 1.0]), cart_spring, constraint=rod, params=jnp.asarray(20.0))
+    zero = jnp.zeros(1)
+    return Problem(system, zero, jnp.array([0.0, -0.5]), zero, jnp.array([0.4, 0.0]))

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -9,15 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.support import largest_difference
+from tests.support import PROBLEMS, largest_difference
 from vmri_jax import (
     Method,
     Newton,
     Result,
     State,
+    compose,
     explicit_slow,
     fully_explicit,
     fully_implicit,
+    galerkin,
+    initial_state,
     simulate,
     simulate_batch,
 )
@@ -31,44 +35,114 @@ def spread(problem, lanes: int) -> State:
     return State(jnp.zeros(lanes), q_s, q_f, scale * state.p_s, scale * state.p_f)
 
 
+RUN = {"num_steps": 20, "save_every": 5}
+WAYS = {  # system, scheme, macro_dt, largest difference of a lane from its single run
+    "kicks": ("fpu", fully_explicit(5), 0.05, 1e-13),  # measured 3e-15
+    "linear fast equations": ("fpu", explicit_slow(5), 0.05, 1e-13),
+    "nested": ("tsp", fully_implicit(5), 0.005, 1e-13),
+    "drift along constraints": ("tsp", fully_explicit(1), 0.002, 1e-13),
+    "collocation": ("tsp", galerkin(1, 3), 0.02, 1e-12),
+    "composition": ("fpu", compose(fully_explicit(3), "yoshida4"), 0.02, 1e-13),
+}
+
+
+def lane_of(states: State, lane: int) -> State:
+    return jax.tree.map(lambda a: a[lane], states)
+
+
+@cache
+def single(way: str, lane: int):
+    """The run of one of five lanes."""
+    name, scheme, macro_dt, _ = WAYS[way]
+    problem = PROBLEMS[name]()
+    return simulate(problem.system, scheme, lane_of(spread(problem, 5), lane), macro_dt=macro_dt, **RUN)
+
+
 @pytest.mark.parametrize(
-    ("name", "scheme", "macro_dt"),
-    [("fpu", fully_explicit(5), 0.05), ("fpu", explicit_slow(5), 0.05), ("tsp", fully_implicit(5), 0.005)],
+    ("way", "chunk"), [(way, None) for way in WAYS] + [(way, 2) for way in ("kicks", "linear fast equations", "nested")]
 )
-@pytest.mark.parametrize("chunk", [None, 2])
-def test_lanes_equal_single_runs(name, scheme, macro_dt, chunk, request):
-    problem = request.getfixturevalue(name)
-    states = spread(problem, 5)
-    batch = simulate_batch(problem.system, scheme, states, macro_dt=macro_dt, num_steps=20, save_every=5, chunk=chunk)
+def test_lanes_equal_single_runs(way, chunk):
+    name, scheme, macro_dt, bound = WAYS[way]
+    problem = PROBLEMS[name]()
+    batch = simulate_batch(problem.system, scheme, spread(problem, 5), macro_dt=macro_dt, chunk=chunk, **RUN)
     assert batch.q_f.shape == (5, 5, problem.q_f.size)
     assert np.all(np.asarray(batch.result) <= Result.CONVERGED_AT_ROUNDOFF)
     for lane in (0, 4):
-        state = jax.tree.map(lambda a, lane=lane: a[lane], states)
-        single = simulate(problem.system, scheme, state, macro_dt=macro_dt, num_steps=20, save_every=5)
-        assert largest_difference(batch.q_f[lane], single.q_f) < 1e-13  # measured 3e-15
-        assert largest_difference(batch.t[lane], single.t) == 0
+        assert largest_difference(batch.q_f[lane], single(way, lane).q_f) < bound
+        assert largest_difference(batch.t[lane], single(way, lane).t) == 0
 
 
-def test_step_sizes_and_params_per_lane(fpu):
-    steps, omegas = jnp.array([0.01, 0.02, 0.03]), jnp.array([30.0, 50.0, 60.0])
-    batch = simulate_batch(
-        fpu.system, fully_implicit(4), spread(fpu, 3), macro_dt=steps, num_steps=10, params={"omega": omegas}
-    )
+STEPS, OMEGAS = jnp.array([0.01, 0.02, 0.03]), jnp.array([30.0, 50.0, 60.0])
+
+
+def batch_of_three(fpu, states: State):
+    """Each lane with a step size and a stiffness of its own."""
+    return simulate_batch(fpu.system, fully_implicit(4), states, macro_dt=STEPS, num_steps=10, params={"omega": OMEGAS})
+
+
+@pytest.fixture(scope="module")
+def three(fpu):
+    return batch_of_three(fpu, spread(fpu, 3))
+
+
+def test_step_sizes_and_params_per_lane(fpu, three):
     for lane in range(3):
-        system = fpu.system.replace(params={"omega": omegas[lane]})
-        state = jax.tree.map(lambda a, lane=lane: a[lane], spread(fpu, 3))
-        single = simulate(system, fully_implicit(4), state, macro_dt=steps[lane], num_steps=10)
-        assert largest_difference(batch.p_f[lane], single.p_f) < 1e-12
+        system = fpu.system.replace(params={"omega": OMEGAS[lane]})
+        state = lane_of(spread(fpu, 3), lane)
+        alone = simulate(system, fully_implicit(4), state, macro_dt=STEPS[lane], num_steps=10)
+        assert largest_difference(three.p_f[lane], alone.p_f) < 1e-12
 
 
-def test_a_failing_lane_leaves_the_others_alone(fpu):
+def test_a_failing_lane_leaves_the_others_alone(fpu, three):
     states = spread(fpu, 3)
     states = State(states.t, states.q_s.at[1, 0].set(1e200), states.q_f, states.p_s, states.p_f)
-    batch = simulate_batch(fpu.system, fully_implicit(4), states, macro_dt=0.02, num_steps=10)
+    batch = batch_of_three(fpu, states)
     assert np.asarray(batch.failed_at).tolist() == [-1, 0, -1]
     assert bool(jnp.all(jnp.isnan(batch.q_f[1, 1:])))
-    alone = simulate_batch(fpu.system, fully_implicit(4), spread(fpu, 3), macro_dt=0.02, num_steps=10)
-    assert largest_difference(batch.q_f[2], alone.q_f[2]) == 0
+    assert largest_difference(batch.q_f[2], three.q_f[2]) == 0
+
+
+LANES, BAD = 64, 7
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme", "macro_dt", "newton"),
+    [("fpu", fully_implicit(3), 0.05, Newton()), ("tsp", explicit_slow(3), 0.02, Newton("march"))],
+)
+def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, newton):
+    """Over starts, step sizes and parameters. One start has velocities beyond what a double can square."""
+    problem, rng = PROBLEMS[name](), np.random.default_rng(5)
+    v_s = problem.v_s + 0.3 * rng.normal(size=(LANES, problem.v_s.size))
+    v_f = problem.v_f + 0.3 * rng.normal(size=(LANES, problem.v_f.size))
+    v_f[BAD] *= 1e200
+    steps = macro_dt * np.linspace(0.2, 1.0, LANES)
+    params = {key: value * np.linspace(0.4, 1.0, LANES) for key, value in scalars(problem).items()}
+
+    def go(v_s, v_f, macro_dt, params):
+        system = problem.system.replace(params=problem.system.params | params)
+        state = initial_state(system, problem.q_s, problem.q_f, v_s, v_f)
+        return simulate(system, scheme, state, macro_dt=macro_dt, newton=newton, throw=False, **RUN)
+
+    batch = jax.jit(jax.vmap(go))(v_s, v_f, steps, params)
+    assert batch.q_f.shape == (LANES, 5, problem.q_f.size)
+    assert np.flatnonzero(~np.asarray(batch.success)).tolist() == [BAD]
+    assert Result(int(batch.result[BAD])) in (Result.NON_FINITE, Result.DIVERGED, Result.STAGNATED)
+    assert int(batch.failed_at[BAD]) == 0
+    assert np.isnan(batch.q_f[BAD, 1:]).all()
+    worst = 0.0
+    for lane in [*range(BAD), *range(BAD + 1, LANES)]:
+        alone = go(v_s[lane], v_f[lane], steps[lane], {key: value[lane] for key, value in params.items()})
+        assert largest_difference(batch.t[lane], alone.t) < 1e-15
+        for field in ("q_s", "q_f", "p_s", "p_f"):
+            a, b = np.asarray(getattr(batch, field)[lane]), np.asarray(getattr(alone, field))
+            worst = max(worst, largest_difference(a, b) / np.abs(b).max())
+        assert np.abs(np.asarray(batch.info.iterations[lane] - alone.info.iterations)).max() <= 1  # at the tolerance
+    assert worst < 3e-13  # measured 3.7e-14
+
+
+def scalars(problem) -> dict:
+    """The stiffness of a system: the parameter that lanes differ in."""
+    return {key: problem.system.params[key] for key in ("omega", "stiffness") if key in problem.system.params}
 
 
 def test_lanes_that_the_march_does_not_solve_are_solved_exactly(fpu):

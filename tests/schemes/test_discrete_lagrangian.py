@@ -116,7 +116,7 @@ def test_degree_two_is_a_sum_over_nodes(fpu, name):
 def test_discrete_legendre_transforms_are_slot_derivatives(fpu, scheme):
     s, f = control_points(scheme.degree)
     L_d = jax.jit(discrete_lagrangian(fpu.system, scheme))
-    start, end = discrete_legendre(fpu.system, scheme)(s, f, H)
+    start, end = jax.jit(discrete_legendre(fpu.system, scheme))(s, f, H)
     eps = 1e-5
     for (p_s, p_f), k, sign in ((start, 0, -1), (end, -1, 1)):
         for p, slot in ((p_s, s), (p_f, f)):

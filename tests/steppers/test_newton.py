@@ -1,6 +1,5 @@
 """Newton's iteration: how it ends, and how many iterations hard steps take."""
 
-import jax
 import jax.numpy as jnp
 import pytest
 from vmri_jax.steppers.newton.full import PLAIN_ITERATIONS
@@ -18,7 +17,7 @@ def step(problem, scheme, macro_dt, newton=EXACT, state=None):
 
 
 def test_a_plain_step_converges(fpu):
-    _, info, result = step(fpu, fully_implicit(5), 0.05)
+    _, info, result = step(fpu, fully_implicit(20), 0.05)
     assert result is Result.CONVERGED
     assert result.success
     assert 1 <= int(info.iterations) <= 4
@@ -26,7 +25,7 @@ def test_a_plain_step_converges(fpu):
 
 
 def test_too_few_iterations_stagnate(fpu):
-    _, info, result = step(fpu, fully_implicit(5), 0.05, Newton("arrowhead", max_iterations=1))
+    _, info, result = step(fpu, fully_implicit(20), 0.05, Newton("arrowhead", max_iterations=1))
     assert result is Result.STAGNATED
     assert not result.success
     assert int(info.iterations) == 1
@@ -36,13 +35,13 @@ def test_too_few_iterations_stagnate(fpu):
 def test_nan_is_reported(fpu):
     start = fpu.state()
     _, _, result = step(
-        fpu, fully_implicit(5), 0.05, state=State(start.t, start.q_s, start.q_f * jnp.nan, 0.0 * start.p_s, start.p_f)
+        fpu, fully_implicit(20), 0.05, state=State(start.t, start.q_s, start.q_f * jnp.nan, 0.0 * start.p_s, start.p_f)
     )
     assert result is Result.NON_FINITE
 
 
 def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
-    _, info, result = step(fpu, fully_implicit(5), 0.05, Newton("arrowhead", tolerance=1e-30))
+    _, info, result = step(fpu, fully_implicit(20), 0.05, Newton("arrowhead", tolerance=1e-30))
     assert result is Result.CONVERGED_AT_ROUNDOFF or result is Result.CONVERGED
     assert int(info.iterations) < 10
     assert float(info.residual) < 1e-13
@@ -50,8 +49,11 @@ def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
 
 @pytest.mark.parametrize(("macro_dt", "most"), [(0.01, 3), (0.05, 4)])
 def test_iterations_of_the_pendulum(tsp, macro_dt, most):
-    run = simulate(tsp.system, fully_implicit(5), tsp.state(), macro_dt=macro_dt, num_steps=100, newton=EXACT)
-    assert int(run.info.iterations.max()) <= most
+    state = tsp.state()
+    for _ in range(2):
+        run = simulate(tsp.system, fully_implicit(10), state, macro_dt=macro_dt, num_steps=60, newton=EXACT)
+        assert int(run.info.iterations.max()) <= most
+        state = run.final_state
 
 
 def test_iterations_of_a_large_macro_step(fpu):
@@ -66,13 +68,6 @@ def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(f
     assert result is Result.CONVERGED
     assert int(loose_info.iterations) < int(info.iterations)
     assert 1e-15 < largest_difference(loose.q_s, exact.q_s) < 1e-4
-
-
-def test_solution_does_not_depend_on_the_method(tsp):
-    scheme = fully_implicit(5)
-    ends = [step(tsp, scheme, 0.05, Newton(method=s))[0] for s in ("arrowhead", "dense")]
-    for a, b in zip(jax.tree.leaves(ends[0]), jax.tree.leaves(ends[1]), strict=True):
-        assert largest_difference(a, b) < 1e-10
 
 
 @pytest.mark.parametrize(

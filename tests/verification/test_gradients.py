@@ -1,12 +1,15 @@
 # pyright: reportCallIssue=false
 """Derivatives of a final position, by the implicit function theorem at each step, against central differences."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.support import PROBLEMS, without_fallback
+from tests.user_systems import cart
 from vmri_jax import Newton, State, fully_explicit, fully_implicit, galerkin, initial_state, simulate
 
 CASES = {
@@ -16,22 +19,7 @@ CASES = {
     "tsp, fully implicit": ("tsp", fully_implicit(3), 0.02, "stiffness", None),
     "sam, fully implicit": ("sam", fully_implicit(2), 0.02, "stiffness", 2),
 }
-
-
-def final_position(name, scheme, macro_dt, parameter, entry, newton):
-    """A function of one stiffness: the sum of cosines of the fast positions after 10 steps; by the march alone without `newton`."""
-    problem = PROBLEMS[name]()
-    state, newton = problem.state(), newton or without_fallback(problem.system, scheme)
-
-    def function(stiffness) -> jax.Array:
-        value = problem.system.params[parameter]
-        value = stiffness if entry is None else value.at[entry].set(stiffness)
-        system = problem.system.replace(params=problem.system.params | {parameter: value})
-        run = simulate(system, scheme, state, macro_dt=macro_dt, num_steps=10, save_every=5, newton=newton)
-        return jnp.sum(jnp.cos(run.q_f[-1] * jnp.arange(1, run.q_f.shape[1] + 1)))
-
-    value = problem.system.params[parameter]
-    return function, float(value if entry is None else value[entry])
+LONG = ("sam, fully implicit",)
 
 
 def central_difference(function, x, step):
@@ -40,68 +28,106 @@ def central_difference(function, x, step):
     return float((4 * d[1] - d[0]) / 3)
 
 
-@pytest.mark.parametrize("case", CASES)
+def final_position(case: str, newton: Newton | None = None):
+    """The sum of cosines of the fast positions after 10 steps as a function of ``(stiffness, v, q_f, macro_dt)``.
+
+    The start has the velocities v, projected onto the constraints, and the fast positions q_f; by the march alone where no
+    `newton` is given. Also the stiffness, v, q_f and step of the case.
+    """
+    name, scheme, macro_dt, parameter, entry = CASES[case]
+    problem = PROBLEMS[name]()
+    params, n_s = problem.system.params, problem.q_s.size
+    newton = newton or without_fallback(problem.system, scheme)
+
+    def function(stiffness, v, q_f, macro_dt) -> jax.Array:
+        value = stiffness if entry is None else params[parameter].at[entry].set(stiffness)
+        system = problem.system.replace(params=params | {parameter: value})
+        state = initial_state(problem.system, problem.q_s, problem.q_f, v[:n_s], v[n_s:])
+        state = State(state.t, state.q_s, q_f, state.p_s, state.p_f)
+        run = simulate(system, scheme, state, macro_dt=macro_dt, num_steps=10, save_every=5, newton=newton)
+        return jnp.sum(jnp.cos(run.q_f[-1] * jnp.arange(1, run.q_f.shape[1] + 1)))
+
+    stiffness = jnp.asarray(params[parameter] if entry is None else params[parameter][entry])
+    return function, (stiffness, jnp.concatenate([problem.v_s, problem.v_f]), problem.q_f, jnp.asarray(macro_dt))
+
+
+@cache
+def gradient_program(case: str):
+    """Value and gradient by all arguments in one compiled program, and the arguments of the case."""
+    function, at = final_position(case, Newton() if case == "fpu, fully implicit" else None)
+    return jax.jit(jax.value_and_grad(function, argnums=(0, 1, 2, 3))), at
+
+
+def along(case: str, argument: int, entry: int | None = None):
+    """The value as a function of one argument, or of one of its entries, alone."""
+    program, at = gradient_program(case)
+
+    def function(x):
+        value = x if entry is None else at[argument].at[entry].set(x)
+        return program(*at[:argument], value, *at[argument + 1 :])[0]
+
+    return function
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.full if c in LONG else ()) for c in CASES])
 def test_gradient_with_respect_to_a_stiffness(case):
-    function, x = final_position(*CASES[case], Newton() if case == "fpu, fully implicit" else None)
-    function = jax.jit(function)
-    expected = central_difference(function, x, 1e-3 * x)
-    reverse = float(jax.jit(jax.grad(function))(x))
+    program, at = gradient_program(case)
+    expected = central_difference(along(case, 0), at[0], 1e-3 * at[0])
     assert abs(expected) > 1e-9
-    assert reverse == pytest.approx(expected, rel=2e-7)  # measured 1.6e-8, 1e-6 wanted
+    assert float(program(*at)[1][0]) == pytest.approx(expected, rel=2e-7)  # measured 1.6e-8, 1e-6 wanted
+
+
+def test_gradient_with_respect_to_the_initial_velocities():
+    """Through the projection of the momenta onto the constraints."""
+    case = "tsp, fully implicit"
+    program, at = gradient_program(case)
+    expected = [central_difference(along(case, 1, i), at[1][i], 1e-2) for i in range(9)]
+    assert np.abs(expected).max() > 0.01
+    assert np.allclose(program(*at)[1][1], expected, rtol=1e-6, atol=1e-9)
+
+
+def test_gradient_with_respect_to_a_state_and_the_step():
+    case = "fpu, fully implicit"
+    program, at = gradient_program(case)
+    _, _, by_position, by_step = program(*at)[1]
+    expected = [central_difference(along(case, 2, i), at[2][i], 1e-3) for i in range(3)]
+    assert np.allclose(by_position, expected, rtol=1e-6, atol=1e-9)
+    assert float(by_step) == pytest.approx(central_difference(along(case, 3), at[3], 1e-4), rel=1e-5)
 
 
 def test_forward_reverse_and_both_methods_agree():
-    values = []
-    for solver in ("arrowhead", "dense"):
-        function, x = final_position(*CASES["tsp, fully implicit"], Newton(method=solver))
-        values += [float(jax.jit(jax.jacfwd(function))(x)), float(jax.jit(jax.grad(function))(x))]
+    problem = cart()
+    state = problem.state()
+
+    def end(weight, method):
+        run = simulate(
+            problem.system.replace(params=weight),
+            fully_implicit(2),
+            state,
+            macro_dt=0.1,
+            num_steps=3,
+            save_every=3,
+            newton=Newton(method),
+        )
+        return jnp.sum(jnp.cos(run.q_f[-1] * jnp.arange(1, 3)))
+
+    at = problem.system.params
+    values = [
+        float(jax.jit(derivative(end), static_argnums=1)(at, method))
+        for method in ("arrowhead", "dense")
+        for derivative in (jax.jacfwd, jax.grad)
+    ]
+    assert abs(values[0]) > 1e-6
     assert np.allclose(values, values[0], rtol=1e-9, atol=0)
 
 
-def test_gradient_with_respect_to_the_initial_state(tsp):
-    """Initial velocities, through the projection of the momenta onto the constraints."""
-
-    scheme = fully_implicit(2)
-    newton = without_fallback(tsp.system, scheme)
-
-    @jax.jit
-    def height(v):
-        state = initial_state(tsp.system, tsp.q_s, tsp.q_f, v[:3], v[3:])
-        return simulate(tsp.system, scheme, state, macro_dt=0.02, num_steps=5, newton=newton).q_f[-1, 5]
-
-    v = jnp.concatenate([tsp.v_s, tsp.v_f])
-    gradient = jax.jit(jax.grad(height))(v)
-    expected = [central_difference(lambda x, i=i: height(v.at[i].set(x)), v[i], 1e-2) for i in range(9)]
-    assert np.abs(expected).max() > 0.01
-    assert np.allclose(gradient, expected, rtol=1e-6, atol=1e-9)
-
-
-def test_gradient_with_respect_to_a_state_and_the_step(fpu):
-    start, scheme = fpu.state(), fully_implicit(2)
-    newton = without_fallback(fpu.system, scheme)
-
-    @jax.jit
-    def end(q_f, macro_dt):
-        state = State(start.t, start.q_s, q_f, start.p_s, start.p_f)
-        return simulate(fpu.system, scheme, state, macro_dt=macro_dt, num_steps=5, newton=newton).q_f[-1, 0]
-
-    gradient, by_step = jax.jit(jax.grad(end, argnums=(0, 1)))(start.q_f, 0.05)
-    expected = [
-        central_difference(lambda x, i=i: end(start.q_f.at[i].set(x), 0.05), start.q_f[i], 1e-3) for i in range(3)
-    ]
-    assert np.allclose(gradient, expected, rtol=1e-6, atol=1e-9)
-    assert float(by_step) == pytest.approx(central_difference(lambda x: end(start.q_f, x), 0.05, 1e-3), rel=1e-5)
-
-
 @pytest.mark.parametrize("hessian", [jax.hessian, lambda f: jax.jacfwd(jax.jacfwd(f))], ids=["over reverse", "forward"])
-def test_second_derivative(fpu, hessian):
-    scheme = fully_implicit(2)
-    newton = without_fallback(fpu.system, scheme)
-
-    def end(omega):
-        system, steps = fpu.system.replace(params={"omega": omega}), {"macro_dt": 0.1, "num_steps": 3, "save_every": 3}
-        return simulate(system, scheme, fpu.state(), **steps, newton=newton).q_f[-1, 0]
-
-    slope, step = jax.jit(jax.grad(end)), 1e-3
-    difference = float(slope(50.0 + step) - slope(50.0 - step)) / (2 * step)
-    assert float(jax.jit(hessian(end))(50.0)) == pytest.approx(difference, rel=1e-6)  # measured 2e-9
+def test_second_derivative(hessian):
+    case = "fpu, fully implicit"
+    program, at = gradient_program(case)
+    function, _ = final_position(case)
+    step = 1e-3
+    slopes = [float(program(at[0] + h, *at[1:])[1][0]) for h in (step, -step)]
+    difference = (slopes[0] - slopes[1]) / (2 * step)
+    second = jax.jit(hessian(lambda stiffness: function(stiffness, *at[1:])))(at[0])
+    assert float(second) == pytest.approx(difference, rel=1e-6)

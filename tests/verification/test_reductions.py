@@ -1,111 +1,125 @@
-"""Known methods as special cases, each written out in numpy: midpoint variational integrator, Verlet, RATTLE."""
+"""Known methods as special cases, each written out in numpy: midpoint variational integrator, Verlet, impulses, RATTLE."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.support import largest_difference
+from tests.support import largest_difference, masses
 from tests.user_systems import stiff_spring, two_oscillators
-from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, macro, micro, quadrature, simulate
+from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, macro, micro, quadrature, simulate, systems
 
-H, STEPS = 0.02, 25
-
-
-def joined(run):
-    return np.concatenate([run.q_s, run.q_f], axis=1), np.concatenate([run.p_s, run.p_f], axis=1)
+H, STEPS, OMEGA = 0.02, 25, 50.0
 
 
-def force_of(problem):
-    """-dU/dq and its derivative, of all potentials together."""
+def forces(problem):
+    """``-dV/dq``, ``-dW/dq`` and the derivative of their sum, of all variables together."""
     system, n_s = problem.system, problem.q_s.size
 
-    def potential(q):
-        return system.slow_potential(q[:n_s], q[n_s:], system.params) + system.fast_potential(q[n_s:], system.params)
+    def slow(q):
+        return -system.slow_potential(q[:n_s], q[n_s:], system.params)
 
-    gradient, hessian = jax.jit(jax.grad(potential)), jax.jit(jax.hessian(potential))
-    return lambda q: -np.asarray(gradient(q)), lambda q: -np.asarray(hessian(q))
+    def fast(q):
+        return -system.fast_potential(q[n_s:], system.params)
+
+    def in_numpy(function):
+        compiled = jax.jit(function)
+        return lambda q: np.asarray(compiled(q))
+
+    slope = jax.hessian(lambda q: slow(q) + fast(q))
+    return in_numpy(jax.grad(slow)), in_numpy(jax.grad(fast)), in_numpy(slope)
 
 
-def start_of(problem):
-    state = problem.state()
-    return np.concatenate([state.q_s, state.q_f]), np.concatenate([state.p_s, state.p_f])
+def check(problem, scheme, step, macro_dt=H, num_steps=STEPS, p_bound=1e-12):
+    """A run of the scheme goes where ``q, p = step(q, p)`` goes."""
+    run = simulate(problem.system, scheme, problem.state(), macro_dt=macro_dt, num_steps=num_steps)
+    nodes_q, nodes_p = np.concatenate([run.q_s, run.q_f], axis=1), np.concatenate([run.p_s, run.p_f], axis=1)
+    q, p = nodes_q[0], nodes_p[0]
+    for k in range(num_steps):
+        q, p = step(q, p)
+        assert largest_difference(nodes_q[k + 1], q) < 1e-12
+        assert largest_difference(nodes_p[k + 1], p) < p_bound
 
 
 def test_one_implicit_micro_step_is_the_midpoint_variational_integrator(fpu):
-    run = simulate(fpu.system, fully_implicit(1), fpu.state(), macro_dt=H, num_steps=STEPS)
-    force, slope = force_of(fpu)
-    q, p = start_of(fpu)
-    for k in range(STEPS):
+    slow, fast, slope = forces(fpu)
+
+    def step(q, p):
         new = q + H * p
         for _ in range(8):  # p = (q+ - q) / H - H/2 F((q + q+) / 2), unit masses
-            residual = (new - q) / H - H / 2 * force((q + new) / 2) - p
-            new = new - np.linalg.solve(np.eye(6) / H - H / 4 * slope((q + new) / 2), residual)
-        p, q = (new - q) / H + H / 2 * force((q + new) / 2), new
-        assert largest_difference(joined(run)[0][k + 1], q) < 1e-12
-        assert largest_difference(joined(run)[1][k + 1], p) < 1e-12
+            middle = (q + new) / 2
+            residual = (new - q) / H - H / 2 * (slow(middle) + fast(middle)) - p
+            new = new - np.linalg.solve(np.eye(6) / H - H / 4 * slope(middle), residual)
+        middle = (q + new) / 2
+        return new, (new - q) / H + H / 2 * (slow(middle) + fast(middle))
+
+    check(fpu, fully_implicit(1), step)
 
 
-def test_one_explicit_micro_step_is_verlet(fpu):
-    run = simulate(fpu.system, fully_explicit(1), fpu.state(), macro_dt=H, num_steps=STEPS)
-    force, _ = force_of(fpu)
-    q, p = start_of(fpu)
-    for k in range(STEPS):
-        p = p + H / 2 * force(q)
-        q = q + H * p
-        p = p + H / 2 * force(q)
-        assert largest_difference(joined(run)[0][k + 1], q) < 1e-12
-        assert largest_difference(joined(run)[1][k + 1], p) < 1e-12
+@pytest.mark.parametrize(("num_micro", "alpha"), [(1, 0.5), (1, 1.0), (4, 0.5)], ids=["verlet", "euler", "r-RESPA"])
+def test_explicit_micro_steps_are_the_impulse_method(fpu, num_micro, alpha):
+    """Kick by V, num_micro steps of W by kicks and drifts, kick by V; a single one is Verlet's step, or symplectic Euler's."""
+    slow, fast, _ = forces(fpu)
+    h = H / num_micro
+
+    def step(q, p):
+        p = p + alpha * H * slow(q)
+        for _ in range(num_micro):
+            p = p + alpha * h * fast(q)
+            q = q + h * p
+            p = p + (1 - alpha) * h * fast(q)
+        return q, p + (1 - alpha) * H * slow(q)
+
+    check(fpu, fully_explicit(num_micro, alpha), step)
 
 
-def test_kicks_of_alpha_one_are_symplectic_euler(fpu):
-    run = simulate(fpu.system, fully_explicit(1, 1.0), fpu.state(), macro_dt=H, num_steps=STEPS)
-    force, _ = force_of(fpu)
-    q, p = start_of(fpu)
-    for k in range(STEPS):
-        p = p + H * force(q)
-        q = q + H * p
-        assert largest_difference(joined(run)[0][k + 1], q) < 1e-12
-        assert largest_difference(joined(run)[1][k + 1], p) < 1e-12
+@pytest.mark.parametrize(("springs", "num_micro"), [(3, 4), (200, 1), (200, 2), (200, 5), (200, 6)])
+def test_implicit_micro_steps_of_linear_springs(springs, num_micro):
+    """Kick by V, num_micro steps of the midpoint rule for W, kick by V: also where the chain is long."""
+    problem = systems.fermi_pasta_ulam(springs)
+    slow, _, _ = forces(problem)
+    h, stiff = H / num_micro, np.repeat([0.0, OMEGA**2], springs)
+
+    def step(q, p):
+        p = p + H / 2 * slow(q)
+        for _ in range(num_micro):
+            middle = (q + h / 2 * p) / (1 + h**2 / 4 * stiff)
+            q, p = 2 * middle - q, p - h * stiff * middle
+        return q, p + H / 2 * slow(q)
+
+    check(problem, explicit_slow(num_micro), step, num_steps=5, p_bound=1e-11)
 
 
-def test_many_explicit_micro_steps_are_the_impulse_method(fpu):
-    """Kick by V, num_micro Verlet steps of W, kick by V (r-RESPA)."""
-    n, omega = 4, 50.0
-    run = simulate(fpu.system, fully_explicit(n), fpu.state(), macro_dt=H, num_steps=STEPS)
-    gradient = jax.jit(jax.grad(lambda q: fpu.system.slow_potential(q[:3], q[3:], None)))
-    q, p = start_of(fpu)
-    stiff = np.repeat([0.0, omega**2], 3)
-    for k in range(STEPS):
-        p = p - H / 2 * np.asarray(gradient(q))
-        for _ in range(n):
-            p = p - H / n / 2 * stiff * q
-            q = q + H / n * p
-            p = p - H / n / 2 * stiff * q
-        p = p - H / 2 * np.asarray(gradient(q))
-        assert largest_difference(joined(run)[0][k + 1], q) < 1e-12
-        assert largest_difference(joined(run)[1][k + 1], p) < 1e-12
+def test_derivative_of_linear_micro_steps_of_a_long_chain():
+    problem = systems.fermi_pasta_ulam(200)
+
+    def end(macro_dt):
+        run = simulate(problem.system, explicit_slow(6), problem.state(), macro_dt=macro_dt, num_steps=5)
+        return jnp.sum(run.p_f[-1][:3])
+
+    slope = float(jax.jit(jax.grad(end))(H))
+    assert slope == pytest.approx(float(end(H + 1e-6) - end(H - 1e-6)) / 2e-6, rel=1e-7)
 
 
 def test_one_explicit_micro_step_with_constraints_is_rattle(tsp):
     macro_dt = 0.005
-    run = simulate(tsp.system, fully_explicit(1), tsp.state(), macro_dt=macro_dt, num_steps=STEPS)
-    force, _ = force_of(tsp)
+    slow, fast, _ = forces(tsp)
     constraints = jax.jit(lambda q: tsp.system.constraints(0.0, q[:3], q[3:]))
     jacobian = jax.jit(jax.jacrev(constraints))
-    mass = np.concatenate([tsp.system.kinetic.slow, tsp.system.kinetic.fast])
-    q, p = start_of(tsp)
-    for k in range(STEPS):
-        G, free, multiplier = np.asarray(jacobian(q)), p + macro_dt / 2 * force(q), np.zeros(2)
+    mass = masses(tsp)
+
+    def step(q, p):
+        G, free = np.asarray(jacobian(q)), p + macro_dt / 2 * (slow(q) + fast(q))
+        new, multiplier = q, np.zeros(2)
         for _ in range(12):  # g(q + H M^-1 (free - H/2 G^T lambda)) = 0
             new = q + macro_dt / mass * (free - macro_dt / 2 * G.T @ multiplier)
             slope = -(macro_dt**2) / 2 * np.asarray(jacobian(new)) / mass @ G.T
             multiplier = multiplier - np.linalg.solve(slope, np.asarray(constraints(new)))
-        q, p = new, free - macro_dt / 2 * G.T @ multiplier + macro_dt / 2 * force(new)
-        G = np.asarray(jacobian(q))
-        p = p - G.T @ np.linalg.solve(G / mass @ G.T, G @ (p / mass))
-        assert largest_difference(joined(run)[0][k + 1], q) < 1e-12
-        assert largest_difference(joined(run)[1][k + 1], p) < 1e-11  # slow momenta of size 100
+        p = free - macro_dt / 2 * G.T @ multiplier + macro_dt / 2 * (slow(new) + fast(new))
+        G = np.asarray(jacobian(new))
+        return new, p - G.T @ np.linalg.solve(G / mass @ G.T, G @ (p / mass))
+
+    check(tsp, fully_explicit(1), step, macro_dt, p_bound=1e-11)  # slow momenta of size 100
 
 
 def slow_well(q_s, q_f, params):

@@ -19,11 +19,8 @@ def scheme_of(case):
     )
 
 
-OTHERS = ("nested", "arrowhead")
-
-
 @pytest.mark.parametrize(
-    "method", ["auto", "dense", *(pytest.param(method, marks=pytest.mark.full) for method in OTHERS)]
+    "method", ["auto", "dense", *(pytest.param(method, marks=pytest.mark.full) for method in ("march", "arrowhead"))]
 )
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_trajectory_equals_the_reference(name, method):
