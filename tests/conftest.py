@@ -34,9 +34,9 @@ def pytest_configure(config):
                 "--kernels: vmri_jax is imported already; import it in fixtures of conftest.py only"
             )
         os.environ["VMRI_KERNELS"] = kernels  # read where the package is imported, also in processes of tests
-    from vmri_jax import runtime
+    from vmri_jax import configure
 
-    runtime.configure()
+    configure()
 
 
 def pytest_collection_modifyitems(config, items):

@@ -107,7 +107,7 @@ LANES, BAD = 64, 7
 
 @pytest.mark.parametrize(
     ("name", "scheme", "macro_dt", "newton"),
-    [("fpu", fully_implicit(3), 0.05, Newton()), ("tsp", explicit_slow(3), 0.02, Newton("march"))],
+    [("fpu", fully_implicit(3), 0.05, Newton()), ("tsp", explicit_slow(3), 0.02, Newton("nested"))],
 )
 def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, newton):
     """Over starts, step sizes and parameters. One start has velocities beyond what a double can square."""

@@ -113,7 +113,7 @@ def test_potentials_are_taken_at_the_nodes_of_their_rule_alone(scheme):
     system = System(mass, fast_potential=lambda q_f, params: 1e-3 * jnp.sum(jnp.sqrt(q_f)))
     none, one, h = jnp.zeros(0), jnp.ones(2), 0.1
     state = State(jnp.zeros(()), none, one, none, -1.05 / h * one)
-    end, info = compiled_step(system, scheme, state, h, Newton("march"))
+    end, info = compiled_step(system, scheme, state, h, Newton("nested"))
     assert np.all(np.asarray(end.q_f) < 0)
     assert Result(int(info.result)).success or scheme.fast.rule.nodes[-1] == 1.0  # there is no momentum there
 
@@ -139,13 +139,13 @@ def test_it_solves_the_equations_of_the_step(name, scheme, macro_dt, passes, req
     system, state = start_of(name, request)
     n = state.q_s.size + state.q_f.size
     expected, _ = phases(system, scheme, state, Newton("arrowhead"), macro_dt)
-    found, info = phases(system, scheme, state, Newton("march"), macro_dt)
-    assert int(info.method.max()) == Method.MARCH
+    found, info = phases(system, scheme, state, Newton("nested"), macro_dt)
+    assert int(info.method.max()) == Method.NESTED
     assert largest_difference(found, expected) / np.abs(expected).max() < 1e-12  # measured 1e-14
     assert info.iterations.mean() < passes, info.iterations.mean()
     motion = np.abs(np.diff(expected[:, :n], axis=0)).max()
     for tolerance in (1e-3, 1e-9):
-        loose, _ = phases(system, scheme, state, Newton("march", tolerance), macro_dt)
+        loose, _ = phases(system, scheme, state, Newton("nested", tolerance), macro_dt)
         assert largest_difference(loose[:, :n], expected[:, :n]) < tolerance * motion
 
 
@@ -161,7 +161,7 @@ def test_where_it_fails_the_whole_equations_are_asked(tsp):
     fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)
     step = {"macro_dt": 0.2, "num_steps": 10, "throw": False}
     march, auto = (
-        simulate(tsp.system, galerkin(1, 3), fast, newton=Newton(method), **step) for method in ("march", "auto")
+        simulate(tsp.system, galerkin(1, 3), fast, newton=Newton(method), **step) for method in ("nested", "auto")
     )
     assert int(march.failed_at) == 0
     assert int(auto.info.method[0]) == Method.ARROWHEAD

@@ -62,12 +62,12 @@ def test_it_solves_the_equations_of_the_step(name, scheme, macro_dt, passes, req
     def run(newton):
         return simulate(problem.system, scheme, problem.state(), macro_dt=macro_dt, num_steps=20, newton=newton)
 
-    exact, found = run(Newton("arrowhead")), run(Newton("march"))
+    exact, found = run(Newton("arrowhead")), run(Newton("nested"))
     assert ends_differ(found.final_state, exact.final_state) < 1e-11  # measured 1e-12
     assert found.info.iterations.mean() < passes, found.info.iterations.mean()
     motion = np.abs(np.diff(positions(exact), axis=0)).max()
     for tolerance in (1e-3, 1e-9):
-        error = np.abs(positions(run(Newton("march", tolerance))) - positions(exact)).max()
+        error = np.abs(positions(run(Newton("nested", tolerance))) - positions(exact)).max()
         assert error < tolerance * motion  # measured at most 0.14 of it
 
 
@@ -136,7 +136,7 @@ def test_equal_masses_converge():
     """Fast and slow parts of one weight: nothing is weak about the coupling."""
     problem = systems.triple_spherical_pendulum(masses=(1.0, 1.0, 1.0), stiffness=50.0)
     run = simulate(problem.system, fully_implicit(10), problem.state(), macro_dt=0.1, num_steps=50)
-    assert int(run.info.method.max()) == Method.MARCH
+    assert int(run.info.method.max()) == Method.NESTED
     passes = run.info.iterations
     assert passes.mean() < 11  # measured 9.3
     assert passes.max() < 15  # measured 13
@@ -147,8 +147,8 @@ def test_equal_masses_converge():
     [
         (fully_explicit(4), None, Method.EXPLICIT),
         (explicit_slow(4), None, Method.LINEAR),
-        (fully_implicit(4), None, Method.MARCH),
-        (explicit_slow(4), drag, Method.MARCH),
+        (fully_implicit(4), None, Method.NESTED),
+        (explicit_slow(4), drag, Method.NESTED),
     ],
 )
 def test_info_says_how_a_step_was_solved(fpu, scheme, force, method):
@@ -181,7 +181,7 @@ def test_auto_falls_back_where_the_march_does_not_converge():
         return simulate(problem.system, fully_implicit(20), state, **step)
 
     state = problem.state()
-    march, run, exact = (go(state, n) for n in (Newton("march", max_iterations=6), newton, Newton("arrowhead")))
+    march, run, exact = (go(state, n) for n in (Newton("nested", max_iterations=6), newton, Newton("arrowhead")))
     assert int(march.result) == Result.STAGNATED
     assert int(march.failed_at) == 0
     assert run.success
@@ -224,7 +224,7 @@ def test_a_fallback_keeps_what_was_computed(fpu):
     run = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20, newton=Newton(max_iterations=first))
     exact = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20, newton=Newton("arrowhead"))
     methods = np.asarray(run.info.method)
-    assert methods[0] == Method.MARCH
+    assert methods[0] == Method.NESTED
     assert Method.ARROWHEAD in methods
     assert largest_difference(run.q_f[:10], exact.q_f[:10]) < 1e-8  # errors grow fast at this step; measured 1e-10
 

@@ -117,7 +117,7 @@ def test_order(name, scheme, steps):
     [
         ("pivot on a sprung cart", galerkin(2, 2), "nested"),
         pytest.param("pivot on a sprung cart", galerkin(2, 2), "dense", marks=pytest.mark.full),
-        ("cart that is moved", fully_implicit(3), "march"),
+        ("cart that is moved", fully_implicit(3), "nested"),
     ],
 )
 def test_all_methods_find_the_same(name, scheme, method):

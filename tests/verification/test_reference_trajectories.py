@@ -20,7 +20,7 @@ def scheme_of(case):
 
 
 @pytest.mark.parametrize(
-    "method", ["auto", "dense", *(pytest.param(method, marks=pytest.mark.full) for method in ("march", "arrowhead"))]
+    "method", ["auto", "dense", *(pytest.param(method, marks=pytest.mark.full) for method in ("nested", "arrowhead"))]
 )
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_trajectory_equals_the_reference(name, method):
