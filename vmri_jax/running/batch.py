@@ -63,8 +63,9 @@ def simulate_batch(
     if params is not None:
         _check_params(system, params, lanes)
     first = jax.tree.map(lambda a: np.asarray(a)[0], states)
-    steps = [_first(dt) for dt in (macro_dt, micro_dt)]
-    run = simulation(system, scheme, first, newton, *steps, num_steps, save_every, save_micro)
+    run = simulation(
+        system, scheme, first, newton, _first(macro_dt), _first(micro_dt), num_steps, save_every, save_micro
+    )
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
     dt = np.asarray(real_array(f"simulate_batch: {name}", dt))
     if dt.shape not in ((), (lanes,)):

@@ -97,7 +97,9 @@ class Engine:
         at, (nodes, *between) = jax.lax.scan(save, at, np.arange(self.num_saves + 1) == 0)
         worst, micro = jax.tree.map(lambda a: a[1:], between)
         t_micro = None if micro is None else nodes[0][1:, None] - macro_dt * (1 - stepper.scheme.micro_times)
-        return Trajectory(*nodes, worst, at.result, at.failed_at, t_micro, micro), at.state, at.own
+        status = {"result": at.result, "failed_at": at.failed_at}
+        trajectory = Trajectory(*nodes, info=worst, **status, t_micro=t_micro, q_f_micro=micro)
+        return trajectory, at.state, at.own
 
 
 engine = lru_cache(maxsize=32)(Engine)
