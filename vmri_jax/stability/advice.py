@@ -157,19 +157,7 @@ def advise(
     radius = float(multipliers(motions, scheme, [macro_dt]).radius[0])
     growth = radius - 1 if radius > 1 + tolerance else 0.0
 
-    findings = []
-    if growth:
-        kind, cause = _cause(motions, scheme, macro_dt)
-        tenfold = np.log(10) / np.log1p(growth)
-        grows = f"Disturbances grow by {growth:.2g} per macro step, tenfold in {max(1, round(tenfold))}."
-        findings.append(Finding("error", kind, f"{cause} {grows}", growth))
-    else:
-        for a, b, _ in windows:
-            distance = max(a - macro_dt, macro_dt - b) / macro_dt
-            if distance * macro_dt <= _margin(a, b, macro_dt):
-                kind, cause = _cause(motions, scheme, (a + b) / 2)
-                where = f"Steps from {a:.6g} to {b:.6g} are unstable, {100 * distance:.1f} % from this one."
-                findings.append(Finding("warning", kind, f"{where} There: {cause}", distance))
+    findings = _of_step(motions, scheme, macro_dt, growth, windows)
     near = bool(findings)
     findings += _labels(motions) + _stages(scheme) + _motion(motions)
 
@@ -190,6 +178,24 @@ def advise(
         motions.fast_frequencies,
         motions.slow_frequencies,
     )
+
+
+def _of_step(motions: SmallMotions, scheme, macro_dt: float, growth: float, windows) -> list[Finding]:
+    """An error where the step is unstable, else a warning for every window near it."""
+    findings: list[Finding] = []
+    if growth:
+        kind, cause = _cause(motions, scheme, macro_dt)
+        tenfold = np.log(10) / np.log1p(growth)
+        grows = f"Disturbances grow by {growth:.2g} per macro step, tenfold in {max(1, round(tenfold))}."
+        findings.append(Finding("error", kind, f"{cause} {grows}", growth))
+    else:
+        for a, b, _ in windows:
+            distance = max(a - macro_dt, macro_dt - b) / macro_dt
+            if distance * macro_dt <= _margin(a, b, macro_dt):
+                kind, cause = _cause(motions, scheme, (a + b) / 2)
+                where = f"Steps from {a:.6g} to {b:.6g} are unstable, {100 * distance:.1f} % from this one."
+                findings.append(Finding("warning", kind, f"{where} There: {cause}", distance))
+    return findings
 
 
 def _scan(motions: SmallMotions, scheme, lower: float, upper: float, through: float, tolerance: float) -> list[Window]:

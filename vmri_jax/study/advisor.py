@@ -315,17 +315,19 @@ def recommend(
     chosen, checked = found[0], None
     if verify:
         progress("another start", 1, 1)
-        verified = _from_another_start(problem, t_end, reference.num_saves, newton)
-        for setting in found[:KEPT]:  # an error that is small by chance at one time is not from another start
-            checked = verified(setting)
-            if checked.error_ratio <= LUCK:
-                chosen = setting
-                break
-        else:
-            checked = verified(chosen)
+        chosen, checked = _not_by_luck(found, _from_another_start(problem, t_end, reference.num_saves, newton))
     progress("done", 1, 1)
     others = tuple(setting for setting in found if setting is not chosen)
     return Recommendation(error, chosen, others, checked, search.rows())
+
+
+def _not_by_luck(found: Sequence[Setting], verified: Callable[[Setting], Verification]) -> tuple[Setting, Verification]:
+    """The first of the best settings whose error is not small by chance; the very first one where all are."""
+    for setting in found[:KEPT]:
+        checked = verified(setting)
+        if checked.error_ratio <= LUCK:
+            return setting, checked
+    return found[0], verified(found[0])
 
 
 def _from_another_start(problem, t_end, num_saves: int, newton) -> Callable[[Setting], Verification]:

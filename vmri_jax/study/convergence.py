@@ -241,11 +241,7 @@ def convergence_study(
     steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
     if not steps:
         raise ValueError("convergence_study: macro_dt is empty; give the macro steps to run.")
-    cases = {"": problem}
-    if params is not None:
-        cases = {case: replace(problem, system=problem.system.replace(params=p)) for case, p in params.items()}
-    if not cases:
-        raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
+    cases = _cases(problem, params)
     total = len(schemes) * len(steps)
     references = _references(cases, reference, t_end, num_saves, progress, total)
 
@@ -261,6 +257,15 @@ def convergence_study(
                 rows.append(_row(label, case, scheme, dt, changed.system, momentum_maps, runs[k], references[case]))
     progress("done", total, total)
     return ConvergenceStudy(tuple(rows), references)
+
+
+def _cases(problem: Problem, params: Mapping[str, Any] | None) -> dict[str, Problem]:
+    """The problem with every set of parameters, by label."""
+    if params is None:
+        return {"": problem}
+    if not params:
+        raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
+    return {case: replace(problem, system=problem.system.replace(params=p)) for case, p in params.items()}
 
 
 def _runner(problems: Sequence[Problem], scheme, t_end: float, num_saves: int, newton):
