@@ -147,7 +147,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Compare all of it, a report after each case."""
     seats = {BEFORE: size.before, AFTER: size.after}
     about: dict = {side: {"commit": seat.commit, "checkout": str(seat.checkout)} for side, seat in seats.items()}
-    about["clock"] = "processor time" if PROCESSOR_TIME in size.after.options else "wall time"
+    about["clock"] = "processor time, on a shared core" if PROCESSOR_TIME in size.after.options else "wall time"
     rows, claims = [], []
     notes = [", ".join(f"{side}: {seat.commit}" for side, seat in seats.items())]
     for group, entry, outcome in _outcomes(size, seats, tell):

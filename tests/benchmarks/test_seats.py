@@ -1,15 +1,19 @@
 """Workers take turns, and what is compared is what both sides compute."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 import vmri_jax as vm
 from benchmarks import against, baseline, seats, tricks, worker
+from benchmarks.measure import Ratio
 from benchmarks.seats import Seat, Worker, take_turns
 from benchmarks.worker import Case
+from vmri_jax import diagnostics
+from vmri_jax.kernels import cpu
 
 ROOT = Path(__file__).parents[2]
 SHORT = Case("single", "FPU l=3", "fully_explicit 2", 0.01, seconds=1e-3)
@@ -86,13 +90,36 @@ def test_every_case_names_a_scheme_and_a_system():
             assert case.problem().q_s.size
 
 
+def test_plain_form_of_a_kernel(monkeypatch):
+    """It replaces the tuned one in every module that has imported it, and nothing else of that name."""
+
+    def tuned():
+        """Of the kernels."""
+
+    def plain():
+        """The same."""
+
+    other = object()
+    monkeypatch.setattr(cpu, "probe", tuned, raising=False)
+    monkeypatch.setattr(diagnostics, "probe", tuned, raising=False)
+    monkeypatch.setattr(vm, "probe", other, raising=False)
+    monkeypatch.setitem(sys.modules, "vmri_jax.kernels.plain", SimpleNamespace(probe=plain))
+    worker.use_plain("probe")
+    assert cpu.probe is plain  # pyright: ignore[reportAttributeAccessIssue]
+    assert diagnostics.probe is plain  # pyright: ignore[reportAttributeAccessIssue]
+    assert vm.probe is other  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_trick_stays_if_it_buys_enough_somewhere():
+    chain, batch = (next(c for c in tricks.CASES if c.kind == kind) for kind in ("single", "batch"))
+    row = tricks._row("solve", {chain: Ratio(1.5, 1.4, 1.6), batch: Ratio(1.1, 1.0, 1.2)})
+    assert (row["FPU l=3"], row["FPU l=3, batch"], row["TSP"]) == (1.5, 1.1, None)
+    assert (row["most"], row["keep"]) == (1.5, "yes")
+    assert tricks._row("solve", {chain: Ratio(1.5, 1.2, 1.6)})["keep"] == "no"
+
+
 def test_baseline():
     found = baseline._rounded({"rows": [{"us": 1.23456789, "what": "one"}]})
     assert found == {"rows": [{"us": 1.2346, "what": "one"}]}
     with pytest.raises(ValueError, match="has no floor, batch"):
         baseline.assemble(Path("nowhere"), "b597b06")
-
-
-def test_starts_of_a_batch():
-    states = worker.starts(Case("", "TSP").problem(), 3)
-    assert np.asarray(states.q_f).shape == (3, 6)
