@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vmri_jax.steppers.newton.collocation import Interval, Saddles, TimeModes
+from vmri_jax.steppers.newton.collocation import TimeModes
 
 from tests.support import compiled_step, largest_difference
 from tests.user_systems import FULL_MASS, lifted, sphere
@@ -25,7 +25,6 @@ from vmri_jax import (
 )
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.newton import collocation
-from vmri_jax.steppers.newton.collocation import TimeModes
 
 
 def phases(system, scheme, state, newton=None, macro_dt=0.02, num_steps=10):

@@ -7,10 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
-from vmri_jax.steppers.newton.extrapolation import Differences, Line
-from vmri_jax.steppers.newton.secant import Pairs
-from vmri_jax.steppers.newton.slow import ENOUGH, minimal_residuals
-from vmri_jax.steppers.step import Memory, advance, start_memory
 
 from tests.support import compiled_step, largest_difference
 from tests.user_systems import FULL_MASS, double_pendulum, two_oscillators

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vmri_jax.steppers.step import averaging
 
 from tests.support import compiled_step, largest_difference, relative_difference, step_matrix, without_fallback
 from tests.user_systems import two_oscillators

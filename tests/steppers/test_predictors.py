@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-from tests.support import largest_difference
 from vmri_jax.steppers.newton.extrapolation import Differences, Line
 from vmri_jax.steppers.newton.secant import Pairs
 from vmri_jax.steppers.newton.slow import ENOUGH, minimal_residuals
+
+from tests.support import largest_difference
 
 
 def test_extrapolation_takes_the_order_that_was_best():

@@ -3,8 +3,6 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vmri_jax.steppers.split import split
-from vmri_jax.steppers.step import LARGE
 
 from tests.support import compiled_step, largest_difference, relative_difference, without_fallback
 from tests.user_systems import bent_system, two_oscillators

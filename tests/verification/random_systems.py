@@ -12,10 +12,10 @@ from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
-from vmri_jax.steppers.newton.options import Choice
 
 import vmri_jax as vm
 from vmri_jax import quadrature
+from vmri_jax.steppers.newton.options import Choice
 
 
 def _distance(x):
