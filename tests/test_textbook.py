@@ -1,6 +1,7 @@
 """Every stepper against the textbook, on random systems."""
 
 from random import Random
+from typing import Any
 
 import pytest
 
@@ -9,7 +10,7 @@ from benchmarks import oracle
 from tests.verification import random_systems as rs
 from vmri_jax import textbook
 
-SPRINGS = {"slow_potential": "harmonic", "fast_potential": "spring"}
+SPRINGS: dict[str, Any] = {"slow_potential": "harmonic", "fast_potential": "spring"}
 STRUCTURES = {
     "explicit": rs.Structure(2, 1, 2, **SPRINGS, scheme="fully explicit", num_micro=5),
     "corrected kicks": rs.Structure(2, 1, 1, **SPRINGS, scheme="takahashi imada", num_micro=2),

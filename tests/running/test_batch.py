@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from functools import cache
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -35,7 +36,7 @@ def spread(problem, lanes: int) -> State:
     return State(jnp.zeros(lanes), q_s, q_f, scale * state.p_s, scale * state.p_f)
 
 
-RUN = {"num_steps": 20, "save_every": 5}
+RUN: dict[str, Any] = {"num_steps": 20, "save_every": 5}
 WAYS = {  # system, scheme, macro_dt, largest difference of a lane from its single run
     "kicks": ("fpu", fully_explicit(5), 0.05, 1e-13),  # measured 3e-15
     "linear fast equations": ("fpu", explicit_slow(5), 0.05, 1e-13),

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vmri_jax.steppers.newton.collocation import TimeModes
 
 from tests.support import compiled_step, largest_difference
 from tests.user_systems import FULL_MASS, lifted, sphere
@@ -24,7 +23,7 @@ from vmri_jax import (
     simulate,
 )
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.newton import collocation
+from vmri_jax.steppers.time_modes import TimeModes, times_i
 
 
 def phases(system, scheme, state, newton=None, macro_dt=0.02, num_steps=10):
@@ -94,7 +93,7 @@ def test_modes_are_eigenvectors(degree, rule):
 
     def back(matrix, gamma):
         re, im = gamma[:, modes.mode]
-        return ((re * modes.of_values + im * np.asarray(collocation.times_i(modes.of_values))) @ matrix).T
+        return ((re * modes.of_values + im * np.asarray(times_i(modes.of_values))) @ matrix).T
 
     a, b = form(True), form(False)
     diagonalised = np.linalg.solve(a, b)
