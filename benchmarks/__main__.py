@@ -161,7 +161,7 @@ def oracle_command(
     from benchmarks import oracle  # only now: the textbook starts JAX
 
     path = out / f"oracle_{seed}.json"
-    with progress("oracle", count) as tell:
+    with progress("oracle") as tell:
         found = oracle.run(count, seed, path, tell)
     oracle.show(found, console)
     console.print(f"written to {path}\n")

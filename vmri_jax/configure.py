@@ -66,7 +66,7 @@ def warn_if_slow() -> None:
             "the same. Add this line at the start of the program, before any array is made: vm.configure() "
             "(with import vmri_jax as vm)",
             NotConfiguredWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

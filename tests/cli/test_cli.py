@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import signal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -307,7 +308,7 @@ def test_what_the_search_refuses(vmri, arguments, message):
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_schemes_are_found_with_dashes_and_underscores(name):
-    options = {"degree": 2} if name == "galerkin" else {}
+    options: dict[str, Any] = {"degree": 2} if name == "galerkin" else {}
     found = find_scheme(name.replace("-", "_"), 3, **options)
     assert found == SCHEMES[name].factory(3, **options)
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_flags, check_system
 from vmri_jax.mechanics.constraints import check_constraints
@@ -295,6 +296,7 @@ class Simulation:
 
 def simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro) -> Simulation:
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
+    warn_if_slow()
     macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
     newton = newton or Newton()
     leaves, structure = jax.tree.flatten((newton, scheme, system))
