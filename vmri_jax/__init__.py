@@ -26,6 +26,7 @@ from vmri_jax.schemes.scheme import (
     takahashi_imada,
 )
 from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
 from vmri_jax.steppers.stepper import StepInfo
 
@@ -40,6 +41,7 @@ __all__ = [
     "Method",
     "Newton",
     "NotConfiguredWarning",
+    "Plan",
     "Problem",
     "Result",
     "Rheonomic",
@@ -66,6 +68,7 @@ __all__ = [
     "macro_step",
     "micro",
     "mollified_impulse",
+    "plan",
     "prepare",
     "quadrature",
     "simulate",

@@ -72,7 +72,7 @@ class Engine:
 
     def _stepper(self, leaves, state: State) -> Plan:
         newton, scheme, system = jax.tree.unflatten(self.structure, leaves)
-        return plan(system, scheme, newton, state, fallback=self.falls_back)
+        return plan(system, scheme, state, newton, fallback=self.falls_back)
 
     def _run(self, stepper: Plan, state: State, own, t_start, macro_dt, step, save_every):
         """`num_saves * save_every` macro steps from step number `step`."""

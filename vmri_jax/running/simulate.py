@@ -227,7 +227,7 @@ class Simulation:
     @cached_property
     def plan(self) -> Plan:
         """How its steps are taken; ``print`` shows it in words."""
-        return plan(self.system, self.scheme, self.newton, self.state)
+        return plan(self.system, self.scheme, self.state, self.newton)
 
     @cached_property
     def start_arrays(self) -> tuple:

@@ -88,18 +88,26 @@ class Plan:
         return str(self.stepper)
 
 
-def plan(system: System, scheme: Scheme | Composition, newton: Newton, state: State, fallback: bool = True) -> Plan:
-    """The plan for a system and a scheme.
+def plan(
+    system: System,
+    scheme: Scheme | Composition,
+    state: State,
+    newton: Newton | None = None,
+    *,
+    fallback: bool = True,
+) -> Plan:
+    """How macro steps of a system under a scheme are taken; ``print`` shows it in words.
 
     Args:
         system, scheme: what moves, and how.
-        newton: how implicit equations are solved.
         state: any state of the system; only the shapes of its arrays matter.
+        newton: how implicit equations are solved.
         fallback: whether a first choice that does not converge gives way to another one, which takes long to compile.
 
     Raises:
         ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
     """
+    newton = newton or Newton()
     choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None)
     stepper: Stepper = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
     rarely = _projects_rarely(stepper)

@@ -23,7 +23,7 @@ class Newton(eqx.Module):
 
     "auto" takes "nested" where the terms can be cut into micro intervals (constant masses, potentials on the micro grid
     or kicks at the macro nodes), and "arrowhead" where they cannot or where "nested" does not converge; which one it was
-    is in ``StepInfo.method`` and ``Trajectory.info.method``. ``print(plan(...))`` of `vmri_jax.steppers` shows it beforehand.
+    is in ``StepInfo.method`` and ``Trajectory.info.method``. ``print(vm.plan(system, scheme, state))`` shows it beforehand.
     "nested" includes its special cases: a single drift along the constraints between kicks (RATTLE), and a single interval
     of higher degree (``galerkin(1, degree)``), which is solved for all variables at once in modes of time.
 
