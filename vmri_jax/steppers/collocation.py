@@ -125,19 +125,19 @@ class CollocatedInterval:
                 d = at_nodes(gradient)(q[:, before : before + k])
                 total += jnp.pad(weights * d, ((0, 0), (before, self.r - before - k)))
             else:
-                d = at_nodes(gradient)(self.q[:, None] + x @ basis[:, 1:].T)
+                d = at_nodes(gradient)(self.q[:, None] + matmul(x, basis[:, 1:].T))
                 first += d @ (weights * basis[:, 0])
-                total += d @ (weights[:, None] * basis[:, 1:])
+                total += matmul(d, weights[:, None] * basis[:, 1:])
         inside = jnp.concatenate([(self.h * self.p + first)[:, None], total[:, :-1]], axis=1)
         return Forces(inside, total[:, -1], g)
 
     def residual(self, x, forces: "Forces"):
         """Of the momentum equations of the nodes 0..r-1, times h, (n, r)."""
-        return self.times_mass(x @ self.form[:, :-1]) + forces.inside
+        return self.times_mass(matmul(x, self.form[:, :-1])) + forces.inside
 
     def momentum(self, x, forces: "Forces"):
         """At the end of the step (n,)."""
-        return (self.times_mass(x @ self.form[:, -1:])[:, 0] + forces.last) / self.h
+        return (self.times_mass(matmul(x, self.form[:, -1:]))[:, 0] + forces.last) / self.h
 
 
 class Forces(NamedTuple):
@@ -197,7 +197,7 @@ class Saddles(NamedTuple):
 
         straight = matmul(along, pull)
         columns = jnp.concatenate([straight, matmul(bent, straight)], axis=1)
-        through = (denominator.reshape(k * d, d) @ columns).reshape(k, d, 2 * n_c)
+        through = (matmul(denominator.reshape(k * d, d), columns)).reshape(k, d, 2 * n_c)
         # real and imaginary part of (1 - conj(gamma) L Q) / |1 - gamma L Q|^2 times the columns
         real, imaginary = through[..., :n_c] - re * through[..., n_c:], im * through[..., n_c:]
 
@@ -214,15 +214,15 @@ class Saddles(NamedTuple):
     def solve(self, y, g):
         """x (n, r) and mu (n_c, r) with ``M x - h^2 W'' x (A^-1 B)^T - G^T mu A^-T = M y`` and ``G x = g``."""
         d = len(self.bend)
-        pushed = self.push @ y
-        pushed = jnp.concatenate([pushed[:d], g - pushed[d:]]) @ self.modes.of_values
+        pushed = matmul(self.push, y)
+        pushed = matmul(jnp.concatenate([pushed[:d], g - pushed[d:]]), self.modes.of_values)
         z, g = pushed[:d], pushed[d:]
         z = z - self._times_gamma(matmul(self.bend, z), -1)
         products = (a * row for a, row in zip(self.denominator, z, strict=True))
         z = reduce(jnp.add, products, jnp.zeros_like(z))  # written out: within a sum z would be made anew for every row
         nu = product(self.schur, g - matmul(self.push_bend, self._times_gamma(z)))
         z = self._times_gamma(z + product(self.pull_bend, nu))
-        return y + self.pull @ (jnp.concatenate([z, nu]) @ self.modes.increments), nu @ self.modes.multipliers
+        return y + matmul(self.pull, matmul(jnp.concatenate([z, nu]), self.modes.increments)), matmul(nu, self.modes.multipliers)
 
     def _times_gamma(self, z, sign=1):
         """Or times the conjugate of gamma."""
@@ -281,7 +281,7 @@ class Collocation(Solver):
             return max_abs(x[:n_s]), max_abs(x[n_s:])
 
         def corrected(last: Iterate, forces: Forces) -> Iterate:
-            missing = last.x + interval.over_mass(forces.inside) @ modes.of_rows  # what these forces do not bring about
+            missing = last.x + matmul(interval.over_mass(forces.inside), modes.of_rows)  # what these forces do not bring about
             dx, dmu = saddles.solve(-missing, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
             left = map(expected, moved, last.moved)
