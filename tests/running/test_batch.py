@@ -113,8 +113,8 @@ LANES, BAD = 64, 7
 def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, newton):
     """Over starts, step sizes and parameters. One start has velocities beyond what a double can square."""
     problem, rng = PROBLEMS[name](), np.random.default_rng(5)
-    v_s = problem.v_s + 0.3 * rng.normal(size=(LANES, problem.v_s.size))
-    v_f = problem.v_f + 0.3 * rng.normal(size=(LANES, problem.v_f.size))
+    v_s = np.array(problem.v_s + 0.3 * rng.normal(size=(LANES, problem.v_s.size)))
+    v_f = np.array(problem.v_f + 0.3 * rng.normal(size=(LANES, problem.v_f.size)))
     v_f[BAD] *= 1e200
     steps = macro_dt * np.linspace(0.2, 1.0, LANES)
     params = {key: value * np.linspace(0.4, 1.0, LANES) for key, value in scalars(problem).items()}
