@@ -120,7 +120,7 @@ def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
 
 
 def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Callable]:
-    """V and W as functions of (q_s, q_f); a corrected one is less a square of gradients, see `quadrature.corrected`."""
+    """V and W as functions of (q_s, q_f); a corrected one is less a square of gradients, see `quadrature.gradient_corrected`."""
     micro_dt = macro_dt / scheme.num_micro
 
     def V(q_s, q_f):
@@ -134,13 +134,13 @@ def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Call
         return sum(jnp.sum(x * y) for x, y in zip(a, system.kinetic.velocity(*b), strict=True))  # pyright: ignore[reportAttributeAccessIssue]
 
     def corrected_V(q_s, q_f):
-        mixed = micro_dt**2 / 12 * product(V, W, q_s, q_f) if scheme.fast.corrected else 0.0
+        mixed = micro_dt**2 / 12 * product(V, W, q_s, q_f) if scheme.fast.gradient_corrected else 0.0
         return V(q_s, q_f) - macro_dt**2 / 24 * product(V, V, q_s, q_f) - mixed
 
     def corrected_W(q_s, q_f):
         return W(q_s, q_f) - micro_dt**2 / 24 * product(W, W, q_s, q_f)
 
-    return corrected_V if scheme.slow.corrected else V, corrected_W if scheme.fast.corrected else W
+    return corrected_V if scheme.slow.gradient_corrected else V, corrected_W if scheme.fast.gradient_corrected else W
 
 
 def virtual_work(system: System, scheme: Scheme, path, along, t, macro_dt):
@@ -266,7 +266,9 @@ def check(system: System, scheme: Scheme) -> None:
             "textbook.step: the slow potential of this scheme is mollified, which the textbook leaves out; "
             "take macro_step or simulate, or a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
         )
-    if (scheme.slow.corrected or scheme.fast.corrected) and not isinstance(system.kinetic, ConstantMass):
+    if (scheme.slow.gradient_corrected or scheme.fast.gradient_corrected) and not isinstance(
+        system.kinetic, ConstantMass
+    ):
         raise ValueError("textbook.step: corrected kicks need a System whose kinetic is a ConstantMass.")
 
 

@@ -8,7 +8,7 @@ import pytest
 import vmri_jax as vm
 from tests.support import largest_difference, step_matrix
 from tests.user_systems import double_pendulum, two_oscillators
-from vmri_jax.schemes.quadrature import corrected, midpoint, trapezoidal
+from vmri_jax.schemes.quadrature import gradient_corrected, midpoint, trapezoidal
 
 KAPPA, OMEGA = 25.0, 50.0
 
@@ -117,13 +117,13 @@ def test_it_says_what_it_costs():
 
 
 def test_it_refuses_what_has_no_correction():
-    with pytest.raises(ValueError, match=r"corrected: got .*give kicks at the nodes of a grid"):
-        corrected(vm.micro(midpoint))
+    with pytest.raises(ValueError, match=r"gradient_corrected: got .*give kicks at the nodes of a grid"):
+        gradient_corrected(vm.micro(midpoint))
     kicks = vm.micro(trapezoidal)
     with pytest.raises(ValueError, match="slow on the micro grid, degree 1, is corrected; only kicks"):
-        vm.Scheme(2, kinetic=vm.micro(midpoint), slow=corrected(kicks), fast=kicks)
+        vm.Scheme(2, kinetic=vm.micro(midpoint), slow=gradient_corrected(kicks), fast=kicks)
     with pytest.raises(ValueError, match="fast on the micro grid, degree 2, is corrected"):
-        vm.Scheme(2, 2, kinetic=vm.micro(vm.quadrature.gauss(2)), slow=kicks, fast=corrected(kicks))
+        vm.Scheme(2, 2, kinetic=vm.micro(vm.quadrature.gauss(2)), slow=kicks, fast=gradient_corrected(kicks))
     arms = double_pendulum()
     with pytest.raises(ValueError, match="corrected kicks need a System whose kinetic is a ConstantMass"):
         vm.simulate(arms.system, vm.takahashi_imada(2), arms.state(), macro_dt=0.01, num_steps=1)

@@ -169,13 +169,13 @@ def lagrangian(system: System, scheme: Scheme) -> Sum:
 
 
 def _corrections(system: System, scheme: Scheme) -> Sum:
-    """The squares of gradients of `vmri_jax.schemes.quadrature.corrected`."""
-    if not scheme.slow.corrected and not scheme.fast.corrected:
+    """The squares of gradients of `vmri_jax.schemes.quadrature.gradient_corrected`."""
+    if not scheme.slow.gradient_corrected and not scheme.fast.gradient_corrected:
         return Sum(())
     if not isinstance(system.kinetic, ConstantMass):
         raise ValueError("Scheme: corrected kicks need a System whose kinetic is a ConstantMass.")
     slow_potential, fast_potential, mass = system.slow_potential, system.fast_potential, system.kinetic
-    both = scheme.fast.corrected and fast_potential is not None
+    both = scheme.fast.gradient_corrected and fast_potential is not None
 
     def fast(q_f, params):
         d = jax.grad(fast_potential)(q_f, params)  # pyright: ignore[reportArgumentType]
@@ -190,7 +190,7 @@ def _corrections(system: System, scheme: Scheme) -> Sum:
         return total
 
     terms = Sum(())
-    if scheme.slow.corrected and slow_potential is not None:
+    if scheme.slow.gradient_corrected and slow_potential is not None:
         terms += _on_position_nodes(slow, ("q_s", "q_f"), scheme.slow, scheme, system, "the correction of V")
     if both:
         terms += _on_position_nodes(fast, ("q_f",), scheme.fast, scheme, system, "the correction of W")

@@ -190,13 +190,13 @@ class PlacedRule(eqx.Module):
     """A rule and the grid it lives on: once per macro interval, or once per micro interval.
 
     mollified: whether its term is taken at averaged fast positions, see `mollified`.
-    corrected: whether its term is less a square of its gradient, see `corrected`.
+    gradient_corrected: whether its term is less a square of its gradient, see `gradient_corrected`.
     """
 
     rule: Rule
     grid: Literal["macro", "micro"] = eqx.field(static=True)
     mollified: bool = eqx.field(static=True, default=False)
-    corrected: bool = eqx.field(static=True, default=False)
+    gradient_corrected: bool = eqx.field(static=True, default=False)
 
     def composite(self, num_micro: int) -> Rule:
         """The rule on the macro interval [0, 1] that this placement amounts to."""
@@ -237,7 +237,7 @@ def mollified(placed: PlacedRule) -> PlacedRule:
     return PlacedRule(placed.rule, placed.grid, mollified=True)
 
 
-def corrected(placed: PlacedRule) -> PlacedRule:
+def gradient_corrected(placed: PlacedRule) -> PlacedRule:
     """The same nodes, with a square of the gradient taken off the potential.
 
     Fast kicks act through ``W - h^2/24 grad W . M^-1 grad W``, slow ones through
@@ -247,5 +247,7 @@ def corrected(placed: PlacedRule) -> PlacedRule:
     is of order 4. So are, as they are, the frequencies of harmonic vibrations, which no change of the start alters.
     """
     if not isinstance(placed, PlacedRule) or not placed.only_ends or placed.mollified:
-        raise ValueError(f"corrected: got {placed!r}; give kicks at the nodes of a grid, e.g. micro(trapezoidal).")
-    return PlacedRule(placed.rule, placed.grid, corrected=True)
+        raise ValueError(
+            f"gradient_corrected: got {placed!r}; give kicks at the nodes of a grid, e.g. micro(trapezoidal)."
+        )
+    return PlacedRule(placed.rule, placed.grid, gradient_corrected=True)

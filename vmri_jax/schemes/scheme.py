@@ -8,7 +8,7 @@ A scheme is data. The reference schemes and the Galerkin family are points in on
 | `explicit_slow(num_micro, alpha)` | macro(affine(alpha)) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
 | `mollified_impulse(num_micro, alpha)` | mollified(macro(affine(alpha))) | micro(midpoint) | in V | 2 at alpha = 1/2, else 1 |
 | `fully_explicit(num_micro, alpha)` | macro(affine(alpha)) | micro(affine(alpha)) | yes | 2 at alpha = 1/2, else 1 |
-| `takahashi_imada(num_micro)` | corrected(macro(trapezoidal)) | corrected(micro(trapezoidal)) | yes | 2, frequencies 4 |
+| `takahashi_imada(num_micro)` | gradient_corrected(macro(trapezoidal)) | gradient_corrected(micro(trapezoidal)) | yes | 2, frequencies 4 |
 | `galerkin(num_micro, degree, rule)` | micro(rule) | micro(rule) | no | min(2 degree, rule order) |
 """
 
@@ -24,8 +24,8 @@ from vmri_jax.schemes.quadrature import (
     PlacedRule,
     Rule,
     affine,
-    corrected,
     gauss,
+    gradient_corrected,
     lobatto,
     macro,
     micro,
@@ -88,10 +88,10 @@ class Scheme(eqx.Module):
         grids = {"slow": "macro", "fast": "micro"}
         for name in ("kinetic", "slow", "fast", "force", "constraint"):
             placed = getattr(self, name)
-            if placed.corrected and (placed.grid != grids.get(name) or self.degree > 1):
+            if placed.gradient_corrected and (placed.grid != grids.get(name) or self.degree > 1):
                 raise ValueError(
                     f"Scheme: {name} on the {placed.grid} grid, degree {self.degree}, is corrected; only kicks of a path of degree 1 "
-                    "can be: slow=corrected(macro(...)), fast=corrected(micro(...))."
+                    "can be: slow=gradient_corrected(macro(...)), fast=gradient_corrected(micro(...))."
                 )
         for name, grid in (("constraint", "micro"), ("slow_constraint", "macro")):
             placed = getattr(self, name)
@@ -125,10 +125,10 @@ class Scheme(eqx.Module):
         kicked = self.degree == 1 and self.slow.only_ends and self.slow.grid == "macro"
         free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
         slow, fast = (
-            _evaluations(placed, self.num_micro) * (1 + placed.corrected) for placed in (self.slow, self.fast)
+            _evaluations(placed, self.num_micro) * (1 + placed.gradient_corrected) for placed in (self.slow, self.fast)
         )
         fast *= 1 + self.slow.mollified  # along the motion that is averaged
-        fast += self.slow.corrected and self.fast.corrected  # in the term of both
+        fast += self.slow.gradient_corrected and self.fast.gradient_corrected  # in the term of both
         return Description(self.order, self.is_symmetric, 1, self.num_micro, self.degree, slow, fast, free, 1)
 
 
@@ -249,14 +249,17 @@ def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
 def takahashi_imada(num_micro: int) -> Scheme:
     """`fully_explicit` with corrected kicks. Order 2, symmetric; frequencies of harmonic vibrations are of order 4.
 
-    What is left at order 2 is a change of coordinates, see `vmri_jax.schemes.quadrature.corrected`: phases of vibrations stay accurate;
+    What is left at order 2 is a change of coordinates, see `vmri_jax.schemes.quadrature.gradient_corrected`: phases of vibrations stay accurate;
     where a period depends on the amplitude, it is that of a start which is moved by order 2. With constraints, whose forces the
     correction leaves out, frequencies are of order 2. Explicit for constant masses, which it needs, without constraints, and stable
     for ``omega h < 2 sqrt(3)``. Evaluations per macro step: V once and W num_micro times, each with a product of its Hessian, and one
     such product of W more.
     """
     return Scheme(
-        num_micro, kinetic=micro(midpoint), slow=corrected(macro(trapezoidal)), fast=corrected(micro(trapezoidal))
+        num_micro,
+        kinetic=micro(midpoint),
+        slow=gradient_corrected(macro(trapezoidal)),
+        fast=gradient_corrected(micro(trapezoidal)),
     )
 
 

@@ -30,7 +30,7 @@ def phase(scheme: Scheme, x: float) -> float:
     if scheme.fast.grid != "micro":
         return np.nan
     at = np.linspace(0.0, x, 2 + int(abs(x) / RESOLUTION))
-    cosine, direction = _turn(scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.corrected, at)
+    cosine, direction = _turn(scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.gradient_corrected, at)
     if abs(cosine[-1]) > 1:
         return np.nan
     return float(np.sign(x) * np.unwrap(np.arctan2(direction * np.sqrt(np.maximum(1 - cosine**2, 0)), cosine))[-1])
@@ -40,13 +40,13 @@ def fast_limit(scheme: Scheme) -> float:
     """The smallest ``omega h`` at which the micro step is unstable for a fast vibration; infinite if there is none."""
     if scheme.fast.grid != "micro":
         return np.inf
-    return _limit(scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.corrected)
+    return _limit(scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.gradient_corrected)
 
 
 def slow_limit(scheme: Scheme) -> float:
     """The smallest ``omega H`` at which the macro step is unstable for a vibration of the slow variables under V."""
     n = scheme.num_micro
-    return _limit(scheme.degree, scheme.kinetic.composite(n), scheme.slow.composite(n), scheme.slow.corrected)
+    return _limit(scheme.degree, scheme.kinetic.composite(n), scheme.slow.composite(n), scheme.slow.gradient_corrected)
 
 
 def _limit(degree: int, kinetic: Rule, potential: Rule, corrected: bool) -> float:

@@ -222,7 +222,9 @@ class Saddles(NamedTuple):
         z = reduce(jnp.add, products, jnp.zeros_like(z))  # written out: within a sum z would be made anew for every row
         nu = product(self.schur, g - matmul(self.push_bend, self._times_gamma(z)))
         z = self._times_gamma(z + product(self.pull_bend, nu))
-        return y + matmul(self.pull, matmul(jnp.concatenate([z, nu]), self.modes.increments)), matmul(nu, self.modes.multipliers)
+        return y + matmul(self.pull, matmul(jnp.concatenate([z, nu]), self.modes.increments)), matmul(
+            nu, self.modes.multipliers
+        )
 
     def _times_gamma(self, z, sign=1):
         """Or times the conjugate of gamma."""
@@ -281,7 +283,9 @@ class Collocation(Solver):
             return max_abs(x[:n_s]), max_abs(x[n_s:])
 
         def corrected(last: Iterate, forces: Forces) -> Iterate:
-            missing = last.x + matmul(interval.over_mass(forces.inside), modes.of_rows)  # what these forces do not bring about
+            missing = last.x + matmul(
+                interval.over_mass(forces.inside), modes.of_rows
+            )  # what these forces do not bring about
             dx, dmu = saddles.solve(-missing, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
             left = map(expected, moved, last.moved)
