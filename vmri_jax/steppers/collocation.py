@@ -232,7 +232,7 @@ class Saddles(NamedTuple):
         return re * z + sign * im * times_i(z)
 
 
-class Iterate(NamedTuple):
+class Increments(NamedTuple):
     """Increments x (n, r), multipliers mu (n_c, r), their largest corrections, how many there were, and what the last one tells."""
 
     x: Any
@@ -245,7 +245,7 @@ class Iterate(NamedTuple):
 class Evaluated(NamedTuple):
     """An iterate, forces of it or of the one before, and RUNNING or, with its own forces, the result."""
 
-    last: Iterate
+    last: Increments
     forces: Forces
     result: Any
 
@@ -282,14 +282,16 @@ class Collocation(Solver):
         def slow_and_fast(x):
             return max_abs(x[:n_s]), max_abs(x[n_s:])
 
-        def corrected(last: Iterate, forces: Forces) -> Iterate:
+        def corrected(last: Increments, forces: Forces) -> Increments:
             missing = last.x + matmul(
                 interval.over_mass(forces.inside), modes.of_rows
             )  # what these forces do not bring about
             dx, dmu = saddles.solve(-missing, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
             left = map(expected, moved, last.moved)
-            return Iterate(x, mu, moved, iterations, newton.status(accepted.over(left, slow_and_fast(x)), iterations))
+            return Increments(
+                x, mu, moved, iterations, newton.status(accepted.over(left, slow_and_fast(x)), iterations)
+            )
 
         def step(at: Evaluated) -> Evaluated:
             """Forces first: evaluated in one place, they are compiled once."""
@@ -299,7 +301,7 @@ class Collocation(Solver):
             return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
 
         running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(interval.q), jnp.zeros_like(mu))
-        start = Iterate(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
+        start = Increments(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
         last, forces, _ = newton.iterate(step, Evaluated(start, none, running), -1)  # forces once more than corrections
 
         p, rows = interval.momentum(last.x, forces), interval.residual(last.x, forces)

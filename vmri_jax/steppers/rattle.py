@@ -34,7 +34,7 @@ class RattleState(NamedTuple):
     before: Any
 
 
-class Iterate(NamedTuple):
+class Correction(NamedTuple):
     """Increments x (n_s + n_f,), scaled multipliers mu, constraint values g there, and the corrections that g asks for."""
 
     x: Any
@@ -79,13 +79,13 @@ class Rattle(Solver):
         accepted = Accepted.of(equations, newton).sizes(tuple(map(max_abs, straight)))
         per_slow, per_fast = (1 / size for size in accepted)
 
-        def at(x, mu, g, iterations) -> Iterate:
+        def at(x, mu, g, iterations) -> Correction:
             dmu = matvec(schur, g)
             dx = _combined(dmu, columns)
             change = jnp.maximum(per_slow * max_abs(dx[:n_s]), per_fast * max_abs(dx[n_s:]))
-            return Iterate(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
+            return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
 
-        def corrected(last: Iterate) -> Iterate:
+        def corrected(last: Correction) -> Correction:
             x = last.x - last.dx
             return at(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
 

@@ -1,5 +1,6 @@
 """A step whose equations are solved by iteration: start of the iteration, solver, derivative of the solution."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -29,7 +30,7 @@ class Solution(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Solver:
+class Solver(ABC):
     """Solves the equations of a step: ``own = init(equations, velocity)``, then ``solution, own = solve(equations, guess, own)``."""
 
     def init(self, equations: StepEquations, velocity) -> Any:
@@ -40,9 +41,9 @@ class Solver:
         """`own` with what is computed once for a whole macro step."""
         return own
 
+    @abstractmethod
     def solve(self, equations: StepEquations, guess: Unknowns, own) -> tuple[Solution, Any]:
         """The root of ``equations.residual``, found from a guess and what the last step handed on."""
-        raise NotImplementedError
 
     def continued(self, own, last) -> Any:
         """For a stage of a composition, see `Stepper.continued`."""
@@ -52,8 +53,9 @@ class Solver:
         """After the momenta have been projected."""
         return own
 
+    @abstractmethod
     def lines(self) -> list[str]:
-        raise NotImplementedError
+        """In words, one line each."""
 
 
 class SolvedState(NamedTuple):

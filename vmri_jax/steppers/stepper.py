@@ -1,5 +1,6 @@
 """What every stepper offers, and what a macro step tells about itself."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -56,7 +57,7 @@ class Status(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Stepper:
+class Stepper(ABC):
     """Takes macro steps: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)`` again and again.
 
     `own` is what a stepper carries from step to step, a NamedTuple that its file documents.
@@ -70,9 +71,9 @@ class Stepper:
         """`own` with what is computed once for a whole macro step, however many micro steps share it."""
         return own
 
+    @abstractmethod
     def move(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
         """The step itself; its momenta are those of the discrete Legendre transform."""
-        raise NotImplementedError
 
     def step(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
         """A macro step: `renew`, then `move`; NON_FINITE where a momentum is, since positions follow momenta."""
@@ -88,9 +89,9 @@ class Stepper:
         """For a stage of a composition: what it learned in the macro step before, going on where the last stage ended."""
         return own
 
+    @abstractmethod
     def lines(self) -> list[str]:
         """This stepper and what is inside of it in words, one line each."""
-        raise NotImplementedError
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
