@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import Newton, State, macro_step, simulate, systems
+from vmri_jax.schemes.composition import stage_scheme
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -38,6 +39,7 @@ def step_matrix(system, scheme, macro_dt):
 
 def without_fallback(system, scheme) -> Newton:
     """The default iteration; where it is the nested march, without the exact solve behind it, which takes long to compile."""
+    scheme = stage_scheme(scheme)
     potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
     local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
     return Newton("nested") if system.has_constant_mass and local else Newton()

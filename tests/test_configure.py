@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+from vmri_jax.configure import FAST_LOOPS
+
 
 def printed(program: str) -> str:
     """What a program prints, also as errors and warnings, in a process whose JAX has no settings."""
@@ -29,8 +31,7 @@ except RuntimeError as error:
     print(error)
 """
     assert printed(program).splitlines() == [
-        "--xla_cpu_enable_fast_math=false --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000 "
-        "2 float64",
+        " ".join(["--xla_cpu_enable_fast_math=false", *FAST_LOOPS, "2 float64"]),
         "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made.",
     ]
 

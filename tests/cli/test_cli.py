@@ -1,6 +1,7 @@
 """The command line: what it prints, what it writes, and how it refuses."""
 
 import errno
+import importlib
 import os
 import re
 import signal
@@ -70,7 +71,7 @@ def test_schemes_lists_all_with_their_options(vmri):
         assert piece in text
 
 
-@pytest.mark.parametrize("command", [["simulate", "--help"], ["reproduce", "-h"]])
+@pytest.mark.parametrize("command", [["simulate", "--help"], ["tune", "-h"]])
 def test_help_shows_examples(vmri, command):
     code, text = vmri(*command)
     assert code == 0
@@ -79,7 +80,7 @@ def test_help_shows_examples(vmri, command):
 
 def test_no_arguments_shows_the_commands(vmri):
     _, text = vmri()
-    for command in ("systems", "schemes", "simulate", "reproduce"):
+    for command in ("systems", "schemes", "simulate", "check"):
         assert command in text
 
 
@@ -257,7 +258,7 @@ def short_menu(monkeypatch):
     """The search chooses among few schemes."""
     menu = [family for family in families() if family.name in ("fully explicit", "explicit slow")]
     for module in ("advisor", "cost_report"):
-        monkeypatch.setattr(f"vmri_jax.study.{module}.families", lambda: menu)
+        monkeypatch.setattr(importlib.import_module(f"vmri_jax.study.{module}"), "families", lambda: menu)
 
 
 def test_tune_prints_a_command_that_keeps_its_promise(vmri, short_menu, tmp_path):

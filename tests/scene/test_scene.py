@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from vmri_jax.steppers.step import macro_step
 
 from tests.scene.gallery_scenes import gallery_scene
 from vmri_jax import ConstantMass, compose, fully_explicit, fully_implicit, galerkin, initial_state
 from vmri_jax.animation.drawing import Drawing
+from vmri_jax.running.macro_step import macro_step
 from vmri_jax.scene import (
     Body,
     Constraint,

@@ -138,7 +138,7 @@ def test_it_solves_the_equations_of_the_step(name, scheme, macro_dt, passes, req
     n = state.q_s.size + state.q_f.size
     expected, _ = phases(system, scheme, state, Newton("arrowhead"), macro_dt)
     found, info = phases(system, scheme, state, Newton("nested"), macro_dt)
-    assert int(info.method.max()) == Method.NESTED
+    assert int(info.method.max()) == Method.COLLOCATION
     assert largest_difference(found, expected) / np.abs(expected).max() < 1e-12  # measured 1e-14
     assert info.iterations.mean() < passes, info.iterations.mean()
     motion = np.abs(np.diff(expected[:, :n], axis=0)).max()

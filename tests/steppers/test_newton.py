@@ -2,10 +2,10 @@
 
 import jax.numpy as jnp
 import pytest
-from vmri_jax.steppers.newton.full import PLAIN_ITERATIONS
 
 from tests.support import compiled_step, largest_difference
 from vmri_jax import ConstantMass, Newton, Result, State, System, fully_implicit, initial_state, simulate
+from vmri_jax.steppers.coupled import PLAIN_ITERATIONS
 
 EXACT = Newton(method="arrowhead")
 

@@ -3,22 +3,22 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from vmri_jax.steppers.newton.extrapolation import Differences, Line
-from vmri_jax.steppers.newton.secant import Pairs
-from vmri_jax.steppers.newton.slow import ENOUGH, minimal_residuals
 
 from tests.support import largest_difference
+from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor
+from vmri_jax.steppers.secant import Pairs
+from vmri_jax.steppers.slow_equations import ENOUGH, minimal_residuals
 
 
 def test_extrapolation_takes_the_order_that_was_best():
     n = np.arange(12.0)
     smooth, rough = 2 - n + 0.5 * n**3, np.random.default_rng(0).normal(size=12)
     for values, error in ((smooth, 1e-10), (rough, 5.0)):
-        past = Differences.constant(jnp.asarray(values[:1]))
+        past = PolynomialPredictor.constant(jnp.asarray(values[:1]))
         for x in values[1:-1]:
             past = past.add(jnp.asarray([x]), 1)
         assert abs(past.next(1)[0] - values[-1]) < error
-    rough, past, missed = np.random.default_rng(0).normal(size=200), Differences.constant(jnp.zeros(1)), []
+    rough, past, missed = np.random.default_rng(0).normal(size=200), PolynomialPredictor.constant(jnp.zeros(1)), []
     next_value, add = jax.jit(lambda past: past.next(1)), jax.jit(lambda past, x: past.add(x, 1))
     for x in rough:
         missed.append(abs(float(next_value(past)[0]) - x))
@@ -30,14 +30,14 @@ def test_extrapolation_takes_the_order_that_was_best():
 
 def test_a_line_expects_what_stands_out():
     """A line with a jump at the start of every macro step goes on exactly."""
-    line, value = Line.zero((), stands_out=True), lambda k: 3.0 + 0.5 * k + 7.0 * (k % 4 == 0)
+    line, value = LinearPredictor.zero(()), lambda k: 3.0 + 0.5 * k + 7.0 * (k % 4 == 0)
     missed = []
     for first in range(0, 20, 4):
         within = line
         for m in range(4):
             missed.append(abs(float(within.next(m)) - value(first + m)))
             within = within.add(m, value(first + m))
-        line = line.after_step(jnp.stack([value(first + m) for m in range(4)]))
+        line = line.after_step(jnp.stack([value(first + m) for m in range(4)]), stands_out=True)
     assert max(missed[:8]) > 5.0
     assert max(missed[12:]) < 1e-12
 

@@ -13,6 +13,11 @@ def is_concrete(tree) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def of_one_type(tree):
+    """A pytree with its numbers as arrays of NumPy, tracers as they are: what differs in kind would be traced anew."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, tree)
+
+
 def require_x64() -> None:
     """Raise unless JAX's 64-bit mode is on."""
     if jnp.result_type(float) != np.float64:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, require_x64
+from vmri_jax.mechanics.arrays import is_concrete, of_one_type, require_x64
 from vmri_jax.mechanics.checks import (
     check_arrays,
     check_flags,
@@ -49,6 +49,7 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
     require_x64()
     check_type("initial_state: system", system, System, "a vmri_jax.System")
     check_params(system.params)
+    system = of_one_type(system)
     check_flags(project=project)
     t = check_number("t", t)
     check_number("tolerance", tolerance)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.configure import warn_if_slow
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_flags, check_system
 from vmri_jax.mechanics.constraints import check_constraints
 from vmri_jax.mechanics.state import State
@@ -227,7 +227,8 @@ class Simulation:
     @cached_property
     def plan(self) -> Plan:
         """How its steps are taken; ``print`` shows it in words."""
-        return plan(self.system, self.scheme, self.state, self.newton)
+        newton, scheme, system = jax.tree.unflatten(self.structure, self.leaves)  # arrays as the engine has them
+        return plan(system, scheme, self.state, newton)
 
     @cached_property
     def start_arrays(self) -> tuple:
@@ -299,8 +300,7 @@ def simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, sav
     warn_if_slow()
     macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
     newton = newton or Newton()
-    leaves, structure = jax.tree.flatten((newton, scheme, system))
-    leaves = [np.asarray(leaf) if is_concrete(leaf) else leaf for leaf in leaves]  # of one type wherever they are from
+    leaves, structure = jax.tree.flatten(of_one_type((newton, scheme, system)))
     state = State(*_arrays(state))
     return Simulation(
         system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, leaves, structure

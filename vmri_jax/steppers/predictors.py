@@ -44,8 +44,10 @@ class PolynomialPredictor(NamedTuple):
         return PolynomialPredictor(jnp.stack(rows), jnp.where(jnp.isfinite(missed), FADING * missed, 0.0))
 
     def _missed(self, measured: int):
-        """(ORDER + 1,) by how much each order has missed."""
-        return jnp.maximum(jnp.max(jnp.abs(self.differences[1:, :measured]), axis=1, initial=0.0), self.misses)
+        """(ORDER + 1,) by how much each order has missed, infinite where a step had failed."""
+        misses = jnp.abs(self.differences[1:, :measured])
+        misses = jnp.where(misses < jnp.inf, misses, jnp.inf)
+        return jnp.maximum(jnp.max(misses, axis=1, initial=0.0), self.misses)
 
 
 class LinearPredictor(NamedTuple):

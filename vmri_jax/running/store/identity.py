@@ -46,7 +46,7 @@ def differences(here: dict[str, str], there: dict[str, str], same_jax: bool) -> 
 
 def describe(name: str, value) -> dict[str, str]:
     """Everything in a value in words, by the name of its place."""
-    if dataclasses.is_dataclass(value):
+    if dataclasses.is_dataclass(value) and not isinstance(value, TracedOnce):
         parts = [describe(f"{name}.{field.name}", getattr(value, field.name)) for field in dataclasses.fields(value)]
         return {key: text for part in parts for key, text in part.items()}
     leaves, _ = jax.tree_util.tree_flatten_with_path(value)
