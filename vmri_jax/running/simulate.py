@@ -227,8 +227,7 @@ class Simulation:
     @cached_property
     def plan(self) -> Plan:
         """How its steps are taken; ``print`` shows it in words."""
-        newton, scheme, system = jax.tree.unflatten(self.structure, self.leaves)  # arrays as the engine has them
-        return plan(system, scheme, self.state, newton)
+        return plan(self.system, self.scheme, self.state, self.newton)
 
     @cached_property
     def start_arrays(self) -> tuple:
@@ -299,8 +298,8 @@ def simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, sav
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     warn_if_slow()
     macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
-    newton = newton or Newton()
-    leaves, structure = jax.tree.flatten(of_one_type((newton, scheme, system)))
+    newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
+    leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))
     return Simulation(
         system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, leaves, structure
