@@ -11,10 +11,10 @@ reproduce: .venv/installed  ## the quick reference study: figures, tables and ou
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
 
 test: .venv/installed  ## the whole test suite
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --ignore tests/smoke
 
 smoke:  ## a few minutes: every kind of step, with another environment, make smoke ENVIRONMENT=/path/to/venv
-	$(ENVIRONMENT)/bin/python -m pytest tests/smoke
+	$(ENVIRONMENT)/bin/python -m pytest -n 2 tests/smoke
 
 bench: .venv/installed  ## the quick measurements: time, memory, against C; out/benchmarks
 	$(BIN)/python -m benchmarks all

@@ -85,7 +85,10 @@ def test_cases_without_sense_say_why():
     assert [title for title, why in reasons(damped()).items() if "forces besides its potentials" in why] == work
 
 
-@pytest.mark.parametrize("make", [readme_crane, hoist, damped])
+FULL = pytest.mark.full
+
+
+@pytest.mark.parametrize("make", [readme_crane, pytest.param(hoist, marks=FULL), pytest.param(damped, marks=FULL)])
 def test_at_rest_driven_or_damped_every_criterion_that_applies_is_met(make):
     report = run_cases(cases_for(make()))
     assert report.passed, report.markdown()
