@@ -19,8 +19,8 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 
-WORKING_SET = 8192
-"""Fast and slow variables at all nodes of a macro step that the lanes of a chunk may have together, 64 kB."""
+WORKING_SET = 4096
+"""Fast and slow variables at all nodes of a macro step that the lanes of a chunk may have together, 32 kB."""
 FEWEST, MOST = 64, 1024
 """Lanes of a chunk. With fewer of them a lane takes longer, even where 64 do not fit into the cache."""
 
