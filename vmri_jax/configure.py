@@ -17,9 +17,12 @@ import jax
 FAST_LOOPS = (
     "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000,-memdep-block-scan-limit=10000",
     "--xla_cpu_prefer_vector_width=512",
+    "--xla_disable_hlo_passes=dot-library-rewriter",
 )
 """A loop whose buffers are below 100 MB, instead of a few kB, becomes one kernel (3 to 8 times as fast); a load in it is traced
-further back to the store it could be replaced by (short chains 1.4 times); and vector registers are filled (long chains 1.3)."""
+further back to the store it could be replaced by (short chains 1.4 times); vector registers are filled (long chains 1.3); and
+sums over many lanes stay in the kernel, where a library would do them (batches of high order 2.6). XLA ignores names of passes
+that it does not know."""
 LATER = "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made."
 
 
