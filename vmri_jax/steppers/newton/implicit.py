@@ -26,7 +26,8 @@ def differentiable(equations: StepEquations, x: Unknowns, end):
 @differentiable.defjvp
 def _implicit_derivative(primals, tangents):
     equations, root, _ = primals
-    # One more Newton step: it moves nothing, but makes the root depend on the equations, for second derivatives.
+    # One more Newton step moves nothing, but makes the root depend on the equations, for second derivatives. To call
+    # `differentiable` again would not do: in reverse mode JAX forgets the rules of what it has evaluated already.
     x = jax.tree.map(jnp.add, root, _direction(equations, root, equations.residual(root)))
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
     dx = _direction(equations, x, change)
