@@ -1,5 +1,8 @@
 """Checks at the door: bad input is refused before any compute, with what came, what was expected and what to do."""
 
+import traceback
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,11 +106,27 @@ def check_system(system: System, q_s, q_f) -> None:
 def _shape(name: str, function, *args):
     try:
         return jax.eval_shape(function, *args)
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+        raise ValueError(
+            f"System: {name} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
+            "numpy and math, jnp.where(condition, a, b) instead of if, and no float(...) or int(...)."
+        ) from None
     except Exception as error:
         raise ValueError(
             f"System: {name} could not be evaluated on arguments of shapes "
-            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and the params: {type(error).__name__}: {error}"
+            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and the params{_line_of(error)}: "
+            f"{type(error).__name__}: {error}"
         ) from error
+
+
+def _line_of(error: Exception) -> str:
+    """The line of the user's own file that an error comes from, in words; nothing if it is in no file of his."""
+    package = Path(__file__).parents[1]
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if path.exists() and "site-packages" not in path.parts and package not in path.parents:
+            return f", line {frame.lineno} of {path.name} ({frame.line})"
+    return ""
 
 
 def _check_float64(name: str, value) -> None:
