@@ -16,28 +16,36 @@ of q_s ("s") or q_f ("f") it is; `radius` is only there where the body has one, 
 is "link" or "spring". Everything is lists, strings and numbers.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
-from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.layout import Place
+from vmri_jax.scene.sorting import Sorting
 
 KINDS = ("links", "springs", "anchors", "planes", "spheres")
 
 
-def drawing(bodies: Mapping[str, Body], effects: Iterable[Effect], places: Mapping[str, Place]) -> dict[str, list]:
-    """The description of these bodies at these places with these effects."""
+def drawing(sorting: Sorting, effects: Iterable[Effect]) -> dict[str, list]:
+    """The description of a scene.
+
+    Args:
+        sorting: bodies at their places.
+        effects: in the order in which they are drawn.
+    """
     seen: dict[str, list] = {kind: [] for kind in ("bodies", "blocks", *KINDS)}
-    for name, body in bodies.items():
-        axes = [[places[name].part, places[name].start + i] for i in range(body.size)]
+    radii = {}
+    for name, body in sorting.bodies.items():
+        part, start, size = sorting.places[name]
+        axes = [[part, start + i] for i in range(size)]
         seen["blocks" if body.block else "bodies"].append({"name": name, "coordinates": axes})
-    radii = {name: float(body.radius) for name, body in bodies.items() if body.radius is not None}
+        if body.radius is not None:
+            radii[name] = float(body.radius)
     for effect in effects:
-        parts = effect.drawing(bodies)
+        parts = effect.drawing(sorting.bodies)
         for kind in KINDS:
             seen[kind] += parts.get(kind, [])
         radii |= dict(parts.get("radii", []))
-        seen |= {key: value for key, value in parts.items() if key == "up"}
+        if "up" in parts:
+            seen["up"] = parts["up"]
     for entry in seen["bodies"]:
         if entry["name"] in radii:
             entry["radius"] = radii[entry["name"]]

@@ -52,11 +52,8 @@ class EffectTerm:
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates, None where there is none."""
         forces = self.function(t, self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
-        put = [
-            rows.put(jnp.broadcast_to(force, rows.shape), q_s.shape[0], q_f.shape[0])
-            for rows, force in zip(self.roles, forces, strict=True)
-        ]
-        return sums(put)
+        sizes = q_s.shape[0], q_f.shape[0]
+        return sums([rows.put(force, *sizes) for rows, force in zip(self.roles, forces, strict=True)])
 
 
 @dataclass(frozen=True)
@@ -103,8 +100,7 @@ def sums(pairs: Sequence):
 
 def joined(values: Sequence):
     """One vector of arrays of any shape."""
-    vectors = [jnp.reshape(value, (-1,)) for value in values]
-    return vectors[0] if len(vectors) == 1 else jnp.concatenate(vectors)
+    return jnp.concatenate([jnp.ravel(value) for value in values])
 
 
 @dataclass(frozen=True)
@@ -159,3 +155,14 @@ class TotalForce(_OfTerms):
     def __call__(self, t, q_s, q_f, v_s, v_f, params):
         slow, fast = sums([term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms])
         return jnp.zeros_like(q_s) if slow is None else slow, jnp.zeros_like(q_f) if fast is None else fast
+
+
+FUNCTIONS = {
+    "kinetic": KineticEnergy,
+    "slow_potential": SlowPotential,
+    "fast_potential": FastPotential,
+    "constraint": MicroConstraint,
+    "slow_constraint": MacroConstraint,
+    "force": TotalForce,
+}
+"""What is made of the terms of a home."""
