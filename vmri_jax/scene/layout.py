@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.body import Body
+from vmri_jax.scene.body import Bodies
 
 Part = Literal["s", "f"]
 
@@ -26,7 +26,7 @@ class Place(NamedTuple):
     size: int
 
 
-def layout(bodies: Mapping[str, Body], paces: Mapping[str, Pace]) -> dict[str, Place]:
+def layout(bodies: Bodies, paces: Mapping[str, Pace]) -> dict[str, Place]:
     """The place of every body: slow ones in order in q_s, fast ones in order in q_f.
 
     Args:
@@ -41,7 +41,7 @@ def layout(bodies: Mapping[str, Body], paces: Mapping[str, Pace]) -> dict[str, P
     return places
 
 
-def join(bodies: Mapping[str, Body], places: Mapping[str, Place], part: Part, what: str):
+def join(bodies: Bodies, places: Mapping[str, Place], part: Part, what: str):
     """One vector of all slow or of all fast bodies.
 
     Args:

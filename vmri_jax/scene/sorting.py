@@ -9,7 +9,7 @@ A body is fast that a stiff potential (not one of V) or kinetic effect touches: 
 between slow and fast, see `vmri_jax.scene.rates`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Literal, NamedTuple
@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import jax
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.scene.body import Body
+from vmri_jax.scene.body import Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.layout import Pace, Place, join, layout
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
@@ -48,7 +48,7 @@ class Placed(NamedTuple):
 class Sorting:
     """Bodies by name, their paces, their places in q_s and q_f, and where every effect lives."""
 
-    bodies: Mapping[str, Body]
+    bodies: Bodies
     paces: dict[str, Pace]
     places: dict[str, Place]
     placed: tuple[Placed, ...]
@@ -63,7 +63,7 @@ class Sorting:
         return (*both("position"), *both("velocity"))
 
 
-def sort(bodies: Mapping[str, Body], effects: Sequence[Effect]) -> Sorting:
+def sort(bodies: Bodies, effects: Sequence[Effect]) -> Sorting:
     """Paces of all bodies and homes of all effects.
 
     Args:
