@@ -1,20 +1,4 @@
-"""What a scene looks like, as plain data that is stored with a run.
-
-    {
-        "bodies":  [{"name": "bob", "coordinates": [["s", 0], ["s", 1], ["s", 2]], "radius": 0.1}, ...],
-        "blocks":  [{"name": "modes", "coordinates": [["f", 0], ["f", 1], ["f", 2], ["f", 3]]}, ...],
-        "links":   [["bob", "tip"], ...],
-        "springs": [["tip", "load"], ...],
-        "anchors": [{"body": "bob", "point": [0.0, 0.0, 0.0], "kind": "link"}, ...],
-        "planes":  [{"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}, ...],
-        "spheres": [{"center": [0.0, 0.0, 0.0], "radius": 1.0}, ...],
-        "up":      [0.0, 0.0, 1.0],
-    }
-
-`coordinates` says for each axis of a point (one to three of them), or for each general coordinate of a block, which entry
-of q_s ("s") or q_f ("f") it is; `radius` is only there where the body has one, `up` where gravity has a direction. `kind`
-is "link" or "spring". Everything is lists, strings and numbers.
-"""
+"""What a scene looks like, as plain data that is stored with a run, see `vmri_jax.animation.Drawing.from_dict`."""
 
 from collections.abc import Iterable
 

@@ -257,7 +257,12 @@ def lasting(value):
 
 
 def real_tree(what: str, tree):
-    """A pytree of real numbers as one of arrays; what is neither is refused by its place in the tree."""
+    """A pytree of real numbers as one of arrays; what is neither is refused by its place in the tree.
+
+    Args:
+        what: its name, for messages.
+        tree: numbers, arrays, lists and dictionaries of them.
+    """
 
     def convert(path, leaf):
         return jnp.asarray(double_array(what + jax.tree_util.keystr(path), leaf))

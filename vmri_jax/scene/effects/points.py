@@ -15,7 +15,7 @@ from vmri_jax.scene.effect import Effect, real_tree
 def distance(q, params=None):
     """``|q_b - q_a|`` of the first two roles."""
     a, b = q
-    return jnp.sqrt(jnp.sum((b - a) ** 2, axis=-1))
+    return jnp.linalg.norm(b - a, axis=-1)
 
 
 @effect_class
@@ -45,13 +45,12 @@ class ToPoint(Effect):
     def rest(self, q, params):
         """Distance of a body from the point at the start."""
         (q,) = q
-        return jnp.sqrt(jnp.sum((q - self.point_at_start(params)) ** 2, axis=-1))
+        return jnp.linalg.norm(q - self.point_at_start(params), axis=-1)
 
     def require_apart(self, bodies):
         """Refuse bodies that start at the point."""
-        away = self.at_start(bodies, self.parameters(bodies))
-        expected = f"bodies must not start there; {self.advice}"
-        self.require(away > 0, "the distance of a body from its point", away, expected)
+        away, what = self.at_start(bodies, self.parameters(bodies)), "the distance of a body from its point"
+        self.require(away > 0, what, away, f"bodies must not start there; {self.advice}")
 
 
 @effect_class
@@ -69,10 +68,12 @@ class ToFixedPoint(ToPoint):
             )
 
     def drawing(self, bodies):
-        points = np.atleast_2d(np.asarray(self.parameters(bodies)["point"]))
-        pairs = zip(self.elements(bodies), points, strict=True)
-        drawn = [(name, point) for (name,), point in pairs if not bodies[name].block]
-        return {"anchors": [{"body": name, "point": point.tolist(), "kind": self.drawn_as} for name, point in drawn]}
+        points = np.atleast_2d(self.parameters(bodies)["point"])
+        anchors = []
+        for (name,), point in zip(self.elements(bodies), points.tolist(), strict=True):
+            if not bodies[name].block:
+                anchors.append({"body": name, "point": point, "kind": self.drawn_as})
+        return {"anchors": anchors}
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,8 @@ class ToPath(ToPoint):
         super().check_bodies(bodies)
         shape = jax.eval_shape(lambda: jnp.asarray(self.point_at_start({}))).shape
         for (name,) in self.elements(bodies):
-            needed = (bodies[name].size,)
-            if shape != needed:
+            size = bodies[name].size
+            if shape != (size,):
                 raise ValueError(
-                    f"{self.name}: path returns shape {shape}; {name} has dimension {needed[0]}, return {needed}."
+                    f"{self.name}: path returns shape {shape}; {name} has dimension {size}, return ({size},)."
                 )

@@ -5,17 +5,12 @@ from typing import Any
 import jax.numpy as jnp
 
 from vmri_jax.scene.declare import array, effect_class, positive
-from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
+from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath, distance
 
 
 def elastic_energy(stiffness, elongation):
     """``sum k/2 e^2``."""
     return jnp.sum(stiffness / 2 * elongation**2)
-
-
-def elongation(line, length):
-    """``|x| - l``."""
-    return jnp.linalg.norm(line, axis=-1) - length
 
 
 @effect_class
@@ -40,8 +35,7 @@ class Spring(BetweenPoints):
 
     @staticmethod
     def function(q, params):
-        a, b = q
-        return elastic_energy(params["stiffness"], elongation(b - a, params["length"]))
+        return elastic_energy(params["stiffness"], distance(q) - params["length"])
 
 
 @effect_class
@@ -68,8 +62,7 @@ class NonlinearSpring(BetweenPoints):
 
     @staticmethod
     def function(q, params):
-        a, b = q
-        e, energy = elongation(b - a, params["length"]), 0.0
+        e, energy = distance(q) - params["length"], 0.0
         for j in range(params["coefficients"].shape[0], 0, -1):
             energy = (energy + params["coefficients"][j - 1] / (j + 1)) * e
         return jnp.sum(energy * e)
@@ -77,10 +70,8 @@ class NonlinearSpring(BetweenPoints):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         coefficients = self.parameters(bodies)["coefficients"]
-        if coefficients.ndim != 1 or not coefficients.size:
-            raise ValueError(
-                f"{self.name}: coefficients is {self.coefficients!r}; give (k_1, k_2, ...), at least one number."
-            )
+        one = coefficients.ndim == 1 and coefficients.size > 0
+        self.require(one, "coefficients", repr(self.coefficients), "give (k_1, k_2, ...), at least one number")
 
 
 @effect_class
@@ -108,9 +99,10 @@ class SpringAnchor(ToFixedPoint):
     @staticmethod
     def function(q, params):
         (q,) = q
+        line = q - params["point"]
         if "length" not in params:
-            return jnp.sum(params["stiffness"] / 2 * jnp.sum((q - params["point"]) ** 2, axis=-1))
-        return elastic_energy(params["stiffness"], elongation(q - params["point"], params["length"]))
+            return jnp.sum(params["stiffness"] / 2 * jnp.sum(line**2, axis=-1))
+        return elastic_energy(params["stiffness"], jnp.linalg.norm(line, axis=-1) - params["length"])
 
     @property
     def apart(self):
