@@ -118,13 +118,14 @@ class Effect(ABC):
 
     def at_start(self, bodies: Bodies, params: dict[str, Any]):
         """The measured value of every element at the start, (n,), or () of a single one."""
-        elements = self.elements(bodies)
-        starts = [tuple(bodies[name].position for name in element) for element in elements]
-        return squeeze(jnp.stack([self.rest(q, self.one(params, i, bodies)) for i, q in enumerate(starts)]))
+        count = len(self.elements(bodies))
+        return squeeze(jnp.stack([self.rest(*self.one(i, bodies, params)) for i in range(count)]))
 
-    def one(self, params: dict[str, Any], i: int, bodies: Bodies) -> dict[str, Any]:
-        """The parameters of element i among those of all."""
-        return params if len(self.elements(bodies)) == 1 else choose(params, (i,), self.split)
+    def one(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[tuple, dict[str, Any]]:
+        """Positions of the bodies of element i at the start, and its parameters among those of all."""
+        elements = self.elements(bodies)
+        q = tuple(bodies[name].position for name in elements[i])
+        return q, params if len(elements) == 1 else choose(params, (i,), self.split)
 
     def check(self, bodies: Bodies) -> None:
         """Refuse what is wrong with this effect between these bodies.
@@ -201,7 +202,7 @@ class Effect(ABC):
         return None
 
     def drawing(self, bodies: Bodies) -> dict[str, list]:
-        """What there is to see of it, see `vmri_jax.scene.drawing`."""
+        """What there is to see of it: entries of `Scene.drawing`, and "radii" of bodies, pairs of name and number."""
         if self.drawn_as is None:
             return {}
         return {DRAWN[self.drawn_as]: [list(pair) for element in self.elements(bodies) for pair in pairwise(element)]}

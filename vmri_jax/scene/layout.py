@@ -107,14 +107,14 @@ class Rows:
             n_s, n_f: lengths of q_s and q_f.
 
         Returns:
-            Vectors (n_s,), (n_f,) with the rows added at their places, None where there are none.
+            Vectors (n_s,), (n_f,) with the rows added at their places.
         """
         rows, at = jnp.broadcast_to(rows, (sum(run.count for run in self.runs), self.size)), 0
-        sums: dict[Part, list] = {"s": [], "f": []}
+        sums = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}
         for part, start, count, same in self.runs:
             piece = rows[at : at + count]
             piece = jnp.sum(piece, axis=0) if same else piece.reshape(-1)
-            after = (n_s if part == "s" else n_f) - start - piece.shape[0]
-            sums[part].append(jnp.pad(piece, (start, after)))
+            after = sums[part].shape[0] - start - piece.shape[0]
+            sums[part] += jnp.pad(piece, (start, after))
             at += count
-        return tuple(sum(parts[1:], parts[0]) if parts else None for parts in sums.values())
+        return tuple(sums.values())

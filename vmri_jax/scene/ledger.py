@@ -37,7 +37,7 @@ class Row:
     """One body or effect.
 
     name, kind: what it is called, and "body" or the term it is part of.
-    grid: "macro" or "micro", where it lives. why: how that was decided.
+    grid, why: "macro" or "micro", where it lives, and how that was decided.
     unknowns, multipliers: it adds to the equations of a macro step.
     evaluations: nodes of a macro step at which its function is evaluated (by implicit schemes in every Newton iteration).
     operations, time: shares of the compiled operations and of the measured time that go with it, None where not measured.

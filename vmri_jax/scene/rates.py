@@ -1,13 +1,11 @@
 """How fast bodies would move under each effect alone, and the border between slow and fast.
 
-A potential (L = -V) or kinetic effect gives the force ``f(q, v) = L_q - L_vq v`` at constant velocity; gauge terms, total
-time derivatives in L, drop out of it. With the stiffness ``K = -df/dq`` (V'' of a potential), the gyroscopic matrix G, the
-antisymmetric part of df/dv (``L_qv - L_vq``: of a charge in a magnetic field the matrix of Q v x B), and the mass matrix M
-of its bodies, the frequency of an element is, at the start, the largest w with ``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
+A potential (L = -V) or kinetic effect gives the force ``f(q, v) = L_q - L_vq v`` at constant velocity; gauge terms drop out.
+With the stiffness ``K = -df/dq``, the gyroscopic matrix G, the antisymmetric part of df/dv, and the mass matrix M of its
+bodies, the frequency of an element is the largest w at the start with ``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
 
-What gives bodies at rest an acceleration a has a rate without any curvature, ``sqrt(a / L)``, L the size of the scene. The
-border is the middle of the widest gap between all rates, on a logarithmic scale; where no gap is as wide as SEPARATION, one
-rate is enough for all.
+The rate is that, or ``sqrt(a / L)`` if larger: a an acceleration of bodies at rest, L the size of the scene. The border is
+the middle of the widest gap between all rates, on a logarithmic scale.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +22,7 @@ from vmri_jax.scene.body import LARGEST_POINT, Bodies
 from vmri_jax.scene.effect import Effect
 
 SEPARATION = 3.0
-"""Smallest ratio of two neighbouring rates that separates slow from fast."""
+"""Smallest ratio of two neighbouring rates that separates slow from fast; without, one rate is enough for all."""
 SPAN = 1e3
 """Rates slower than the fastest one by more than this count as slower by this: they are slow in any case."""
 
@@ -112,8 +110,8 @@ def _scaled(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
     params, found = effect.parameters(bodies), []
     for i, element in enumerate(effect.elements(bodies)):
-        q, v = (tuple(getattr(bodies[name], what) for name in element) for what in ("position", "velocity"))
-        chosen = effect.one(params, i, bodies)
+        q, chosen = effect.one(i, bodies, params)
+        v = tuple(bodies[name].velocity for name in element)
         parts = _derivatives(effect.function, effect.kind == "kinetic", q, v, chosen)
         found.append(Linearised(np.concatenate([columns[name] for name in element]), *map(np.asarray, parts)))
         if not all(np.isfinite(part).all() for part in found[-1]):
@@ -125,7 +123,7 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
 
 @partial(jax.jit, static_argnames=("function", "kinetic"))
 def _derivatives(function, kinetic: bool, q, v, params):
-    """What `Linearised` holds besides the columns."""
+    """What `Linearised` holds after the columns."""
     (q, unravel), (v, _) = ravel_pytree(q), ravel_pytree(v)
 
     def lagrangian(q, v):

@@ -46,8 +46,7 @@ def _rows(sorting: Sorting, part: Placed, n_s: int) -> list[tuple[str, np.ndarra
     columns = {name: p.start + np.arange(p.size) + (n_s if p.part == "f" else 0) for name, p in sorting.places.items()}
     elements, params = effect.elements(bodies), effect.parameters(bodies)
     for i in part.elements:
-        q = tuple(bodies[name].position for name in elements[i])
-        jacobian = np.asarray(_jacobian(effect.function, effect.timed, q, effect.one(params, i, bodies)))
+        jacobian = np.asarray(_jacobian(effect.function, effect.timed, *effect.one(i, bodies, params)))
         label = f"{effect.name} {'-'.join(elements[i])}"
         for j, entries in enumerate(jacobian):
             row = np.zeros(sum(body.size for body in bodies.values()))

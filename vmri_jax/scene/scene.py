@@ -12,7 +12,6 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
-from vmri_jax.scene import drawing as drawings
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect, unknown
@@ -23,6 +22,9 @@ from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
+
+DRAWN_LISTS = ("links", "springs", "anchors", "planes", "spheres")
+"""Entries of a drawing to which effects add."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,8 +176,24 @@ class Scene:
         return ledger(self.sorting, scheme, macro_dt, measure)
 
     def drawing(self) -> dict[str, list]:
-        """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.scene.drawing`."""
-        return drawings.drawing(self.sorting, self.effects)
+        """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.animation.Drawing.from_dict`."""
+        seen: dict[str, list] = {kind: [] for kind in ("bodies", "blocks", *DRAWN_LISTS)}
+        radii = {body.name: float(body.radius) for body in self.bodies if body.radius is not None}
+        for body in self.bodies:
+            part, start, size = self.places[body.name]
+            axes = [[part, start + i] for i in range(size)]
+            seen["blocks" if body.block else "bodies"].append({"name": body.name, "coordinates": axes})
+        for effect in self.effects:
+            parts = effect.drawing(self.by_name)
+            for kind in DRAWN_LISTS:
+                seen[kind] += parts.get(kind, [])
+            radii |= dict(parts.get("radii", []))
+            if "up" in parts:
+                seen["up"] = parts["up"]
+        for entry in seen["bodies"]:
+            if entry["name"] in radii:
+                entry["radius"] = radii[entry["name"]]
+        return seen
 
     def _named(self, what: str, names: Iterable[str]) -> list[Effect]:
         """The effects of these names, in the order of the scene."""
