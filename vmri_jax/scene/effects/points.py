@@ -1,4 +1,7 @@
-"""What effects between two points, or between bodies and a point that is fixed or moves, share."""
+"""Attachments: between two points, or between bodies and a point that is fixed or moves.
+
+Each gives the line x from one end to the other; ``law(x, params)`` of a class makes an energy, a constraint or a force of it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,21 +23,28 @@ def distance(q, params=None):
 
 @effect_class
 class BetweenPoints(Effect):
-    """Between the two points of each pair, which do not start at the same place."""
+    """Between the two points of each pair, which do not start at the same place; ``x = q_b - q_a``."""
 
     between: Any = names(2)
 
+    law: ClassVar[Any]
     dimensions = (1, 2, 3)
     apart = True
     rest = staticmethod(distance)
 
+    @classmethod
+    def function(cls, q, params):
+        a, b = q
+        return cls.law(b - a, params)
+
 
 @effect_class
 class ToPoint(Effect):
-    """Between each body and a point that is given."""
+    """Between each body and a point p that is given; ``x = q - p``."""
 
     bodies: Any = names()
 
+    law: ClassVar[Any]
     advice: ClassVar[str] = "move one of them"
     """What to do about bodies that start at the point."""
 
@@ -55,9 +65,14 @@ class ToPoint(Effect):
 
 @effect_class
 class ToFixedPoint(ToPoint):
-    """What anchors to a fixed point share."""
+    """To a point that stays where it is."""
 
     point: Any = vector()
+
+    @classmethod
+    def function(cls, q, params):
+        (q,) = q
+        return cls.law(q - params["point"], params)
 
     def __post_init__(self):
         super().__post_init__()
@@ -78,29 +93,29 @@ class ToFixedPoint(ToPoint):
 
 @dataclass(frozen=True)
 class AlongPath:
-    """A formula with the point of a path, ``formula(a(t), q, ..., params)``, as a function of time; compared by value."""
+    """``law(q - a(t), params)``, as a function of time; compared by value."""
 
-    formula: Callable
+    law: Callable
     path: Callable
 
-    def __call__(self, t, *arguments):
-        return self.formula(self.path(t, arguments[-1]["path"]), *arguments)
+    def __call__(self, t, q, *arguments):
+        (q,), params = q, arguments[-1]
+        return self.law(q - self.path(t, params["path"]), params)
 
 
 @effect_class
 class ToPath(ToPoint):
-    """What effects between bodies and a moving point share: ``formula(point, q, ..., params)`` at the point of the path."""
+    """To a point that moves along a path."""
 
     path: Callable
     params: Any = field(default_factory=dict, kw_only=True)
 
-    formula: ClassVar[Any]
     dimensions = (1, 2, 3)
     timed = True
 
     @property
     def function(self):
-        return AlongPath(self.formula, self.path)
+        return AlongPath(self.law, self.path)
 
     def parameters(self, bodies):
         return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}

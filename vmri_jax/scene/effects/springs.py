@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from vmri_jax.scene.declare import array, effect_class, positive
-from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath, distance
+from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
 
 
 def elastic_energy(stiffness, elongation):
@@ -34,8 +34,8 @@ class Spring(BetweenPoints):
     default_name = "springs"
 
     @staticmethod
-    def function(q, params):
-        return elastic_energy(params["stiffness"], distance(q) - params["length"])
+    def law(line, params):
+        return elastic_energy(params["stiffness"], jnp.linalg.norm(line, axis=-1) - params["length"])
 
 
 @effect_class
@@ -61,8 +61,8 @@ class NonlinearSpring(BetweenPoints):
     default_name = "nonlinear_springs"
 
     @staticmethod
-    def function(q, params):
-        e, energy = distance(q) - params["length"], 0.0
+    def law(line, params):
+        e, energy = jnp.linalg.norm(line, axis=-1) - params["length"], 0.0
         for j in range(params["coefficients"].shape[0], 0, -1):
             energy = (energy + params["coefficients"][j - 1] / (j + 1)) * e
         return jnp.sum(energy * e)
@@ -97,12 +97,10 @@ class SpringAnchor(ToFixedPoint):
     drawn_as = "spring"
 
     @staticmethod
-    def function(q, params):
-        (q,) = q
-        line = q - params["point"]
-        if "length" not in params:
-            return jnp.sum(params["stiffness"] / 2 * jnp.sum(line**2, axis=-1))
-        return elastic_energy(params["stiffness"], jnp.linalg.norm(line, axis=-1) - params["length"])
+    def law(line, params):
+        if "length" in params:
+            return Spring.law(line, params)
+        return jnp.sum(params["stiffness"] / 2 * jnp.sum(line**2, axis=-1))
 
     @property
     def apart(self):
@@ -130,6 +128,5 @@ class MovingAnchor(ToPath):
     default_name = "moving_anchors"
 
     @staticmethod
-    def formula(point, q, v, params):
-        (q,) = q
-        return (params["stiffness"][..., None] * (point - q),)
+    def law(line, params):
+        return (-params["stiffness"][..., None] * line,)
