@@ -5,7 +5,7 @@ from itertools import pairwise
 
 MAGNIFIED = 10.0
 """The stiff springs of the Fermi-Pasta-Ulam chain stretch by a few percent: their elongations are drawn so much larger."""
-STEEL = "#8a97a1"
+STEEL_BALL = {"radius": 0.3, "color": "#8a97a1"}
 
 
 def fermi_pasta_ulam(num_springs: int) -> dict:
@@ -14,14 +14,7 @@ def fermi_pasta_ulam(num_springs: int) -> dict:
     for i in range(num_springs):
         for sign, rest in ((-1.0, 4.5 * i + 3.0), (1.0, 4.5 * i + 4.5)):
             form = [[w, "s", i], [sign * MAGNIFIED * w, "f", i]]
-            body = {
-                "name": f"mass {len(bodies) + 1}",
-                "coordinates": [form],
-                "offset": [rest],
-                "radius": 0.3,
-                "color": STEEL,
-            }
-            bodies.append(body)
+            bodies.append({"name": f"mass {len(bodies) + 1}", "coordinates": [form], "offset": [rest], **STEEL_BALL})
     names = [body["name"] for body in bodies]
     springs = [[a, b, "slow" if i % 2 else "fast"] for i, (a, b) in enumerate(pairwise(names))]
     walls = [(names[0], 0.0), (names[-1], 4.5 * num_springs + 3.0)]
@@ -36,12 +29,9 @@ def fermi_pasta_ulam(num_springs: int) -> dict:
 
 def triple_spherical_pendulum() -> dict:
     """The heavy bob on a rod, two light ones on a rod and a stiff spring."""
+    light = [_point(name, "f", i, 0.4) for i, name in enumerate(("light bob", "last bob"))]
     return {
-        "bodies": [
-            _point("heavy bob", "s", 0, 0.9),
-            _point("light bob", "f", 0, 0.4),
-            _point("last bob", "f", 1, 0.4),
-        ],
+        "bodies": [_point("heavy bob", "s", 0, 0.9), *light],
         "links": [["heavy bob", "light bob"]],
         "springs": [["light bob", "last bob"]],
         "anchors": [{"body": "heavy bob", "point": [0.0, 0.0, 0.0], "kind": "link"}],
@@ -75,4 +65,6 @@ def built_in(name: str, n_s: int) -> dict | None:
     """
     if name == "fpu":
         return fermi_pasta_ulam(n_s)
-    return {"tsp": triple_spherical_pendulum, "sam": simple_atomic_model}.get(name, lambda: None)()
+    if name == "tsp":
+        return triple_spherical_pendulum()
+    return simple_atomic_model() if name == "sam" else None

@@ -3,6 +3,7 @@
 import json
 import operator
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -134,22 +135,26 @@ class Drawing:
         names = [body.name for body in bodies]
         if not bodies and not blocks:
             raise ValueError("drawing: there are no bodies and no blocks; there must be at least one.")
-        for name in (every := [*names, *(block.name for block in blocks)]):
-            if every.count(name) > 1:
-                raise ValueError(f"drawing: {every.count(name)} bodies are named {name!r}; names must be unique.")
+        for name, count in Counter([*names, *(block.name for block in blocks)]).items():
+            if count > 1:
+                raise ValueError(f"drawing: {count} bodies are named {name!r}; names must be unique.")
         links, springs = (all_of(f"{kind}s", partial(_joint, kind, names)) for kind in KINDS)
         return cls(
             bodies=bodies,
             blocks=blocks,
             joints=links + springs + all_of("anchors", partial(_anchor, names)),
-            planes=all_of("planes", _plane),
-            spheres=all_of("spheres", _sphere),
+            planes=all_of("planes", partial(_record, Plane, {"point": numbers, "normal": direction})),
+            spheres=all_of("spheres", partial(_record, Sphere, {"center": numbers, "radius": positive})),
             up=None if data.get("up") is None else direction(data["up"], "drawing: up"),
             caption=str(data.get("caption") or ""),
         )
 
     def pace(self, joint: Joint) -> str:
-        """ "slow" or "fast": as it says, else "fast" if all its bodies are."""
+        """ "slow" or "fast": as it says, else "fast" if all its bodies are.
+
+        Args:
+            joint: between bodies of this drawing.
+        """
         fast = all(body.pace == "fast" for body in self.bodies if body.name in joint.bodies)
         return joint.pace or ("fast" if fast else "slow")
 
@@ -166,13 +171,20 @@ class Drawing:
         return frame(self.up, self.dimension)
 
     def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
-        """(n, 3) points of the picture of given points or directions; missing coordinates are zero."""
+        """(n, 3) points of the picture.
+
+        Args:
+            points: points or directions in coordinates of the bodies; missing coordinates are zero.
+        """
         d = self.dimension
         padded = np.array([np.pad(point, (0, d - len(point))) for point in points]).reshape(-1, d)
         return padded @ self.frame().T
 
     def maps(self, n_s: int, n_f: int) -> tuple[np.ndarray, np.ndarray]:
         """Offset (n, 3) and matrix (n, 3, n_s + n_f): where the bodies are in the picture, ``offset + matrix @ q``.
+
+        Args:
+            n_s, n_f: lengths of q_s and q_f.
 
         Raises:
             ValueError: a body uses a coordinate that q does not have.
@@ -271,14 +283,10 @@ def _anchor(names: Sequence[str], data: Any, where: str) -> Joint:
     return Joint(data["kind"], (body,), point, _pace(data.get("pace"), where))
 
 
-def _plane(data: Any, where: str) -> Plane:
-    check_keys(data, ("point", "normal"), ("point", "normal"), where)
-    return Plane(numbers(data["point"], f"{where}: point"), direction(data["normal"], f"{where}: normal"))
-
-
-def _sphere(data: Any, where: str) -> Sphere:
-    check_keys(data, ("center", "radius"), ("center", "radius"), where)
-    return Sphere(numbers(data["center"], f"{where}: center"), positive(data["radius"], f"{where}: radius"))
+def _record(kind: type, readers: dict[str, Callable], data: Any, where: str) -> Any:
+    """What has just these entries, each read and checked by a function of its own."""
+    check_keys(data, list(readers), list(readers), where)
+    return kind(**{key: read(data[key], f"{where}: {key}") for key, read in readers.items()})
 
 
 def _body_name(name: Any, names: Sequence[str], where: str) -> str:

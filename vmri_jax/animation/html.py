@@ -7,7 +7,6 @@ import jinja2
 import numpy as np
 
 from vmri_jax import plots
-from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.geometry import LAMP, SPAN, helix
 from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
@@ -33,17 +32,18 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     """
     every = -(-motion.points.size // MOST_NUMBERS)
     drawing, sizes = motion.drawing, layout(motion)
+    springs = [connection for connection in sizes.connections if connection.kind == "spring"]
+    uncoloured = [body for body in drawing.bodies if body.color is None]
     data = _data(motion.thinned(-(-len(motion.t) // every)), sizes)
     if every > 1:
         ending = {2: "nd", 3: "rd"}.get(every, "th")
         data["caption"] = f"{drawing.caption} Drawn from every {every}{ending} node.".strip()
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("vmri_jax.animation", "page"), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
+    loader = jinja2.PackageLoader("vmri_jax.animation", "page")
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     text = environment.get_template("page.html.j2").render(
         title=title or "Motion",
         description=_description(motion),
-        paces=sorted(_paces(drawing, sizes), reverse=True),
+        paces=sorted({thing.pace for thing in (*springs, *uncoloured)}, reverse=True),
         constrained=data["residual"] is not None,
         data=data,
         light=plots.LIGHT,
@@ -57,7 +57,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
     drawing, t = motion.drawing, motion.t
     duration = float(t[-1] - t[0])
     speed = 1.0 if 0.15 * WATCHED <= duration <= 3 * WATCHED or duration == 0 else nice(duration / WATCHED)
-    springs = [connection for connection in sizes.connections if connection.kind == "spring"]
+    turns = {connection.turns for connection in sizes.connections if connection.kind == "spring"}
     many = len(sizes.connections) > 20  # every helix is drawn anew in every picture
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
     return {
@@ -76,7 +76,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "spheres": [
             {"center": c.tolist(), "radius": float(r)} for c, r in zip(sizes.spheres, sizes.sphere_radii, strict=True)
         ],
-        "helices": {n: helix(n, 10 if many else 16).tolist() for n in {c.turns for c in springs}},
+        "helices": {n: helix(n, 10 if many else 16).tolist() for n in turns},
         "lamp": LAMP,
         "span": SPAN,
         "size": sizes.size,
@@ -92,12 +92,6 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "caption": drawing.caption,
         "ending": motion.ending,
     }
-
-
-def _paces(drawing: Drawing, sizes: Layout) -> set[str]:
-    """Those whose colours are seen."""
-    springs = {connection.pace for connection in sizes.connections if connection.kind == "spring"}
-    return springs | {body.pace for body in drawing.bodies if body.color is None}
 
 
 def _plain(record: Connection | Ground) -> dict:

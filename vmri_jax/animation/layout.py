@@ -88,7 +88,11 @@ class Layout:
 
 
 def layout(motion: Motion) -> Layout:
-    """Sizes that suit the picture: balls do not touch their neighbours, springs keep inside the space they have."""
+    """Sizes that suit the picture: balls do not touch their neighbours, springs keep inside the space they have.
+
+    Args:
+        motion: from `vmri_jax.animation.motion`.
+    """
     drawing, points = motion.drawing, motion.thinned(500).points
     connections = _connections(drawing)
     fixed = np.array([c.point for c in connections if c.point is not None]).reshape(-1, 3)
@@ -127,9 +131,10 @@ def _connections(drawing: Drawing) -> list[Connection]:
     points = drawing.place([joint.point or () for joint in drawing.joints])
     found = []
     for joint, point in zip(drawing.joints, points, strict=True):
-        body, *others = (index[name] for name in joint.bodies)
-        ends = {"other": others[0], "point": None} if others else {"other": None, "point": point}
-        found.append(Connection(joint.kind, body, **ends, pace=drawing.pace(joint), turns=0))
+        body, other = index[joint.bodies[0]], None
+        if joint.point is None:
+            other, point = index[joint.bodies[1]], None
+        found.append(Connection(joint.kind, body, other, point, drawing.pace(joint), turns=0))
     return found
 
 

@@ -40,11 +40,18 @@ class Motion:
     ending: str = ""
 
     def at(self, times: Sequence[float] | np.ndarray) -> np.ndarray:
-        """(len(times), n_bodies, 3) positions at times, those of the ends beyond them."""
+        """(len(times), n_bodies, 3) positions, beyond the ends those of the ends.
+
+        Args:
+            times: where to look.
+        """
         return hermite(self.t, self.points, self.velocities, np.clip(times, self.t[0], self.t[-1]))
 
     def between(self, start: float | None = None, end: float | None = None) -> "Motion":
-        """The part between the nodes around two times; None for the start or the end of the run.
+        """The part between the nodes around two times.
+
+        Args:
+            start, end: the times; None for the start or the end of the run.
 
         Raises:
             ValueError: times outside of the run, or no time between them.
@@ -61,19 +68,22 @@ class Motion:
         return replace(self, **{name: getattr(self, name)[part] for name in names})
 
     def thinned(self, most: int) -> "Motion":
-        """With at most about `most` nodes; energy and residuals keep the largest of those left out."""
+        """With fewer nodes; energy and residuals keep the largest of those left out.
+
+        Args:
+            most: so many nodes at most, about.
+        """
         every = -(-len(self.t) // most)
         if every == 1:
             return self
         kept = np.append(np.arange(0, len(self.t) - 1, every), len(self.t) - 1)
-        largest = np.maximum.reduceat(np.abs(self.energy), kept)
-        signs = np.sign(self.energy[[k + np.argmax(np.abs(self.energy[k : k + every])) for k in kept]])
+        parts = np.split(self.energy, kept[1:])
         return replace(
             self,
             t=self.t[kept],
             points=self.points[kept],
             velocities=self.velocities[kept],
-            energy=signs * largest,
+            energy=np.array([part[np.argmax(np.abs(part))] for part in parts]),
             residual=np.maximum.reduceat(self.residual, kept),
         )
 
@@ -122,10 +132,14 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
 
 
 def hermite(t, values, velocities, times) -> np.ndarray:
-    """Cubic Hermite interpolation, shape ``(len(times), ...)``, of `values` (k, ...) with `velocities` at nodes t.
+    """Cubic Hermite interpolation, ``x_i + u h v_i + u^2 (3 d - h (2 v_i + v_j)) + u^3 (h (v_i + v_j) - 2 d)``.
 
-    With ``u = (time - t_i) / h`` on ``[t_i, t_i + h]``: ``x_i + u h v_i + u^2 (3 d - h (2 v_i + v_j)) + u^3 (h (v_i + v_j) -
-    2 d)``, ``d = x_j - x_i``.
+    ``u = (time - t_i) / h`` on ``[t_i, t_i + h]``, ``d = x_j - x_i``.
+
+    Args:
+        t: (k,) nodes.
+        values, velocities: (k, ...) at the nodes.
+        times: where the result (len(times), ...) is wanted.
     """
     if len(t) == 1:
         return np.repeat(values, len(times), axis=0)

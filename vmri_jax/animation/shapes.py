@@ -33,7 +33,12 @@ class Stage:
 
     @classmethod
     def of(cls, motion: Motion, theme: plots.Theme) -> "Stage":
-        """With the first view, in a frame as wide as the scene asks for."""
+        """With the first view, in a frame as wide as the scene asks for.
+
+        Args:
+            motion: from `vmri_jax.animation.motion`.
+            theme: colours.
+        """
         sizes = layout(motion)
         radius = float(sizes.radii.max())
         start = Camera(sizes.azimuth, sizes.elevation, np.zeros(3), 1.0)
@@ -57,7 +62,9 @@ class Stage:
         pen = _Pen(axes, self.camera, self.theme, 72 * place[2] * figure.get_figwidth() / (2 * self.aspect))
         points = self.motion.at([time])[0]
         self._draw_around(pen, points)
-        self._draw_trails(pen, time, trail)
+        past = self.motion.at(np.linspace(max(self.motion.t[0], time - trail), time, 160))
+        for i, color in enumerate(self._colors):
+            pen.trail(past[:, i], color, self.sizes.radii[i])
         self._draw_joints(pen, points)
         for point, radius, color in zip(points, self.sizes.radii, self._colors, strict=True):
             pen.ball(point, radius, color)
@@ -88,11 +95,6 @@ class Stage:
                 pen.shadows(ground, centers, radii, self._ends(points), sizes.rod)
         for center, radius in zip(sizes.spheres, sizes.sphere_radii, strict=True):
             pen.ball(center, radius, self.theme.faint)
-
-    def _draw_trails(self, pen: "_Pen", time: float, trail: float) -> None:
-        past = self.motion.at(np.linspace(max(self.motion.t[0], time - trail), time, 160))
-        for i, color in enumerate(self._colors):
-            pen.trail(past[:, i], color, self.sizes.radii[i])
 
     def _draw_joints(self, pen: "_Pen", points: np.ndarray) -> None:
         sizes = self.sizes

@@ -1,5 +1,6 @@
 """Bodies: points of a scene, or blocks of general coordinates."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -87,3 +88,7 @@ class Body:
     def size(self) -> int:
         """Number of coordinates."""
         return self.position.shape[0]
+
+
+Bodies = Mapping[str, Body]
+"""The bodies of a scene by name."""

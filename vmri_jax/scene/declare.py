@@ -9,7 +9,7 @@
 `Effect` reads these declarations: elements, arrays of parameters, checks and messages follow from them.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, dataclass, field
 from itertools import combinations
 from typing import Any, Literal, TypeVar, dataclass_transform
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import double_array, is_concrete
-from vmri_jax.scene.body import Body
+from vmri_jax.scene.body import Bodies, Body
 
 Elements = tuple[tuple[str, ...], ...]
 Sign = Literal["", "positive", "at least zero"]
@@ -39,7 +39,7 @@ class Names:
     pairs: bool = False
     may_be_all: bool = False
 
-    def elements(self, given: Any, bodies: Mapping[str, Body], what: str) -> Elements:
+    def elements(self, given: Any, bodies: Bodies, what: str) -> Elements:
         """Elements of one of them, ``("a", "b")``, or several, ``[("a", "b"), ("b", "c")]``; of all bodies if None is the default.
 
         Args:
@@ -87,33 +87,41 @@ class Parameter:
 
         Args:
             what: the names of effect and field, for messages.
+            given: the numbers as the user gave them.
             bodies: the first body of every element.
 
         Raises:
             TypeError: what is no real number.
-            ValueError: arrays of float32, vectors of another dimension than the bodies.
+            ValueError: arrays of float32, not one number or one for each element, vectors of another dimension than the bodies.
         """
         value = jnp.asarray(double_array(what, given))
-        if self.shape in ("number", "array") or self.may_be_number:
+        count, size = len(bodies), bodies[0].size
+        if self.shape == "number" and value.shape not in ((), (count,)):
+            raise ValueError(
+                f"{what} has shape {value.shape}; give one number, or one for each of the {count} elements."
+            )
+        if self.shape in ("number", "array") or (self.may_be_number and value.ndim == 0):
             return value
         value = jnp.atleast_1d(value)
         if self.shape == "common":
+            for body in bodies:
+                if value.shape != (body.size,):
+                    raise ValueError(
+                        f"{what} has shape {value.shape}, {body.name} has dimension {body.size}; they must agree."
+                    )
             return value
-        count, size = len(bodies), bodies[0].size
         if value.shape not in ((size,), (count, size)):
             more = f", or one for each, ({count}, {size})." if count > 1 else "."
             raise ValueError(f"{what} has shape {value.shape}; its bodies have dimension {size}, give ({size},){more}")
         return squeeze(jnp.broadcast_to(value, (count, size)))
 
-    def check(self, what: str, given: Any, shape: tuple[int, ...], bodies: Sequence[Body]) -> None:
-        """Refuse numbers of another sign, not one or one for each element, and vectors of another dimension than a body."""
-        if self.shape == "number" and shape not in ((), (len(bodies),)):
-            raise ValueError(
-                f"{what} has shape {shape}; give one number, or one for each of the {len(bodies)} elements."
-            )
-        for body in bodies if self.shape == "common" else ():
-            if shape != (body.size,) and not (self.may_be_number and shape == ()):
-                raise ValueError(f"{what} has shape {shape}, {body.name} has dimension {body.size}; they must agree.")
+    def check_sign(self, what: str, given: Any) -> None:
+        """Refuse numbers of another sign.
+
+        Args:
+            what: the names of effect and field, for messages.
+            given: the numbers as the user gave them.
+        """
         if self.sign and is_concrete(given):
             value = np.asarray(given, dtype=float)
             if not np.all(value > 0 if self.sign == "positive" else value >= 0):
@@ -127,31 +135,27 @@ def names(count: int = 1, *, default: Any = MISSING, pairs: bool = False) -> Any
 
 def number(*, default: Any = MISSING, sign: Sign = "", measured: bool = False) -> Any:
     """One number for all elements, or one for each."""
-    return _parameter(default, Parameter("number", sign, measured))
+    return field(default=default, metadata={"parameter": Parameter("number", sign, measured)})
 
 
 def positive(*, default: Any = MISSING, measured: bool = False) -> Any:
     """One positive number for all elements, or one for each."""
-    return _parameter(default, Parameter("number", "positive", measured))
+    return field(default=default, metadata={"parameter": Parameter("number", "positive", measured)})
 
 
 def vector(*, default: Any = MISSING) -> Any:
     """One vector for all elements, or one for each."""
-    return _parameter(default, Parameter("vector"))
+    return field(default=default, metadata={"parameter": Parameter("vector")})
 
 
 def common(*, default: Any = MISSING, may_be_number: bool = False) -> Any:
     """One vector, the same for all elements."""
-    return _parameter(default, Parameter("common", may_be_number=may_be_number))
+    return field(default=default, metadata={"parameter": Parameter("common", may_be_number=may_be_number)})
 
 
 def array(*, default: Any = MISSING, sign: Sign = "") -> Any:
     """Numbers of any shape, the same for all elements."""
-    return _parameter(default, Parameter("array", sign))
-
-
-def _parameter(default: Any, parameter: Parameter) -> Any:
-    return field(default=default, metadata={"parameter": parameter})
+    return field(default=default, metadata={"parameter": Parameter("array", sign)})
 
 
 @dataclass_transform(

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import double_array, is_concrete
-from vmri_jax.scene.body import Body
+from vmri_jax.scene.body import Bodies
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
 from vmri_jax.scene.layout import Place, Rows
 from vmri_jax.scene.terms import EffectTerm, choose
@@ -40,6 +40,8 @@ class Effect(ABC):
 
     q and v are tuples with one entry per role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). params
     are the fields that a class declares as numbers, vectors or arrays (see `vmri_jax.scene.declare`), by name.
+
+    `bodies` of its methods are those of the scene, by name.
 
     Args:
         name: of this effect in its scene; by default the name of its class.
@@ -94,13 +96,13 @@ class Effect(ABC):
         """Names of the potentials that this effect builds on."""
         return ()
 
-    def elements(self, bodies: Mapping[str, Body]) -> Elements:
+    def elements(self, bodies: Bodies) -> Elements:
         """Names of the bodies of every element."""
         given = next(f for f in fields(self) if "names" in f.metadata)
         what = f"{self.name}: {given.name}"
         return given.metadata["names"].elements(getattr(self, given.name), bodies, what)
 
-    def parameters(self, bodies: Mapping[str, Body]) -> dict[str, Any]:
+    def parameters(self, bodies: Bodies) -> dict[str, Any]:
         """What the function gets as params: arrays by name."""
         params, elements = {}, self.elements(bodies)
         firsts = [bodies[element[0]] for element in elements]
@@ -108,24 +110,24 @@ class Effect(ABC):
             if getattr(self, name) is not None:
                 params[name] = parameter.array(f"{self.name}: {name}", getattr(self, name), firsts)
         for role, name in enumerate(self.masses):
-            params[name] = self._masses([element[role] for element in elements], bodies)
+            params[name] = squeeze(jnp.stack([self._mass(element[role], bodies) for element in elements]))
         for name, parameter in self.declared.items():
             if parameter.measured and name not in params:
                 params[name] = self.at_start(bodies, params)
         return params
 
-    def at_start(self, bodies: Mapping[str, Body], params: dict[str, Any]):
+    def at_start(self, bodies: Bodies, params: dict[str, Any]):
         """The measured value of every element at the start, (n,), or () of a single one."""
+        count = len(self.elements(bodies))
+        return squeeze(jnp.stack([self.rest(*self.one(i, bodies, params)) for i in range(count)]))
+
+    def one(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[tuple, dict[str, Any]]:
+        """Positions of the bodies of element i at the start, and its parameters among those of all."""
         elements = self.elements(bodies)
-        starts = [tuple(bodies[name].position for name in element) for element in elements]
-        return squeeze(jnp.stack([self.rest(q, self.one(params, i, bodies)) for i, q in enumerate(starts)]))
+        q = tuple(bodies[name].position for name in elements[i])
+        return q, params if len(elements) == 1 else choose(params, (i,), self.split)
 
-    def one(self, params: dict[str, Any], i: int, bodies: Mapping[str, Body]) -> dict[str, Any]:
-        """The parameters of element i among those of all."""
-        single = len(self.elements(bodies)) == 1
-        return params if single else choose(params, (i,), self.split)
-
-    def check(self, bodies: Mapping[str, Body]) -> None:
+    def check(self, bodies: Bodies) -> None:
         """Refuse what is wrong with this effect between these bodies.
 
         Raises:
@@ -137,7 +139,7 @@ class Effect(ABC):
         self.check_bodies(bodies)
         self.check_parameters(bodies)
 
-    def check_bodies(self, bodies: Mapping[str, Body]) -> None:
+    def check_bodies(self, bodies: Bodies) -> None:
         """Refuse bodies that are not there, or that do not fit."""
         elements = self.elements(bodies)
         for element in elements:
@@ -148,18 +150,22 @@ class Effect(ABC):
                     raise ValueError(
                         f"{self.name}: {name} occurs twice in {element}; an element is between different bodies."
                     )
-                if self.dimensions:
-                    self._check_point(name, bodies[name])
+                block, size = bodies[name].block, bodies[name].size
+                if self.dimensions and (block or size not in self.dimensions):
+                    has, allowed = "general " if block else "", " or ".join(map(str, self.dimensions))
+                    raise ValueError(
+                        f"{self.name}: {name} has {size} {has}coordinates; this effect is between points of dimension {allowed}."
+                    )
             if self.same_size:
                 self._check_sizes(element, bodies)
         if any(parameter.shape == "vector" for parameter in self.declared.values()):
             self._check_sizes([element[0] for element in elements], bodies)
 
-    def check_parameters(self, bodies: Mapping[str, Body]) -> None:
+    def check_parameters(self, bodies: Bodies) -> None:
         """Refuse bodies at one place, parameters of another shape or sign, that are not finite, or that are not what a constraint keeps."""
         if self.apart:
             self.require_apart(bodies)
-        params, firsts = self.parameters(bodies), [bodies[element[0]] for element in self.elements(bodies)]
+        params = self.parameters(bodies)
         for name, value in params.items():
             for leaf in jax.tree.leaves(value):
                 if is_concrete(leaf) and not np.isfinite(leaf).all():
@@ -168,17 +174,11 @@ class Effect(ABC):
             given = getattr(self, name)
             if given is None:
                 continue
-            parameter.check(f"{self.name}: {name}", given, params[name].shape, firsts)
+            parameter.check_sign(f"{self.name}: {name}", given)
             if parameter.measured and self.kind == "constraint":
                 self._check_start(name, bodies, params)
 
-    def terms(
-        self,
-        select: Sequence[int],
-        bodies: Mapping[str, Body],
-        places: Mapping[str, Place],
-        potentials: Mapping[str, Any],
-    ) -> tuple[Any, ...]:
+    def terms(self, select: Sequence[int], bodies: Bodies, places: Mapping[str, Place], potentials: Mapping[str, Any]):
         """The terms of some of the elements; those of bodies of other sizes in another term.
 
         Args:
@@ -197,62 +197,57 @@ class Effect(ABC):
             terms.append(EffectTerm(self.name, self.function, rows, chosen, self.split, self.timed))
         return tuple(terms)
 
-    def curvature(self, bodies: Mapping[str, Body]):
+    def curvature(self, bodies: Bodies):
         """Largest second derivative of the energy of each element, () or (n,), where its start does not show it, else None."""
         return None
 
-    def drawing(self, bodies: Mapping[str, Body]) -> dict[str, list]:
-        """What there is to see of it, see `vmri_jax.scene.drawing`."""
+    def drawing(self, bodies: Bodies) -> dict[str, list]:
+        """What there is to see of it: entries of `Scene.drawing`, and "radii" of bodies, pairs of name and number."""
         if self.drawn_as is None:
             return {}
         return {DRAWN[self.drawn_as]: [list(pair) for element in self.elements(bodies) for pair in pairwise(element)]}
 
     def require(self, condition: Any, what: str, value: Any, expected: str) -> None:
-        """Raise ValueError unless a condition on concrete numbers holds everywhere."""
+        """Raise ValueError unless a condition on concrete numbers holds everywhere.
+
+        Args:
+            what, value, expected: for the message, "{what} is {value}; {expected}."
+        """
         if is_concrete(condition) and not np.all(condition):
             shown = np.asarray(value) if is_concrete(value) else value
             raise ValueError(f"{self.name}: {what} is {shown}; {expected}.")
 
-    def require_apart(self, bodies: Mapping[str, Body]) -> None:
+    def require_apart(self, bodies: Bodies) -> None:
         """Refuse elements whose neighbouring bodies are at one point at the start."""
         for a, b in (pair for element in self.elements(bodies) for pair in pairwise(element)):
             apart = jnp.sqrt(jnp.sum((bodies[b].position - bodies[a].position) ** 2))
             expected = "they must not start at the same point; move one of them"
             self.require(apart > 0, f"the distance of {a} and {b}", apart, expected)
 
-    def _masses(self, names: Sequence[str], bodies: Mapping[str, Body]):
-        """Masses of bodies, (n,), or () of a single one."""
-        for name in names:
-            if bodies[name].mass.ndim:
-                raise ValueError(
-                    f"{self.name}: {name} has a mass for each coordinate; it needs bodies with one mass. Give bodies=."
-                )
-        return squeeze(jnp.stack([bodies[name].mass for name in names]))
-
-    def _check_point(self, name: str, body: Body) -> None:
-        if body.block or body.size not in self.dimensions:
-            has, allowed = "general " if body.block else "", " or ".join(map(str, self.dimensions))
+    def _mass(self, name: str, bodies: Bodies):
+        """The one mass of a body."""
+        if bodies[name].mass.ndim:
             raise ValueError(
-                f"{self.name}: {name} has {body.size} {has}coordinates; this effect is between points of dimension {allowed}."
+                f"{self.name}: {name} has a mass for each coordinate; it needs bodies with one mass. Give bodies=."
             )
+        return bodies[name].mass
 
-    def _check_sizes(self, names: Sequence[str], bodies: Mapping[str, Body]) -> None:
+    def _check_sizes(self, names: Sequence[str], bodies: Bodies) -> None:
         sizes = {name: bodies[name].size for name in names}
         if len(set(sizes.values())) > 1:
             described = ", ".join(f"{name} {size}" for name, size in sizes.items())
             raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must be of the same.")
 
-    def _check_start(self, name: str, bodies: Mapping[str, Body], params: dict[str, Any]) -> None:
+    def _check_start(self, name: str, bodies: Bodies, params: dict[str, Any]) -> None:
         """Refuse a value that a constraint keeps and that is not the one at the start."""
         start = self.at_start(bodies, params)
         if not is_concrete((params[name], start)):
             return
-        elements = self.elements(bodies)
-        values = np.broadcast_arrays(*map(np.atleast_1d, (params[name], start)))
-        for element, given, found in zip(elements, *values, strict=True):
-            what = f"{name} of {'-'.join(element)}"
+        values = np.broadcast_arrays(np.atleast_1d(params[name]), start)
+        for element, given, found in zip(self.elements(bodies), *values, strict=True):
             right = abs(given - found) <= START * given
-            self.require(right, what, f"{given:g}", f"it starts as {found:.12g}; give that, or move a body")
+            expected = f"it starts as {found:.12g}; give that, or move a body"
+            self.require(right, f"{name} of {'-'.join(element)}", f"{given:g}", expected)
 
 
 def lasting(value):
@@ -263,7 +258,12 @@ def lasting(value):
 
 
 def real_tree(what: str, tree):
-    """A pytree of real numbers as one of arrays; what is neither is refused by its place in the tree."""
+    """A pytree of real numbers as one of arrays; what is neither is refused by its place in the tree.
+
+    Args:
+        what: its name, for messages.
+        tree: numbers, arrays, lists and dictionaries of them.
+    """
 
     def convert(path, leaf):
         return jnp.asarray(double_array(what + jax.tree_util.keystr(path), leaf))

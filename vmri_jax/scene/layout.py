@@ -6,9 +6,16 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.body import Body
+from vmri_jax.scene.body import Bodies
 
 Part = Literal["s", "f"]
+
+
+class Pace(NamedTuple):
+    """Whether a body is slow or fast, and why."""
+
+    value: Literal["slow", "fast"]
+    reason: str
 
 
 class Place(NamedTuple):
@@ -19,19 +26,29 @@ class Place(NamedTuple):
     size: int
 
 
-def layout(bodies: Mapping[str, Body], paces: Mapping[str, str]) -> dict[str, Place]:
-    """The place of every body: slow ones in order in q_s, fast ones in order in q_f."""
+def layout(bodies: Bodies, paces: Mapping[str, Pace]) -> dict[str, Place]:
+    """The place of every body: slow ones in order in q_s, fast ones in order in q_f.
+
+    Args:
+        bodies, paces: by name.
+    """
     ends: dict[Part, int] = {"s": 0, "f": 0}
     places = {}
     for name, body in bodies.items():
-        part: Part = "f" if paces[name] == "fast" else "s"
+        part: Part = "f" if paces[name].value == "fast" else "s"
         places[name] = Place(part, ends[part], body.size)
         ends[part] += body.size
     return places
 
 
-def join(bodies: Mapping[str, Body], places: Mapping[str, Place], part: Part, what: str):
-    """One vector of all slow or of all fast bodies: their "position", "velocity" or "mass"."""
+def join(bodies: Bodies, places: Mapping[str, Place], part: Part, what: str):
+    """One vector of all slow or of all fast bodies.
+
+    Args:
+        bodies, places: by name.
+        part: "s" for slow ones, "f" for fast ones.
+        what: "position", "velocity" or "mass".
+    """
     members = [body for name, body in bodies.items() if places[name].part == part]
     pieces = [jnp.broadcast_to(getattr(body, what), (body.size,)) for body in members]
     return jnp.concatenate(pieces) if pieces else jnp.zeros(0)
@@ -56,42 +73,48 @@ class Rows:
 
     @classmethod
     def of(cls, places: Sequence[Place]) -> "Rows":
-        """The rows at these places; a single place gives a vector (size,), more give (n, size)."""
+        """The rows at these places.
+
+        Args:
+            places: a single one gives a vector (size,), more give (n, size).
+        """
         size, runs = places[0].size, []
         for part, start, _ in places:
-            last = runs[-1] if runs else None
-            if last and last.part == part and (last.count == 1 or last.same) and start == last.start:
-                runs[-1] = last._replace(count=last.count + 1, same=True)
-            elif last and last.part == part and not last.same and start == last.start + size * last.count:
-                runs[-1] = last._replace(count=last.count + 1)
+            last = runs[-1] if runs else Run(part, start, 0, False)
+            follows = not last.same and start == last.start + size * last.count
+            again = last.start == start and (last.same or last.count == 1)
+            if last.part == part and last.count and (follows or again):
+                runs[-1] = last._replace(count=last.count + 1, same=again)
             else:
                 runs.append(Run(part, start, 1, False))
         return cls(size, tuple(runs), len(places) == 1)
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(size,) of a single place, (n, size) of more."""
-        return (self.size,) if self.single else (sum(run.count for run in self.runs), self.size)
-
     def take(self, q_s, q_f):
         """The rows of these vectors, positions or velocities."""
-        pieces = [self._take(run, q_s if run.part == "s" else q_f) for run in self.runs]
-        flat = pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
+        pieces = []
+        for part, start, count, same in self.runs:
+            q = q_s if part == "s" else q_f
+            piece = q[start : start + self.size * (1 if same else count)]
+            pieces.append(jnp.tile(piece, count) if same else piece)
+        flat = jnp.concatenate(pieces)
         return flat if self.single else flat.reshape(-1, self.size)
 
-    def _take(self, run: Run, q):
-        stop = run.start + self.size * (1 if run.same else run.count)
-        piece = q if run.start == 0 and stop == q.shape[0] else q[run.start : stop]
-        return jnp.tile(piece, run.count) if run.same else piece
-
     def put(self, rows, n_s: int, n_f: int):
-        """The transpose of `take`: vectors (n_s,), (n_f,) with these rows added at their places, None where there are none."""
-        rows, at = jnp.reshape(rows, (-1, self.size)), 0
-        sums: dict[Part, list] = {"s": [], "f": []}
-        for run in self.runs:
-            piece = rows[at : at + run.count]
-            piece = jnp.sum(piece, axis=0) if run.same else piece.reshape(-1)
-            after = (n_s if run.part == "s" else n_f) - run.start - piece.shape[0]
-            sums[run.part].append(jnp.pad(piece, (run.start, after)) if run.start or after else piece)
-            at += run.count
-        return tuple(sum(parts[1:], parts[0]) if parts else None for parts in sums.values())
+        """The transpose of `take`.
+
+        Args:
+            rows: one for each place, or one for all.
+            n_s, n_f: lengths of q_s and q_f.
+
+        Returns:
+            Vectors (n_s,), (n_f,) with the rows added at their places.
+        """
+        rows, at = jnp.broadcast_to(rows, (sum(run.count for run in self.runs), self.size)), 0
+        sums = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}
+        for part, start, count, same in self.runs:
+            piece = rows[at : at + count]
+            piece = jnp.sum(piece, axis=0) if same else piece.reshape(-1)
+            after = sums[part].shape[0] - start - piece.shape[0]
+            sums[part] += jnp.pad(piece, (start, after))
+            at += count
+        return tuple(sums.values())

@@ -2,11 +2,9 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import jax
 import numpy as np
 from rich.table import Table
 
@@ -16,9 +14,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.simulate import Simulation, prepare
 from vmri_jax.running.timing import interleaved
 from vmri_jax.scene.assembly import build
-from vmri_jax.scene.body import Body
-from vmri_jax.scene.layout import Place
-from vmri_jax.scene.sorting import Placed, Sorting
+from vmri_jax.scene.sorting import Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 
@@ -41,7 +37,7 @@ class Row:
     """One body or effect.
 
     name, kind: what it is called, and "body" or the term it is part of.
-    grid: "macro" or "micro", where it lives. why: how that was decided.
+    grid, why: "macro" or "micro", where it lives, and how that was decided.
     unknowns, multipliers: it adds to the equations of a macro step.
     evaluations: nodes of a macro step at which its function is evaluated (by implicit schemes in every Newton iteration).
     operations, time: shares of the compiled operations and of the measured time that go with it, None where not measured.
@@ -104,79 +100,69 @@ class Ledger:
         return table
 
 
-@dataclass(frozen=True)
-class Contents:
-    """What a ledger is made of: bodies by name, their paces and places, the start, and where every effect lives."""
+def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | None, measure: bool) -> Ledger:
+    """The ledger of a scene, see `Scene.explain`.
 
-    bodies: Mapping[str, Body]
-    sorting: Sorting
-    places: Mapping[str, Place]
-    start: tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-
-    def system(self, placed: Sequence[Placed]) -> System:
-        """The system of the bodies with some of the effects."""
-        return build(self.bodies, self.places, placed)
-
-
-def ledger(contents: Contents, scheme: Scheme | Composition, macro_dt: float | None, measure: bool) -> Ledger:
-    """The ledger of a scene, see `Scene.explain`."""
+    Args:
+        sorting: bodies at their places, effects at their homes.
+        scheme, macro_dt, measure: as of `Scene.explain`.
+    """
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(f"Scene.explain: scheme is {scheme!r}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     stages = scheme.num_stages if isinstance(scheme, Composition) else 1
     one = stage_scheme(scheme)
     intervals = {"macro": stages * one.degree, "micro": stages * one.degree * one.num_micro}
     rows = []
-    for name, pace in contents.sorting.paces.items():
+    for name, pace in sorting.paces.items():
         grid = "micro" if pace.value == "fast" else "macro"
-        unknowns = intervals[grid] * contents.bodies[name].size
+        unknowns = intervals[grid] * sorting.bodies[name].size
         rows.append(Row(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
-    whole, bare, shares = _measure(contents, scheme, macro_dt) if measure else (None, None, {})
-    for part in contents.sorting.placed:
+    whole, bare, shares = _measure(sorting, scheme, macro_dt) if measure else (None, None, {})
+    for part in sorting.placed:
         name = part.effect.name
-        placed = getattr(one, RULES.get(part.home, part.home))
-        multipliers = intervals[placed.grid] * sum(contents.system([part]).num_constraints(*contents.start[:2]))
-        count = stages * evaluations(placed, one.num_micro)
+        rule = getattr(one, RULES.get(part.home, part.home))
+        multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
+        count = stages * evaluations(rule, one.num_micro)
         share = shares.get(name, (None, None))
-        rows.append(Row(name, HOMES[part.home], placed.grid, part.reason, 0, multipliers, count, *share))
+        rows.append(Row(name, HOMES[part.home], rule.grid, part.reason, 0, multipliers, count, *share))
     return Ledger(tuple(rows), whole, bare)
 
 
-def evaluations(placed, num_micro: int) -> int:
+def evaluations(rule, num_micro: int) -> int:
     """Nodes of a rule in a macro step, one at the border of two steps counted once."""
-    nodes = placed.composite(num_micro).nodes
+    nodes = rule.composite(num_micro).nodes
     shared = np.isclose(nodes[0], 0.0) and np.isclose(nodes[-1], 1.0)
     return len(nodes) - int(shared)
 
 
-def _measure(contents: Contents, scheme, macro_dt) -> tuple[Program, Program, dict]:
+def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[Program, Program, dict]:
     """The scene's program, that of its bodies alone, and shares of operations and time by effect."""
-    placed, whole, bare = contents.sorting.placed, "whole", "bare"
-    names = {part.effect.name: f"without {part.effect.name}" for part in placed}
-    kept = {key: [part for part in placed if part.effect.name != name] for name, key in names.items()}
-    systems = {key: contents.system(parts) for key, parts in (kept | {whole: placed, bare: ()}).items()}
-    states = {key: initial_state(system, *contents.start) for key, system in systems.items()}
+    names = dict.fromkeys(part.effect.name for part in sorting.placed)
+    kept = {f"without {name}": [part for part in sorting.placed if part.effect.name != name] for name in names}
+    systems = {key: build(sorting, some) for key, some in {"whole": sorting.placed, "bare": (), **kept}.items()}
+    states = {key: initial_state(system, *sorting.start) for key, system in systems.items()}
     if macro_dt is None:
-        fastest = float(frequencies(systems[whole], states[whole])[0])
+        fastest = float(frequencies(systems["whole"], states["whole"])[0])
         macro_dt = scheme.num_micro * 0.1 / fastest if fastest > 0 else 0.01
-    arguments = {key: (system, scheme, states[key], macro_dt) for key, system in systems.items()}
-    runs = {key: prepare_steps(*some) for key, some in arguments.items()}
+    runs = {key: prepare_steps(system, scheme, states[key], macro_dt) for key, system in systems.items()}
     times = interleaved({key: run.timed() for key, run in runs.items()}, 5)
-
-    def program(key: str) -> Program:
-        us = 1e6 * float(np.median(times[key])) / STEPS
-        compiled = runs[key].compiled()
-        return Program(sum(operations(compiled).values()), temporary_bytes(compiled), us)
-
-    of = {key: program(key) for key in systems}
-    shares = {
-        name: (1 - of[key].operations / of[whole].operations, 1 - of[key].microseconds / of[whole].microseconds)
-        for name, key in names.items()
-    }
-    return of[whole], of[bare], shares
+    programs = {}
+    for key, run in runs.items():
+        compiled, us = run.compiled(), 1e6 * float(np.median(times[key])) / STEPS
+        programs[key] = Program(sum(operations(compiled).values()), temporary_bytes(compiled), us)
+    whole, shares = programs["whole"], {}
+    for name in names:
+        left = programs[f"without {name}"]
+        shares[name] = 1 - left.operations / whole.operations, 1 - left.microseconds / whole.microseconds
+    return whole, programs["bare"], shares
 
 
 def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:
-    """So many macro steps, prepared; `operations` and `temporary_bytes` look into ``.compiled()``."""
+    """So many macro steps, prepared; `operations` and `temporary_bytes` look into ``.compiled()``.
+
+    Args:
+        system, scheme, state, macro_dt, num_steps: as of `vmri_jax.prepare`.
+    """
     return prepare(system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps)
 
 

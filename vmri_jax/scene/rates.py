@@ -1,18 +1,16 @@
 """How fast bodies would move under each effect alone, and the border between slow and fast.
 
-A potential (L = -V) or kinetic effect gives the force ``f(q, v) = L_q - L_vq v`` at constant velocity; gauge terms, total
-time derivatives in L, drop out of it. With the stiffness ``K = -df/dq`` (V'' of a potential), the gyroscopic matrix G, the
-antisymmetric part of df/dv (``L_qv - L_vq``: of a charge in a magnetic field the matrix of Q v x B), and the mass matrix M
-of its bodies, the frequency of an element is, at the start, the largest w with ``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
+A potential (L = -V) or kinetic effect gives the force ``f(q, v) = L_q - L_vq v`` at constant velocity; gauge terms drop out.
+With the stiffness ``K = -df/dq``, the gyroscopic matrix G, the antisymmetric part of df/dv, and the mass matrix M of its
+bodies, the frequency of an element is the largest w at the start with ``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
 
-What gives bodies at rest an acceleration a has a rate without any curvature, ``sqrt(a / L)``, L the size of the scene. The
-border is the middle of the widest gap between all rates, on a logarithmic scale; where no gap is as wide as SEPARATION, one
-rate is enough for all.
+The rate is that, or ``sqrt(a / L)`` if larger: a an acceleration of bodies at rest, L the size of the scene. The border is
+the middle of the widest gap between all rates, on a logarithmic scale.
 """
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 import jax
@@ -20,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from vmri_jax.scene.body import LARGEST_POINT, Body
+from vmri_jax.scene.body import LARGEST_POINT, Bodies
 from vmri_jax.scene.effect import Effect
 
 SEPARATION = 3.0
-"""Smallest ratio of two neighbouring rates that separates slow from fast."""
+"""Smallest ratio of two neighbouring rates that separates slow from fast; without, one rate is enough for all."""
 SPAN = 1e3
 """Rates slower than the fastest one by more than this count as slower by this: they are slow in any case."""
 
@@ -37,36 +35,43 @@ class Rates(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """An element at the start: its force on bodies at rest, K, G, and what it adds to the mass matrix, d2L/dv2."""
+    """An element at the start: its coordinates, its force on bodies at rest, K, G, and d2L/dv2, its part of the mass matrix."""
 
+    columns: np.ndarray
     force: np.ndarray
     stiffness: np.ndarray
     gyroscopic: np.ndarray
     mass: np.ndarray
 
 
-def measure(bodies: Mapping[str, Body], effects: Sequence[Effect]) -> dict[str, Rates]:
+def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     """Rates of potentials and kinetic effects by name.
+
+    Args:
+        bodies: by name.
+        effects: the potentials and kinetic effects.
 
     Raises:
         ValueError: energies that are not smooth at the start, or a kinetic energy that is not positive there.
     """
-    found = {effect.name: _linearise(effect, bodies) for effect in effects}
-    blocks = {(name, name): np.diag(np.broadcast_to(body.mass, (body.size,))) for name, body in bodies.items()}
-    for effect in effects:
-        for element, linearised in zip(effect.elements(bodies), found[effect.name], strict=True):
-            cuts = np.cumsum([bodies[name].size for name in element])[:-1]
-            for a, rows in zip(element, np.split(linearised.mass, cuts), strict=True):
-                for b, block in zip(element, np.split(rows, cuts, axis=1), strict=True):
-                    blocks[a, b] = blocks.get((a, b), 0.0) + block
-    size = max(float(np.ptp(_positions(bodies), axis=0).max(initial=0.0)), float(np.abs(_positions(bodies)).max()))
-    return {effect.name: _rates(effect, bodies, found[effect.name], blocks, size or 1.0) for effect in effects}
+    sizes = [body.size for body in bodies.values()]
+    columns = dict(zip(bodies, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
+    mass = np.diag(np.concatenate([np.broadcast_to(body.mass, (body.size,)) for body in bodies.values()]))
+    found = {effect.name: _linearise(effect, bodies, columns) for effect in effects}
+    for element in chain(*found.values()):
+        mass[np.ix_(element.columns, element.columns)] += element.mass
+    positions = _positions(bodies)
+    size = max(float(np.ptp(positions, axis=0).max(initial=0.0)), float(np.abs(positions).max()))
+    return {effect.name: _rates(effect, bodies, found[effect.name], mass, size or 1.0) for effect in effects}
 
 
 def border(rates: Sequence[np.ndarray]) -> float | None:
-    """The middle of the widest gap between rates, None where there is none."""
-    found = np.concatenate([*rates, np.zeros(0)])
-    found = np.sort(found[found > 0])
+    """The middle of the widest gap between rates, None where there is none.
+
+    Args:
+        rates: of all effects, rad/s.
+    """
+    found = np.sort([rate for some in rates for rate in some if rate > 0])
     if not found.size:
         return None
     found = np.maximum(found, found[-1] / SPAN)
@@ -75,26 +80,25 @@ def border(rates: Sequence[np.ndarray]) -> float | None:
     return float(middle) if widest >= SEPARATION else None
 
 
-def _rates(effect: Effect, bodies, elements: Sequence[Linearised], blocks, size: float) -> Rates:
+def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndarray, size: float) -> Rates:
     known = effect.curvature(bodies)
+    curvatures = np.broadcast_to(-np.inf if known is None else known, len(elements))
     frequency, rate = np.zeros(len(elements)), np.zeros(len(elements))
-    for i, (names, (force, stiffness, gyroscopic, _)) in enumerate(zip(effect.elements(bodies), elements, strict=True)):
-        zeros = {(a, b): np.zeros((bodies[a].size, bodies[b].size)) for a in names for b in names}
-        mass = np.block([[blocks.get((a, b), zeros[a, b]) for b in names] for a in names])
-        lightest = np.linalg.eigvalsh(mass).min()
+    for i, (names, element) in enumerate(zip(effect.elements(bodies), elements, strict=True)):
+        own = mass[np.ix_(element.columns, element.columns)]
+        lightest = np.linalg.eigvalsh(own).min()
         if not lightest > 0:
             raise ValueError(
                 f"{effect.name}: the kinetic energy of {', '.join(names)} is not positive at the start; change masses or kinetic "
                 "effects, or give every body a pace and every potential between fast bodies a rate."
             )
-        root = np.linalg.cholesky(mass)
-        matrix = _scaled(root, (stiffness + stiffness.T) / 2)
-        largest = np.linalg.eigvalsh(matrix).max()
-        if known is not None:
-            largest = max(largest, np.broadcast_to(known, len(elements))[i] / lightest)
-        largest = max(largest, 0.0) if largest > 1e-12 * np.abs(matrix).max(initial=0.0) else 0.0
-        frequency[i] = max(np.sqrt(largest), np.linalg.norm(_scaled(root, gyroscopic), 2))
-        rate[i] = max(frequency[i], np.sqrt(np.abs(np.linalg.solve(mass, force)).max() / size))
+        root = np.linalg.cholesky(own)
+        matrix = _scaled(root, (element.stiffness + element.stiffness.T) / 2)
+        largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] / lightest)
+        if largest > 1e-12 * np.abs(matrix).max(initial=0.0):  # else round-off
+            frequency[i] = np.sqrt(largest)
+        frequency[i] = max(frequency[i], np.linalg.norm(_scaled(root, element.gyroscopic), 2))
+        rate[i] = max(frequency[i], np.sqrt(np.abs(np.linalg.solve(own, element.force)).max() / size))
     return Rates(frequency, rate)
 
 
@@ -103,14 +107,13 @@ def _scaled(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     return np.linalg.solve(root, np.linalg.solve(root, matrix).T).T
 
 
-def _linearise(effect: Effect, bodies: Mapping[str, Body]) -> list[Linearised]:
+def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
     params, found = effect.parameters(bodies), []
     for i, element in enumerate(effect.elements(bodies)):
-        q, v = (tuple(getattr(bodies[name], what) for name in element) for what in ("position", "velocity"))
-        chosen = effect.one(params, i, bodies)
-        found.append(
-            Linearised(*map(np.asarray, _derivatives(effect.function, effect.kind == "kinetic", q, v, chosen)))
-        )
+        q, chosen = effect.one(i, bodies, params)
+        v = tuple(bodies[name].velocity for name in element)
+        parts = _derivatives(effect.function, effect.kind == "kinetic", q, v, chosen)
+        found.append(Linearised(np.concatenate([columns[name] for name in element]), *map(np.asarray, parts)))
         if not all(np.isfinite(part).all() for part in found[-1]):
             raise ValueError(
                 f"{effect.name}: its energy between {', '.join(element)} has no finite derivatives at the start; move them, or smooth it."
@@ -120,7 +123,7 @@ def _linearise(effect: Effect, bodies: Mapping[str, Body]) -> list[Linearised]:
 
 @partial(jax.jit, static_argnames=("function", "kinetic"))
 def _derivatives(function, kinetic: bool, q, v, params):
-    """What `Linearised` holds."""
+    """What `Linearised` holds after the columns."""
     (q, unravel), (v, _) = ravel_pytree(q), ravel_pytree(v)
 
     def lagrangian(q, v):

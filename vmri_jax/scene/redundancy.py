@@ -1,6 +1,6 @@
 """Constraints that are too many, found at the start and named."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -10,28 +10,29 @@ from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraints import rank_of
-from vmri_jax.scene.body import Body
-from vmri_jax.scene.layout import Place
-from vmri_jax.scene.sorting import Placed
+from vmri_jax.scene.sorting import Placed, Sorting
 
 HOMES = ("slow_constraint", "constraint")
 
 
-def check_constraints(bodies: Mapping[str, Body], places: Mapping[str, Place], placed: Sequence[Placed]) -> None:
+def check_constraints(sorting: Sorting) -> None:
     """Refuse constraints that are redundant, or that the fast bodies cannot keep, naming them.
+
+    Args:
+        sorting: bodies at their places, effects at their homes.
 
     Raises:
         ValueError: with the names of the constraints that are too many.
     """
-    held = [part for part in placed if part.home in HOMES]
-    positions = [body.position for body in bodies.values()]
-    if not held or not is_concrete((positions, [part.effect.parameters(bodies) for part in held])):
+    held = [part for part in sorting.placed if part.home in HOMES]
+    positions = [body.position for body in sorting.bodies.values()]
+    if not held or not is_concrete((positions, [part.effect.parameters(sorting.bodies) for part in held])):
         return
-    macro, micro = ([row for p in held if p.home == home for row in _rows(bodies, places, p)] for home in HOMES)
+    n_s = sum(place.size for place in sorting.places.values() if place.part == "s")
+    macro, micro = ([row for p in held if p.home == home for row in _rows(sorting, p, n_s)] for home in HOMES)
     _refuse(macro + micro, 0, "leave one of them out")
-    fast = [name for name, place in places.items() if place.part == "f"]
     if micro:
-        n_s = sum(place.size for place in places.values() if place.part == "s")
+        fast = [name for name, place in sorting.places.items() if place.part == "f"]
         advice = (
             f"they touch fast bodies and are held on the micro grid, where only {', '.join(fast)} can move; leave one out, or make "
             "more of their bodies fast"
@@ -39,21 +40,17 @@ def check_constraints(bodies: Mapping[str, Body], places: Mapping[str, Place], p
         _refuse(micro, n_s, advice)
 
 
-def _rows(bodies, places, part: Placed) -> list[tuple[str, np.ndarray]]:
+def _rows(sorting: Sorting, part: Placed, n_s: int) -> list[tuple[str, np.ndarray]]:
     """Rows of the Jacobian of some constraints, slow coordinates first, each with the name of its element."""
-    n_s = sum(place.size for place in places.values() if place.part == "s")
-    n = sum(place.size for place in places.values())
-    effect, rows = part.effect, []
+    bodies, effect, rows = sorting.bodies, part.effect, []
+    columns = {name: p.start + np.arange(p.size) + (n_s if p.part == "f" else 0) for name, p in sorting.places.items()}
     elements, params = effect.elements(bodies), effect.parameters(bodies)
     for i in part.elements:
-        starts = [places[name].start + (n_s if places[name].part == "f" else 0) for name in elements[i]]
-        q = tuple(bodies[name].position for name in elements[i])
-        columns = np.concatenate([start + np.arange(x.size) for start, x in zip(starts, q, strict=True)])
-        jacobian = np.asarray(_jacobian(effect.function, effect.timed, q, effect.one(params, i, bodies)))
+        jacobian = np.asarray(_jacobian(effect.function, effect.timed, *effect.one(i, bodies, params)))
         label = f"{effect.name} {'-'.join(elements[i])}"
         for j, entries in enumerate(jacobian):
-            row = np.zeros(n)
-            row[columns] = entries
+            row = np.zeros(sum(body.size for body in bodies.values()))
+            row[np.concatenate([columns[name] for name in elements[i]])] = entries
             rows.append((label if len(jacobian) == 1 else f"{label} [{j}]", row))
     return rows
 

@@ -1,5 +1,6 @@
 """Scenes: bodies and the effects between them, turned into an ordinary `System`."""
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,17 +12,19 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
-from vmri_jax.scene import drawing as drawings
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect, unknown
-from vmri_jax.scene.layout import Place, join, layout
-from vmri_jax.scene.ledger import Contents, Ledger, ledger
+from vmri_jax.scene.layout import Place
+from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
+
+DRAWN_LISTS = ("links", "springs", "anchors", "planes", "spheres")
+"""Entries of a drawing to which effects add."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +66,8 @@ class Scene:
                     raise TypeError(f"Scene: {item!r} is among {name}; it must be {kind.__name__}.")
         if not self.bodies:
             raise ValueError("Scene: there are no bodies; give at least one.")
-        names = [item.name for item in (*self.bodies, *self.effects)]
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(item.name for item in (*self.bodies, *self.effects)).items():
+            if count > 1:
                 raise ValueError(
                     f"Scene: the name {name!r} occurs twice; give each body and effect its own, e.g. name=..."
                 )
@@ -79,7 +81,7 @@ class Scene:
             for name in effect.refers_to:
                 if name not in potentials:
                     raise ValueError(f"{effect.name}: {unknown('potential', name, potentials)}")
-        check_constraints(self.by_name, self.places, self.sorting.placed)
+        check_constraints(self.sorting)
 
     @cached_property
     def by_name(self) -> dict[str, Body]:
@@ -91,27 +93,24 @@ class Scene:
         """Who is slow and who is fast, where every effect lives, and why."""
         return sort(self.by_name, self.effects)
 
-    @cached_property
+    @property
     def places(self) -> dict[str, Place]:
         """Where each body's coordinates are in q_s and q_f."""
-        return layout(self.by_name, {name: pace.value for name, pace in self.sorting.paces.items()})
+        return self.sorting.places
 
     @property
     def params(self) -> dict[str, Any]:
         """Parameters by the name of the effect."""
         return {effect.name: effect.parameters(self.by_name) for effect in self.effects}
 
-    def system(self) -> System:
-        """The system: ``T - V - W`` with constraints and forces, each None where no effect calls for it."""
-        return build(self.by_name, self.places, self.sorting.placed)
-
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """(q_s, q_f, v_s, v_f) at the start."""
-        q_s, q_f, v_s, v_f = (
-            join(self.by_name, self.places, part, what) for what in ("position", "velocity") for part in ("s", "f")
-        )
-        return q_s, q_f, v_s, v_f
+        return self.sorting.start
+
+    def system(self) -> System:
+        """The system: ``T - V - W`` with constraints and forces, each None where no effect calls for it."""
+        return build(self.sorting, self.sorting.placed)
 
     def problem(self) -> Problem:
         """The system with positions and velocities at the start, and with the drawing unless its numbers are traced."""
@@ -125,23 +124,32 @@ class Scene:
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.
 
+        Args:
+            names: of the effects.
+
         Raises:
             ValueError: a name that no effect has.
         """
-        self._check_names("without", names)
-        return Scene(self.bodies, [effect for effect in self.effects if effect.name not in names])
+        found = self._named("without", names)
+        return Scene(self.bodies, [effect for effect in self.effects if effect not in found])
 
     def only(self, *names: str) -> "Scene":
         """The scene with these effects and no other.
 
+        Args:
+            names: of the effects.
+
         Raises:
             ValueError: a name that no effect has.
         """
-        self._check_names("only", names)
-        return Scene(self.bodies, [effect for effect in self.effects if effect.name in names])
+        return Scene(self.bodies, self._named("only", names))
 
     def replace(self, name: str, **changes) -> "Scene":
         """The scene with a body or an effect changed, ``scene.replace("springs", stiffness=2.0)``.
+
+        Args:
+            name: of the body or effect.
+            changes: its arguments that are new.
 
         Raises:
             ValueError: a name that no body or effect has, or an argument that it does not have.
@@ -161,17 +169,36 @@ class Scene:
         """What every body and effect adds to a macro step of a scheme: where it lives, unknowns, evaluations, and its cost.
 
         Args:
+            scheme: how the steps are taken.
             macro_dt: step that is measured; by default micro steps of a tenth of the fastest vibration's radian.
             measure: compile the scene without each effect in turn and time it; without, the ledger costs nothing.
         """
-        return ledger(Contents(self.by_name, self.sorting, self.places, self.start), scheme, macro_dt, measure)
+        return ledger(self.sorting, scheme, macro_dt, measure)
 
     def drawing(self) -> dict[str, list]:
-        """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.scene.drawing`."""
-        return drawings.drawing(self.by_name, self.effects, self.places)
+        """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.animation.Drawing.from_dict`."""
+        seen: dict[str, list] = {kind: [] for kind in ("bodies", "blocks", *DRAWN_LISTS)}
+        radii = {body.name: float(body.radius) for body in self.bodies if body.radius is not None}
+        for body in self.bodies:
+            part, start, size = self.places[body.name]
+            axes = [[part, start + i] for i in range(size)]
+            seen["blocks" if body.block else "bodies"].append({"name": body.name, "coordinates": axes})
+        for effect in self.effects:
+            parts = effect.drawing(self.by_name)
+            for kind in DRAWN_LISTS:
+                seen[kind] += parts.get(kind, [])
+            radii |= dict(parts.get("radii", []))
+            if "up" in parts:
+                seen["up"] = parts["up"]
+        for entry in seen["bodies"]:
+            if entry["name"] in radii:
+                entry["radius"] = radii[entry["name"]]
+        return seen
 
-    def _check_names(self, what: str, names: Iterable[str]) -> None:
+    def _named(self, what: str, names: Iterable[str]) -> list[Effect]:
+        """The effects of these names, in the order of the scene."""
         known = [effect.name for effect in self.effects]
         for name in names:
             if name not in known:
                 raise ValueError(f"Scene.{what}: {unknown('effect', name, known)}")
+        return [effect for effect in self.effects if effect.name in names]

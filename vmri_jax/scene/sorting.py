@@ -9,27 +9,23 @@ A body is fast that a stiff potential (not one of V) or kinetic effect touches: 
 between slow and fast, see `vmri_jax.scene.rates`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Literal, NamedTuple
 
+import jax
+
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.scene.body import Body
+from vmri_jax.scene.body import Bodies
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.layout import Pace, Place, join, layout
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
 
 NAMED = 3
 """Most bodies that a reason names."""
 
 Home = Literal["kinetic", "slow_potential", "fast_potential", "constraint", "slow_constraint", "force"]
-
-
-class Pace(NamedTuple):
-    """Whether a body is slow or fast, and why."""
-
-    value: Literal["slow", "fast"]
-    reason: str
 
 
 class Reason(NamedTuple):
@@ -39,8 +35,7 @@ class Reason(NamedTuple):
     bodies: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Placed:
+class Placed(NamedTuple):
     """Some elements of an effect, the argument of `System` that they are part of, and why."""
 
     effect: Effect
@@ -49,15 +44,31 @@ class Placed:
     reason: str
 
 
-class Sorting(NamedTuple):
-    """Paces by the name of the body, and where every effect lives."""
+@dataclass(frozen=True)
+class Sorting:
+    """Bodies by name, their paces, their places in q_s and q_f, and where every effect lives."""
 
+    bodies: Bodies
     paces: dict[str, Pace]
+    places: dict[str, Place]
     placed: tuple[Placed, ...]
 
+    @property
+    def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """(q_s, q_f, v_s, v_f) at the start."""
 
-def sort(bodies: Mapping[str, Body], effects: Sequence[Effect]) -> Sorting:
+        def both(what: str):
+            return join(self.bodies, self.places, "s", what), join(self.bodies, self.places, "f", what)
+
+        return (*both("position"), *both("velocity"))
+
+
+def sort(bodies: Bodies, effects: Sequence[Effect]) -> Sorting:
     """Paces of all bodies and homes of all effects.
+
+    Args:
+        bodies: by name.
+        effects: in the order in which their terms are added.
 
     Raises:
         ValueError: a potential that is to be fast but touches a slow body; something to be decided by numbers that are traced.
@@ -74,19 +85,17 @@ def sort(bodies: Mapping[str, Body], effects: Sequence[Effect]) -> Sorting:
             home, reason = _home(effect, i, slow, len(element), measured, limit)
             homes.setdefault(home, {})[i] = reason
         placed += [Placed(effect, tuple(some), home, _together(some.values())) for home, some in homes.items()]
-    return Sorting(paces, tuple(placed))
+    return Sorting(bodies, paces, layout(bodies, paces), tuple(placed))
 
 
 def _measure(bodies, energies) -> dict[str, Rates]:
     """Rates of potentials and kinetic effects, if a decision depends on them."""
-    auto = any(body.pace == "auto" for body in bodies.values())
-
-    def matters(effect: Effect) -> bool:
+    undecided = []
+    for effect in energies:
         free = [all(bodies[name].pace != "slow" for name in element) for element in effect.elements(bodies)]
-        return effect.kind == "potential" and effect.rate == "auto" and any(free)
-
-    undecided = [effect.name for effect in energies if matters(effect)]
-    if not undecided and not auto:
+        if effect.kind == "potential" and effect.rate == "auto" and any(free):
+            undecided.append(effect.name)
+    if not undecided and all(body.pace != "auto" for body in bodies.values()):
         return {}
     moving = any(effect.kind == "kinetic" for effect in energies)
     numbers = [(body.mass, body.position, body.velocity if moving else None) for body in bodies.values()]
@@ -129,13 +138,13 @@ def _stiff(effect: Effect, i: int, measured, limit) -> str:
 
 def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, limit) -> tuple[Home, Reason]:
     """Where an element of an effect belongs that touches these slow bodies, and why."""
-    if effect.kind in ("kinetic", "force"):
-        return effect.kind, Reason(
-            "depends on velocities" if effect.kind == "kinetic" else "not derived from a potential"
-        )
+    if effect.kind == "kinetic":
+        return "kinetic", Reason("depends on velocities")
+    if effect.kind == "force":
+        return "force", Reason("not derived from a potential")
+    if effect.kind == "constraint" and len(slow) == size:
+        return "slow_constraint", Reason("between slow bodies")
     if effect.kind == "constraint":
-        if len(slow) == size:
-            return "slow_constraint", Reason("between slow bodies")
         return "constraint", Reason("touches a fast body")
     if slow:
         if effect.rate == "fast":

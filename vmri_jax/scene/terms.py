@@ -50,13 +50,10 @@ class EffectTerm:
         return self.function(self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
-        """Force on all slow and on all fast coordinates, None where there is none."""
+        """Force on all slow and on all fast coordinates."""
         forces = self.function(t, self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
-        put = [
-            rows.put(jnp.broadcast_to(force, rows.shape), q_s.shape[0], q_f.shape[0])
-            for rows, force in zip(self.roles, forces, strict=True)
-        ]
-        return sums(put)
+        sizes = q_s.shape[0], q_f.shape[0]
+        return totals([rows.put(force, *sizes) for rows, force in zip(self.roles, forces, strict=True)])
 
 
 @dataclass(frozen=True)
@@ -92,19 +89,18 @@ def pick(values, select: Sequence[int]):
 
 
 def total(values: Sequence):
-    """Sum of one or more arrays, None of none."""
-    return reduce(add, values) if values else None
+    """Sum of one or more arrays."""
+    return reduce(add, values)
 
 
-def sums(pairs: Sequence):
-    """Sums of the first and of the second ones of pairs (slow, fast), without those that are None."""
-    return tuple(total([part for part in parts if part is not None]) for parts in zip(*pairs, strict=True))
+def totals(pairs: Sequence):
+    """Sums of the first and of the second ones of pairs (slow, fast)."""
+    return tuple(total(parts) for parts in zip(*pairs, strict=True))
 
 
 def joined(values: Sequence):
     """One vector of arrays of any shape."""
-    vectors = [jnp.reshape(value, (-1,)) for value in values]
-    return vectors[0] if len(vectors) == 1 else jnp.concatenate(vectors)
+    return jnp.concatenate([jnp.ravel(value) for value in values])
 
 
 @dataclass(frozen=True)
@@ -157,5 +153,15 @@ class TotalForce(_OfTerms):
     """``F(t, q_s, q_f, v_s, v_f, params)``, the sum of its terms."""
 
     def __call__(self, t, q_s, q_f, v_s, v_f, params):
-        slow, fast = sums([term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms])
-        return jnp.zeros_like(q_s) if slow is None else slow, jnp.zeros_like(q_f) if fast is None else fast
+        return totals([term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms])
+
+
+FUNCTIONS = {
+    "kinetic": KineticEnergy,
+    "slow_potential": SlowPotential,
+    "fast_potential": FastPotential,
+    "constraint": MicroConstraint,
+    "slow_constraint": MacroConstraint,
+    "force": TotalForce,
+}
+"""What is made of the terms of a home."""

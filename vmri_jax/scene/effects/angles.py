@@ -58,9 +58,8 @@ class Angle(_AmongPoints):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         angle = self.parameters(bodies)["angle"]
-        inside = (angle > 1e-3) & (angle < np.pi - 1e-3)
         expected = "it must lie between 0 and pi, where the energy is smooth; for pi take Bending"
-        self.require(inside, "angle", angle, expected)
+        self.require((angle > 1e-3) & (angle < np.pi - 1e-3), "angle", angle, expected)
 
 
 @effect_class

@@ -35,8 +35,8 @@ class _Contact(Effect):
 
     def drawing(self, bodies):
         elements = self.elements(bodies)
-        radii = np.broadcast_to(np.asarray(self.radius, dtype=float), (len(elements),))
-        return {"radii": [[name, float(r)] for (name,), r in zip(elements, radii, strict=True) if r > 0]}
+        radii = np.broadcast_to(np.asarray(self.radius, dtype=float), len(elements)).tolist()
+        return {"radii": [[name, r] for (name,), r in zip(elements, radii, strict=True) if r > 0]}
 
 
 @effect_class
@@ -71,7 +71,7 @@ class PlaneContact(_Contact):
     def parameters(self, bodies):
         params = super().parameters(bodies)
         normal = params["normal"]
-        return params | {"normal": normal / jnp.sqrt(jnp.sum(normal**2))}
+        return params | {"normal": normal / jnp.linalg.norm(normal)}
 
     def check_parameters(self, bodies):
         self.require(jnp.any(jnp.asarray(self.normal) != 0), "normal", self.normal, "it must not be zero")
@@ -79,7 +79,7 @@ class PlaneContact(_Contact):
 
     def drawing(self, bodies):
         params = self.parameters(bodies)
-        plane = {name: np.asarray(params[name]).tolist() for name in ("point", "normal")}
+        plane = {name: params[name].tolist() for name in ("point", "normal")}
         return super().drawing(bodies) | {"planes": [plane]}
 
 
@@ -107,7 +107,7 @@ class SphereContact(_Contact):
     @staticmethod
     def function(q, params):
         (q,) = q
-        distance = jnp.sqrt(jnp.sum((q - params["center"]) ** 2, axis=-1))
+        distance = jnp.linalg.norm(q - params["center"], axis=-1)
         return penalty(distance - params["sphere_radius"] - params["radius"], params)
 
     def check_parameters(self, bodies):
@@ -119,5 +119,5 @@ class SphereContact(_Contact):
 
     def drawing(self, bodies):
         params = self.parameters(bodies)
-        sphere = {"center": np.asarray(params["center"]).tolist(), "radius": float(params["sphere_radius"])}
+        sphere = {"center": params["center"].tolist(), "radius": float(params["sphere_radius"])}
         return super().drawing(bodies) | {"spheres": [sphere]}

@@ -32,8 +32,7 @@ class Gravity(Effect):
     def function(q, params):
         (q,), g = q, params["acceleration"]
         if jnp.ndim(g) == 0:
-            last = q.shape[-1] - 1
-            return g * jnp.sum(params["mass"] * q.reshape(-1)[last :: last + 1])
+            return g * jnp.sum(params["mass"] * q[..., -1])
         return -jnp.sum(params["mass"] * jnp.sum(g * q, axis=-1))
 
     def drawing(self, bodies):

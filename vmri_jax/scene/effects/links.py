@@ -5,17 +5,27 @@ from typing import Any
 import jax.numpy as jnp
 
 from vmri_jax.scene.declare import effect_class, positive
-from vmri_jax.scene.effect import START
+from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
 
 
-def length_defect(line, length):
-    """``(|x|^2 - l^2) / 2``, smooth also at x = 0."""
-    return (jnp.sum(line**2, axis=-1) - length**2) / 2
+@effect_class
+class _Rigid(Effect):
+    """``g = (|x|^2 - l^2) / 2``, smooth also at x = 0."""
+
+    length: Any = positive(default=None, measured=True)
+
+    kind = "constraint"
+    apart = True
+    dimensions = (1, 2, 3)
+
+    @staticmethod
+    def law(line, params):
+        return (jnp.sum(line**2, axis=-1) - params["length"] ** 2) / 2
 
 
 @effect_class
-class RigidLink(BetweenPoints):
+class RigidLink(_Rigid, BetweenPoints):
     """Massless rigid links, ``g = (|q_b - q_a|^2 - l^2) / 2 = 0``.
 
     A link between slow bodies is held at the macro nodes, one that touches a fast body at the micro nodes.
@@ -29,20 +39,12 @@ class RigidLink(BetweenPoints):
             the start, links that together are redundant.
     """
 
-    length: Any = positive(default=None, measured=True)
-
-    kind = "constraint"
     default_name = "links"
     drawn_as = "link"
 
-    @staticmethod
-    def function(q, params):
-        a, b = q
-        return length_defect(b - a, params["length"])
-
 
 @effect_class
-class Anchor(ToFixedPoint):
+class Anchor(_Rigid, ToFixedPoint):
     """Rigid links to fixed points, ``g = (|q - a|^2 - l^2) / 2 = 0``: a pendulum's rod.
 
     The points stay where they are; `MovingPivot` is a rigid link to a point that moves.
@@ -57,22 +59,12 @@ class Anchor(ToFixedPoint):
         ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
     """
 
-    length: Any = positive(default=None, measured=True)
-
-    kind = "constraint"
     default_name = "anchors"
-    apart = True
-    dimensions = (1, 2, 3)
     drawn_as = "link"
-
-    @staticmethod
-    def function(q, params):
-        (q,) = q
-        return length_defect(q - params["point"], params["length"])
 
 
 @effect_class
-class MovingPivot(ToPath):
+class MovingPivot(_Rigid, ToPath):
     """Rigid links to a moving point, ``g = (|q - a(t)|^2 - l^2) / 2 = 0``: a pendulum on a pivot that is moved.
 
     Args:
@@ -86,17 +78,8 @@ class MovingPivot(ToPath):
         ValueError: (of the scene) bodies that start at the point, a length that is not positive or not the distance at the start.
     """
 
-    length: Any = positive(default=None, measured=True)
-
-    kind = "constraint"
     default_name = "moving_pivots"
-    apart = True
     advice = "move one of them, or take Guide"
-
-    @staticmethod
-    def formula(point, q, params):
-        (q,) = q
-        return length_defect(q - point, params["length"])
 
 
 @effect_class
@@ -117,9 +100,8 @@ class Guide(ToPath):
     default_name = "guides"
 
     @staticmethod
-    def formula(point, q, params):
-        (q,) = q
-        return q - point
+    def law(line, params):
+        return line
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)

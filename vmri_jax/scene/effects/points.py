@@ -1,4 +1,7 @@
-"""What effects between two points, or between bodies and a point that is fixed or moves, share."""
+"""Attachments: between two points, or between bodies and a point that is fixed or moves.
+
+Each gives the line x from one end to the other; ``law(x, params)`` of a class makes an energy, a constraint or a force of it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,26 +18,33 @@ from vmri_jax.scene.effect import Effect, real_tree
 def distance(q, params=None):
     """``|q_b - q_a|`` of the first two roles."""
     a, b = q
-    return jnp.sqrt(jnp.sum((b - a) ** 2, axis=-1))
+    return jnp.linalg.norm(b - a, axis=-1)
 
 
 @effect_class
 class BetweenPoints(Effect):
-    """Between the two points of each pair, which do not start at the same place."""
+    """Between the two points of each pair, which do not start at the same place; ``x = q_b - q_a``."""
 
     between: Any = names(2)
 
+    law: ClassVar[Any]
     dimensions = (1, 2, 3)
     apart = True
     rest = staticmethod(distance)
 
+    @classmethod
+    def function(cls, q, params):
+        a, b = q
+        return cls.law(b - a, params)
+
 
 @effect_class
 class ToPoint(Effect):
-    """Between each body and a point that is given."""
+    """Between each body and a point p that is given; ``x = q - p``."""
 
     bodies: Any = names()
 
+    law: ClassVar[Any]
     advice: ClassVar[str] = "move one of them"
     """What to do about bodies that start at the point."""
 
@@ -45,20 +55,24 @@ class ToPoint(Effect):
     def rest(self, q, params):
         """Distance of a body from the point at the start."""
         (q,) = q
-        return jnp.sqrt(jnp.sum((q - self.point_at_start(params)) ** 2, axis=-1))
+        return jnp.linalg.norm(q - self.point_at_start(params), axis=-1)
 
     def require_apart(self, bodies):
         """Refuse bodies that start at the point."""
-        away = self.at_start(bodies, self.parameters(bodies))
-        expected = f"bodies must not start there; {self.advice}"
-        self.require(away > 0, "the distance of a body from its point", away, expected)
+        away, what = self.at_start(bodies, self.parameters(bodies)), "the distance of a body from its point"
+        self.require(away > 0, what, away, f"bodies must not start there; {self.advice}")
 
 
 @effect_class
 class ToFixedPoint(ToPoint):
-    """What anchors to a fixed point share."""
+    """To a point that stays where it is."""
 
     point: Any = vector()
+
+    @classmethod
+    def function(cls, q, params):
+        (q,) = q
+        return cls.law(q - params["point"], params)
 
     def __post_init__(self):
         super().__post_init__()
@@ -69,37 +83,39 @@ class ToFixedPoint(ToPoint):
             )
 
     def drawing(self, bodies):
-        points = np.atleast_2d(np.asarray(self.parameters(bodies)["point"]))
-        pairs = zip(self.elements(bodies), points, strict=True)
-        drawn = [(name, point) for (name,), point in pairs if not bodies[name].block]
-        return {"anchors": [{"body": name, "point": point.tolist(), "kind": self.drawn_as} for name, point in drawn]}
+        points = np.atleast_2d(self.parameters(bodies)["point"])
+        anchors = []
+        for (name,), point in zip(self.elements(bodies), points.tolist(), strict=True):
+            if not bodies[name].block:
+                anchors.append({"body": name, "point": point, "kind": self.drawn_as})
+        return {"anchors": anchors}
 
 
 @dataclass(frozen=True)
 class AlongPath:
-    """A formula with the point of a path, ``formula(a(t), q, ..., params)``, as a function of time; compared by value."""
+    """``law(q - a(t), params)``, as a function of time; compared by value."""
 
-    formula: Callable
+    law: Callable
     path: Callable
 
-    def __call__(self, t, *arguments):
-        return self.formula(self.path(t, arguments[-1]["path"]), *arguments)
+    def __call__(self, t, q, *arguments):
+        (q,), params = q, arguments[-1]
+        return self.law(q - self.path(t, params["path"]), params)
 
 
 @effect_class
 class ToPath(ToPoint):
-    """What effects between bodies and a moving point share: ``formula(point, q, ..., params)`` at the point of the path."""
+    """To a point that moves along a path."""
 
     path: Callable
     params: Any = field(default_factory=dict, kw_only=True)
 
-    formula: ClassVar[Any]
     dimensions = (1, 2, 3)
     timed = True
 
     @property
     def function(self):
-        return AlongPath(self.formula, self.path)
+        return AlongPath(self.law, self.path)
 
     def parameters(self, bodies):
         return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}
@@ -113,8 +129,8 @@ class ToPath(ToPoint):
         super().check_bodies(bodies)
         shape = jax.eval_shape(lambda: jnp.asarray(self.point_at_start({}))).shape
         for (name,) in self.elements(bodies):
-            needed = (bodies[name].size,)
-            if shape != needed:
+            size = bodies[name].size
+            if shape != (size,):
                 raise ValueError(
-                    f"{self.name}: path returns shape {shape}; {name} has dimension {needed[0]}, return {needed}."
+                    f"{self.name}: path returns shape {shape}; {name} has dimension {size}, return ({size},)."
                 )

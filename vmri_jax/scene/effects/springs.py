@@ -13,11 +13,6 @@ def elastic_energy(stiffness, elongation):
     return jnp.sum(stiffness / 2 * elongation**2)
 
 
-def elongation(line, length):
-    """``|x| - l``."""
-    return jnp.linalg.norm(line, axis=-1) - length
-
-
 @effect_class
 class Spring(BetweenPoints):
     """Linear springs, ``V = sum k/2 (|q_b - q_a| - l)^2``.
@@ -39,9 +34,8 @@ class Spring(BetweenPoints):
     default_name = "springs"
 
     @staticmethod
-    def function(q, params):
-        a, b = q
-        return elastic_energy(params["stiffness"], elongation(b - a, params["length"]))
+    def law(line, params):
+        return elastic_energy(params["stiffness"], jnp.linalg.norm(line, axis=-1) - params["length"])
 
 
 @effect_class
@@ -67,9 +61,8 @@ class NonlinearSpring(BetweenPoints):
     default_name = "nonlinear_springs"
 
     @staticmethod
-    def function(q, params):
-        a, b = q
-        e, energy = elongation(b - a, params["length"]), 0.0
+    def law(line, params):
+        e, energy = jnp.linalg.norm(line, axis=-1) - params["length"], 0.0
         for j in range(params["coefficients"].shape[0], 0, -1):
             energy = (energy + params["coefficients"][j - 1] / (j + 1)) * e
         return jnp.sum(energy * e)
@@ -77,10 +70,8 @@ class NonlinearSpring(BetweenPoints):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         coefficients = self.parameters(bodies)["coefficients"]
-        if coefficients.ndim != 1 or not coefficients.size:
-            raise ValueError(
-                f"{self.name}: coefficients is {self.coefficients!r}; give (k_1, k_2, ...), at least one number."
-            )
+        one = coefficients.ndim == 1 and coefficients.size > 0
+        self.require(one, "coefficients", repr(self.coefficients), "give (k_1, k_2, ...), at least one number")
 
 
 @effect_class
@@ -106,11 +97,10 @@ class SpringAnchor(ToFixedPoint):
     drawn_as = "spring"
 
     @staticmethod
-    def function(q, params):
-        (q,) = q
-        if "length" not in params:
-            return jnp.sum(params["stiffness"] / 2 * jnp.sum((q - params["point"]) ** 2, axis=-1))
-        return elastic_energy(params["stiffness"], elongation(q - params["point"], params["length"]))
+    def law(line, params):
+        if "length" in params:
+            return Spring.law(line, params)
+        return jnp.sum(params["stiffness"] / 2 * jnp.sum(line**2, axis=-1))
 
     @property
     def apart(self):
@@ -138,6 +128,5 @@ class MovingAnchor(ToPath):
     default_name = "moving_anchors"
 
     @staticmethod
-    def formula(point, q, v, params):
-        (q,) = q
-        return (params["stiffness"][..., None] * (point - q),)
+    def law(line, params):
+        return (-params["stiffness"][..., None] * line,)
