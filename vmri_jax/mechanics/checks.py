@@ -64,8 +64,11 @@ def check_params(params) -> None:
         if is_concrete(leaf) and getattr(leaf, "dtype", np.asarray(leaf).dtype).kind not in "biufc":
             raise TypeError(
                 f"{name} is {leaf!r}; give arrays of numbers, which are handed to every function. What is no number "
-                "belongs into the functions themselves."
+                "belongs into the functions themselves. A class of your own becomes a pytree by "
+                "jax.tree_util.register_dataclass or as an equinox.Module."
             )
+        if is_concrete(leaf) and not np.isfinite(leaf).all():
+            raise ValueError(f"{name} is {leaf}, which is not finite; every function would be handed it.")
 
 
 def check_system(system: System, q_s, q_f) -> None:

@@ -1,4 +1,4 @@
-"""Constraints at one configuration: kept or not, independent or not, and the nearest positions that keep them."""
+"""Constraints and masses at one configuration: kept or not, independent or not, regular or not; the nearest positions that keep them."""
 
 from typing import NamedTuple
 
@@ -12,6 +12,8 @@ from vmri_jax.mechanics.system import System
 
 RANK = 1e-8
 """Rows of length one are dependent where a singular value is not above this."""
+REGULAR = 1e-12
+"""A mass matrix is singular where an eigenvalue is not above this part of the largest one."""
 TAKES_PART = 1e-6
 """Smallest coefficient of a row, in dependences of length one, with which it takes part in them."""
 FAST_PART = 1e-12
@@ -78,6 +80,36 @@ def project_positions(system: System, t, q_s, q_f):
         g = constraints(q)
         q = q - directions @ jnp.linalg.lstsq(jax.jacrev(constraints)(q) @ directions, g)[0]
     return q[:n_s], q[n_s:]
+
+
+def check_mass(system: System, q_s, q_f) -> None:
+    """Refuse a kinetic energy function whose mass matrix ``d2T/dv2`` is not positive definite at these positions.
+
+    It is taken at generic velocities, since one that is not quadratic may be singular at rest.
+
+    Raises:
+        ValueError: the matrix is not finite or not positive definite; names the coordinates it leaves without mass.
+    """
+    if system.has_constant_mass:
+        return
+    mass = np.asarray(_mass_matrix(system, q_s, q_f, *_nearby(np.zeros_like(q_s), np.zeros_like(q_f))))
+    if not np.isfinite(mass).all():
+        raise ValueError("System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?).")
+    values, vectors = np.linalg.eigh(mass)
+    without = np.abs(vectors[:, values <= REGULAR * np.abs(values).max()]).max(axis=1, initial=0.0) > TAKES_PART
+    if without.any():
+        n_s = np.size(q_s)
+        names = [f"q_s[{i}]" if i < n_s else f"q_f[{i - n_s}]" for i in np.flatnonzero(without)]
+        raise ValueError(
+            f"System: the mass matrix d2T/dv2 of kinetic is not positive definite at these positions, along {', '.join(names)} "
+            f"(eigenvalues from {values[0]:.3g} to {values[-1]:.3g}). Give every coordinate a mass, one that constraints move too."
+        )
+
+
+@jax.jit
+def _mass_matrix(system, q_s, q_f, v_s, v_f):
+    n_s = v_s.size
+    return jax.hessian(lambda v: system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params))(jnp.append(v_s, v_f))
 
 
 def check_constraints(

@@ -1,10 +1,12 @@
 """States: time, positions and momenta on the constraint manifold, and how a run gets its first one."""
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type, require_x64
@@ -17,10 +19,13 @@ from vmri_jax.mechanics.checks import (
     check_type,
 )
 from vmri_jax.mechanics.constraints import check_constraints as check_constraints
-from vmri_jax.mechanics.constraints import project_positions
+from vmri_jax.mechanics.constraints import check_mass, project_positions
 from vmri_jax.mechanics.projection import legendre as legendre
 from vmri_jax.mechanics.projection import project_momentum as project_momentum
 from vmri_jax.mechanics.system import System
+
+NOTICED, REFUSED = 1e-6, 1e-2
+"""Parts of the velocities against the constraints that are said, and that are refused."""
 
 
 class State(eqx.Module):
@@ -39,12 +44,14 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
     Args:
         q_s, q_f, v_s, v_f: (n_s,), (n_f,) arrays of float64.
         t: start time.
-        project: move positions onto the constraints instead of refusing them.
+        project: move positions onto the constraints instead of refusing them, and take away what of the velocities points
+            against them.
         tolerance: largest constraint value, in the constraint's own unit, that counts as satisfied.
 
     Raises:
         ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint (with
-            the size of the violation), constraints that the fast variables cannot satisfy.
+            the size of the violation), velocities against a constraint, constraints that the fast variables cannot satisfy, a
+            kinetic energy without mass along some coordinate.
     """
     require_x64()
     check_type("initial_state: system", system, System, "a vmri_jax.System")
@@ -54,9 +61,13 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
     t = check_number("t", t)
     check_number("tolerance", tolerance)
     q_s, q_f, v_s, v_f = check_arrays(q_s=q_s, q_f=q_f, v_s=v_s, v_f=v_f)
+    if is_concrete((system, q_s, q_f)) and not system.has_constant_mass:
+        check_system(system, q_s, q_f)
+        check_mass(system, q_s, q_f)
     if project:
         q_s, q_f = _projected_positions(system, t, q_s, q_f)
-    state = State(t, q_s, q_f, *_momenta(system, t, q_s, q_f, v_s, v_f))
+    *momenta, taken = _momenta(system, t, q_s, q_f, v_s, v_f)
+    state = State(t, q_s, q_f, *momenta)
     if is_concrete(state):
         advice = (
             "projection did not reach the constraints; start closer to them."
@@ -69,7 +80,21 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
                 "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
                 "singular at the initial positions, or a function returned NaN there."
             )
+        if not project:
+            _tell_of_velocities(float(taken))
     return state
+
+
+def _tell_of_velocities(taken: float) -> None:
+    """Say which part of the velocities pointed against the constraints, and refuse a large one."""
+    message = (
+        f"initial_state: {taken:.2%} of the velocities (in the norm of the kinetic energy) point against the constraints, "
+        "which take them away"
+    )
+    if taken > REFUSED:
+        raise ValueError(f"{message}. Correct the velocities, or pass project=True for those that are left.")
+    if taken > NOTICED:
+        warnings.warn(f"{message}; pass project=True if that is meant.", stacklevel=3)
 
 
 @dataclass(frozen=True)
@@ -77,6 +102,7 @@ class Problem:
     """A system with initial positions and velocities, (n_s,), (n_f,), which are kept as arrays.
 
     drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
+    project: whether `state` projects positions and velocities onto the constraints, see `initial_state`.
 
     Raises:
         TypeError, ValueError: arrays as `initial_state` refuses them.
@@ -89,6 +115,7 @@ class Problem:
     v_f: Any
     t: Any = 0.0
     drawing: Any = None
+    project: bool = False
 
     def __post_init__(self):
         require_x64()
@@ -97,17 +124,22 @@ class Problem:
         for name, array in zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True):
             object.__setattr__(self, name, array)
 
-    def state(self, project: bool = False) -> State:
-        """The consistent initial `State` (see `initial_state`)."""
+    def state(self, project: bool | None = None) -> State:
+        """The consistent initial `State` (see `initial_state`); None for `project` of the problem."""
+        project = self.project if project is None else project
         return initial_state(self.system, self.q_s, self.q_f, self.v_s, self.v_f, self.t, project=project)
 
 
 @jax.jit
 def _momenta(system, t, q_s, q_f, v_s, v_f):
-    """Consistent momenta; what the user's functions return is checked while tracing."""
+    """Consistent momenta, and the part of the velocities that constraints take away; what functions return is checked while tracing."""
     check_system(system, q_s, q_f)
-    state = State(t, q_s, q_f, *legendre(system, q_s, q_f, v_s, v_f))
-    return project_momentum(system, state, (v_s, v_f))[:2]
+    given = legendre(system, q_s, q_f, v_s, v_f)
+    p_s, p_f, *velocities = project_momentum(system, State(t, q_s, q_f, *given), (v_s, v_f))
+    v, kept, p, kept_p = (jnp.concatenate(a) for a in ((v_s, v_f), velocities, given, (p_s, p_f)))
+    size = v @ p
+    part = jnp.where(size > 0, (v - kept) @ (p - kept_p) / jnp.where(size > 0, size, 1.0), 0.0)
+    return p_s, p_f, jnp.sqrt(jnp.maximum(part, 0.0))
 
 
 _projected_positions = jax.jit(project_positions)

@@ -13,6 +13,7 @@ from vmri_jax.mechanics.checks import check_params, check_type
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import Engine
+from vmri_jax.running.memory import check_memory
 from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory, from_arrays
 from vmri_jax.schemes.composition import Composition, stage_scheme
@@ -76,6 +77,7 @@ def simulate_batch(
         raise ValueError(f"simulate_batch: every {name} must be a positive number, got {dt}.")
     _check_devices(devices, chunk)
     run.check("simulate_batch: the first state", constraints=params is None)
+    check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, save_micro, lanes)
     width = (_chunk(run) if chunk is None else chunk) * devices
     batch = {
         "params": None if params is None else [np.asarray(leaf) for leaf in jax.tree.leaves(params)],

@@ -12,12 +12,13 @@ import numpy as np
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_flags, check_system
-from vmri_jax.mechanics.constraints import check_constraints
+from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import check_run
 from vmri_jax.running.engine import Engine, engine
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
+from vmri_jax.running.memory import check_memory
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join
 from vmri_jax.schemes.composition import Composition
@@ -74,6 +75,7 @@ def simulate(
     if not run.is_concrete:
         return run.traced()
     run.check()
+    check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     trajectory = run.in_parts() if progress else run()
     if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
         check_constraints(system, state, "simulate: the state")
@@ -112,6 +114,7 @@ def prepare(
     if not run.is_concrete:
         raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
+    check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
     leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
     run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start)
     jax.block_until_ready(run.engine.whole(leaves, run.start_arrays, macro_dt, 0))  # no steps: it only compiles
@@ -329,6 +332,7 @@ class _Known:
 @lru_cache(maxsize=256)
 def _check_once(known: _Known) -> None:
     check_system(known.system, known.state.q_s, known.state.q_f)
+    check_mass(known.system, known.state.q_s, known.state.q_f)
     if known.constraints:
         check_constraints(known.system, known.state, known.what)
 

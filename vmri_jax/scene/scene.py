@@ -117,9 +117,13 @@ class Scene:
         seen = is_concrete((self.params, [body.radius for body in self.bodies]))
         return Problem(self.system(), *self.start, drawing=self.drawing() if seen else None)
 
-    def state(self) -> State:
-        """The consistent initial state: velocities are projected onto the constraints."""
-        return initial_state(self.system(), *self.start)
+    def state(self, project: bool = False) -> State:
+        """The consistent initial state.
+
+        Args:
+            project: as of `initial_state`.
+        """
+        return initial_state(self.system(), *self.start, project=project)
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.

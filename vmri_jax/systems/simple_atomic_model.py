@@ -46,7 +46,7 @@ def simple_atomic_model(
 ) -> Problem:
     """Simple atomic model in R^3: (q_1, q_2) slow, (q_3, ..., q_6) fast; hanging, atoms 2 to 5 a regular tetrahedron.
 
-    The initial velocities are given before projection onto the bonds; ``.state()`` projects them.
+    The initial velocities are given before their projection onto the bonds.
 
     Args:
         masses: of the six atoms.
@@ -80,4 +80,4 @@ def simple_atomic_model(
     )
     v_s = np.array([[0.0, 0.5, 0.0], [0.3, 0.2, 0.1]])
     v_f = np.array([[0.0, 0.4, 0.2], [-0.5, 0.2, 0.3], [0.2, -0.6, 0.4], [0.7, 0.1, 0.2]])
-    return Problem(system, *(jnp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f)))
+    return Problem(system, *(jnp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f)), project=True)
