@@ -5,7 +5,7 @@ import shlex
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import jax
 import numpy as np
@@ -156,39 +156,28 @@ def _compile_clock() -> list[float]:
 def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> dict[str, str]:
     """How a run went, in words; one on disk is read piece by piece."""
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
-    found = [_extremes(piece) for piece in pieces]
-    first, last = found[0], found[-1]
-    position, velocity, method, iterations = np.max([one.largest for one in found], axis=0)
-    change = max(max(one.highest - first.energy, first.energy - one.lowest) for one in found)
-    relative = abs(first.energy) > 1e-12
-    energy = f"{change / abs(first.energy):.2e} of the energy at the start" if relative else f"{change:.2e}"
+    times, energies, largest = (np.array(found) for found in zip(*map(_extremes, pieces), strict=True))
+    position, velocity, method, iterations = largest.max(axis=0)
+    start = energies[0, 0]
+    change = np.abs(energies - start).max()
+    energy = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"
     return {
-        "simulated time": f"{first.start:g} to {last.end:g}",
+        "simulated time": f"{times[0, 0]:g} to {times[-1, 1]:g}",
         "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
         "energy change": f"at most {energy}",
         "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if constrained else "",
     }
 
 
-class _Extremes(NamedTuple):
-    """Of a piece of a run: times, energy at its start, lowest and highest energy.
-
-    largest: residuals of positions and velocities, dearest method, most iterations.
-    """
-
-    start: float
-    end: float
-    energy: float
-    lowest: float
-    highest: float
-    largest: tuple[float, float, int, int]
-
-
-def _extremes(piece: Trajectory) -> _Extremes:
+def _extremes(piece: Trajectory) -> tuple:
+    """First and last time; energy at the start, lowest, highest; largest residuals, dearest method, most iterations."""
     energy, info = np.asarray(piece.energy), piece.info
-    position, velocity = np.asarray(piece.constraint_residual).max(axis=0)
-    largest = position, velocity, int(np.max(info.method)), int(np.max(info.iterations))
-    return _Extremes(float(piece.t[0]), float(piece.t[-1]), energy[0], energy.min(), energy.max(), largest)
+    residuals = np.asarray(piece.constraint_residual).max(axis=0)
+    return (
+        (piece.t[0], piece.t[-1]),
+        (energy[0], energy.min(), energy.max()),
+        (*residuals, np.max(info.method), np.max(info.iterations)),
+    )
 
 
 def default_save_every(steps: int) -> int:
