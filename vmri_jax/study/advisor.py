@@ -18,8 +18,7 @@ from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.progress import Progress, silent
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.timing import interleaved
-from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
+from vmri_jax.study.work import WorkPrecision, WorkRow, timed_in_turn, work_row
 
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 PATIENCE = 5.0
@@ -91,9 +90,7 @@ class Search:
         key = (family.name, num_micro)
         program = self.programs.pop(key, None)
         if program is None:
-            scheme, saves = family.make(num_micro), self.reference.num_saves
-            newton = self.newton
-            program = Program(self.problem, scheme, self.t_end, saves, newton)
+            program = Program(self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton)
         self.programs[key] = program  # the last one now
         if len(self.programs) > PROGRAMS:
             self.programs.pop(next(iter(self.programs)))
@@ -104,8 +101,8 @@ class Search:
         key = (family.name, num_micro, num_steps)
         if key not in self.settings:
             program = self.program(family, num_micro)
-            [seconds] = interleaved({"": program.timed(num_steps)}, 2, 0.0).values()
-            row = work_row(family.label(num_micro), program, num_steps, self.reference, [min(seconds)])
+            fastest = min(program.seconds(num_steps, 2, 0.0))
+            row = work_row(family.label(num_micro), program, num_steps, self.reference).timed([fastest])
             self.settings[key] = Setting(family, num_micro, num_steps, row)
         return self.settings[key]
 
@@ -192,14 +189,9 @@ class Search:
 
     def _timed(self, settings: Sequence[Setting]) -> list[Setting]:
         """The same with medians of runs that took turns."""
-        programs = [self.program(s.family, s.num_micro) for s in settings]
-        runs = {str(i): p.timed(s.num_steps) for i, (p, s) in enumerate(zip(programs, settings, strict=True))}
-        timed = interleaved(runs, 5)
-        found = []
-        for i, (program, setting) in enumerate(zip(programs, settings, strict=True)):
-            row = work_row(setting.row.scheme, program, setting.num_steps, self.reference, timed[str(i)])
-            found.append(replace(setting, row=row))
-            self.settings[setting.family.name, setting.num_micro, setting.num_steps] = found[-1]
+        runs = [(self.program(s.family, s.num_micro), s.row) for s in settings]
+        found = [replace(s, row=row) for s, row in zip(settings, timed_in_turn(runs, 5), strict=True)]
+        self.settings |= {(s.family.name, s.num_micro, s.num_steps): s for s in found}
         return found
 
     def rows(self) -> WorkPrecision:
@@ -341,8 +333,8 @@ def _from_another_start(problem, t_end, num_saves: int, newton) -> Callable[[Set
 
     def verified(setting: Setting) -> Verification:
         program = Program(other, setting.scheme, t_end, num_saves, newton)
-        [seconds] = interleaved({"": program.timed(setting.num_steps)}, 5).values()
-        row, seen = work_row(setting.row.scheme, program, setting.num_steps, reference, seconds), setting.row
+        seconds = program.seconds(setting.num_steps, 5)
+        row, seen = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds), setting.row
         return Verification(row.error_q, row.seconds, row.error_q / seen.error_q, row.seconds / seen.seconds)
 
     return verified

@@ -295,7 +295,10 @@ def _runner(problems: Sequence[Problem], scheme, t_end: float, num_saves: int, n
 def _references(cases, reference, t_end, num_saves, progress, total) -> dict[str, Any]:
     """A reference of the right shape for every case."""
     if reference is None:
-        told = lambda what, *_: progress(what, 0, total)  # noqa: E731
+
+        def told(what: str, *_) -> None:
+            progress(what, 0, total)
+
         return {
             case: reference_solution(problem, t_end, num_saves=num_saves, progress=told)
             for case, problem in cases.items()
@@ -356,6 +359,6 @@ def _drift_and_band(t: np.ndarray, energy: np.ndarray) -> tuple[float, float]:
     """Change over the run of the line fitted to the energy, and the largest distance from it."""
     if not np.isfinite(energy).all():
         return float("nan"), float("nan")
-    x = t - t.mean()
-    slope = float(x @ energy / (x @ x))
-    return slope * float(t[-1] - t[0]), float(np.abs(energy - energy.mean() - slope * x).max())
+    line = np.polynomial.Polynomial.fit(t, energy, 1)
+    fitted = line(t)
+    return float(fitted[-1] - fitted[0]), float(np.abs(energy - fitted).max())
