@@ -228,7 +228,7 @@ def plot_convergence(
                 _guide_triangle(axes, study, quantity, order, theme)
             axes.set(title=name, xlabel="macro step $H$")
             axes.set(ylabel=rf"largest error $|{quantity} - {quantity}_{{\mathrm{{ref}}}}|$")
-            _log_ticks(axes.xaxis, steps)
+            log_ticks(axes.xaxis, steps)
             axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=1, handlelength=2.4)
     return figure
 
@@ -286,9 +286,9 @@ def plot_work_precision(
             axes.axhline(study.reference.error_q, color=theme.ink, linewidth=0.8, linestyle=":")
             above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}
             axes.text(0.995, study.reference.error_q, "error of the reference ", **above)
+        log_ticks(axes.xaxis, [getattr(row, work) for scheme in study.schemes for row in study.curve(scheme)])
         if work == "seconds":
             axes.xaxis.set_major_formatter(EngFormatter("s"))
-        axes.xaxis.set_minor_formatter(NullFormatter())
         _legend_beside(axes)
     return figure
 
@@ -357,7 +357,7 @@ def _cost_panel(axes: Axes, study: CostCurves, paper_minimum: int | None, theme:
     axes.xaxis.set_major_locator(FixedLocator(ticks.tolist()))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter("{x:.0f}")
-    _log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
+    log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
 
 
 def _coordinates(axes: Axes, t, values, letter: str, theme: Theme) -> None:
@@ -390,8 +390,13 @@ def _energy_error(energy) -> tuple[np.ndarray, str]:
     return error, r"energy error $\Delta E$"
 
 
-def _log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
-    """Labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them."""
+def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
+    """Labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them.
+
+    Args:
+        axis: logarithmic.
+        values: what is drawn along it.
+    """
     finite = [value for value in values if np.isfinite(value)]
     axis.set_minor_formatter(NullFormatter())
     if finite and max(finite) < 30 * min(finite):

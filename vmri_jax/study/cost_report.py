@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, NullFormatter
+from matplotlib.ticker import EngFormatter
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.mechanics.invariants import potentials
@@ -251,7 +252,7 @@ def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
     """Time against num_micro of the families that were varied, at each error, one panel per error."""
     answers = [answer for answer in report.answers if answer.all]
     names = list(dict.fromkeys(s.family.name for answer in answers for s in answer.all[: 2 * SHOWN]))
-    colors = {name: theme.curves[i % len(theme.curves)] for i, name in enumerate(names)}
+    colors = dict(zip(names, cycle(theme.curves), strict=False))
     with plots.new_figure(7.2, 3.2, "", theme) as figure:
         panels = figure.subplots(1, max(1, len(answers)), sharey=True, squeeze=False)[0]
         drawn = {}
@@ -263,7 +264,7 @@ def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
                     drawn[name] = axes.loglog(x, y, "o-", color=colors[name], markersize=3.5, linewidth=1.2)[0]
             axes.set(title=f"error {answer.error:.0e}", xlabel="num_micro")
             axes.xaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            plots.log_ticks(axes.yaxis, [s.row.seconds for shown in answers for s in shown.all])
         panels[0].set_ylabel("computing time")
         panels[0].yaxis.set_major_formatter(EngFormatter("s"))
         if drawn:
@@ -276,9 +277,9 @@ def _draw_shares(report: CostReport, theme: plots.Theme) -> Figure:
     with plots.new_figure(7.2, 1.1, "", theme) as figure:
         axes = figure.subplots()
         left = 0.0
-        for i, (name, share) in enumerate(report.shares.items()):
+        for color, (name, share) in zip(theme.curves, report.shares.items(), strict=False):
             last = name == "everything else"
-            axes.barh([0], [share], left=left, color=theme.faint if last else theme.curves[i % len(theme.curves)])
+            axes.barh([0], [share], left=left, color=theme.faint if last else color)
             if share > 0.06:
                 ink = theme.ink if last else theme.paper
                 axes.text(left + share / 2, 0, f"{name}\n{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
