@@ -92,17 +92,23 @@ def simulate(
     if stopped is not None:
         raise typer.Exit(_print_stop(stopped, saved, streamed))
     done = (steps - (0 if before is None else before.step)) * chosen.num_micro
-    summary = {
-        "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
-        "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
-        "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
-        **_summary(trajectory, problem.system.is_constrained),
-        "saved": ", ".join(saved) if saved else "nothing; give --out run.npz or --plot run.png",
-    }
+    _print_named(
+        {
+            "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
+            "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
+            "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
+            **_summary(trajectory, problem.system.is_constrained),
+            "saved": ", ".join(saved) or "nothing; give --out run.npz or --plot run.png",
+        }
+    )
+
+
+def _print_named(texts: dict[str, str]) -> None:
+    """Names and texts, line by line; empty ones are left out."""
     table = plain_table("", "", show_header=False)
-    for name, value in summary.items():
-        if value:
-            table.add_row(f"[dim]{name}[/dim]", escape(value))
+    for name, text in texts.items():
+        if text:
+            table.add_row(f"[dim]{name}[/dim]", escape(text))
     console.print(table)
 
 

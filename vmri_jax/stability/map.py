@@ -19,11 +19,7 @@ from vmri_jax.stability.windows import find_windows
 from vmri_jax.study.table import Column, ResultTable
 
 TOLERANCE = 1e-6
-"""Growth per step that counts as instability.
-
-Two equal multipliers (free motion, the end of a window) split under round-off by the square root of it: 2e-8 on the triple
-pendulum, 1e-8 on the atomic model. Growth by less than 1e-6 takes a million macro steps to be a factor of e.
-"""
+"""Growth per step that counts as instability: round-off alone splits two equal multipliers by its square root, up to 2e-8."""
 INSIDE = np.linspace(0.0, 1.0, 9)
 """Where the growth in a window is measured."""
 EDGE = 1e-7
