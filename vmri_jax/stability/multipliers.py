@@ -81,7 +81,7 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
     padded = np.pad(macro_dt, (0, -len(macro_dt) % lanes), mode="edge").reshape(-1, lanes)
     fixed = motions.system, scheme, motions.rest, motions.embed, motions.read
     matrices = np.concatenate([_step_matrices(*fixed, part) for part in padded])[: len(macro_dt)]
-    failed = ~np.isfinite(matrices).all(axis=(1, 2))
+    failed = ~np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     values, vectors = np.linalg.eig(np.where(failed[:, None, None], np.eye(size), matrices))
     values = np.where(failed[:, None], np.nan, values.astype(complex))
     own = np.zeros(values.shape, dtype=bool)
