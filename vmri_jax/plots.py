@@ -158,16 +158,16 @@ def plot_trajectory(trajectory: Trajectory, title: str = "", theme: Theme = LIGH
         axes = figure.subplots(3 + constrained, sharex=True)
         _coordinates(axes[0], t, np.asarray(trajectory.q_s), "s", theme)
         _coordinates(axes[1], t, np.asarray(trajectory.q_f), "f", theme)
+        axes[0].set_ylabel(r"slow positions $q_s$")
+        axes[1].set_ylabel(r"fast positions $q_f$")
         axes[2].plot(t, error, color=theme.curves[0], linewidth=_thin(t))
-        labels = [r"slow positions $q_s$", r"fast positions $q_f$", label]
+        axes[2].set_ylabel(label)
         if constrained:
             shown = np.where(residual > 0, residual, np.nan)
             axes[3].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
             axes[3].semilogy(t, shown[:, 1], "--", linewidth=_thin(t), label="velocity $|G v|$")
+            axes[3].set_ylabel("constraint residual")
             _legend_beside(axes[3])
-            labels.append("constraint residual")
-        for panel, label in zip(axes, labels, strict=True):
-            panel.set(ylabel=label)
         axes[-1].set(xlabel="time $t$", xlim=(t[0], t[-1]))
         figure.align_ylabels()
     return figure
@@ -295,8 +295,11 @@ def plot_work_precision(
 
 def _look(i: int, theme: Theme) -> dict[str, Any]:
     """Colour and marker of curve i."""
-    look = {"color": theme.curves[i % len(theme.curves)], "marker": MARKERS[i % len(MARKERS)]}
-    return look | {"markerfacecolor": theme.paper}
+    return {
+        "color": theme.curves[i % len(theme.curves)],
+        "marker": MARKERS[i % len(MARKERS)],
+        "markerfacecolor": theme.paper,
+    }
 
 
 class CostCurves(Protocol):
