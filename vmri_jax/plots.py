@@ -4,18 +4,19 @@ Every function returns a matplotlib `Figure` made without pyplot: no window open
 notebook shows it when it is the value of a cell. Colours follow Okabe and Ito, told apart by the colour-blind.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any
+from typing import Any, Protocol
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import EngFormatter, FixedLocator, LogLocator, NullFormatter, NullLocator
 
 from vmri_jax import diagnostics
 from vmri_jax.running.trajectory import Trajectory
@@ -111,6 +112,20 @@ def new_figure(width: float, height: float, title: str, theme: Theme) -> Iterato
         figure.suptitle(title, x=0.01, ha="left")
 
 
+def panel_grid(figure: Figure, count: int, columns: int) -> np.ndarray:
+    """So many axes in rows of `columns`; cells of the grid that are left over stay empty.
+
+    Args:
+        figure: to draw on.
+        count: number of panels.
+        columns: of the grid.
+    """
+    axes = figure.subplots(math.ceil(count / columns), columns, squeeze=False).reshape(-1)
+    for empty in axes[count:]:
+        empty.set_axis_off()
+    return axes[:count]
+
+
 def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
     """Write a figure in the format of the file's ending.
 
@@ -143,16 +158,16 @@ def plot_trajectory(trajectory: Trajectory, title: str = "", theme: Theme = LIGH
         axes = figure.subplots(3 + constrained, sharex=True)
         _coordinates(axes[0], t, np.asarray(trajectory.q_s), "s", theme)
         _coordinates(axes[1], t, np.asarray(trajectory.q_f), "f", theme)
+        axes[0].set_ylabel(r"slow positions $q_s$")
+        axes[1].set_ylabel(r"fast positions $q_f$")
         axes[2].plot(t, error, color=theme.curves[0], linewidth=_thin(t))
-        labels = [r"slow positions $q_s$", r"fast positions $q_f$", label]
+        axes[2].set_ylabel(label)
         if constrained:
             shown = np.where(residual > 0, residual, np.nan)
             axes[3].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
             axes[3].semilogy(t, shown[:, 1], "--", linewidth=_thin(t), label="velocity $|G v|$")
+            axes[3].set_ylabel("constraint residual")
             _legend_beside(axes[3])
-            labels.append("constraint residual")
-        for panel, label in zip(axes, labels, strict=True):
-            panel.set(ylabel=label)
         axes[-1].set(xlabel="time $t$", xlim=(t[0], t[-1]))
         figure.align_ylabels()
     return figure
@@ -178,12 +193,23 @@ def plot_oscillatory_energies(trajectory: Trajectory, omega, title: str = "", th
     return figure
 
 
-def plot_convergence(study: Any, orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+class ConvergenceErrors(Protocol):
+    """Errors by scheme and quantity, "q" or "p": macro steps and errors, those worth a fit, and the order they show."""
+
+    @property
+    def schemes(self) -> Sequence[str]: ...
+    def errors(self, scheme: str, quantity: str) -> tuple[np.ndarray, np.ndarray]: ...
+    def usable(self, scheme: str, quantity: str) -> tuple[np.ndarray, np.ndarray]: ...
+    def order(self, scheme: str, quantity: str) -> float: ...
+
+
+def plot_convergence(
+    study: ConvergenceErrors, orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT
+) -> NotebookFigure:
     """Errors of positions and of momenta against the macro step, with guide triangles of the given slopes.
 
     Args:
-        study: has `schemes`, and by scheme and quantity ("q" or "p") `errors`, `usable` errors (macro steps and errors each)
-            and `order`, as of `vmri_jax.study.convergence_study`.
+        study: e.g. of `vmri_jax.study.convergence_study`.
         orders: slopes to draw for comparison.
         title: over the figure.
         theme: colours.
@@ -196,13 +222,13 @@ def plot_convergence(study: Any, orders: Sequence[int] = (), title: str = "", th
                 macro_dt, errors = study.errors(scheme, quantity)
                 order = study.order(scheme, quantity)
                 label = f"{scheme}   order {order:.2f}" if np.isfinite(order) else f"{scheme}   failed"
-                axes.loglog(macro_dt, errors, label=label, **_look(i, i, theme))
+                axes.loglog(macro_dt, errors, label=label, **_look(i, theme))
                 steps += list(macro_dt)
             for order in orders:
                 _guide_triangle(axes, study, quantity, order, theme)
             axes.set(title=name, xlabel="macro step $H$")
             axes.set(ylabel=rf"largest error $|{quantity} - {quantity}_{{\mathrm{{ref}}}}|$")
-            _log_ticks(axes.xaxis, steps)
+            log_ticks(axes.xaxis, steps)
             axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=1, handlelength=2.4)
     return figure
 
@@ -216,12 +242,24 @@ WORK = {
 """What `plot_work_precision` has on its axis, by the name in the rows."""
 
 
-def plot_work_precision(study: Any, title: str = "", work: str = "seconds", theme: Theme = LIGHT) -> NotebookFigure:
+class RunsByWork(Protocol):
+    """Runs by scheme and the best of all: rows with `error_q`, `num_steps` and every kind of `WORK`."""
+
+    @property
+    def schemes(self) -> Sequence[str]: ...
+    @property
+    def reference(self) -> Any: ...
+    def curve(self, scheme: str) -> Sequence[Any]: ...
+    def pareto(self, work: str) -> Sequence[Any]: ...
+
+
+def plot_work_precision(
+    study: RunsByWork, title: str = "", work: str = "seconds", theme: Theme = LIGHT
+) -> NotebookFigure:
     """Error of the positions against work, one curve per scheme; the Pareto front is underlaid.
 
     Args:
-        study: has `schemes`, rows by scheme (`curve`) and the best of all (`pareto`), and a `reference`, as of
-            `vmri_jax.study.work_precision` or the runs of a recommendation.
+        study: e.g. of `vmri_jax.study.work_precision`, or the runs of a recommendation.
         title: over the figure.
         work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
         theme: colours.
@@ -240,41 +278,40 @@ def plot_work_precision(study: Any, title: str = "", work: str = "seconds", them
         for i, scheme in enumerate(study.schemes):
             curve = sorted(study.curve(scheme), key=lambda row: row.num_steps)
             x, y = [getattr(row, work) or np.nan for row in curve], [row.error_q for row in curve]
-            look = _look(i, i // len(theme.curves), theme)
+            look = _look(i, theme) | {"marker": MARKERS[i // len(theme.curves) % len(MARKERS)]}
             axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **look)
         axes.set(xlabel=WORK[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
         axes.set_ylim(top=30 * max(errors, default=1.0))
         if study.reference.error_q > axes.get_ylim()[0]:
-            _reference_line(axes, study.reference.error_q, theme)
+            axes.axhline(study.reference.error_q, color=theme.ink, linewidth=0.8, linestyle=":")
+            above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}
+            axes.text(0.995, study.reference.error_q, "error of the reference ", **above)
+        log_ticks(axes.xaxis, [getattr(row, work) for scheme in study.schemes for row in study.curve(scheme)])
         if work == "seconds":
-            axes.xaxis.set_major_formatter(lambda x, _: _seconds(x))
-        axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.xaxis.set_major_formatter(EngFormatter("s"))
         _legend_beside(axes)
     return figure
 
 
-def _reference_line(axes: Axes, error: float, theme: Theme) -> None:
-    axes.axhline(error, color=theme.ink, linewidth=0.8, linestyle=":")
-    text = "error of the reference "
-    axes.text(0.995, error, text, transform=axes.get_yaxis_transform(), ha="right", va="bottom", fontsize=7.5)
+def _look(i: int, theme: Theme) -> dict[str, Any]:
+    """Colour and marker of curve i."""
+    return {
+        "color": theme.curves[i % len(theme.curves)],
+        "marker": MARKERS[i % len(MARKERS)],
+        "markerfacecolor": theme.paper,
+    }
 
 
-def _look(color: int, marker: int, theme: Theme) -> dict[str, Any]:
-    """Colour and marker of a curve by their numbers."""
-    look = {"color": theme.curves[color % len(theme.curves)], "marker": MARKERS[marker % len(MARKERS)]}
-    return look | {"markerfacecolor": theme.paper}
+class CostCurves(Protocol):
+    """By label and method: num_micro and microseconds per micro step."""
 
-
-def _seconds(x: float) -> str:
-    """A power of ten of seconds with its unit."""
-    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if x >= 0.999 * size:
-            return f"{x / size:g} {unit}"
-    return f"{x / 1e-9:g} ns"
+    @property
+    def curves(self) -> Sequence[tuple[str, str]]: ...
+    def curve(self, label: str, method: str) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 def plot_cost(
-    studies: Mapping[str, Any],
+    studies: Mapping[str, CostCurves],
     paper_minima: Mapping[str, int] | None = None,
     title: str = "",
     theme: Theme = LIGHT,
@@ -282,33 +319,30 @@ def plot_cost(
     """Computing time per micro step against num_micro, one panel per study, the cheapest point of each curve circled.
 
     Args:
-        studies: by the title of their panel; each has `curves`, pairs of a label and a method, and by pair the `curve` of
-            num_micro and microseconds per micro step, as of `vmri_jax.study.cost_study`.
+        studies: by the title of their panel, e.g. of `vmri_jax.study.cost_study`.
         paper_minima: num_micro to mark, by the title of the panel.
         title: over the figure.
         theme: colours.
     """
     columns = 2 if len(studies) == 4 else min(3, len(studies))
-    lines = -(-len(studies) // columns)
-    with new_figure(max(5.2, 0.6 + 3.0 * columns), 0.6 + 2.7 * lines, title, theme) as figure:
-        panels = figure.subplots(lines, columns, squeeze=False).reshape(-1)
+    height = 0.6 + 2.7 * math.ceil(len(studies) / columns)
+    with new_figure(max(5.2, 0.6 + 3.0 * columns), height, title, theme) as figure:
+        grid = panel_grid(figure, len(studies), columns)
         handles: dict = {}
-        for axes, (name, study) in zip(panels, studies.items(), strict=False):
+        for axes, (name, study) in zip(grid, studies.items(), strict=True):
             _cost_panel(axes, study, (paper_minima or {}).get(name), theme)
             axes.set(title=name)
             shown = zip(*axes.get_legend_handles_labels(), strict=True)
             handles.update({label: handle for handle, label in shown})
-        for axes in panels[len(studies) :]:
-            axes.set_axis_off()
-        for axes in panels[max(0, len(studies) - columns) : len(studies)]:
+        for axes in grid[-columns:]:
             axes.set(xlabel="micro steps per macro step")
-        for axes in panels[::columns]:
+        for axes in grid[::columns]:
             axes.set(ylabel="µs per micro step")
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, len(handles)))
     return figure
 
 
-def _cost_panel(axes: Axes, study: Any, paper_minimum: int | None, theme: Theme) -> None:
+def _cost_panel(axes: Axes, study: CostCurves, paper_minimum: int | None, theme: Theme) -> None:
     one_label = len({label for label, _ in study.curves}) == 1
     curves = [study.curve(label, method) for label, method in study.curves]
     for i, ((label, method), (num_micro, cost)) in enumerate(zip(study.curves, curves, strict=True)):
@@ -326,7 +360,7 @@ def _cost_panel(axes: Axes, study: Any, paper_minimum: int | None, theme: Theme)
     axes.xaxis.set_major_locator(FixedLocator(ticks.tolist()))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter("{x:.0f}")
-    _log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
+    log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
 
 
 def _coordinates(axes: Axes, t, values, letter: str, theme: Theme) -> None:
@@ -359,8 +393,13 @@ def _energy_error(energy) -> tuple[np.ndarray, str]:
     return error, r"energy error $\Delta E$"
 
 
-def _log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
-    """Labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them."""
+def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
+    """Labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them.
+
+    Args:
+        axis: logarithmic.
+        values: what is drawn along it.
+    """
     finite = [value for value in values if np.isfinite(value)]
     axis.set_minor_formatter(NullFormatter())
     if finite and max(finite) < 30 * min(finite):
@@ -368,7 +407,7 @@ def _log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
         axis.set_major_formatter("{x:g}")
 
 
-def _guide_triangle(axes: Axes, study: Any, quantity: str, order: int, theme: Theme) -> None:
+def _guide_triangle(axes: Axes, study: ConvergenceErrors, quantity: str, order: int, theme: Theme) -> None:
     """Triangle of slope `order` right below the most accurate curve of about that order."""
     lowest = None
     for scheme in study.schemes:

@@ -24,7 +24,7 @@ from vmri_jax.check.measures import (
 from vmri_jax.check.pictures import draw_energy
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
 from vmri_jax.steppers.newton import Newton
@@ -141,12 +141,6 @@ class Resolved:
         advice = advise(self.problem.system, self.scheme, self.problem.state(), self.macro_dt)
         return Outcome(str(advice).replace("\n", "; "), advice.ok, {"safe_macro_dt": advice.safe_macro_dt})
 
-    def single_precision(self, full: bool) -> Outcome:
-        return single_precision(self.problem, self.macro_dt)
-
-    def bad_lane(self, full: bool) -> Outcome:
-        return bad_lane(self.problem, self.scheme, self.macro_dt, 20, Newton(), lanes=64 if full else 16)
-
 
 def resolved(problem: Problem) -> Resolved:
     """A problem with five micro steps of ``omega h = 0.2`` for its fastest frequency at the start.
@@ -170,12 +164,25 @@ def resolved(problem: Problem) -> Resolved:
 def cases_for(problem: Problem) -> tuple[Case, ...]:
     """The hard cases for a system of your own, each with a criterion; those that do not apply to it say why.
 
+    Args:
+        problem: system and start.
+
     Raises:
         ValueError: the problem is refused by `initial_state`.
     """
     own, system = resolved(problem), problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
-    work, masses, implicit = _does_work(system), _bent_masses(system), _implicit_anyway(system)
+    implicit = "its constraints are solved for in every step" if system.is_constrained else ""
+    masses = "" if system.has_constant_mass else "its masses are not constant"
+    work = _does_work(system)
+    explicit = work or masses or implicit
+
+    def precision(full: bool) -> Outcome:
+        return single_precision(problem, own.macro_dt)
+
+    def lane(full: bool) -> Outcome:
+        return bad_lane(problem, own.scheme, own.macro_dt, 20, Newton(), lanes=64 if full else 16)
+
     step = f"fully_implicit, num_micro {NUM_MICRO}, H = {own.macro_dt:.3g}"
     one = f"num_micro 1, omega = {own.omega:.3g}"
     rows = [
@@ -186,16 +193,10 @@ def cases_for(problem: Problem) -> tuple[Case, ...]:
         ("loose Newton tolerance", f"{step}, 1e-4 to 1e-12", "error shrinks with the tolerance", own.tolerance),
         ("tiny steps", f"{step} and smaller", "scaled condition flat", own.tiny_steps),
         ("reversibility", step, "back at the start to 1e-6", own.reversal, work),
-        (
-            "explicit limit",
-            f"fully_explicit, {one}",
-            EXPLICIT_CRITERION,
-            own.explicit_limit,
-            work or masses or implicit,
-        ),
+        ("explicit limit", f"fully_explicit, {one}", EXPLICIT_CRITERION, own.explicit_limit, explicit),
         ("reductions", one, "known methods to 1e-10", own.reductions, work or masses),
-        ("float32", "64-bit mode off, and float32 data", "refused with the one-line fix", own.single_precision),
-        ("one bad lane in a batch", step, LANE_CRITERION, own.bad_lane),
+        ("float32", "64-bit mode off, and float32 data", "refused with the one-line fix", precision),
+        ("one bad lane in a batch", step, LANE_CRITERION, lane),
     ]
     pictures = {"energy for long": draw_energy}
     return tuple(
@@ -211,16 +212,3 @@ def _does_work(system: System) -> str:
     if system.force is not None:
         return "it has forces besides its potentials: they may do work, and the way back is another motion"
     return ""
-
-
-def _bent_masses(system: System) -> str:
-    """Why the known methods are not written for its masses; empty if they are."""
-    kinetic = system.kinetic
-    if isinstance(kinetic, ConstantMass) and kinetic.slow.ndim == kinetic.fast.ndim == 1:
-        return ""
-    return "its masses are not one constant per coordinate"
-
-
-def _implicit_anyway(system: System) -> str:
-    """Why no scheme is explicit for it; empty if one is."""
-    return "its constraints are solved for in every step" if system.is_constrained else ""

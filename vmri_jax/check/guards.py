@@ -47,14 +47,16 @@ def bad_lane(
 ) -> Outcome:
     """A batch whose lanes start along one run, one of them with absurd momenta, against single runs of some lanes."""
     bad = lanes // 3
-    states = _with_absurd_lane(_states_along(problem, scheme, macro_dt, lanes, newton), bad)
+    along = run(problem, scheme, macro_dt, lanes - 1, newton=newton)  # consistent states, at rest or driven
+    p_s, p_f = (jnp.asarray(p).at[bad].set(ABSURD) for p in (along.p_s, along.p_f))
+    states = State(along.t, along.q_s, along.q_f, p_s, p_f)
     options = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps, "newton": newton}
     batch = simulate_batch(problem.system, scheme, states, **options)
     failed = np.flatnonzero(np.asarray(batch.failed_at) >= 0)
     apart = 0.0
     for lane in sorted({*np.linspace(0, lanes - 1, compared, dtype=int), bad - 1, bad + 1} - {bad}):
         state = jax.tree.map(lambda a, lane=lane: a[lane], states)
-        single = simulate(problem.system, scheme, state, throw=False, **options)
+        single = run(problem, scheme, state=state, **options)
         for name in ("q_s", "q_f"):
             size = max(float(jnp.max(jnp.abs(getattr(single, name)), initial=0.0)), 1e-300)
             apart = max(apart, difference(getattr(batch, name)[lane], getattr(single, name)) / size)
@@ -64,14 +66,3 @@ def bad_lane(
         list(failed) == [bad] and apart < 1e-12,
         {"failed": len(failed), "apart": apart},
     )
-
-
-def _states_along(problem: Problem, scheme, macro_dt, lanes: int, newton: Newton) -> State:
-    """The first nodes of a run: so many consistent states, whether the system starts at rest or is driven."""
-    nodes = run(problem, scheme, macro_dt, lanes - 1, newton=newton)
-    return State(nodes.t, nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f)
-
-
-def _with_absurd_lane(states: State, lane: int) -> State:
-    p_s, p_f = (jnp.asarray(p).at[lane].set(ABSURD) for p in (states.p_s, states.p_f))
-    return State(states.t, states.q_s, states.q_f, p_s, p_f)

@@ -12,15 +12,16 @@ from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.running.simulate import simulate
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
+from vmri_jax.study.program import joined
 
 SAVED = 10_000
 """About as many nodes of a long run are kept."""
 
 
-def run(problem: Problem, scheme, macro_dt, num_steps: int, **options: Any) -> Trajectory:
-    """`vmri_jax.running.simulate` from the problem's start; a failure is in the trajectory and not raised."""
-    state = problem.state()
-    return simulate(problem.system, scheme, state, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
+def run(problem: Problem, scheme, macro_dt, num_steps: int, state: State | None = None, **options: Any) -> Trajectory:
+    """`vmri_jax.running.simulate`, by default from the problem's start; a failure is in the trajectory and not raised."""
+    start = problem.state() if state is None else state
+    return simulate(problem.system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
 
 
 def long_run(problem: Problem, scheme, macro_dt, num_steps: int, **options) -> Trajectory:
@@ -105,7 +106,7 @@ def constraints(trajectory: Trajectory) -> tuple[float, float]:
 
 def nodes(trajectory: Trajectory) -> np.ndarray:
     """(k, n) positions at the saved nodes, slow first."""
-    return np.concatenate([trajectory.q_s, trajectory.q_f], axis=1)
+    return joined(trajectory)[0]
 
 
 def difference(a, b) -> float:
@@ -120,7 +121,5 @@ def reversal(problem: Problem, scheme, macro_dt, num_steps: int) -> float:
         return np.inf
     end = there.final_state
     turned = State(0.0, end.q_s, end.q_f, -end.p_s, -end.p_f)
-    back = simulate(
-        problem.system, scheme, turned, macro_dt=macro_dt, num_steps=num_steps, save_every=num_steps, throw=False
-    )
+    back = run(problem, scheme, macro_dt, num_steps, turned, save_every=num_steps)
     return difference(nodes(back)[-1], nodes(there)[0])

@@ -1,6 +1,7 @@
 """Built-in systems and schemes by name, and problems from a user's own file: what the command line accepts."""
 
 import importlib.util
+import inspect
 import sys
 import traceback
 from collections.abc import Callable, Collection
@@ -36,12 +37,16 @@ class NamedSystem:
 
 @dataclass(frozen=True)
 class NamedScheme:
-    """A built-in scheme: its factory, which options it takes besides num_micro, and its order."""
+    """A built-in scheme: its factory, its order and what it does."""
 
     factory: Callable[..., Scheme]
-    options: tuple[str, ...]
     order: str
     title: str
+
+    @property
+    def options(self) -> list[str]:
+        """What the factory takes besides num_micro."""
+        return [name for name in inspect.signature(self.factory).parameters if name != "num_micro"]
 
 
 SYSTEMS = {
@@ -68,29 +73,20 @@ SYSTEMS = {
 DEFAULT_NAME = "scene"
 """What a file alone stands for, if it has one."""
 
+KICKED = "2 at alpha = 1/2, else 1"
 SCHEMES = {
-    "fully-implicit": NamedScheme(fully_implicit, (), "2", "V and W at the micro midpoints"),
-    "explicit-slow": NamedScheme(
-        explicit_slow, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at micro midpoints"
-    ),
+    "fully-implicit": NamedScheme(fully_implicit, "2", "V and W at the micro midpoints"),
+    "explicit-slow": NamedScheme(explicit_slow, KICKED, "V as kicks at the macro nodes, W at micro midpoints"),
     "mollified-impulse": NamedScheme(
-        mollified_impulse,
-        ("alpha",),
-        "2 at alpha = 1/2, else 1",
-        "explicit-slow with V at averaged fast positions: no impulse resonance",
+        mollified_impulse, KICKED, "explicit-slow with V at averaged fast positions: no impulse resonance"
     ),
-    "fully-explicit": NamedScheme(
-        fully_explicit, ("alpha",), "2 at alpha = 1/2, else 1", "V as kicks at the macro nodes, W at the micro nodes"
-    ),
+    "fully-explicit": NamedScheme(fully_explicit, KICKED, "V as kicks at the macro nodes, W at the micro nodes"),
     "takahashi-imada": NamedScheme(
         takahashi_imada,
-        (),
         "2, of frequencies 4",
         "fully-explicit with corrected kicks: a Hessian product beside each gradient",
     ),
-    "galerkin": NamedScheme(
-        galerkin, ("degree", "rule"), "2 x degree", "one rule (gauss or lobatto) on every term, any degree"
-    ),
+    "galerkin": NamedScheme(galerkin, "2 x degree", "one rule (gauss or lobatto) on every term, any degree"),
 }
 
 
@@ -134,11 +130,9 @@ def _find_own(name: str) -> Problem | Scene:
     if not path.is_file():
         raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
     module = _run_file(path)
-    if not attribute and hasattr(module, DEFAULT_NAME):
-        attribute = DEFAULT_NAME
-    if not attribute:
+    if not attribute and not hasattr(module, DEFAULT_NAME):
         raise ValueError(f"{name}: say which problem in that file, e.g. {file_name}:my_problem.")
-    return _found_in(module, path, attribute)
+    return _found_in(module, path, attribute or DEFAULT_NAME)
 
 
 def find_scheme(name: str, num_micro: int, compose: str | None = None, **options) -> Scheme | Composition:
@@ -156,8 +150,7 @@ def find_scheme(name: str, num_micro: int, compose: str | None = None, **options
     """
     if _dashed(name) not in SCHEMES:
         raise ValueError(_unknown("scheme", name, SCHEMES))
-    name = _dashed(name)
-    scheme = SCHEMES[name]
+    name, scheme = _dashed(name), SCHEMES[_dashed(name)]
     given = {key: value for key, value in options.items() if value is not None}
     for key in given:
         if key not in scheme.options:

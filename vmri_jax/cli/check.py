@@ -9,7 +9,7 @@ import typer
 from vmri_jax.check import Case, cases_for, run_cases
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_problem
-from vmri_jax.cli.common import BadInput, console, progress_bar
+from vmri_jax.cli.common import console, progress_bar, refusals
 
 Numbers = Annotated[list[int] | None, typer.Option("--case", help="Number of a case; again for more of them.")]
 Full = Annotated[bool, typer.Option("--full", help="Full forms: runs of up to a million steps, minutes.")]
@@ -21,20 +21,15 @@ def check(system: options.System, case: Numbers = None, full: Full = False, out:
 
     Steps are chosen from its frequencies. Cases that do not apply say why. Ends with code 1 if a criterion is not met.
     """
-    try:
+    with refusals():
         cases = cases_for(find_problem(system))
-    except ValueError as error:
-        raise BadInput(str(error)) from error
     run_and_show(cases, case or (), full, out)
 
 
 def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out: Path | None) -> None:
     """Run these cases, print the table, write the files; exit code 1 if a criterion is not met, 2 for an unknown number."""
-    try:
-        with progress_bar() as tell:
-            report = run_cases(cases, numbers, full, tell)
-    except ValueError as error:
-        raise BadInput(str(error)) from error
+    with refusals(), progress_bar() as tell:
+        report = run_cases(cases, numbers, full, tell)
     console.print(report.table())
     judged = [row for row in report.rows if row.outcome.passed is not None]
     missed = [str(row.case.number) for row in judged if row.missed]

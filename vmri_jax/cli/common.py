@@ -7,6 +7,7 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -56,6 +57,12 @@ def progress_bar() -> Iterator[StudyProgress]:
 def print_failure(title: str, text: str) -> None:
     """A red panel on the error stream."""
     Console(stderr=True).print(Panel(Text(text), title=title, title_align="left", border_style="red"))
+
+
+def print_written(what: str, path: Path | None) -> None:
+    """Where a file is, if it was asked for."""
+    if path is not None:
+        console.print(f"{what}: [bold]{escape(str(path))}[/bold]", soft_wrap=True)
 
 
 def plain_table(*columns: str, show_header: bool = True) -> Table:

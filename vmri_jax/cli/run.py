@@ -5,7 +5,7 @@ import shlex
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import jax
 import numpy as np
@@ -92,17 +92,23 @@ def simulate(
     if stopped is not None:
         raise typer.Exit(_print_stop(stopped, saved, streamed))
     done = (steps - (0 if before is None else before.step)) * chosen.num_micro
-    summary = {
-        "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
-        "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
-        "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
-        **_summary(trajectory, problem.system.is_constrained),
-        "saved": ", ".join(saved) if saved else "nothing; give --out run.npz or --plot run.png",
-    }
+    _print_named(
+        {
+            "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
+            "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
+            "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
+            **_summary(trajectory, problem.system.is_constrained),
+            "saved": ", ".join(saved) or "nothing; give --out run.npz or --plot run.png",
+        }
+    )
+
+
+def _print_named(texts: dict[str, str]) -> None:
+    """Names and texts, line by line; empty ones are left out."""
     table = plain_table("", "", show_header=False)
-    for name, value in summary.items():
-        if value:
-            table.add_row(f"[dim]{name}[/dim]", escape(value))
+    for name, text in texts.items():
+        if text:
+            table.add_row(f"[dim]{name}[/dim]", escape(text))
     console.print(table)
 
 
@@ -156,39 +162,28 @@ def _compile_clock() -> list[float]:
 def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> dict[str, str]:
     """How a run went, in words; one on disk is read piece by piece."""
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
-    found = [_extremes(piece) for piece in pieces]
-    first, last = found[0], found[-1]
-    position, velocity, method, iterations = np.max([one.largest for one in found], axis=0)
-    change = max(max(one.highest - first.energy, first.energy - one.lowest) for one in found)
-    relative = abs(first.energy) > 1e-12
-    energy = f"{change / abs(first.energy):.2e} of the energy at the start" if relative else f"{change:.2e}"
+    times, energies, largest = (np.array(found) for found in zip(*map(_extremes, pieces), strict=True))
+    position, velocity, method, iterations = largest.max(axis=0)
+    start = energies[0, 0]
+    change = np.abs(energies - start).max()
+    energy = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"
     return {
-        "simulated time": f"{first.start:g} to {last.end:g}",
+        "simulated time": f"{times[0, 0]:g} to {times[-1, 1]:g}",
         "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
         "energy change": f"at most {energy}",
         "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if constrained else "",
     }
 
 
-class _Extremes(NamedTuple):
-    """Of a piece of a run: times, energy at its start, lowest and highest energy.
-
-    largest: residuals of positions and velocities, dearest method, most iterations.
-    """
-
-    start: float
-    end: float
-    energy: float
-    lowest: float
-    highest: float
-    largest: tuple[float, float, int, int]
-
-
-def _extremes(piece: Trajectory) -> _Extremes:
+def _extremes(piece: Trajectory) -> tuple:
+    """First and last time; energy at the start, lowest, highest; largest residuals, dearest method, most iterations."""
     energy, info = np.asarray(piece.energy), piece.info
-    position, velocity = np.asarray(piece.constraint_residual).max(axis=0)
-    largest = position, velocity, int(np.max(info.method)), int(np.max(info.iterations))
-    return _Extremes(float(piece.t[0]), float(piece.t[-1]), energy[0], energy.min(), energy.max(), largest)
+    residuals = np.asarray(piece.constraint_residual).max(axis=0)
+    return (
+        (piece.t[0], piece.t[-1]),
+        (energy[0], energy.min(), energy.max()),
+        (*residuals, np.max(info.method), np.max(info.iterations)),
+    )
 
 
 def default_save_every(steps: int) -> int:

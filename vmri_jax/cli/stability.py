@@ -10,11 +10,10 @@ from rich.markup import escape
 from vmri_jax import plots
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_problem, find_scheme
-from vmri_jax.cli.common import BadInput, check_target_file, console
+from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_written, refusals
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
 from vmri_jax.stability.map import windows_text
-from vmri_jax.study.table import Column, rich_table
 
 app = typer.Typer()
 
@@ -39,7 +38,7 @@ def advise(
 
     Exit code 1 where the step is unstable at the start of the run, or close to it.
     """
-    try:
+    with refusals():
         problem = find_problem(system)
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         if (macro_dt is None) == (micro_dt is None):
@@ -47,12 +46,7 @@ def advise(
         step = macro_dt if micro_dt is None else chosen.num_micro * micro_dt
         with console.status("looking at the steps around it"):
             advice = advise_on(problem.system, chosen, problem.state(), step)  # pyright: ignore[reportArgumentType]
-    except (ValueError, TypeError) as error:
-        raise BadInput(str(error)) from error
-    if advice.findings:
-        console.print(advice.table())
-    else:
-        console.print(escape(advice.verdict))
+    console.print(advice.table() if advice.findings else escape(advice.verdict))
     if not advice.ok:
         raise typer.Exit(1)
 
@@ -79,8 +73,8 @@ def stability(
     out: Annotated[Path | None, typer.Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Which macro steps are stable with a scheme, in units of the fastest vibration."""
-    try:
-        check_target_file("--out", out, (".png", ".svg", ".pdf"))
+    with refusals():
+        check_target_file("--out", out, PICTURES)
         problem = linear_model() if system is None else find_problem(system)
         numbers, grid = num_micro or [2, 5, 10, 20], np.linspace(0.02, until, max(2, round(50 * until))) * np.pi
         chosen = {
@@ -89,14 +83,11 @@ def stability(
         }
         with console.status("multipliers of the steps"):
             maps = {name: stability_map(problem, schemes, grid) for name, schemes in chosen.items()}
-    except (ValueError, TypeError) as error:
-        raise BadInput(str(error)) from error
-    columns = (
-        Column("scheme", lambda row: row[0]),
-        Column("num_micro", lambda row: str(row[1])),
-        Column("unstable where omega H / pi is in", lambda row: windows_text(row[2])),
-    )
-    console.print(rich_table(columns, [(name, *shown) for name, found in maps.items() for shown in found.shown()]))
-    if out is not None:
-        plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
-        console.print(f"Figure: [bold]{escape(str(out))}[/bold]", soft_wrap=True)
+        if out is not None:
+            plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
+    table = plain_table("scheme", "num_micro", "unstable where omega H / pi is in")
+    for name, found in maps.items():
+        for n, windows in found.shown():
+            table.add_row(name, str(n), windows_text(windows))
+    console.print(table)
+    print_written("Figure", out)

@@ -1,5 +1,7 @@
 """`vmri tune` and `vmri cost`: what accuracy costs."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -7,11 +9,22 @@ import numpy as np
 import typer
 from rich.markup import escape
 
+from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_problem
-from vmri_jax.cli.common import BadInput, check_target_file, console, print_failure, progress_bar
+from vmri_jax.cli.common import (
+    BadInput,
+    check_target_file,
+    console,
+    print_failure,
+    print_written,
+    progress_bar,
+    refusals,
+)
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study import WorkPrecision, cost_report, recommend
 from vmri_jax.study.advisor import NothingReached, check_target
+from vmri_jax.study.cost_report import PERIODS
+from vmri_jax.study.progress import Progress
 from vmri_jax.study.table import rich_table
 
 app = typer.Typer()
@@ -24,30 +37,26 @@ SHOWN = 5
     epilog="Examples:\n\nvmri tune fpu --error 1e-4 --t-end 10\n\nvmri tune my_file.py:my_problem --error 1e-3 --t-end 2"
 )
 def tune(
-    system: Annotated[str, typer.Argument(help="fpu, tsp, sam, or my_file.py:my_problem.")],
+    system: options.System,
     error: Annotated[float, typer.Option(help="Largest accepted error of a position at the end, in its unit.")],
     t_end: Annotated[float, typer.Option(help="Simulated time.")],
     exhaustive: Annotated[bool, typer.Option("--exhaustive", help="Search without shortcuts.")] = False,
     out: Annotated[Path | None, typer.Option(help="Write all runs of the search here, .csv or .json.")] = None,
 ) -> None:
     """Find the scheme, num_micro and macro step that reach an error in the least time on this machine."""
-    try:
+    with refusals():
         check_target_file("--out", out, (".csv", ".json"))
         problem = find_problem(system)
         check_target(error, t_end, problem)
-        with progress_bar() as tell:
-            found = recommend(problem, error, t_end, exhaustive=exhaustive, progress=tell)
-    except NothingReached as failure:
-        _write_runs(failure.runs, out)
-        console.print(failure.runs.table())
-        print_failure("Nothing reached the error", f"{failure} The best runs are above.")
-        raise typer.Exit(1) from failure
-    except SimulationError as failure:
-        print_failure("No reference solution", str(failure))
-        raise typer.Exit(1) from failure
-    except (ValueError, TypeError) as wrong:
-        raise BadInput(str(wrong)) from wrong
-    _write_runs(found.runs, out)
+        try:
+            with _search() as tell:
+                found = recommend(problem, error, t_end, exhaustive=exhaustive, progress=tell)
+        except NothingReached as failure:
+            _write_runs(failure.runs, out)
+            console.print(failure.runs.table())
+            print_failure("Nothing reached the error", f"{failure} The best runs are above.")
+            raise typer.Exit(1) from failure
+        _write_runs(found.runs, out)
     console.print("[bold]Errors against time[/bold], the best of all runs\n", found.runs.table())
     fastest = [setting.row for setting in (found.setting, *found.others)[:SHOWN]]
     console.print(f"\n[bold]For an error of {error:g}[/bold], the fastest\n", rich_table(found.runs.columns, fastest))
@@ -62,9 +71,9 @@ def tune(
 
 @app.command(epilog="Examples:\n\nvmri cost tsp --out out/tsp\n\nvmri cost my_file.py:my_problem --t-end 5")
 def cost(
-    system: Annotated[str, typer.Argument(help="fpu, tsp, sam, or my_file.py:my_problem.")],
+    system: options.System,
     t_end: Annotated[
-        float | None, typer.Option(help="Simulated time. [dim]8 periods of the fastest vibration[/dim]")
+        float | None, typer.Option(help=f"Simulated time. [dim]{PERIODS} periods of the fastest vibration[/dim]")
     ] = None,
     error: Annotated[
         list[float] | None, typer.Option(help="Error asked for; may be repeated. [dim]1e-2 to 1e-8 of the motion[/dim]")
@@ -72,22 +81,29 @@ def cost(
     out: Annotated[Path, typer.Option(help="Folder for the page.")] = Path("out/cost"),
 ) -> None:
     """One page: what accuracy costs, which scheme to take for which error, where the time goes."""
-    try:
+    with refusals():
         problem = find_problem(system)
         for asked in error or [np.finfo(float).max]:
             check_target(asked, 1.0 if t_end is None else t_end, problem)
-        out.mkdir(parents=True, exist_ok=True)
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            with _search() as tell:
+                report = cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
+        except OSError as wrong:
+            raise BadInput(f"--out {out}: {wrong.strerror}; give a folder that can be written.") from wrong
+    console.print(report.table())
+    print_written("\nPage", report.path)
+
+
+@contextmanager
+def _search() -> Iterator[Progress]:
+    """A progress bar, and a panel where the reference solution fails."""
+    try:
         with progress_bar() as tell:
-            report = cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
-    except OSError as wrong:
-        raise BadInput(f"--out {out}: {wrong.strerror}; give a folder that can be written.") from wrong
+            yield tell
     except SimulationError as failure:
         print_failure("No reference solution", str(failure))
         raise typer.Exit(1) from failure
-    except (ValueError, TypeError) as wrong:
-        raise BadInput(str(wrong)) from wrong
-    console.print(report.table())
-    console.print(f"\nPage: [bold]{escape(str(report.path))}[/bold]", soft_wrap=True)
 
 
 def _write_runs(runs: WorkPrecision, out: Path | None) -> None:

@@ -14,12 +14,39 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton, dense
 
 
+def phase_vector(state: State):
+    """``z = (q_s, q_f, p_s, p_f)``, joined, (2 n,)."""
+    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
+
+
+def phase_splits(state: State) -> tuple[int, int, int]:
+    """Where ``jnp.split`` cuts a `phase_vector` into its four parts."""
+    n_s, n = state.q_s.size, state.q_s.size + state.q_f.size
+    return n_s, n, n + n_s
+
+
+def symplectic_form(n: int) -> np.ndarray:
+    """``J = [[0, 1], [-1, 0]]``, (2 n, 2 n)."""
+    return np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(n))
+
+
 def tangents(system: System, t, z, splits):
-    """Orthonormal basis, one row each, of the tangent vectors of the constraint manifold at ``z = (q_s, q_f, p_s, p_f)``."""
-    return _across(jax.jacfwd(lambda z: jnp.concatenate(all_constraints(system, State(t, *jnp.split(z, splits)))))(z))
+    """Orthonormal basis, one row each, of the tangent vectors of the constraint manifold.
+
+    Args:
+        system: its constraints.
+        t: time.
+        z: (2 n,) point ``(q_s, q_f, p_s, p_f)`` on the manifold.
+        splits: where z is cut into its four parts.
+    """
+
+    def constraints(z):
+        return jnp.concatenate(all_constraints(system, State(t, *jnp.split(z, splits))))
+
+    return _null_space(jax.jacfwd(constraints)(z))
 
 
-def _across(normals):
+def _null_space(normals):
     """Orthonormal basis, one row each, of the vectors that are orthogonal to independent rows."""
     if not normals.shape[0]:
         return jnp.eye(normals.shape[1])
@@ -45,11 +72,16 @@ def frequencies(system: System, state: State):
         return sum(potentials(system, q[:n_s], q[n_s:]))
 
     mass = jax.hessian(lambda v: system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params))(v)
-    basis = np.asarray(_across(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q)))
+    basis = np.asarray(_null_space(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q)))
     half = np.linalg.cholesky(basis @ np.asarray(mass) @ basis.T)
     stiffness = basis @ np.asarray(jax.hessian(potential)(q)) @ basis.T
     inner = np.linalg.solve(half, np.linalg.solve(half, stiffness).T)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh((inner + inner.T) / 2)[::-1], 0.0))
+    return frequencies_of(inner)
+
+
+def frequencies_of(stiffness: np.ndarray) -> np.ndarray:
+    """``omega_i = sqrt(max(lambda_i, 0))`` of the symmetric part of a (d, d) stiffness for unit masses, largest first."""
+    return np.sqrt(np.maximum(np.linalg.eigvalsh((stiffness + stiffness.T) / 2)[::-1], 0.0))
 
 
 def symplectic_defect(
@@ -62,17 +94,14 @@ def symplectic_defect(
     Args:
         system, scheme, state, macro_dt, newton: as in `macro_step`; the state fulfils the constraints.
     """
-    n_s, n_f = state.q_s.size, state.q_f.size
-    n = n_s + n_f
-    splits = (n_s, n, n + n_s)
+    z, splits = phase_vector(state), phase_splits(state)
 
     def step(z):
-        s, _ = macro_step(system, scheme, State(state.t, *jnp.split(z, splits)), macro_dt, newton)
-        return jnp.concatenate([s.q_s, s.q_f, s.p_s, s.p_f])
+        start = State(state.t, *jnp.split(z, splits))
+        return phase_vector(macro_step(system, scheme, start, macro_dt, newton)[0])
 
-    z = jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
     M = jax.jit(jax.jacfwd(step))(z)
-    J = jnp.block([[jnp.zeros((n, n)), jnp.eye(n)], [-jnp.eye(n), jnp.zeros((n, n))]])
+    J = symplectic_form(z.size // 2)
     basis = tangents(system, state.t, z, splits)
     return jnp.max(jnp.abs(basis @ (M.T @ J @ M - J) @ basis.T))
 

@@ -46,15 +46,14 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
     keep = e > plateau * level
     keep[:2] = True
     x, y = np.log(h[keep]), np.log(e[keep])
-    slope, intercept = np.polyfit(x, y, 1)
     free = len(x) - 2
-    half_width = np.nan
-    if free:
-        scatter = np.sum((y - slope * x - intercept) ** 2) / free / np.sum((x - x.mean()) ** 2)
-        half_width = (STUDENT[free] if free < len(STUDENT) else 2.0) * np.sqrt(scatter)
-    return OrderFit(float(slope), float(half_width), len(x))
+    if not free:
+        return OrderFit(float(np.diff(y)[0] / np.diff(x)[0]), np.nan, 2)
+    (slope, _), covariance = np.polyfit(x, y, 1, cov=True)
+    quantile = STUDENT[free] if free < len(STUDENT) else 2.0
+    return OrderFit(float(slope), float(quantile * np.sqrt(covariance[0, 0])), len(x))
 
 
 def observed_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> float:
-    """The order of `fit_order`."""
+    """The order of `fit_order`, with the same arguments and errors."""
     return fit_order(macro_dt, errors, plateau, floor).order

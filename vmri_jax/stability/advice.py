@@ -1,10 +1,10 @@
 """Advice before a long run: is a step stable at this state, what is wrong where it is not, and which step is."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import State
@@ -15,7 +15,7 @@ from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
-from vmri_jax.study.table import Column, ResultTable, rich_table
+from vmri_jax.study.table import Column, ResultTable
 
 SCAN = (0.5, 1.25)
 """Macro steps that are looked at, in units of the one in question; further ones if none of them is safe."""
@@ -103,17 +103,22 @@ class Advice(ResultTable):
 
     def content(self) -> dict[str, Any]:
         """Findings, windows and frequencies."""
-        known = {"macro_dt": self.macro_dt, "growth": self.growth, "safe_macro_dt": self.safe_macro_dt}
-        known |= {"scanned": self.scanned, "windows": [window._asdict() for window in self.windows]}
-        frequencies = {name: getattr(self, name).tolist() for name in ("fast_frequencies", "slow_frequencies")}
-        return {"verdict": self.verdict, **known, **frequencies, **super().content()}
+        return {
+            "verdict": self.verdict,
+            "macro_dt": self.macro_dt,
+            "growth": self.growth,
+            "safe_macro_dt": self.safe_macro_dt,
+            "scanned": self.scanned,
+            "windows": [window._asdict() for window in self.windows],
+            "fast_frequencies": self.fast_frequencies.tolist(),
+            "slow_frequencies": self.slow_frequencies.tolist(),
+            **super().content(),
+        }
 
-    def table(self) -> Table:
-        """Findings, and the verdict below them."""
-        return rich_table(self.columns, self.findings, caption=self.verdict)
-
-    def __rich__(self):
-        return self.table()
+    @property
+    def caption(self) -> str:
+        """The verdict."""
+        return self.verdict
 
     def __str__(self) -> str:
         lines = [f"{f.severity}: {f.kind}: {f.sentence}" for f in self.findings]
@@ -157,45 +162,42 @@ def advise(
     radius = float(multipliers(motions, scheme, [macro_dt]).radius[0])
     growth = radius - 1 if radius > 1 + tolerance else 0.0
 
-    findings = _of_step(motions, scheme, macro_dt, growth, windows)
-    near = bool(findings)
-    findings += _labels(motions) + _stages(scheme) + _motion(motions)
-
-    safe, scans = macro_dt, 0
-    while near and scans < SCANS:
+    of_step = list(_of_step(motions, scheme, macro_dt, growth, windows))
+    safe = macro_dt
+    for _ in range(SCANS if of_step else 0):
         safe = _nearest_safe(macro_dt, windows, lower, upper)
         if not np.isnan(safe):
             break
         upper, lower = lower, lower / 3
-        windows, scans = _scan(motions, scheme, lower, upper, upper, tolerance) + windows, scans + 1
+        windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
+
+    findings = [*of_step, *_labels(motions), *_stages(scheme), *_motion(motions)]
     return Advice(
-        macro_dt,
-        growth,
-        tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))),
-        tuple(windows),
-        (lower, SCAN[1] * macro_dt),
-        safe,
-        motions.fast_frequencies,
-        motions.slow_frequencies,
+        macro_dt=macro_dt,
+        growth=growth,
+        findings=tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))),
+        windows=tuple(windows),
+        scanned=(lower, SCAN[1] * macro_dt),
+        safe_macro_dt=safe,
+        fast_frequencies=motions.fast_frequencies,
+        slow_frequencies=motions.slow_frequencies,
     )
 
 
-def _of_step(motions: SmallMotions, scheme, macro_dt: float, growth: float, windows) -> list[Finding]:
+def _of_step(motions: SmallMotions, scheme, macro_dt: float, growth: float, windows) -> Iterator[Finding]:
     """An error where the step is unstable, else a warning for every window near it."""
-    findings: list[Finding] = []
     if growth:
         kind, cause = _cause(motions, scheme, macro_dt)
-        tenfold = np.log(10) / np.log1p(growth)
-        grows = f"Disturbances grow by {growth:.2g} per macro step, tenfold in {max(1, round(tenfold))}."
-        findings.append(Finding("error", kind, f"{cause} {grows}", growth))
-    else:
-        for a, b, _ in windows:
-            distance = max(a - macro_dt, macro_dt - b) / macro_dt
-            if distance * macro_dt <= _margin(a, b, macro_dt):
-                kind, cause = _cause(motions, scheme, (a + b) / 2)
-                where = f"Steps from {a:.6g} to {b:.6g} are unstable, {100 * distance:.1f} % from this one."
-                findings.append(Finding("warning", kind, f"{where} There: {cause}", distance))
-    return findings
+        tenfold = max(1, round(np.log(10) / np.log1p(growth)))
+        grows = f"Disturbances grow by {growth:.2g} per macro step, tenfold in {tenfold}."
+        yield Finding("error", kind, f"{cause} {grows}", growth)
+        return
+    for a, b, _ in windows:
+        distance = max(a - macro_dt, macro_dt - b) / macro_dt
+        if distance * macro_dt <= _margin(a, b, macro_dt):
+            kind, cause = _cause(motions, scheme, (a + b) / 2)
+            where = f"Steps from {a:.6g} to {b:.6g} are unstable, {100 * distance:.1f} % from this one."
+            yield Finding("warning", kind, f"{where} There: {cause}", distance)
 
 
 def _scan(motions: SmallMotions, scheme, lower: float, upper: float, through: float, tolerance: float) -> list[Window]:
@@ -220,50 +222,65 @@ def _nearest_safe(macro_dt: float, windows, lower: float, upper: float) -> float
 
 def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
     """Kind and description of an instability at this step."""
+    limit = _stability_limit(motions, scheme, macro_dt)
+    return ("stability limit", limit) if limit else _resonance(motions, scheme, macro_dt)
+
+
+def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> str:
+    """What the fast or the slow potential alone does to the step; empty where it is stable for both."""
     stage = stage_scheme(scheme)
-    parts = np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)
-    h, longest = macro_dt / stage.num_micro, np.abs(parts).max()
+    longest = macro_dt * np.abs(_stage_lengths(scheme)).max()
     of = " of the longest stage" if isinstance(scheme, Composition) else ""
     for name, frequencies, grid, step, limit in (
-        ("fast", motions.fast_frequencies, "micro", longest * h, fast_limit(stage)),
-        ("slow", motions.slow_frequencies, "macro", longest * macro_dt, slow_limit(stage)),
+        ("fast", motions.fast_frequencies, "micro", longest / stage.num_micro, fast_limit(stage)),
+        ("slow", motions.slow_frequencies, "macro", longest, slow_limit(stage)),
     ):
         alone = multipliers(motions.only(name), scheme, [macro_dt * (1 + BEYOND)])
         if alone.radius[0] > 1 + TOLERANCE:
             bears = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
-            return "stability limit", (
+            return (
                 f"The step is unstable for the {name} potential alone: its frequency {frequencies[0]:.4g} times the {grid} "
                 f"step{of} is {frequencies[0] * step:.4g}{bears}."
             )
+    return ""
+
+
+def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
+    """Kind of resonance, and the vibrations with the most energy in the multiplier that grows most."""
     found = multipliers(motions, scheme, [macro_dt])
     worst = np.argmax(np.where(found.own[0], 0.0, np.abs(found.values[0])))
     eta, pi = np.split(found.vectors[0][:, worst], 2)
     frequencies, modes = motions.modes
     energy = np.abs(modes.T @ eta) ** 2 * frequencies**2 + np.abs(modes.T @ pi) ** 2
-    first, second = np.argsort(-energy)[:2] if len(energy) > 1 else (0, 0)
-    alone = abs(found.values[0, worst].imag) < 1e-6
-    second = first if alone else second
+    pair = np.argsort(-energy)[:2]
 
-    def turned(i) -> float:
-        if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
-            return float(frequencies[i] * macro_dt)
-        turn = stage.num_micro * sum(phase(stage, float(frequencies[i] * c * h)) for c in parts)
-        return turn if np.isfinite(turn) else float(frequencies[i] * macro_dt)
-
-    kind = "impulse resonance" if stage.slow.grid == "macro" else "combination resonance"
-    a, b = turned(first), turned(second)
-    if alone:
+    kind = "impulse resonance" if stage_scheme(scheme).slow.grid == "macro" else "combination resonance"
+    a, b = pair[0], pair[-1]
+    turns = [_turn(motions, scheme, macro_dt, i) / np.pi for i in (a, b)]
+    if abs(found.values[0, worst].imag) < 1e-6:
         return kind, (
-            f"The vibration of frequency {frequencies[first]:.4g} turns by {a / np.pi:.4g} pi in a macro step, close to a "
+            f"The vibration of frequency {frequencies[a]:.4g} turns by {turns[0]:.4g} pi in a macro step, close to a "
             "multiple of pi, and the slow potential feeds it."
         )
     return kind, (
-        f"The vibrations of frequencies {frequencies[first]:.4g} and {frequencies[second]:.4g} turn by {a / np.pi:.4g} pi and "
-        f"{b / np.pi:.4g} pi in a macro step, together close to a multiple of 2 pi, and the slow potential couples them."
+        f"The vibrations of frequencies {frequencies[a]:.4g} and {frequencies[b]:.4g} turn by {turns[0]:.4g} pi and "
+        f"{turns[1]:.4g} pi in a macro step, together close to a multiple of 2 pi, and the slow potential couples them."
     )
 
 
-def _labels(motions: SmallMotions) -> list[Finding]:
+def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, i) -> float:
+    """Angle by which vibration i turns in a macro step: as the micro steps turn it where W carries it."""
+    frequencies, modes = motions.modes
+    exact = float(frequencies[i] * macro_dt)
+    if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
+        return exact
+    stage = stage_scheme(scheme)
+    phases = [phase(stage, exact * part / stage.num_micro) for part in _stage_lengths(scheme)]
+    turn = stage.num_micro * sum(phases)
+    return turn if np.isfinite(turn) else exact
+
+
+def _labels(motions: SmallMotions) -> Iterator[Finding]:
     """Whether slow variables carry faster vibrations than fast ones."""
     frequencies, modes = motions.modes
     n_s, n_f, d = motions.rest.q_s.size, motions.rest.q_f.size, len(frequencies)
@@ -271,46 +288,47 @@ def _labels(motions: SmallMotions) -> list[Finding]:
     slow = shares[:n_s].sum(axis=0) > 0.5
     fastest, others = frequencies[slow].max(initial=0.0), frequencies[~slow].max(initial=0.0)
     if not n_f or fastest <= FASTER * others or fastest == 0:
-        return []
+        return
     carried = shares[:n_s, frequencies > fastest / FASTER].sum(axis=1)
     names = ", ".join(f"q_s[{i}]" for i in np.flatnonzero(carried > 0.1))
-    return [
-        Finding(
-            "warning",
-            "labels",
-            f"The fastest vibration, of frequency {fastest:.4g}, is one of the slow variables {names}; those of the fast "
-            f"variables reach {others:.4g}. Swap the labels: make these variables fast and put their energy into "
-            "fast_potential, and the soft ones slow.",
-            float(fastest / others) if others else np.inf,
-        )
-    ]
+    yield Finding(
+        "warning",
+        "labels",
+        f"The fastest vibration, of frequency {fastest:.4g}, is one of the slow variables {names}; those of the fast "
+        f"variables reach {others:.4g}. Swap the labels: make these variables fast and put their energy into "
+        "fast_potential, and the soft ones slow.",
+        float(fastest / others) if others else np.inf,
+    )
 
 
-def _stages(scheme: Scheme | Composition) -> list[Finding]:
-    if not isinstance(scheme, Composition) or (np.asarray(scheme.coefficients) > 0).all():
-        return []
-    parts = np.asarray(scheme.coefficients)
+def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
+    """Whether a composition steps backwards."""
+    parts = _stage_lengths(scheme)
+    if (parts > 0).all():
+        return
     longest = float(np.abs(parts).max())
-    return [
-        Finding(
-            "note",
-            "stages",
-            f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
-            f"backwards: it meets the stability limits of its scheme at steps about {longest:.3g} times shorter.",
-            longest,
-        )
-    ]
+    yield Finding(
+        "note",
+        "stages",
+        f"The {len(parts)} stages of the composition make steps of {parts.min():.3g} to {parts.max():.3g} macro steps, some "
+        f"backwards: it meets the stability limits of its scheme at steps about {longest:.3g} times shorter.",
+        longest,
+    )
 
 
-def _motion(motions: SmallMotions) -> list[Finding]:
+def _stage_lengths(scheme: Scheme | Composition) -> np.ndarray:
+    """In macro steps."""
+    return np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)
+
+
+def _motion(motions: SmallMotions) -> Iterator[Finding]:
+    """Whether the state is unstable by itself."""
     if not motions.growing.size:
-        return []
+        return
     rate = float(np.real(motions.growing).max())
-    return [
-        Finding(
-            "note",
-            "motion",
-            f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of what is measured.",
-            rate,
-        )
-    ]
+    yield Finding(
+        "note",
+        "motion",
+        f"Motion about this state grows by itself, like exp({rate:.3g} t); that is left out of what is measured.",
+        rate,
+    )

@@ -1,12 +1,13 @@
 """Figures of stability maps: stable and unstable regions side by side."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, LogNorm
 
-from vmri_jax.plots import LIGHT, NotebookFigure, Theme, style
+from vmri_jax.plots import LIGHT, NotebookFigure, Theme, new_figure, panel_grid
 from vmri_jax.stability.map import StabilityMap
 
 SHOWN = (1e-6, 1.0)
@@ -26,14 +27,13 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
         theme: colours.
     """
     columns = min(COLUMNS, len(maps))
-    lines = -(-len(maps) // columns)
     height = float(np.clip(0.9 + 0.17 * max(len(m.rows) for m in maps.values()), 1.6, 3.2))
     shades = LinearSegmentedColormap.from_list("growth", [theme.curves[4], theme.curves[1], theme.ink])
     colors = ScalarMappable(LogNorm(*SHOWN, clip=True), shades)
-    with style(theme):
-        figure = NotebookFigure(figsize=(max(5.2, 0.9 + 2.9 * columns), 0.9 + height * lines))
-        panels = figure.subplots(lines, columns, squeeze=False).reshape(-1)
-        for axes, (name, stability) in zip(panels, maps.items(), strict=False):
+    size = max(5.2, 0.9 + 2.9 * columns), 0.9 + height * math.ceil(len(maps) / columns)
+    with new_figure(*size, title, theme) as figure:
+        panels = panel_grid(figure, len(maps), columns)
+        for axes, (name, stability) in zip(panels, maps.items(), strict=True):
             over_kappa = stability.axis == "kappa"
             y = np.array(stability.rows, dtype=float) if over_kappa else np.arange(len(stability.rows))
             edges = _cells(y)
@@ -49,12 +49,9 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
                 axes.grid(axis="y", visible=False)
             if all(isinstance(row, int) for row in stability.rows):
                 axes.set(ylabel="micro steps per macro step")
-        for axes in panels[len(maps) :]:
-            axes.set_axis_off()
-        for axes in panels[max(0, len(maps) - columns) : len(maps)]:
+        for axes in panels[-columns:]:
             axes.set(xlabel=r"$\omega H / \pi$")
         figure.colorbar(colors, ax=panels.tolist(), label="growth per macro step; white: stable", aspect=30, pad=0.01)
-        figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.diagnostics import velocity
+from vmri_jax.diagnostics.linear import frequencies_of, phase_splits
+from vmri_jax.mechanics.invariants import potentials, velocity
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.mechanics.system import ConstantMass, System
 
@@ -89,12 +90,12 @@ class SmallMotions:
     @property
     def slow_frequencies(self) -> np.ndarray:
         """(d,) frequencies of the slow potential alone, the largest first; zero where it is not convex."""
-        return _frequencies(self.slow)
+        return frequencies_of(self.slow)
 
     @property
     def fast_frequencies(self) -> np.ndarray:
         """(d,) frequencies of the fast potential alone, the largest first: what a micro step must resolve."""
-        return _frequencies(self.fast)
+        return frequencies_of(self.fast)
 
     @cached_property
     def modes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -115,10 +116,6 @@ class SmallMotions:
         none = jax.tree.map(np.zeros_like, self.system.params[other])
         system = self.system.replace(params=self.system.params | {other: none})
         return replace(self, system=system, stiffness=self.stiffness - removed, **{other: np.zeros_like(removed)})
-
-
-def _frequencies(stiffness) -> np.ndarray:
-    return np.sqrt(np.maximum(np.linalg.eigvalsh((stiffness + stiffness.T) / 2)[::-1], 0.0))
 
 
 def small_motions(system: System, state: State) -> SmallMotions:
@@ -143,71 +140,81 @@ def small_motions(system: System, state: State) -> SmallMotions:
             f"small_motions: got {type(system).__name__} and {type(state).__name__}; give a System and a State, e.g. "
             "problem.system and problem.state()."
         )
-    e = {name: np.asarray(value) for name, value in _expansion(system, state).items()}
-    broken = [name for name, value in e.items() if not np.isfinite(value).all()]
+    terms = {name: np.asarray(value) for name, value in _expansion(system, state).items()}
+    broken = [name for name, value in terms.items() if not np.isfinite(value).all()]
     if broken:
         raise ValueError(
             f"small_motions: the expansion of {', '.join(broken)} is not finite at the state (a norm at zero, a point "
             "outside a function's domain?). Give a state where second derivatives exist."
         )
-    n, n_s, n_g = len(e["slow_gradient"]), state.q_s.size, system.num_constraints(state.q_s, state.q_f)[0]
-    mass, coupling = e["kinetic"][n:, n:], e["kinetic"][n:, :n]
-    G, curvature = e["jacobian"], e["curvature"]
 
-    inverse_mass = np.linalg.inv(mass)
-    gram = np.linalg.pinv(G @ inverse_mass @ G.T, rcond=1e-12, hermitian=True)
-    multiplier = gram @ (G @ inverse_mass @ e["impetus"] + e["centripetal"])
-    own = -gram @ (G @ inverse_mass @ e["slow_gradient"])  # the share of V
-    rest = G.T @ (multiplier - own)
-
-    held = np.abs(rest).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
-    params = {
-        "kinetic": e["kinetic"],
-        "slow": (-G.T @ own, e["slow"]),
-        "fast": e["fast"][n_s:, n_s:],
-        "constraint": (G[:n_g], curvature[:n_g]),
-        "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
-        "force": (rest, e["force_q"], e["force_v"]),
-    }
-    expanded = System(
-        system.kinetic if isinstance(system.kinetic, ConstantMass) else _kinetic,
-        None if system.slow_potential is None else _slow_potential,
-        None if system.fast_potential is None else _fast_potential,
-        None if system.constraint is None else _constraint,
-        None if system.slow_constraint is None else _slow_constraint,
-        _force if held or e["force_q"].any() or e["force_v"].any() else None,
-        params,
-    )
-
-    tangents = np.eye(n)
-    if len(G):
-        _, sizes, rows = np.linalg.svd(G)
-        tangents = rows[np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :].T
-    if not tangents.shape[1]:
-        raise ValueError(
-            f"small_motions: the {len(G)} constraints leave none of the {n} coordinates free; nothing moves."
-        )
-    shapes = np.linalg.solve(np.linalg.cholesky(tangents.T @ mass @ tangents), tangents.T).T
-    bent = np.tensordot(multiplier, curvature, 1)
-    bent_by_slow = np.tensordot(own, curvature, 1)
-    gyroscopic = shapes.T @ coupling @ shapes
-    zero = np.zeros_like(shapes)
-    embed = np.block([[shapes, zero], [coupling @ shapes - mass @ shapes @ gyroscopic, mass @ shapes]])
-    read = np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]])
+    n = len(terms["slow_gradient"])
+    mass, coupling = terms["kinetic"][n:, n:], terms["kinetic"][n:, :n]
+    shapes = _shapes(mass, terms["jacobian"])
+    multiplier, of_slow = _multipliers_at_rest(terms, mass)
+    bent, bent_by_slow = (np.tensordot(x, terms["curvature"], 1) for x in (multiplier, of_slow))
 
     def reduced(matrix):
         return shapes.T @ matrix @ shapes
 
+    gyroscopic = reduced(coupling)
+    zero = np.zeros_like(shapes)
     return SmallMotions(
-        system=expanded,
+        system=_expanded_system(system, state, terms, multiplier, of_slow),
         shapes=shapes,
-        embed=embed,
-        read=read,
-        slow=reduced(e["slow"] + bent_by_slow),
-        fast=reduced(e["fast"]),
-        stiffness=reduced(e["slow"] + e["fast"] + bent - e["kinetic"][:n, :n] - e["force_q"]),
-        damping=gyroscopic - gyroscopic.T - reduced(e["force_v"]),
-        rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), (n_s, n, n + n_s))),
+        embed=np.block([[shapes, zero], [coupling @ shapes - mass @ shapes @ gyroscopic, mass @ shapes]]),
+        read=np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]]),
+        slow=reduced(terms["slow"] + bent_by_slow),
+        fast=reduced(terms["fast"]),
+        stiffness=reduced(terms["slow"] + terms["fast"] + bent - terms["kinetic"][:n, :n] - terms["force_q"]),
+        damping=gyroscopic - gyroscopic.T - reduced(terms["force_v"]),
+        rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), phase_splits(state))),
+    )
+
+
+def _shapes(mass: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
+    """N (n, d) with ``N^T M N = 1`` and ``G N = 0``."""
+    tangents = np.eye(len(mass))
+    if len(jacobian):
+        _, sizes, rows = np.linalg.svd(jacobian)
+        tangents = rows[np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :].T
+    if not tangents.shape[1]:
+        raise ValueError(
+            f"small_motions: the {len(jacobian)} constraints leave none of the {len(mass)} coordinates free; nothing moves."
+        )
+    return np.linalg.solve(np.linalg.cholesky(tangents.T @ mass @ tangents), tangents.T).T
+
+
+def _multipliers_at_rest(terms: dict, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Multipliers lambda of the constraint forces ``-G^T lambda``, and the share of the slow potential in them."""
+    G = terms["jacobian"]
+    weighted = G @ np.linalg.inv(mass)
+    gram = np.linalg.pinv(weighted @ G.T, rcond=1e-12, hermitian=True)
+    multiplier = gram @ (weighted @ terms["impetus"] + terms["centripetal"])
+    return multiplier, -gram @ (weighted @ terms["slow_gradient"])
+
+
+def _expanded_system(system: System, state: State, terms: dict, multiplier, of_slow) -> System:
+    """The terms of a system as quadratic functions of the displacement; a term that is absent stays so."""
+    n_s, n_g = state.q_s.size, system.num_constraints(state.q_s, state.q_f)[0]
+    G, curvature = terms["jacobian"], terms["curvature"]
+    rest = G.T @ (multiplier - of_slow)
+    held = np.abs(rest).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
+    return System(
+        system.kinetic if system.has_constant_mass else _kinetic,
+        None if system.slow_potential is None else _slow_potential,
+        None if system.fast_potential is None else _fast_potential,
+        None if system.constraint is None else _constraint,
+        None if system.slow_constraint is None else _slow_constraint,
+        _force if held or terms["force_q"].any() or terms["force_v"].any() else None,
+        params={
+            "kinetic": terms["kinetic"],
+            "slow": (-G.T @ of_slow, terms["slow"]),
+            "fast": terms["fast"][n_s:, n_s:],
+            "constraint": (G[:n_g], curvature[:n_g]),
+            "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
+            "force": (rest, terms["force_q"], terms["force_v"]),
+        },
     )
 
 
@@ -220,17 +227,16 @@ def _expansion(system: System, state: State) -> dict:
     n_s = state.q_s.size
     q = jnp.concatenate([state.q_s, state.q_f])
     v = jnp.concatenate(velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
-    params = system.params
 
     def slow(q):
-        return jnp.zeros(()) if system.slow_potential is None else system.slow_potential(q[:n_s], q[n_s:], params)
+        return potentials(system, q[:n_s], q[n_s:])[0]
 
     def fast(q):
-        return jnp.zeros(()) if system.fast_potential is None else system.fast_potential(q[n_s:], params)
+        return potentials(system, q[:n_s], q[n_s:])[1]
 
     def kinetic(z):
         q, v = jnp.split(z, 2)
-        return system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], params)
+        return system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params)
 
     def constraints(q):
         return system.constraints(state.t, q[:n_s], q[n_s:])
@@ -243,7 +249,6 @@ def _expansion(system: System, state: State) -> dict:
 
     z = jnp.concatenate([q, v])
     slope, turn = jax.jvp(jax.grad(kinetic), (z,), (jnp.concatenate([v, jnp.zeros_like(v)]),))
-    curvature = jax.jacfwd(jax.jacrev(constraints))(q)
     force_q, force_v = jax.jacfwd(force, argnums=(0, 1))(q, v)
     return {
         "kinetic": jax.hessian(kinetic)(z.at[q.size :].set(0.0)),
@@ -251,7 +256,7 @@ def _expansion(system: System, state: State) -> dict:
         "slow": jax.hessian(slow)(q),
         "fast": jax.hessian(fast)(q),
         "jacobian": jax.jacrev(constraints)(q),
-        "curvature": curvature,
+        "curvature": jax.jacfwd(jax.jacrev(constraints))(q),
         "centripetal": jax.jacfwd(jax.jacfwd(along))(0.0),
         "force_q": force_q,
         "force_v": force_v,

@@ -19,11 +19,7 @@ from vmri_jax.stability.windows import find_windows
 from vmri_jax.study.table import Column, ResultTable
 
 TOLERANCE = 1e-6
-"""Growth per step that counts as instability.
-
-Two equal multipliers (free motion, the end of a window) split under round-off by the square root of it: 2e-8 on the triple
-pendulum, 1e-8 on the atomic model. Growth by less than 1e-6 takes a million macro steps to be a factor of e.
-"""
+"""Growth per step that counts as instability: round-off alone splits two equal multipliers by its square root, up to 2e-8."""
 INSIDE = np.linspace(0.0, 1.0, 9)
 """Where the growth in a window is measured."""
 EDGE = 1e-7
@@ -146,12 +142,7 @@ def stability_map(
     """
     require_x64()
     system, state = _system_and_state(model)
-    grid = np.asarray(omega_H, dtype=float)
-    if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
-        raise ValueError(
-            f"stability_map: omega_H has shape {grid.shape} and values {_ends(grid)}; give two or more positive values, "
-            "increasing, e.g. numpy.linspace(0.05, 12, 240)."
-        )
+    grid = _grid(omega_H)
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
         raise TypeError(
@@ -161,14 +152,7 @@ def stability_map(
         motions = small_motions(system, state)
         rows = {label: (motions, s) for label, s in schemes.items()}
     else:
-        [only] = schemes.values() if len(schemes) == 1 else [None]
-        if not len(kappa):
-            raise ValueError("stability_map: kappa is empty; give at least one value.")
-        if only is None or not isinstance(system.params, Mapping) or "kappa" not in system.params:
-            raise ValueError(
-                "stability_map: kappa goes with a single scheme and a system whose params are a dict with an entry 'kappa'; "
-                f"got {len(schemes)} scheme(s) and params {system.params!r}. Make one map per scheme."
-            )
+        only = _single_scheme(schemes, system, kappa)
         rows = {float(k): (small_motions(_with_kappa(system, k), state), only) for k in kappa}
     omega = next(iter(rows.values()))[0].omega
     if omega == 0:
@@ -214,9 +198,28 @@ def _system_and_state(model) -> tuple[System, State]:
     raise TypeError(f"stability_map: model is {type(model).__name__}; give a Problem, or (system, state).")
 
 
+def _grid(omega_H) -> np.ndarray:
+    grid = np.asarray(omega_H, dtype=float)
+    if grid.ndim != 1 or grid.size < 2 or not (np.isfinite(grid).all() and grid[0] > 0 and (np.diff(grid) > 0).all()):
+        values = f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"
+        raise ValueError(
+            f"stability_map: omega_H has shape {grid.shape} and values {values}; give two or more positive values, "
+            "increasing, e.g. numpy.linspace(0.05, 12, 240)."
+        )
+    return grid
+
+
+def _single_scheme(schemes: Mapping[Any, Scheme | Composition], system: System, kappa) -> Scheme | Composition:
+    if not len(kappa):
+        raise ValueError("stability_map: kappa is empty; give at least one value.")
+    if len(schemes) > 1 or not isinstance(system.params, Mapping) or "kappa" not in system.params:
+        raise ValueError(
+            "stability_map: kappa goes with a single scheme and a system whose params are a dict with an entry 'kappa'; "
+            f"got {len(schemes)} scheme(s) and params {system.params!r}. Make one map per scheme."
+        )
+    [only] = schemes.values()
+    return only
+
+
 def _with_kappa(system: System, kappa) -> System:
     return system.replace(params={**system.params, "kappa": np.asarray(kappa, dtype=float)})
-
-
-def _ends(grid) -> str:
-    return f"{grid.flat[0]:g} to {grid.flat[-1]:g}" if grid.size else "none"

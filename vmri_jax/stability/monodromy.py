@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.diagnostics import tangents
+from vmri_jax.diagnostics.linear import phase_splits, phase_vector, symplectic_form, tangents
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import State
@@ -82,21 +82,20 @@ def monodromy(
     if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
         raise ValueError(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
     start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
-    z, matrix, bases, results = _product(system, scheme, start, macro_dt, newton or Newton(), num_steps)
-    if not all(Result(int(r)).success for r in np.unique(results)):
-        step = next(k for k, r in enumerate(results) if not Result(int(r)).success)
-        raise RuntimeError(f"monodromy: macro step {step} failed: {Result(int(results[step])).message}")
-    first, last = np.asarray(_vector(start)), np.asarray(z)
-    M, (at_start, at_end) = np.asarray(matrix), (np.asarray(b) for b in bases)
-    n = first.size // 2
-    J = np.block([[np.zeros((n, n)), np.eye(n)], [-np.eye(n), np.zeros((n, n))]])
+    product = _product(system, scheme, start, macro_dt, newton or Newton(), num_steps)
+    last, M, at_start, at_end, results = (np.asarray(a) for a in product)
+    failed = np.flatnonzero(results > Result.CONVERGED_AT_ROUNDOFF)
+    if failed.size:
+        raise RuntimeError(f"monodromy: macro step {failed[0]} failed: {Result(int(results[failed[0]])).message}")
+    first = np.asarray(phase_vector(start))
+    J = symplectic_form(first.size // 2)
     defect = M.T @ (at_end @ J @ at_end.T) @ M - at_start @ J @ at_start.T
     return Monodromy(
         matrix=M,
         start_basis=at_start,
         end_basis=at_end,
         start=start,
-        end=State(start.t + num_steps * macro_dt, *jnp.split(z, _splits(start))),
+        end=State(start.t + num_steps * macro_dt, *jnp.split(last, phase_splits(start))),
         closure=float(np.linalg.norm(last - first) / max(np.linalg.norm(first), np.linalg.norm(last))),
         symplectic_defect=float(np.abs(defect).max() / max(1.0, np.abs(M).max() ** 2)),
     )
@@ -104,12 +103,12 @@ def monodromy(
 
 @partial(jax.jit, static_argnames="num_steps", compiler_options=QUICK)
 def _product(system, scheme, state, macro_dt, newton, num_steps: int):
-    """End (2 n,), product of the derivatives, tangent bases at both ends, status of every step."""
-    splits = _splits(state)
+    """End (2 n,), product of the derivatives, tangent bases at the start and at the end, status of every step."""
+    splits = phase_splits(state)
 
     def step(z, t):
         end, info = macro_step(system, scheme, State(t, *jnp.split(z, splits)), macro_dt, newton)
-        z = _vector(end)
+        z = phase_vector(end)
         return z, (z, info.result)
 
     def along(carry, k):
@@ -119,16 +118,7 @@ def _product(system, scheme, state, macro_dt, newton, num_steps: int):
         end_basis = tangents(system, t + macro_dt, z, splits)
         return (z, end_basis, end_basis @ derivative @ (basis.T @ matrix)), result
 
-    z = _vector(state)
+    z = phase_vector(state)
     basis = tangents(system, state.t, z, splits)
-    carry, results = jax.lax.scan(along, (z, basis, jnp.eye(basis.shape[0])), jnp.arange(num_steps))
-    return carry[0], carry[2], (basis, carry[1]), results
-
-
-def _vector(state: State):
-    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
-
-
-def _splits(state: State) -> tuple[int, int, int]:
-    n_s, n = state.q_s.size, state.q_s.size + state.q_f.size
-    return n_s, n, n + n_s
+    (z, end_basis, matrix), results = jax.lax.scan(along, (z, basis, jnp.eye(len(basis))), jnp.arange(num_steps))
+    return z, matrix, basis, end_basis, results

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.diagnostics.linear import phase_splits, phase_vector
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
@@ -68,16 +69,18 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
 
     The derivative of the step is exact, ``jax.jacfwd(macro_step)`` of the expansion at rest on the tangent space of the
     constraint manifold.
+
+    Args:
+        motions: of `small_motions`.
+        scheme: any scheme or composition.
+        macro_dt: (k,) macro steps.
     """
     macro_dt = np.asarray(macro_dt, dtype=float)
     size = motions.read.shape[0]
     lanes = int(np.clip(LANES * 36 // max(size, 1), 4, LANES))
-    padded = np.concatenate([macro_dt, np.full(-len(macro_dt) % lanes, macro_dt[0])]).reshape(-1, lanes)
-    pieces = [
-        np.asarray(_step_matrices(motions.system, scheme, motions.rest, motions.embed, motions.read, part))
-        for part in padded
-    ]
-    matrices = np.concatenate(pieces)[: len(macro_dt)]
+    padded = np.pad(macro_dt, (0, -len(macro_dt) % lanes), mode="edge").reshape(-1, lanes)
+    fixed = motions.system, scheme, motions.rest, motions.embed, motions.read
+    matrices = np.concatenate([_step_matrices(*fixed, part) for part in padded])[: len(macro_dt)]
     failed = ~np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     values, vectors = np.linalg.eig(np.where(failed[:, None, None], np.eye(size), matrices))
     values = np.where(failed[:, None], np.nan, values.astype(complex))
@@ -91,12 +94,10 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
 @partial(jax.jit, compiler_options=QUICK)
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest for k lengths of it."""
-    n_s, n = rest.q_s.size, rest.q_s.size + rest.q_f.size
     newton = Newton(method="arrowhead", fixed_iterations=CONSTRAINED_ITERATIONS if system.is_constrained else 1)
 
     def step(coordinates, macro_dt):
-        state = State(rest.t, *jnp.split(embed @ coordinates, (n_s, n, n + n_s)))
-        end = macro_step(system, scheme, state, macro_dt, newton)[0]
-        return read @ jnp.concatenate([end.q_s, end.q_f, end.p_s, end.p_f])
+        state = State(rest.t, *jnp.split(embed @ coordinates, phase_splits(rest)))
+        return read @ phase_vector(macro_step(system, scheme, state, macro_dt, newton)[0])
 
     return jax.vmap(lambda dt: jax.jacfwd(step)(jnp.zeros(embed.shape[1]), dt))(macro_dt)

@@ -18,8 +18,7 @@ from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.progress import Progress, silent
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.timing import interleaved
-from vmri_jax.study.work import WorkPrecision, WorkRow, work_row
+from vmri_jax.study.work import WorkPrecision, WorkRow, timed_in_turn, work_row
 
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 PATIENCE = 5.0
@@ -59,6 +58,10 @@ class Setting:
         return f"vmri simulate {system} {self.family.options} {step} --out run.npz"
 
 
+def _seconds(setting: Setting) -> float:
+    return setting.row.seconds
+
+
 class NothingReached(ValueError):
     """No setting reached the error; what was run is in `.runs`."""
 
@@ -75,13 +78,12 @@ class Search:
         t_end: simulated time.
         menu: families to choose from.
         reference: what runs are compared with; its number of nodes is that of the runs.
-        newton: how implicit equations are solved; steps that "auto" would fall back for are given up, for smaller ones take less
-            time, and the fallback takes long to compile.
+        newton: how implicit equations are solved.
     """
 
     def __init__(self, problem, t_end: float, menu: Sequence[Family], reference: ReferenceSolution, newton=None):
         self.problem, self.t_end, self.menu, self.reference = problem, t_end, menu, reference
-        self.newton = newton or Newton()
+        self.newton = newton
         self.frequency = float(diagnostics.frequencies(problem.system, problem.state())[0])
         self.programs: dict[tuple[str, int], Program] = {}
         self.settings: dict[tuple[str, int, int], Setting] = {}
@@ -91,9 +93,7 @@ class Search:
         key = (family.name, num_micro)
         program = self.programs.pop(key, None)
         if program is None:
-            scheme, saves = family.make(num_micro), self.reference.num_saves
-            newton = self.newton
-            program = Program(self.problem, scheme, self.t_end, saves, newton)
+            program = Program(self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton)
         self.programs[key] = program  # the last one now
         if len(self.programs) > PROGRAMS:
             self.programs.pop(next(iter(self.programs)))
@@ -104,8 +104,8 @@ class Search:
         key = (family.name, num_micro, num_steps)
         if key not in self.settings:
             program = self.program(family, num_micro)
-            [seconds] = interleaved({"": program.timed(num_steps)}, 2, 0.0).values()
-            row = work_row(family.label(num_micro), program, num_steps, self.reference, [min(seconds)])
+            fastest = min(program.seconds(num_steps, 2, 0.0))
+            row = work_row(family.label(num_micro), program, num_steps, self.reference).timed([fastest])
             self.settings[key] = Setting(family, num_micro, num_steps, row)
         return self.settings[key]
 
@@ -156,7 +156,9 @@ class Search:
         reached: dict[tuple[str, int], Setting] = {}
         limit, deadline = LONGEST, time.monotonic() + budget
 
-        def attempt(family: Family, num_micro: int, done: int, total: int) -> Setting | None:
+        total = len(self.menu) + KEPT
+
+        def attempt(family: Family, num_micro: int, done: int) -> Setting | None:
             nonlocal limit
             key = (family.name, num_micro)
             if reached and key not in self.programs and time.monotonic() > deadline:
@@ -168,23 +170,23 @@ class Search:
                 limit = min(limit, (10 if exhaustive else 1) * PATIENCE * setting.row.seconds)
             return setting
 
-        total = len(self.menu) + KEPT
+        def climb(best: Setting, upwards: Sequence[int], done: int) -> None:
+            for num_micro in upwards:
+                setting = attempt(best.family, num_micro, done)
+                if setting is None or setting.row.seconds > 1.05 * best.row.seconds:
+                    return
+                best = setting
+
         for i, family in enumerate(self.by_promise(error)):
             for num_micro in NUM_MICRO if exhaustive else (family.first,):
-                attempt(family, num_micro, i, total)
-        if not exhaustive:
-            firsts = sorted(reached.values(), key=lambda s: s.row.seconds)[:KEPT]
-            for i, first in enumerate(firsts):
-                attempt(first.family, 1, len(self.menu) + i, total)  # a case of its own: slow and fast share their grid
-                for direction in (1, -1):
-                    at, best = NUM_MICRO.index(first.num_micro) + direction, first
-                    while 0 <= at < len(NUM_MICRO):
-                        setting = attempt(first.family, NUM_MICRO[at], len(self.menu) + i, total)
-                        if setting is None or setting.row.seconds > 1.05 * best.row.seconds:
-                            break
-                        best, at = setting, at + direction
-        ranked = sorted(reached.values(), key=lambda s: s.row.seconds)
-        return sorted(self._timed(ranked[: 2 * KEPT]), key=lambda s: s.row.seconds) + ranked[2 * KEPT :]
+                attempt(family, num_micro, i)
+        firsts = [] if exhaustive else sorted(reached.values(), key=_seconds)[:KEPT]
+        for done, first in enumerate(firsts, start=len(self.menu)):
+            attempt(first.family, 1, done)  # a case of its own: slow and fast share their grid
+            climb(first, [n for n in NUM_MICRO if n > first.num_micro], done)
+            climb(first, [n for n in reversed(NUM_MICRO) if n < first.num_micro], done)
+        ranked = sorted(reached.values(), key=_seconds)
+        return sorted(self._timed(ranked[: 2 * KEPT]), key=_seconds) + ranked[2 * KEPT :]
 
     def time_again(self, labels: Sequence[str]) -> None:
         """Time all runs of these schemes in turn."""
@@ -192,14 +194,9 @@ class Search:
 
     def _timed(self, settings: Sequence[Setting]) -> list[Setting]:
         """The same with medians of runs that took turns."""
-        programs = [self.program(s.family, s.num_micro) for s in settings]
-        runs = {str(i): p.timed(s.num_steps) for i, (p, s) in enumerate(zip(programs, settings, strict=True))}
-        timed = interleaved(runs, 5)
-        found = []
-        for i, (program, setting) in enumerate(zip(programs, settings, strict=True)):
-            row = work_row(setting.row.scheme, program, setting.num_steps, self.reference, timed[str(i)])
-            found.append(replace(setting, row=row))
-            self.settings[setting.family.name, setting.num_micro, setting.num_steps] = found[-1]
+        runs = [(self.program(s.family, s.num_micro), s.row) for s in settings]
+        found = [replace(s, row=row) for s, row in zip(settings, timed_in_turn(runs, 5), strict=True)]
+        self.settings |= {(s.family.name, s.num_micro, s.num_steps): s for s in found}
         return found
 
     def rows(self) -> WorkPrecision:
@@ -334,15 +331,14 @@ def _from_another_start(problem, t_end, num_saves: int, newton) -> Callable[[Set
     """Runs a setting from a start whose velocities differ by about a hundredth."""
     random = np.random.default_rng(1)
     size = 0.01 * max(np.abs(problem.v_s).max(initial=0), np.abs(problem.v_f).max(initial=0))
-    changes = {name: getattr(problem, name) for name in ("v_s", "v_f")}
-    changes = {name: v + size * random.normal(size=np.shape(v)) for name, v in changes.items()}
-    other = replace(problem, **changes)
+    v_s, v_f = (v + size * random.normal(size=np.shape(v)) for v in (problem.v_s, problem.v_f))
+    other = replace(problem, v_s=v_s, v_f=v_f)
     reference = reference_solution(other, t_end, num_saves=num_saves)
 
     def verified(setting: Setting) -> Verification:
         program = Program(other, setting.scheme, t_end, num_saves, newton)
-        [seconds] = interleaved({"": program.timed(setting.num_steps)}, 5).values()
-        row, seen = work_row(setting.row.scheme, program, setting.num_steps, reference, seconds), setting.row
+        seconds = program.seconds(setting.num_steps, 5)
+        row, seen = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds), setting.row
         return Verification(row.error_q, row.seconds, row.error_q / seen.error_q, row.seconds / seen.seconds)
 
     return verified

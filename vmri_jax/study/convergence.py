@@ -38,7 +38,7 @@ class ConvergenceRow:
     case: label of the parameters, "" if there is one set only.
     error_q, error_p: of positions and momenta.
     energy_error, energy_drift, energy_band: largest change of the energy since the start; change over the run of the
-        straight line fitted to it; and largest distance from that line.
+        straight line fitted to it; largest distance from that line.
     momentum_error: largest change of a momentum map since the start.
     constraint_residual: largest constraint value, of positions or velocities.
     iterations, method, result: most Newton iterations of a step, costliest `Method`, `Result`.
@@ -63,20 +63,23 @@ class ConvergenceRow:
 
 @dataclass(frozen=True)
 class SchemeSummary:
-    """What a reader wants to know about one scheme with one set of parameters.
+    """One scheme with one set of parameters: its runs and observed orders of positions and momenta."""
 
-    fit_q, fit_p: observed orders of positions and momenta.
-    finest: the run with the smallest step that did not fail, None if all failed.
-    num_failed, num_runs: how many of the runs failed.
-    """
-
-    scheme: str
-    case: str
+    runs: tuple[ConvergenceRow, ...]
     fit_q: OrderFit
     fit_p: OrderFit
-    finest: ConvergenceRow | None
-    num_failed: int
-    num_runs: int
+
+    @property
+    def finest(self) -> ConvergenceRow | None:
+        """The run with the smallest step that did not fail."""
+        ran = [row for row in self.runs if np.isfinite(row.error_q)]
+        return min(ran, key=lambda row: row.macro_dt, default=None)
+
+    @property
+    def failures(self) -> str:
+        """How many of the runs failed; empty if none did."""
+        failed = sum(not np.isfinite(row.error_q) for row in self.runs)
+        return f"{failed} of {len(self.runs)}" if failed else ""
 
 
 def _order(fit: OrderFit) -> str:
@@ -98,15 +101,15 @@ class ConvergenceStudy(ResultTable):
     """
 
     columns = (
-        Column("scheme", lambda summary: summary.scheme),
-        Column("case", lambda summary: summary.case),
+        Column("scheme", lambda summary: summary.runs[0].scheme),
+        Column("case", lambda summary: summary.runs[0].case),
         Column("order of q", lambda summary: _order(summary.fit_q), right=True),
         Column("order of p", lambda summary: _order(summary.fit_p), right=True),
         Column("smallest H", _of_finest("macro_dt", "g"), right=True),
         Column("error of q", _of_finest("error_q"), right=True),
         Column("error of p", _of_finest("error_p"), right=True),
         Column("energy", _of_finest("energy_error"), right=True),
-        Column("failed", lambda s: f"{s.num_failed} of {s.num_runs}" if s.num_failed else "", right=True),
+        Column("failed", lambda summary: summary.failures, right=True),
     )
     rows: tuple[ConvergenceRow, ...]
     references: Mapping[str, ReferenceSolution]
@@ -160,17 +163,8 @@ class ConvergenceStudy(ResultTable):
         return [self._summary(scheme, case) for scheme in self.schemes for case in self.cases]
 
     def _summary(self, scheme: str, case: str) -> SchemeSummary:
-        rows = [row for row in self.rows if (row.scheme, row.case) == (scheme, case)]
-        ran = [row for row in rows if np.isfinite(row.error_q)]
-        return SchemeSummary(
-            scheme=scheme,
-            case=case,
-            fit_q=self.fit(scheme, "q", case=case),
-            fit_p=self.fit(scheme, "p", case=case),
-            finest=min(ran, key=lambda row: row.macro_dt, default=None),
-            num_failed=len(rows) - len(ran),
-            num_runs=len(rows),
-        )
+        runs = tuple(row for row in self.rows if (row.scheme, row.case) == (scheme, case))
+        return SchemeSummary(runs, self.fit(scheme, "q", case=case), self.fit(scheme, "p", case=case))
 
     def content(self) -> dict[str, Any]:
         """The rows, and how accurate the references are."""
@@ -295,7 +289,10 @@ def _runner(problems: Sequence[Problem], scheme, t_end: float, num_saves: int, n
 def _references(cases, reference, t_end, num_saves, progress, total) -> dict[str, Any]:
     """A reference of the right shape for every case."""
     if reference is None:
-        told = lambda what, *_: progress(what, 0, total)  # noqa: E731
+
+        def told(what: str, *_) -> None:
+            progress(what, 0, total)
+
         return {
             case: reference_solution(problem, t_end, num_saves=num_saves, progress=told)
             for case, problem in cases.items()
@@ -356,6 +353,6 @@ def _drift_and_band(t: np.ndarray, energy: np.ndarray) -> tuple[float, float]:
     """Change over the run of the line fitted to the energy, and the largest distance from it."""
     if not np.isfinite(energy).all():
         return float("nan"), float("nan")
-    x = t - t.mean()
-    slope = float(x @ energy / (x @ x))
-    return slope * float(t[-1] - t[0]), float(np.abs(energy - energy.mean() - slope * x).max())
+    line = np.polynomial.Polynomial.fit(t, energy, 1)
+    fitted = line(t)
+    return float(fitted[-1] - fitted[0]), float(np.abs(energy - fitted).max())

@@ -1,11 +1,12 @@
 """Cost studies: computing time of a fixed simulated time against num_micro, at a constant micro step."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from vmri_jax.mechanics.state import Problem
+from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
@@ -112,26 +113,26 @@ def cost_study(
             f"micro_dt = {micro_dt}, t_end = {t_end}; give at least one of each, and positive times."
         )
     total = len(num_micro) * len(methods) + 1
-    runs, rows = {}, []
+    runs: list[tuple[str, Program, int, Trajectory]] = []
     for method in methods:
         newton = Newton(method=method)  # pyright: ignore[reportArgumentType]
         for n in num_micro:
-            progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(rows), total)
+            progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
             num_steps = max(1, round(t_end / (n * micro_dt)))
             program = Program(problem, scheme(n), num_steps * n * micro_dt, newton=newton)
-            row = _untimed(label, method, program, num_steps)
-            if row.result in ("CONVERGED", "CONVERGED_AT_ROUNDOFF"):
-                runs[f"{method} {n}"] = program.timed(num_steps)
-            rows.append(row)
+            runs.append((method, program, num_steps, program(num_steps)))
     progress(f"{label} measuring times".strip(), total - 1, total)
-    seconds = interleaved(runs, repeats, min_seconds)
+    calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}
+    seconds = interleaved(calls, repeats, min_seconds)
     progress("done", total, total)
-    return CostStudy(tuple(_timed(row, seconds.get(f"{row.method} {row.num_micro}", ()), micro_dt) for row in rows))
+    return CostStudy(tuple(_row(label, *run, seconds.get(str(i), [np.nan])) for i, run in enumerate(runs)))
 
 
-def _untimed(label: str, method: str, program: Program, num_steps: int) -> CostRow:
-    """The row of a program that has been compiled and run once."""
-    trajectory, scheme, state = program(num_steps), program.scheme, program.state
+def _row(
+    label: str, method: str, program: Program, num_steps: int, trajectory: Trajectory, seconds: Sequence[float]
+) -> CostRow:
+    """The row of a run with the median of its samples."""
+    scheme, state, median = program.scheme, program.state, float(np.median(seconds))
     n_g, n_gs = program.problem.system.num_constraints(state.q_s, state.q_f)
     return CostRow(
         label=label,
@@ -139,15 +140,9 @@ def _untimed(label: str, method: str, program: Program, num_steps: int) -> CostR
         num_micro=scheme.num_micro,
         num_unknowns=scheme.degree * (state.q_s.size + n_gs + scheme.num_micro * (state.q_f.size + n_g)),
         num_steps=num_steps,
-        seconds_per_unit=float("nan"),
-        us_per_micro_step=float("nan"),
+        seconds_per_unit=median / program.t_end,
+        us_per_micro_step=1e6 * median / (num_steps * scheme.num_micro),
         first_call_seconds=program.compile_seconds,
         iterations=int(np.max(trajectory.info.iterations)),
         result=Result(int(trajectory.result)).name,
     )
-
-
-def _timed(row: CostRow, seconds: Sequence[float], micro_dt: float) -> CostRow:
-    """The row with the median of its samples, NaN where it was not timed."""
-    per_micro_step = float(np.median(seconds)) / (row.num_steps * row.num_micro) if seconds else float("nan")
-    return replace(row, seconds_per_unit=per_micro_step / micro_dt, us_per_micro_step=1e6 * per_micro_step)

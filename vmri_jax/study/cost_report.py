@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import EngFormatter
 
 from vmri_jax import diagnostics, plots
+from vmri_jax.mechanics.invariants import potentials
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.study.advisor import MARGIN, Search, Setting
 from vmri_jax.study.families import Family, families
@@ -132,17 +134,17 @@ def cost_report(
             f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions."
         )
     search = Search(problem, t_end, families() if menu is None else menu, reference)
-    answers, report, deadline = [], None, time.monotonic() + BUDGET
+    answers, deadline = [], time.monotonic() + BUDGET
     for i, error in enumerate(sorted(errors, reverse=True)):
         left = deadline - time.monotonic()
         found = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
         answers.append(Answer(error, found[0] if found else None, tuple(found)))
-        report = _write(search, answers, problem, name, out)
+        _write(search, answers, problem, name, out)
     progress("measuring times", 1, 1)
     search.time_again(_shown(answers))
     report = _write(search, answers, problem, name, out)
     progress("done", 1, 1)
-    return report  # pyright: ignore[reportReturnType]
+    return report
 
 
 def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: str, out: Path) -> CostReport:
@@ -209,26 +211,25 @@ def _shares(problem: Problem, setting: Setting | None) -> dict[str, float]:
     """Parts of the time of a run: gradients of V and of W, constraints with their Jacobian, all the rest."""
     if setting is None:
         return {}
-    system, row = problem.system, setting.row
-    n_s = problem.q_s.size
-    terms, n_constraints = {}, sum(system.num_constraints(problem.q_s, problem.q_f))
+    system, row, n_s = problem.system, setting.row, problem.q_s.size
 
-    def whole(function, *arguments):
-        return lambda q: jnp.concatenate(jax.grad(function, argnums=(0, 1))(q[:n_s], q[n_s:], *arguments))
+    def slow(q):
+        return potentials(system, q[:n_s], q[n_s:])[0]
 
+    def fast(q):
+        return potentials(system, q[:n_s], q[n_s:])[1]
+
+    def constraints(q):
+        return system.constraints(problem.t, q[:n_s], q[n_s:])
+
+    terms = {}
     if system.slow_potential is not None:
-        terms["gradient of V"] = whole(system.slow_potential, system.params), row.slow_evaluations
+        terms["gradient of V"] = jax.grad(slow), row.slow_evaluations
     if system.fast_potential is not None:
-        fast = system.fast_potential
-        terms["gradient of W"] = whole(lambda _, q_f, params: fast(q_f, params), system.params), row.fast_evaluations
-    if n_constraints:
-
-        def rows(q):
-            value, pull = jax.vjp(lambda q: system.constraints(problem.t, q[:n_s], q[n_s:]), q)
-            return sum(value) + jax.vmap(pull)(jnp.eye(n_constraints))[0].sum(0)
-
-        evaluations = row.fast_evaluations if row.fast_evaluations else row.slow_evaluations
-        terms["constraints"] = rows, evaluations
+        terms["gradient of W"] = jax.grad(fast), row.fast_evaluations
+    if any(system.num_constraints(problem.q_s, problem.q_f)):
+        evaluations = row.fast_evaluations or row.slow_evaluations
+        terms["constraints"] = lambda q: jax.jacrev(constraints)(q).sum(0) + constraints(q).sum(), evaluations
     q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
     shares = {name: _seconds_each(f, q) * count / row.seconds for name, (f, count) in terms.items()}
     total = sum(shares.values())
@@ -243,7 +244,7 @@ def _seconds_each(function, q, count: int = 2000) -> float:
     def loop(q, nothing):
         return jax.lax.fori_loop(0, count, lambda _, q: q + nothing * function(q), q)
 
-    [seconds] = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005).values()
+    seconds = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005)[""]
     return float(np.median(seconds)) / count
 
 
@@ -251,9 +252,8 @@ def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
     """Time against num_micro of the families that were varied, at each error, one panel per error."""
     answers = [answer for answer in report.answers if answer.all]
     names = list(dict.fromkeys(s.family.name for answer in answers for s in answer.all[: 2 * SHOWN]))
-    colors = {name: theme.curves[i % len(theme.curves)] for i, name in enumerate(names)}
-    with plots.style(theme):
-        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+    colors = dict(zip(names, cycle(theme.curves), strict=False))
+    with plots.new_figure(7.2, 3.2, "", theme) as figure:
         panels = figure.subplots(1, max(1, len(answers)), sharey=True, squeeze=False)[0]
         drawn = {}
         for axes, answer in zip(panels, answers, strict=False):
@@ -264,9 +264,9 @@ def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
                     drawn[name] = axes.loglog(x, y, "o-", color=colors[name], markersize=3.5, linewidth=1.2)[0]
             axes.set(title=f"error {answer.error:.0e}", xlabel="num_micro")
             axes.xaxis.set_major_formatter("{x:g}")
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            plots.log_ticks(axes.yaxis, [s.row.seconds for shown in answers for s in shown.all])
         panels[0].set_ylabel("computing time")
-        panels[0].yaxis.set_major_formatter(lambda x, _: duration(x))
+        panels[0].yaxis.set_major_formatter(EngFormatter("s"))
         if drawn:
             figure.legend(drawn.values(), drawn, loc="outside lower center", ncols=3, frameon=False)
     return figure
@@ -274,13 +274,12 @@ def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
 
 def _draw_shares(report: CostReport, theme: plots.Theme) -> Figure:
     """One bar, cut by what the time is spent on."""
-    with plots.style(theme):
-        figure = plots.NotebookFigure(figsize=(7.2, 1.1))
+    with plots.new_figure(7.2, 1.1, "", theme) as figure:
         axes = figure.subplots()
         left = 0.0
-        for i, (name, share) in enumerate(report.shares.items()):
+        for color, (name, share) in zip(theme.curves, report.shares.items(), strict=False):
             last = name == "everything else"
-            axes.barh([0], [share], left=left, color=theme.faint if last else theme.curves[i % len(theme.curves)])
+            axes.barh([0], [share], left=left, color=theme.faint if last else color)
             if share > 0.06:
                 ink = theme.ink if last else theme.paper
                 axes.text(left + share / 2, 0, f"{name}\n{share:.0%}", ha="center", va="center", fontsize=8, color=ink)

@@ -25,6 +25,14 @@ class Family:
     options: str
     first: int = 5
 
+    def composed(self, coefficients: str) -> "Family":
+        """Compositions of its schemes."""
+
+        def make(num_micro: int) -> Composition:
+            return compose(self.make(num_micro), coefficients)
+
+        return Family(f"{self.name}, {coefficients}", make, f"{self.options} --compose {coefficients}")
+
     def label(self, num_micro: int) -> str:
         """With num_micro."""
         return f"{self.name}, {num_micro} micro"
@@ -38,27 +46,22 @@ class Family:
         return max(1, int(frequency * t_end * longest / (num_micro * scheme.degree)))
 
 
-def _composed(base: Callable[[int], Scheme], coefficients: str, num_micro: int) -> Composition:
-    return compose(base(num_micro), coefficients)
-
-
-BASES = {
-    "fully explicit": fully_explicit,
-    "explicit slow": explicit_slow,
-    "fully implicit": fully_implicit,
-    "takahashi imada": takahashi_imada,
-}
-
-
 def families(
     compositions: tuple[str, ...] = ("suzuki4", "kahan-li6", "kahan-li8"), degrees: tuple[int, ...] = (2, 4, 12)
 ) -> list[Family]:
-    """The schemes of order 2, compositions of the first two of them, and Galerkin schemes."""
-    menu = [Family(name, make, f"--scheme {name.replace(' ', '-')}") for name, make in BASES.items()]
-    for base in menu[:2]:
-        for name in compositions:
-            make = partial(_composed, BASES[base.name], name)
-            menu.append(Family(f"{base.name}, {name}", make, f"{base.options} --compose {name}"))
+    """The schemes of order 2, compositions of the first two of them, and Galerkin schemes.
+
+    Args:
+        compositions: their names, see `vmri_jax.compose`.
+        degrees: of the Galerkin schemes, which have Lobatto quadrature.
+    """
+    bases = [
+        Family("fully explicit", fully_explicit, "--scheme fully-explicit"),
+        Family("explicit slow", explicit_slow, "--scheme explicit-slow"),
+        Family("fully implicit", fully_implicit, "--scheme fully-implicit"),
+        Family("takahashi imada", takahashi_imada, "--scheme takahashi-imada"),
+    ]
+    menu = bases + [base.composed(name) for base in bases[:2] for name in compositions]
     for degree in degrees:
         make = partial(galerkin, degree=degree, rule="lobatto")
         first = 1 if degree > 2 else Family.first  # high degrees resolve the fast variables with a single interval

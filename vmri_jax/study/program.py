@@ -8,6 +8,7 @@ import numpy as np
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.arguments import check_run
 from vmri_jax.running.simulate import Simulation, prepare
+from vmri_jax.running.timing import MIN_SECONDS, interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -68,6 +69,10 @@ class Program:
     def timed(self, num_steps: int):
         """A function without arguments that runs and waits, for a clock; takes the fallback if the run needs it."""
         return self._run.timed(**self._steps(num_steps))
+
+    def seconds(self, num_steps: int, repeats: int, min_seconds: float = MIN_SECONDS) -> list[float]:
+        """So many samples of the time of a run, see `interleaved`."""
+        return interleaved({"": self.timed(num_steps)}, repeats, min_seconds)[""]
 
 
 def joined(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:

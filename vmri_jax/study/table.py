@@ -32,6 +32,11 @@ class ResultTable:
     rows: Any
     columns: ClassVar[tuple[Column, ...]]
 
+    @property
+    def caption(self) -> str:
+        """Printed below the table."""
+        return ""
+
     def shown(self) -> Sequence[Any]:
         """What `table` and `markdown` show, one item per line: the rows, unless a subclass chooses among them."""
         return self.rows
@@ -50,7 +55,10 @@ class ResultTable:
 
     def table(self) -> Table:
         """A table for the terminal and for notebooks."""
-        return rich_table(self.columns, self.shown())
+        return rich_table(self.columns, self.shown(), self.caption)
+
+    def __rich__(self) -> Table:
+        return self.table()
 
     def markdown(self) -> str:
         """The same table in Markdown."""

@@ -1,7 +1,7 @@
 """Work and precision: what an error costs in time and in evaluations, run by run, and the best of all runs."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,11 @@ class WorkRow:
     iterations: int
     method: str
     result: str
+
+    def timed(self, seconds: Sequence[float]) -> "WorkRow":
+        """The same with the median and the quartiles of these samples."""
+        low, middle, high = (float(x) for x in np.quantile(seconds, (0.25, 0.5, 0.75)))
+        return replace(self, seconds=middle, low=low, high=high)
 
 
 def duration(seconds: float) -> str:
@@ -120,8 +125,8 @@ class WorkPrecision(ResultTable):
         return plots.plot_work_precision(self, title, work)
 
 
-def work_row(label: str, program: Program, num_steps: int, reference: ReferenceSolution, seconds=(np.nan,)) -> WorkRow:
-    """Run the program once more and say what it gave and cost."""
+def work_row(label: str, program: Program, num_steps: int, reference: ReferenceSolution) -> WorkRow:
+    """Run the program and say what it gave and cost; not timed."""
     trajectory, scheme = program(num_steps), program.scheme
     error_q, error_p = reference.errors(trajectory)
     cost, passes = scheme.describe(), np.maximum(np.asarray(trajectory.info.iterations), 1)
@@ -131,7 +136,6 @@ def work_row(label: str, program: Program, num_steps: int, reference: ReferenceS
         constrained = max(program.problem.system.num_constraints(program.problem.q_s, program.problem.q_f)) > 0
         solves = num_steps * (cost.constrained_solves if constrained else cost.solves)
     evaluations = num_steps * float(passes.mean())
-    low, middle, high = (float(x) for x in np.quantile(seconds, (0.25, 0.5, 0.75)))
     return WorkRow(
         scheme=label,
         num_micro=scheme.num_micro,
@@ -140,9 +144,9 @@ def work_row(label: str, program: Program, num_steps: int, reference: ReferenceS
         macro_dt=program.t_end / num_steps,
         error_q=error_q,
         error_p=error_p,
-        seconds=middle,
-        low=low,
-        high=high,
+        seconds=np.nan,
+        low=np.nan,
+        high=np.nan,
         compile_seconds=program.compile_seconds,
         slow_evaluations=round(evaluations * cost.slow_evaluations),
         fast_evaluations=round(evaluations * cost.fast_evaluations),
@@ -192,7 +196,7 @@ def work_precision(
     if reference is None:
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
     frequency = float(diagnostics.frequencies(problem.system, problem.state())[0])
-    runs, rows = {}, []
+    runs: list[tuple[Program, WorkRow]] = []
     for i, (label, scheme) in enumerate(schemes.items()):
         program = Program(problem, scheme, t_end, num_saves, newton)
         coarsest = num_saves * max(1, int(frequency * t_end / scheme.num_micro / scheme.degree / num_saves))
@@ -200,18 +204,22 @@ def work_precision(
         while ladder:
             n = ladder.pop(0)
             progress(f"{label}, {n} steps", i, len(schemes) + 1)
-            [seconds] = interleaved({"": program.timed(n)}, 1, 0.0).values()
-            seen.append(work_row(label, program, n, reference, seconds))
-            runs[label, n] = program, seen[-1]
+            seconds = program.seconds(n, 1, 0.0)
+            seen.append(work_row(label, program, n, reference).timed(seconds))
+            runs.append((program, seen[-1]))
             if num_steps is None and _goes_on(seen, reference):
                 ladder = [2 * n]
     progress("measuring times", len(schemes), len(schemes) + 1)
-    fine = {key: program.timed(key[1]) for key, (program, row) in runs.items() if np.isfinite(row.error_q)}
-    timed = interleaved(fine, repeats)  # pyright: ignore[reportArgumentType]
-    for key, (program, row) in runs.items():
-        rows.append(work_row(key[0], program, key[1], reference, timed[key]) if key in timed else row)
+    rows = timed_in_turn(runs, repeats)
     progress("done", 1, 1)
     return WorkPrecision(tuple(rows), t_end, reference)
+
+
+def timed_in_turn(runs: Sequence[tuple[Program, WorkRow]], repeats: int) -> list[WorkRow]:
+    """The rows, those that did not fail with the times of runs that took turns."""
+    calls = {str(i): program.timed(row.num_steps) for i, (program, row) in enumerate(runs) if np.isfinite(row.error_q)}
+    samples = interleaved(calls, repeats)
+    return [row.timed(samples[str(i)]) if str(i) in samples else row for i, (_, row) in enumerate(runs)]
 
 
 def _goes_on(rows: Sequence[WorkRow], reference: ReferenceSolution) -> bool:
