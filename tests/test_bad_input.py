@@ -188,8 +188,14 @@ def numpy_potential(q_f, params):
         ({"slow_potential": whole_potential}, "slow_potential returns int64; it must return float64"),
         ({"fast_potential": complex_potential}, "fast_potential returns complex128; it must return float64"),
         ({"constraint": single_constraint}, "constraint returns float32; it must return float64"),
-        ({"fast_potential": branching_potential}, "fast_potential cannot be traced, line .* of test_bad_input.py .*jnp.where"),
-        ({"fast_potential": numpy_potential}, "fast_potential cannot be traced, line .* of test_bad_input.py .*instead of numpy and math"),
+        (
+            {"fast_potential": branching_potential},
+            "fast_potential cannot be traced, line .* of test_bad_input.py .*jnp.where",
+        ),
+        (
+            {"fast_potential": numpy_potential},
+            "fast_potential cannot be traced, line .* of test_bad_input.py .*instead of numpy and math",
+        ),
         ({"fast_potential": lambda q_f: 0.0}, "fast_potential could not be evaluated .*positional argument"),
         ({"slow_potential": lambda q_s, q_f, params: None}, "slow_potential returns NoneType; it must return a scalar"),
         ({"slow_potential": vector_potential}, r"slow_potential returns shape \(3,\); it must return a scalar"),
@@ -331,3 +337,18 @@ def test_only_rules_are_placed():
 def test_bad_number_of_springs():
     with pytest.raises(ValueError, match="num_springs is 0; there must be at least 1"):
         systems.fermi_pasta_ulam(num_springs=0)
+
+
+def test_parameters_that_are_not_finite(fpu):
+    system = fpu.system.replace(params={"omega": np.nan})
+    with pytest.raises(ValueError, match=r"System: params\['omega'\] is nan, which is not finite"):
+        initial_state(system, fpu.q_s, fpu.q_f, fpu.v_s, fpu.v_f)
+
+
+def test_results_that_do_not_fit_into_memory(fpu):
+    message = r"100000000000 saved nodes would take 1.5\de\+04 GB, and .* GB of memory are free. Save fewer .*stream"
+    with pytest.raises(ValueError, match=message):
+        simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=10**11)
+    states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
+    with pytest.raises(ValueError, match="simulate_batch: 100000000000 saved nodes of 2 runs would take 3"):
+        simulate_batch(fpu.system, fully_implicit(2), states, macro_dt=0.1, num_steps=10**11)

@@ -35,4 +35,5 @@ scene = Scene(
         RigidLink([("2", "4"), ("2", "5"), ("3", "6")], LENGTH),
         Anchor("1", [0.0, 0.0, 0.0], LENGTH),
     ],
+    project=True,  # velocities onto the bonds
 )

@@ -66,4 +66,5 @@ scene = Scene(
         *on_right,
         LinearDamping(1.0, ["left valve", "right valve"]),
     ],
+    project=True,  # the tappets move with the cams from the start
 )

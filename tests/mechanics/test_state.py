@@ -59,7 +59,7 @@ def test_momenta_are_projected_onto_the_hidden_constraints(name, request):
     problem = request.getfixturevalue(name)
     rng = np.random.default_rng(1)
     v_s, v_f = rng.normal(size=problem.q_s.shape), rng.normal(size=problem.q_f.shape)
-    state = initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f)
+    state = initial_state(problem.system, problem.q_s, problem.q_f, v_s, v_f, project=True)
     assert float(constraint_residual(problem.system, state)[1]) < 1e-12  # measured 1.5e-13
     raw = legendre(problem.system, problem.q_s, problem.q_f, v_s, v_f)
     residual = constraint_residual(problem.system, State(0.0, problem.q_s, problem.q_f, *raw))
@@ -73,6 +73,34 @@ def test_momenta_are_projected_onto_the_hidden_constraints(name, request):
     assert np.abs(jacobian.T @ mu - correction).max() < 1e-12
     again = project_momentum(problem.system, state)
     assert largest_difference(again[0], state.p_s) < 1e-12
+
+
+def test_velocities_against_a_constraint_are_said_or_refused():
+    def constraint(q_s, q_f, params):
+        return jnp.array([q_f @ q_f - 1.0]) / 2
+
+    def start(radial: float, **options):
+        return initial_state(pendulum, [], [1.0, 0.0], [], [radial, 1.0], **options)
+
+    pendulum = System(ConstantMass(jnp.zeros(0), jnp.ones(2)), constraint=constraint)
+    with pytest.raises(ValueError, match=r"44.72% of the velocities .* Correct the velocities, or pass project=True"):
+        start(0.5)  # 0.5 / sqrt(1.25)
+    with pytest.warns(UserWarning, match=r"0.10% of the velocities"):
+        assert np.allclose(start(1e-3).p_f, [0.0, 1.0], atol=1e-15)
+    for quiet in (start(1e-8), start(0.5, project=True)):
+        assert np.allclose(quiet.p_f, [0.0, 1.0], atol=1e-15)
+
+
+def test_a_kinetic_energy_without_mass_is_refused_at_the_start():
+    def kinetic(q_s, q_f, v_s, v_f, params):
+        return 0.5 * jnp.sum(v_s**2) + 0.5 * v_f[0] ** 2
+
+    def quartic(q_s, q_f, v_s, v_f, params):
+        return 0.5 * jnp.sum(v_s**2) + jnp.sum(v_f**4)
+
+    with pytest.raises(ValueError, match=r"not positive definite at these positions, along q_f\[1\]"):
+        initial_state(System(kinetic), [0.0], [1.0, 2.0], [1.0], [0.0, 0.0])
+    assert np.allclose(initial_state(System(quartic), [0.0], [1.0], [1.0], [0.5]).p_f, [0.5], atol=1e-15)
 
 
 def test_inconsistent_positions_are_refused_with_the_violation(tsp):

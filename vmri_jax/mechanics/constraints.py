@@ -94,7 +94,9 @@ def check_mass(system: System, q_s, q_f) -> None:
         return
     mass = np.asarray(_mass_matrix(system, q_s, q_f, *_nearby(np.zeros_like(q_s), np.zeros_like(q_f))))
     if not np.isfinite(mass).all():
-        raise ValueError("System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?).")
+        raise ValueError(
+            "System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?)."
+        )
     values, vectors = np.linalg.eigh(mass)
     without = np.abs(vectors[:, values <= REGULAR * np.abs(values).max()]).max(axis=1, initial=0.0) > TAKES_PART
     if without.any():

@@ -45,6 +45,8 @@ class Scene:
         bodies: `Body` instances; slow ones become q_s and fast ones q_f, in this order.
         effects: of `vmri_jax.scene`, also custom ones: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
             summed and constraints joined in this order.
+        project: move positions onto the constraints at the start, and take away what of the velocities points against them,
+            instead of refusing them.
 
     Raises:
         TypeError: something else among them.
@@ -53,6 +55,7 @@ class Scene:
 
     bodies: Any
     effects: Any = ()
+    project: bool = False
 
     def __post_init__(self):
         require_x64()
@@ -115,15 +118,11 @@ class Scene:
     def problem(self) -> Problem:
         """The system with positions and velocities at the start, and with the drawing unless its numbers are traced."""
         seen = is_concrete((self.params, [body.radius for body in self.bodies]))
-        return Problem(self.system(), *self.start, drawing=self.drawing() if seen else None)
+        return Problem(self.system(), *self.start, drawing=self.drawing() if seen else None, project=self.project)
 
-    def state(self, project: bool = False) -> State:
-        """The consistent initial state.
-
-        Args:
-            project: as of `initial_state`.
-        """
-        return initial_state(self.system(), *self.start, project=project)
+    def state(self) -> State:
+        """The consistent initial state, see `initial_state`."""
+        return initial_state(self.system(), *self.start, project=self.project)
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.
@@ -135,7 +134,7 @@ class Scene:
             ValueError: a name that no effect has.
         """
         found = self._named("without", names)
-        return Scene(self.bodies, [effect for effect in self.effects if effect not in found])
+        return replace(self, effects=[effect for effect in self.effects if effect not in found])
 
     def only(self, *names: str) -> "Scene":
         """The scene with these effects and no other.
@@ -146,7 +145,7 @@ class Scene:
         Raises:
             ValueError: a name that no effect has.
         """
-        return Scene(self.bodies, self._named("only", names))
+        return replace(self, effects=self._named("only", names))
 
     def replace(self, name: str, **changes) -> "Scene":
         """The scene with a body or an effect changed, ``scene.replace("springs", stiffness=2.0)``.
@@ -167,7 +166,7 @@ class Scene:
                 raise ValueError(f"Scene.replace: {name}: {unknown('argument', key, fields)}")
         items[name] = replace(items[name], **changes)
         changed = list(items.values())
-        return Scene(changed[: len(self.bodies)], changed[len(self.bodies) :])
+        return replace(self, bodies=changed[: len(self.bodies)], effects=changed[len(self.bodies) :])
 
     def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
         """What every body and effect adds to a macro step of a scheme: where it lives, unknowns, evaluations, and its cost.
