@@ -25,7 +25,7 @@ class Engine:
 
     Attributes:
         structure: of the pytree (newton, scheme, system).
-        num_saves: saved intervals of a run.
+        num_saves: saved intervals that there is room for.
         save_micro: whether micro nodes are saved.
         falls_back: whether a step that the first method does not solve goes to the fallback of `newton`, which takes long to
             compile.
@@ -38,7 +38,10 @@ class Engine:
 
     @cached_property
     def whole(self):
-        """``whole(leaves, state, macro_dt, save_every)``: a run from its first step, as the arrays of its `Trajectory`."""
+        """``whole(leaves, state, macro_dt, save_every, saves)``: a run from its first step, as the arrays of its `Trajectory`.
+
+        Only the first `saves` of the saved intervals are computed, so that one program does for many lengths.
+        """
         return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)))
 
     @cached_property
@@ -63,19 +66,19 @@ class Engine:
 
         return jax.jit(onwards)
 
-    def trajectory(self, leaves, state, macro_dt, save_every) -> Trajectory:
-        """A run from its first step, not compiled."""
+    def trajectory(self, leaves, state, macro_dt, save_every, saves=None) -> Trajectory:
+        """A run from its first step, not compiled; of all saved intervals, or of the first `saves` of them."""
         start = State(*state)
         stepper = self._stepper(leaves, start)
         own = stepper.init(start, macro_dt)
-        return self._run(stepper, start, own, start.t, macro_dt, 0, save_every)[0]
+        return self._run(stepper, start, own, start.t, macro_dt, 0, save_every, saves)[0]
 
     def _stepper(self, leaves, state: State) -> Plan:
         newton, scheme, system = jax.tree.unflatten(self.structure, leaves)
         return plan(system, scheme, state, newton, fallback=self.falls_back)
 
-    def _run(self, stepper: Plan, state: State, own, t_start, macro_dt, step, save_every):
-        """`num_saves * save_every` macro steps from step number `step`."""
+    def _run(self, stepper: Plan, state: State, own, t_start, macro_dt, step, save_every, saves=None):
+        """`num_saves * save_every` macro steps from step number `step`, or `saves * save_every` of them."""
         system, tolerance, num_micro = stepper.system, stepper.newton.tolerance, stepper.scheme.num_micro
         no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
         no_micro = jnp.zeros((num_micro, state.q_f.shape[0])) if self.save_micro else None
@@ -88,13 +91,15 @@ class Engine:
                 at = at._replace(state=state, own=own)
             return at, worst, micro
 
-        def save(at: _At, is_start):  # one place for the first node and all others: compiled once
-            at, worst, micro = jax.lax.cond(is_start, lambda at: (at, no_info, no_micro), interval, at)
+        def save(at: _At, moves):  # one place for the first node and all others: compiled once
+            at, worst, micro = jax.lax.cond(moves, interval, lambda at: (at, no_info, no_micro), at)
             node, at = _node(system, tolerance, at)
             return at, (node, worst, micro)
 
         at = _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
-        at, (nodes, *between) = jax.lax.scan(save, at, np.arange(self.num_saves + 1) == 0)
+        number = np.arange(self.num_saves + 1)
+        moves = number > 0 if saves is None else (number > 0) & (number <= saves)
+        at, (nodes, *between) = jax.lax.scan(save, at, moves)
         worst, micro = jax.tree.map(lambda a: a[1:], between)
         t_micro = None if micro is None else nodes[0][1:, None] - macro_dt * (1 - stepper.scheme.micro_times)
         status = {"result": at.result, "failed_at": at.failed_at}

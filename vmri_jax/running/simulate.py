@@ -44,8 +44,8 @@ def simulate(
 ) -> Trajectory:
     """Simulate `num_steps` macro steps and save every `save_every`-th macro node.
 
-    Compiled once per system structure, scheme structure and number of saved nodes: step sizes, parameters, rule
-    weights, initial states and `save_every` may vary without compiling again. Works under ``jax.vmap`` over state,
+    Compiled once per system structure and scheme structure, and for every eighth or so of the number of saved nodes: step sizes,
+    parameters, rule weights, initial states and `save_every` may vary without compiling again. Works under ``jax.vmap`` over state,
     params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised.
     Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "nested".
 
@@ -75,7 +75,7 @@ def simulate(
     if not run.is_concrete:
         return run.traced()
     run.check()
-    check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
+    check_memory("simulate", run.state, scheme.num_micro, run.room, save_micro)
     trajectory = run.in_parts() if progress else run()
     if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
         check_constraints(system, state, "simulate: the state")
@@ -116,8 +116,8 @@ def prepare(
     run.check()
     check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
     leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
-    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start)
-    jax.block_until_ready(run.engine.whole(leaves, run.start_arrays, macro_dt, 0))  # no steps: it only compiles
+    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start, room=run.num_saves)
+    jax.block_until_ready(run._program(False)(leaves, run.start_arrays, macro_dt, 0, 0))  # no steps: it only compiles
     return run
 
 
@@ -145,6 +145,7 @@ class Simulation:
     Attributes:
         system, scheme, newton, state, num_steps, save_every, save_micro: as of `simulate`.
         macro_dt: an array of shape ().
+        room: saved intervals that the program has room for.
     """
 
     system: System
@@ -155,6 +156,7 @@ class Simulation:
     num_steps: int
     save_every: int
     save_micro: bool
+    room: int
     leaves: list = field(repr=False)
     structure: Any = field(repr=False)
 
@@ -167,18 +169,18 @@ class Simulation:
             throw: raise `SimulationError` if a step fails; else the status is in the trajectory.
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
-        trajectory = from_arrays(self.engine.whole(*arguments))
+        trajectory = from_arrays(self._program(False)(*arguments), self.num_saves)
         if int(trajectory.failed_at) < 0:
             return trajectory
         if self._fallback_helps(trajectory):
-            trajectory = from_arrays(self.exact_engine.whole(*arguments))
+            trajectory = from_arrays(self._program(True)(*arguments), self.num_saves)
         if throw and int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, arguments[2], arguments[3])
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
         """The program of the run without the fallback, to look into."""
-        return self.engine.whole.lower(*self._arguments(None, None, None, None)).compile()
+        return self._program(False).lower(*self._arguments(None, None, None, None)).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that makes such a run and waits for it, for a clock.
@@ -187,8 +189,7 @@ class Simulation:
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
         arguments = jax.device_put(arguments[:3]) + arguments[3:]
-        helps = self._fallback_helps(from_arrays(self.engine.whole(*arguments)))
-        program = self.exact_engine.whole if helps else self.engine.whole
+        program = self._program(self._fallback_helps(from_arrays(self._program(False)(*arguments))))
         program(*arguments)
         return lambda: program(*arguments)[0].block_until_ready()  # the arrays of one program are ready together
 
@@ -208,7 +209,8 @@ class Simulation:
             if num_steps < 1 or num_steps % self.num_saves:
                 raise ValueError(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
             save_every = num_steps // self.num_saves
-        return leaves, start, self.macro_dt if macro_dt is None else np.asarray(macro_dt, dtype=float), save_every
+        macro_dt = self.macro_dt if macro_dt is None else np.asarray(macro_dt, dtype=float)
+        return leaves, start, macro_dt, save_every, self.num_saves
 
     def _leaves_with(self, params) -> list:
         own, structure = jax.tree.flatten(self.system.params)
@@ -216,6 +218,10 @@ class Simulation:
         if structure_given != structure or list(map(np.shape, given)) != list(map(np.shape, own)):
             raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
         return self.leaves[: len(self.leaves) - len(own)] + [np.asarray(leaf) for leaf in given]
+
+    def _program(self, falls_back: bool):
+        """The compiled run, see `Engine.whole`."""
+        return self.engine_for(falls_back, self.room).whole
 
     @property
     def num_saves(self) -> int:
@@ -304,9 +310,16 @@ def simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, sav
     newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
     leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))
+    room = room_for(num_steps // save_every)
     return Simulation(
-        system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, leaves, structure
+        system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, room, leaves, structure
     )
+
+
+def room_for(saves: int) -> int:
+    """The next number with at most four leading binary digits, so that many lengths of runs share few programs."""
+    unit = 2 ** max(saves.bit_length() - 4, 0)
+    return -(-saves // unit) * unit
 
 
 def _arrays(state: State) -> tuple:

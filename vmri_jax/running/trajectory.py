@@ -174,9 +174,16 @@ def from_named_arrays(arrays: dict) -> Trajectory:
     return Trajectory(**arrays, info=info)
 
 
-def from_arrays(arrays: list) -> Trajectory:
-    """The trajectory with these leaves."""
-    return jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
+def from_arrays(arrays: list, saves: int | None = None) -> Trajectory:
+    """The trajectory with these leaves, or the first `saves` saved intervals of it."""
+    whole = jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
+    if saves is None or len(whole.t) == saves + 1:
+        return whole
+
+    def first(name: str, value):
+        return value if value is None or name in STATUS else jnp.asarray(np.asarray(value)[: saves + (name in NODES)])
+
+    return from_named_arrays({name: first(name, value) for name, value in named_arrays(whole).items()})
 
 
 _STRUCTURES = {
