@@ -4,6 +4,7 @@ from importlib.metadata import version
 
 from vmri_jax import diagnostics
 from vmri_jax.configure import NotConfiguredWarning, configure
+from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.running.batch import simulate_batch
@@ -35,6 +36,7 @@ from vmri_jax import systems  # isort: skip  (written with the names above)
 __version__ = version("vmri_jax")
 
 __all__ = [
+    "CompiledAgainWarning",
     "Composition",
     "ConstantMass",
     "Interrupted",

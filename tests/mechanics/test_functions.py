@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from vmri_jax import ConstantMass, Rheonomic, System, explicit_slow, fully_implicit, simulate
+from vmri_jax import CompiledAgainWarning, ConstantMass, Rheonomic, System, explicit_slow, fully_implicit, simulate
 from vmri_jax.mechanics.functions import TracedOnce, traced_once
 
 
@@ -25,6 +25,13 @@ def test_the_code_of_a_function_runs_once(name, request):
     for scheme in (fully_implicit(2), explicit_slow(3)):
         simulate(system, scheme, state, macro_dt=0.01, num_steps=2)
     assert sorted(calls) == sorted(name for name in names if getattr(system, name))
+
+
+def test_functions_made_in_a_loop_are_told_once():
+    with pytest.warns(CompiledAgainWarning, match=r"<lambda> \(line \d+ of .*test_functions.py\) has been made 5 times") as told:
+        for stiffness in range(8):
+            TracedOnce(lambda x, stiffness=stiffness: stiffness * x)(1.0)
+    assert len(told) == 1
 
 
 def soft(q_s, q_f, params):

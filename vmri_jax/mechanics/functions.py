@@ -1,10 +1,15 @@
 """The user's functions: Python code that runs once for all programs that they are part of."""
 
 import dataclasses
+import warnings
+from collections import Counter
 from collections.abc import Callable
 from functools import lru_cache
 
 import jax
+
+AGAIN = 5
+"""So many functions of one piece of code, each compiled anew, are worth a warning."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +29,33 @@ class TracedOnce:
         return repr(self.function)
 
 
+class CompiledAgainWarning(UserWarning):
+    """The same function is made anew again and again, and everything that contains it is compiled each time."""
+
+
 @lru_cache(maxsize=1024)
 def _traced(function: Callable) -> Callable:
+    _count(function)
     return jax.jit(function, inline=True)
+
+
+def _count(function: Callable) -> None:
+    """Warn, once for each piece of code, that functions are made of it again and again."""
+    code = getattr(function, "__code__", None)
+    if code is None:
+        return
+    _made[code] += 1
+    if _made[code] == AGAIN:
+        warnings.warn(
+            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been made {AGAIN} times, and "
+            "everything that contains it was compiled as often, since functions are compared by identity. Define it once, outside of "
+            "the loop, and hand over what varies as params.",
+            CompiledAgainWarning,
+            stacklevel=2,
+        )
+
+
+_made: Counter = Counter()
 
 
 def traced_once(function: Callable) -> TracedOnce:
