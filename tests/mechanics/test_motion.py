@@ -1,0 +1,71 @@
+"""Accelerations, multipliers and reaction forces of the continuous equations, against formulas and runs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.user_systems import double_pendulum
+from vmri_jax import ConstantMass, Rheonomic, State, System, fully_implicit, galerkin, initial_state, simulate
+from vmri_jax.mechanics.invariants import energy
+from vmri_jax.mechanics.motion import motion, powers, reaction_forces
+
+GRAVITY, MASS, LENGTH = 9.81, 2.0, 1.5
+
+
+def weight(q_f, params):
+    return MASS * GRAVITY * q_f[1]
+
+
+def rod(q_s, q_f, params):
+    return jnp.array([q_f @ q_f - LENGTH**2]) / 2
+
+
+def swinging(t, q_s, q_f, params):
+    pivot = jnp.stack([0.2 * jnp.sin(3 * t), jnp.zeros_like(t)])
+    return jnp.array([jnp.sum((q_f - pivot) ** 2) - LENGTH**2]) / 2
+
+
+def drag(t, q_s, q_f, v_s, v_f, params):
+    return jnp.zeros(0), -0.3 * v_f
+
+
+def test_a_pendulum_by_the_formula():
+    system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), fast_potential=weight, constraint=rod)
+    state = initial_state(system, [], LENGTH * np.array([0.6, -0.8]), [], np.array([0.8, 0.6]))
+    found = motion(system, state)
+    tension = MASS * (1.0 + GRAVITY * 0.8 * LENGTH) / LENGTH**2  # m (v^2 - g y) / L^2
+    assert float(found.multiplier[0]) == pytest.approx(tension, rel=1e-13)
+    pull = reaction_forces(system, state, found.multiplier, found.slow_multiplier)[1]
+    assert np.allclose(pull, -tension * state.q_f, rtol=1e-13)
+    assert np.allclose(found.a_f, pull / MASS - np.array([0.0, GRAVITY]), rtol=1e-13)
+
+
+@pytest.mark.parametrize("make", [double_pendulum, None], ids=["mass that depends on the positions", "driven and damped"])
+def test_accelerations_are_those_of_runs(make):
+    if make is None:
+        system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), None, weight, Rheonomic(swinging), force=drag)
+        state = initial_state(system, [], [LENGTH, 0.0], [], [0.0, 0.0], project=True)
+    else:
+        problem = make()
+        system, state = problem.system, problem.state()
+    h = 1e-3
+    run = simulate(system, galerkin(1, 4), state, macro_dt=h, num_steps=2)
+    middle = State(*(a[1] for a in (run.t, run.q_s, run.q_f, run.p_s, run.p_f)))
+    found = motion(system, middle)
+    for q, a in ((run.q_s, found.a_s), (run.q_f, found.a_f)):
+        assert np.allclose((q[2] - 2 * q[1] + q[0]) / h**2, a, rtol=1e-4, atol=1e-4)  # measured 2e-5, of the difference itself
+
+
+def test_powers_are_the_rate_of_energy():
+    system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), None, weight, Rheonomic(swinging), force=drag)
+    state = initial_state(system, [], [LENGTH, 0.0], [], [0.0, 1.0], project=True)
+    run = simulate(system, fully_implicit(1), state, macro_dt=1e-3, num_steps=1000)
+    states = State(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
+    rates = np.asarray(jax.vmap(lambda s: powers(system, s))(states))
+    work = 1e-3 * (np.cumsum(rates, axis=0) - (rates + rates[0]) / 2)
+    change = run.energy - run.energy[0]
+    assert np.abs(change).max() > 1.0
+    assert np.abs(work).max(axis=0).min() > 0.1  # forces and constraints both take part
+    assert np.allclose(change, work.sum(axis=1), atol=2e-5 * np.abs(change).max())
+    assert float(energy(system, *(a[-1] for a in (run.q_s, run.q_f, run.p_s, run.p_f)))) == pytest.approx(float(run.energy[-1]))

@@ -1,0 +1,104 @@
+"""The continuous equations of motion at one state: accelerations, and the multipliers of the constraints.
+
+    d/dt dT/dv = dL/dq + F - G^T lambda      d2/dt2 g(t, q) = 0
+
+With the mass matrix ``M = d2T/dv2`` these are linear in the accelerations a and the multipliers,
+
+    [M, G^T; G, 0] (a, lambda) = (dL/dq + F - (dp/dq) v,  -gamma)
+
+where gamma is the second derivative of g in time without acceleration.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+
+
+class Motion(NamedTuple):
+    """How a state moves on.
+
+    v_s, v_f: velocities.
+    a_s, a_f: accelerations.
+    multiplier, slow_multiplier: (n_g,), (n_gs,) lambda of `constraint` and of `slow_constraint`.
+    """
+
+    v_s: Any
+    v_f: Any
+    a_s: Any
+    a_f: Any
+    multiplier: Any
+    slow_multiplier: Any
+
+
+def motion(system: System, state: State) -> Motion:
+    """Velocities, accelerations and multipliers of a state; of dependent constraints the multipliers of least norm.
+
+    Args:
+        system: masses, potentials, constraints and forces.
+        state: time, positions and momenta.
+    """
+    n_s = state.q_s.size
+    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    q, v = jnp.append(state.q_s, state.q_f), jnp.append(v_s, v_f)
+
+    def lagrangian(q, v):
+        q_s, q_f = q[:n_s], q[n_s:]
+        value = system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params)
+        if system.slow_potential is not None:
+            value -= system.slow_potential(q_s, q_f, system.params)
+        if system.fast_potential is not None:
+            value -= system.fast_potential(q_f, system.params)
+        return value
+
+    def constraints(t, q):
+        return system.constraints(t, q[:n_s], q[n_s:])
+
+    def rates(t, q):
+        """``dg/dt`` along the velocities."""
+        return jax.jvp(constraints, (t, q), (jnp.ones_like(t), v))[1]
+
+    t = jnp.asarray(state.t)
+    momentum = jax.grad(lagrangian, argnums=1)
+    mass = jax.jacfwd(momentum, argnums=1)(q, v)
+    forces = jax.grad(lagrangian)(q, v) - jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
+    if system.force is not None:
+        forces += jnp.append(*system.forces(t, state.q_s, state.q_f, v_s, v_f))
+    jacobian = jax.jacrev(constraints, argnums=1)(t, q)
+    gamma = jax.jvp(rates, (t, q), (jnp.ones_like(t), v))[1]
+
+    free, responses = jnp.linalg.solve(mass, forces), jnp.linalg.solve(mass, jacobian.T)
+    multiplier = jnp.linalg.lstsq(jacobian @ responses, jacobian @ free + gamma)[0]
+    a = free - responses @ multiplier
+    n_g = system.num_constraints(state.q_s, state.q_f)[0]
+    return Motion(v_s, v_f, a[:n_s], a[n_s:], multiplier[:n_g], multiplier[n_g:])
+
+
+def reaction_forces(system: System, state: State, multiplier, slow_multiplier):
+    """Forces ``-G^T lambda`` (n_s,), (n_f,) of the constraints for given multipliers.
+
+    Args:
+        system: its constraints.
+        state: where they are held.
+        multiplier, slow_multiplier: (n_g,), (n_gs,).
+    """
+    constraints = jax.vjp(lambda q_s, q_f: system.constraints(state.t, q_s, q_f), state.q_s, state.q_f)[1]
+    return jax.tree.map(jnp.negative, constraints(jnp.append(multiplier, slow_multiplier)))
+
+
+def powers(system: System, state: State):
+    """Power (2,) of the forces, ``F . v``, and of constraints that depend on time, ``lambda . dg/dt``: what changes the energy."""
+    moving = motion(system, state)
+    of_forces = of_constraints = jnp.zeros(())
+    if system.force is not None:
+        f_s, f_f = system.forces(state.t, state.q_s, state.q_f, moving.v_s, moving.v_f)
+        of_forces = jnp.sum(f_s * moving.v_s) + jnp.sum(f_f * moving.v_f)
+    if system.is_rheonomic:
+        at_rest = jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f)
+        own = system.constraint_rates(state.t, state.q_s, state.q_f, *at_rest)
+        of_constraints = jnp.sum(jnp.append(moving.multiplier, moving.slow_multiplier) * own)
+    return jnp.stack([of_forces, of_constraints])
