@@ -3,6 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
+
+Numbers = jax.Array | np.ndarray
+"""Arrays in annotations: ``Float[Numbers, "n_s"]`` are so many floats, in an array of JAX or of NumPy."""
+Number = Float[Numbers, ""] | float
+"""A number in annotations, of Python or as an array."""
 
 ADVICE = "give float64: lists of numbers, NumPy arrays by .astype(float), JAX arrays made after vm.configure()"
 """What to do about numbers of less than 64 bits."""

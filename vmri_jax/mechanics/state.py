@@ -6,8 +6,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import is_concrete, of_one_type, require_x64
+from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, require_x64
 from vmri_jax.mechanics.checks import (
     check_arrays,
     check_flags,
@@ -24,16 +25,18 @@ from vmri_jax.mechanics.system import System
 
 
 class State(eqx.Module):
-    """Time, slow and fast positions (n_s,), (n_f,) and their conjugate momenta."""
+    """Time, positions of the slow and of the fast variables, and their conjugate momenta."""
 
-    t: Any
-    q_s: Any
-    q_f: Any
-    p_s: Any
-    p_f: Any
+    t: Number
+    q_s: Float[Numbers, "n_s"]
+    q_f: Float[Numbers, "n_f"]
+    p_s: Float[Numbers, "n_s"]
+    p_f: Float[Numbers, "n_f"]
 
 
-def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = False, tolerance=1e-9) -> State:
+def initial_state(
+    system: System, q_s, q_f, v_s, v_f, t: Number = 0.0, *, project: bool = False, tolerance=1e-9
+) -> State:
     """Consistent state from positions and velocities: ``p = dT/dv``, projected onto the hidden constraints.
 
     Args:
@@ -74,7 +77,7 @@ def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = 
 
 @dataclass(frozen=True)
 class Problem:
-    """A system with initial positions and velocities, (n_s,), (n_f,), which are kept as arrays.
+    """A system with initial positions and velocities, which are kept as arrays.
 
     drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
 
@@ -83,11 +86,11 @@ class Problem:
     """
 
     system: System
-    q_s: Any
-    q_f: Any
-    v_s: Any
-    v_f: Any
-    t: Any = 0.0
+    q_s: Float[Numbers, "n_s"] | list[float]
+    q_f: Float[Numbers, "n_f"] | list[float]
+    v_s: Float[Numbers, "n_s"] | list[float]
+    v_f: Float[Numbers, "n_f"] | list[float]
+    t: Number = 0.0
     drawing: Any = None
 
     def __post_init__(self):

@@ -17,9 +17,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from numpy.polynomial import legendre
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
 
 NODE_TOLERANCE = 1e-12
 """Nodes closer than this are the same node."""
@@ -37,7 +38,7 @@ class Rule(eqx.Module):
     """
 
     nodes: tuple[float, ...] = eqx.field(static=True)
-    weights: Any
+    weights: Float[Numbers, "nodes"]
     __array_ufunc__ = None  # so that numpy scalars leave `alpha * rule` to __rmul__
 
     def __init__(self, nodes, weights):

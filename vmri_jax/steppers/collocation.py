@@ -17,11 +17,12 @@ potentials are curved along. Forces are exact, so that all of this decides only 
 
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import inverse, matmul, max_abs, regularized
 from vmri_jax.mechanics.structure import curved_directions
@@ -143,14 +144,14 @@ class CollocatedInterval:
 class Forces(NamedTuple):
     """What increments and multipliers make of a step.
 
-    inside (n, r): forces at the nodes 0..r-1, times h, at node 0 with the momentum that arrives.
-    last (n,): forces at the end of the step, times h.
-    g (n_c, r): constraints at the nodes 1..r.
+    inside: forces at the nodes 0..r-1, times h, at node 0 with the momentum that arrives.
+    last: forces at the end of the step, times h.
+    g: constraints at the nodes 1..r.
     """
 
-    inside: Any
-    last: Any
-    g: Any
+    inside: Float[Array, "n r"]
+    last: Float[Array, "n"]
+    g: Float[Array, "n_c r"]
 
 
 class Saddles(NamedTuple):
@@ -160,25 +161,25 @@ class Saddles(NamedTuple):
     that only d rows, and those of the constraints, are solved for each mode.
 
     modes: as which everything below but `push` and `pull` is.
-    gamma (2, k): eigenvalues, for every part of a mode.
-    push: L and G (d + n_c, n), of the variables.
-    pull: ``Q = M^-1 L^T w`` and ``M^-1 G^T`` (n, d + n_c), with ``w = h^2 W''``.
-    bend: ``L Q`` (d, d).
-    denominator (d, d, k): inverses of ``|1 - gamma L Q|^2``.
-    push_bend: ``G Q`` (n_c, d).
-    pull_bend two of (d, n_c, k): ``(1 - gamma L Q)^-1 L M^-1 G^T``.
-    schur two of (n_c, n_c, k): inverse of G times x for every multiplier.
+    gamma: eigenvalues, for every part of a mode.
+    push: L and G, of the variables.
+    pull: ``Q = M^-1 L^T w`` and ``M^-1 G^T``, with ``w = h^2 W''``.
+    bend: ``L Q``.
+    denominator: inverses of ``|1 - gamma L Q|^2``.
+    push_bend: ``G Q``.
+    pull_bend: real and imaginary part of ``(1 - gamma L Q)^-1 L M^-1 G^T``.
+    schur: of the inverse of G times x for every multiplier.
     """
 
     modes: TimeModes
-    gamma: Any
-    push: Any
-    pull: Any
-    bend: Any
-    denominator: Any
-    push_bend: Any
-    pull_bend: Any
-    schur: Any
+    gamma: Float[np.ndarray, "2 k"]
+    push: Float[Array, "d+n_c n"]
+    pull: Float[Array, "n d+n_c"]
+    bend: Float[Array, "d d"]
+    denominator: Float[Array, "d d k"]
+    push_bend: Float[Array, "n_c d"]
+    pull_bend: list[Float[Array, "d n_c k"]]
+    schur: list[Float[Array, "n_c n_c k"]]
 
     @classmethod
     def at(cls, interval: CollocatedInterval, modes: TimeModes, t, q) -> "Saddles":
@@ -233,13 +234,13 @@ class Saddles(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """Increments x (n, r), multipliers mu (n_c, r), their largest corrections, how many there were, and what the last one tells."""
+    """Increments x, multipliers mu, largest corrections (slow, fast), how many there were, and what the last one tells."""
 
-    x: Any
-    mu: Any
-    moved: Any
-    iterations: Any
-    result: Any
+    x: Float[Array, "n r"]
+    mu: Float[Array, "n_c r"]
+    moved: tuple[Float[Array, ""], ...]
+    iterations: Int[Array, ""]
+    result: Int[Array, ""]
 
 
 class Evaluated(NamedTuple):
@@ -247,7 +248,7 @@ class Evaluated(NamedTuple):
 
     last: Increments
     forces: Forces
-    result: Any
+    result: Int[Array, ""]
 
 
 def at_nodes(function):

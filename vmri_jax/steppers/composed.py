@@ -5,7 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
@@ -21,11 +23,11 @@ class ComposedState(NamedTuple):
 class Composed(Stepper):
     """``Psi_H = Phi_{c_s H} o ... o Phi_{c_1 H}``.
 
-    coefficients: (s,) parts c_i of the macro step.
+    coefficients: parts c_i of the macro step.
     stage: the stepper Phi.
     """
 
-    coefficients: Any
+    coefficients: Float[Numbers, "s"]
     stage: Stepper
 
     def init(self, state: State, macro_dt) -> ComposedState:

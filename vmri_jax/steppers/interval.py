@@ -6,13 +6,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from vmri_jax.kernels import inverse, matvec, max_abs, regularized, solve
+from vmri_jax.mechanics.arrays import Number
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
-from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
 from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
@@ -30,9 +32,9 @@ class Accepted(NamedTuple):
     slow, fast: round-off.
     """
 
-    tolerance: Any
-    slow: Any
-    fast: Any
+    tolerance: Number
+    slow: Float[Array, ""]
+    fast: Float[Array, ""]
 
     @classmethod
     def of(cls, equations: StepEquations, newton) -> "Accepted":
@@ -83,11 +85,12 @@ def implicit_terms(system: System, scheme: Scheme) -> list[Term]:
 class DiagonalMatrix(NamedTuple):
     """K of a micro interval for every coordinate alone.
 
-    inverse: (r, r, n_f) of the rows of slots 0..r-1. last: (r, n_f) the row of slot r, which is the momentum handed on.
+    inverse: of the rows of slots 0..r-1.
+    last: the row of slot r, which is the momentum handed on.
     """
 
-    inverse: Any
-    last: Any
+    inverse: Float[Array, "r r n_f"]
+    last: Float[Array, "r n_f"]
 
     def solve(self, rows):
         """The increments (r, n_f) for given rows (r, n_f)."""
@@ -99,10 +102,10 @@ class DiagonalMatrix(NamedTuple):
 
 
 class FullMatrix(NamedTuple):
-    """K of a micro interval: inverse (r n_f, r n_f) and last (n_f, r n_f), as in `DiagonalMatrix`."""
+    """K of a micro interval, as in `DiagonalMatrix` with the increments in a row."""
 
-    inverse: Any
-    last: Any
+    inverse: Float[Array, "r*n_f r*n_f"]
+    last: Float[Array, "n_f r*n_f"]
 
     def solve(self, rows):
         """The increments (r, n_f) for given rows (r, n_f)."""
@@ -161,7 +164,7 @@ class Interval:
         local = StepEquations(system, scheme, equations.t, *start, equations.micro_dt)
         velocities = constant_mass(system).velocity(equations.p_s, equations.p_f)
         slow, fast = (local.macro_dt * control_nodes(scheme.degree)[1:, None] * v for v in velocities)
-        path = local.path(Unknowns(slow, None, fast[None], None))
+        path = local.path_of(slow, fast[None])
         return _diagonal_matrix(local, path) if self.is_diagonal else _full_matrix(local, path)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import DiagonalMatrix, FullMatrix, Interval
 from vmri_jax.steppers.results import Method
@@ -30,7 +30,7 @@ class Linear(Stepper):
     ) -> tuple[State, StepInfo, DiagonalMatrix | FullMatrix]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         h, rest = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
-        path = equations.path(Unknowns(jnp.zeros((self.scheme.degree, 0)), None, rest[None], None))
+        path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), rest[None])
         d = jax.grad(equations.without_kinetic)(path, path)
         rows = jnp.concatenate([d.fast_start - d.fast[0].sum(0) + h * state.p_f, d.fast[0, :-1]])
         increments = -own.solve(rows)

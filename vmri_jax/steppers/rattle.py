@@ -6,10 +6,11 @@ after this is RATTLE (Andersen 1983).
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import inverse, matvec, max_abs, regularized
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
@@ -25,25 +26,25 @@ LEAST = 0.1
 class RattleState(NamedTuple):
     """What a step hands to the next one.
 
-    multiplier: (2, n_g + n_gs) multipliers of the last steps, the last one first.
+    multiplier: of all constraints in the last two steps, the last one first.
     before: length of the last step, 0 where the momenta have been projected since. Otherwise its half of the constraint force at
         the node between the two steps is left to the next one.
     """
 
-    multiplier: Any
-    before: Any
+    multiplier: Float[Array, "2 n_g+n_gs"]
+    before: Float[Array, ""]
 
 
 class Correction(NamedTuple):
-    """Increments x (n_s + n_f,), scaled multipliers mu, constraint values g there, and the corrections that g asks for."""
+    """Increments x of all variables, scaled multipliers mu, constraint values g there, and the corrections that g asks for."""
 
-    x: Any
-    mu: Any
-    g: Any
-    dx: Any
-    dmu: Any
-    iterations: Any
-    result: Any
+    x: Float[Array, "n_s+n_f"]
+    mu: Float[Array, "n_g+n_gs"]
+    g: Float[Array, "n_g+n_gs"]
+    dx: Float[Array, "n_s+n_f"]
+    dmu: Float[Array, "n_g+n_gs"]
+    iterations: Int[Array, ""]
+    result: Int[Array, ""]
 
 
 @dataclass(frozen=True)
