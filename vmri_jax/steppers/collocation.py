@@ -36,7 +36,7 @@ from vmri_jax.steppers.solved import Solution, Solver, status_of
 from vmri_jax.steppers.time_modes import TimeModes, product, taken, times_i
 
 
-class CollocatedInterval:
+class JoinedEquations:
     """The equations of the step, with the variables joined, q = (q_s, q_f), and nodes as the last axis.
 
     num_curved: how many variables, the last ones, the Hessian is taken by: the fast ones where there are any.
@@ -182,10 +182,10 @@ class Saddles(NamedTuple):
     schur: list[Float[Array, "n_c n_c k"]]
 
     @classmethod
-    def at(cls, interval: CollocatedInterval, modes: TimeModes, t, q) -> "Saddles":
+    def at(cls, joined: JoinedEquations, modes: TimeModes, t, q) -> "Saddles":
         """With Hessian and Jacobian at a point."""
-        along, jacobian = interval.directions, interval.jacobian(t, q)
-        bend, pull = interval.over_mass(interval.h**2 * interval.curvature(q)), interval.over_mass(jacobian.T)
+        along, jacobian = joined.directions, joined.jacobian(t, q)
+        bend, pull = joined.over_mass(joined.h**2 * joined.curvature(q)), joined.over_mass(jacobian.T)
         k, d, n_c = modes.gamma.shape[1], len(along), len(jacobian)
         re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
 
@@ -273,11 +273,11 @@ class Collocation(Solver):
 
     def solve(self, equations: StepEquations, guess: Unknowns, own: tuple) -> tuple[Solution, tuple]:
         newton = self.newton
-        interval, modes = CollocatedInterval(equations), TimeModes.of(equations.scheme)
-        n_s, (n_g, _) = interval.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
+        joined, modes = JoinedEquations(equations), TimeModes.of(equations.scheme)
+        n_s, (n_g, _) = joined.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
         x = jnp.concatenate([guess.slow, guess.fast[0]], axis=1).T
         mu = jnp.concatenate([guess.multiplier[0], guess.slow_multiplier], axis=1).T
-        saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
+        saddles = Saddles.at(joined, modes, equations.t + joined.h / 2, joined.q + x[:, -1] / 2)
         accepted = Accepted.of(equations, newton)
 
         def slow_and_fast(x):
@@ -285,7 +285,7 @@ class Collocation(Solver):
 
         def corrected(last: Increments, forces: Forces) -> Increments:
             missing = last.x + matmul(
-                interval.over_mass(forces.inside), modes.of_rows
+                joined.over_mass(forces.inside), modes.of_rows
             )  # what these forces do not bring about
             dx, dmu = saddles.solve(-missing, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
@@ -297,15 +297,15 @@ class Collocation(Solver):
         def step(at: Evaluated) -> Evaluated:
             """Forces first: evaluated in one place, they are compiled once."""
             last, fixed = at.last, newton.fixed_iterations
-            forces = interval.forces(last.x, last.mu)
+            forces = joined.forces(last.x, last.mu)
             goes_on = last.result == RUNNING if fixed is None else last.iterations < fixed
             return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
 
-        running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(interval.q), jnp.zeros_like(mu))
+        running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(joined.q), jnp.zeros_like(mu))
         start = Increments(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
         last, forces, _ = newton.iterate(step, Evaluated(start, none, running), -1)  # forces once more than corrections
 
-        p, rows = interval.momentum(last.x, forces), interval.residual(last.x, forces)
+        p, rows = joined.momentum(last.x, forces), joined.residual(last.x, forces)
         x, mu = last.x.T, last.mu.T
         unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
         end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
