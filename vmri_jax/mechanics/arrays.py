@@ -55,6 +55,10 @@ def check_precision(name: str, value) -> None:
 def real_array(name: str, value, ndim: int | None = None):
     """Numbers as users give them as an array of float64, of JAX if they are, else of NumPy.
 
+    Args:
+        name: what they are called in messages.
+        ndim: how many dimensions they must have, None for any.
+
     Raises:
         TypeError: what is not real.
         ValueError: floats of less than 64 bits, or another number of dimensions.

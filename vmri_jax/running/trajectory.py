@@ -68,6 +68,7 @@ class Trajectory(eqx.Module):
 
     @property
     def success(self):
+        """Whether no step failed (of every run, in a batch)."""
         return self.result <= Result.CONVERGED_AT_ROUNDOFF
 
     @property

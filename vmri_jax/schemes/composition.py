@@ -144,7 +144,7 @@ class Composition(eqx.Module):
         return _order(np.asarray(self.coefficients), self.scheme.order, self.scheme.is_symmetric)
 
     def describe(self) -> Description:
-        """Order, symmetry, evaluations and solves per macro step; prints as a table."""
+        """As of a `Scheme`; the rules are those of a stage."""
         return self.scheme.describe().repeated(self.num_stages, self.order, self.is_symmetric)
 
 

@@ -244,7 +244,7 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
 def discrete_legendre(system: System, scheme: Scheme) -> Callable:
     """Discrete Legendre transforms ``(slow, fast, macro_dt) -> ((p_s, p_f) at the start, (p_s, p_f) at the end)``.
 
-    ``p = -D_first L_d`` and ``p+ = D_last L_d`` (without constraint forces).
+    ``p = -D_first L_d`` and ``p+ = D_last L_d`` (without constraint forces). Arguments as of `discrete_lagrangian`.
     """
     slots = jax.grad(discrete_lagrangian(system, scheme), argnums=(0, 1))
 

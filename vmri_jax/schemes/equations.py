@@ -44,7 +44,10 @@ class Unknowns(NamedTuple):
 
 
 class StepEquations(eqx.Module):
-    """The nonlinear equations of one macro step from given positions and (kicked) momenta."""
+    """The nonlinear equations of one macro step from given positions and (kicked) momenta.
+
+    The methods take x, the `Unknowns`; `path`, which is varied, and `at`, the same path held fixed where forces are evaluated.
+    """
 
     system: System
     scheme: Scheme
@@ -62,10 +65,12 @@ class StepEquations(eqx.Module):
 
     @property
     def micro_dt(self):
+        """Length h of a micro interval."""
         return self.macro_dt / self.scheme.num_micro
 
     @property
     def force_nodes(self) -> Nodes:
+        """Where forces are evaluated."""
         return velocity_nodes(self.scheme.force, self.scheme.num_micro, self.scheme.degree)
 
     def path(self, x: Unknowns) -> Path:

@@ -79,10 +79,12 @@ class Path(eqx.Module):
 
     @property
     def degree(self) -> int:
+        """Polynomial degree r."""
         return self.slow.shape[0]
 
     @property
     def num_micro(self) -> int:
+        """Micro intervals."""
         return self.fast.shape[0]
 
     def control_points(self):
@@ -118,6 +120,7 @@ class NodeGroup:
 
     @property
     def size(self) -> int:
+        """Number of nodes."""
         return self.stop - self.first
 
 
@@ -135,6 +138,7 @@ class Nodes:
 
     @cached_property
     def weights(self):
+        """Of all nodes, group after group."""
         return jnp.concatenate([jnp.asarray(g.weights) for g in self.groups])
 
     def theta(self, group: NodeGroup) -> np.ndarray:

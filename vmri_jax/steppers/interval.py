@@ -38,6 +38,7 @@ class Accepted(NamedTuple):
 
     @classmethod
     def of(cls, equations: StepEquations, newton) -> "Accepted":
+        """For a step from its positions."""
         floors = (ROUNDOFF * jnp.finfo(float).eps * max_abs(q) for q in (equations.q_s, equations.q_f))
         return cls(newton.tolerance / SAFETY, *floors)
 

@@ -27,10 +27,11 @@ class Pairs(NamedTuple):
 
     @classmethod
     def none(cls, n: int, size: int = SIZE) -> "Pairs":
+        """Nothing learned of n unknowns yet."""
         return cls(jnp.zeros((size, n)), jnp.zeros((size, n)))
 
     def add(self, move, change, noise, measured: int) -> "Pairs":
-        """With one more pair, unless its change is below the noise."""
+        """With one more pair (n,), (n,), unless its change is below the noise."""
         length = jnp.sqrt(jnp.sum(change[:measured] ** 2))
         scale = 1 / jnp.where(length > noise, length, 1.0)
         new = Pairs(

@@ -54,6 +54,7 @@ class SlowEquations(NamedTuple):
 
     @classmethod
     def of(cls, equations: StepEquations) -> "SlowEquations":
+        """With the inverse of the masses."""
         kinetic = lagrangian(equations.system, equations.scheme).kinetic
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
         return cls(equations, kinetic, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)

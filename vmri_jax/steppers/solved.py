@@ -156,9 +156,13 @@ class Fallback(Solver):
 
 
 def status_of(equations: StepEquations, result, method, iterations, rows, g, tolerance) -> Status:
-    """How a solver ended, from the largest row of the momentum equations times h and the largest constraint value.
+    """How a solver ended. Increments that converged with constraints that are not kept mean rows that contradict each other.
 
-    Increments that converged with constraints that are not kept mean rows that contradict each other.
+    Args:
+        result, method, iterations: as in `StepInfo`.
+        rows: largest row of the momentum equations, times h.
+        g: largest constraint value.
+        tolerance: of Newton; constraints may miss zero by more where it is loose.
     """
     if equations.system.is_constrained:
         violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)

@@ -62,7 +62,8 @@ class Status(NamedTuple):
 class Stepper(ABC):
     """Takes macro steps: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)`` again and again.
 
-    `own` is what a stepper carries from step to step, a NamedTuple that its file documents.
+    Arguments of its methods are the `State` at the start of a step, `own`, which is what a stepper carries from step to step, a
+    NamedTuple that its file documents, and the length of the step.
     """
 
     def init(self, state: State, macro_dt) -> Any:
