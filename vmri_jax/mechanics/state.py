@@ -9,18 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, require_x64
-from vmri_jax.mechanics.checks import (
-    check_arrays,
-    check_flags,
-    check_number,
-    check_params,
-    check_system,
-    check_type,
-)
-from vmri_jax.mechanics.constraints import check_constraints as check_constraints
-from vmri_jax.mechanics.constraints import project_positions
-from vmri_jax.mechanics.projection import legendre as legendre
-from vmri_jax.mechanics.projection import project_momentum as project_momentum
+from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
+from vmri_jax.mechanics.constraints import check_constraints, project_positions
+from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.system import System
 
 

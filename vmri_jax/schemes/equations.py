@@ -83,14 +83,10 @@ class StepEquations(eqx.Module):
 
     def action(self, path: Path, at: Path, x: Unknowns):
         """Augmented action times h; forces act on the virtual displacement of `path`, evaluated along `at`."""
-        return self.unconstrained(path, at) - self.constraint_work(path, x)
-
-    def unconstrained(self, path: Path, at: Path):
-        """The action times h without constraints."""
-        return self._action(lagrangian(self.system, self.scheme), path, at)
+        return self._action(lagrangian(self.system, self.scheme), path, at) - self.constraint_work(path, x)
 
     def without_kinetic(self, path: Path, at: Path):
-        """The same without the kinetic energy of constant masses."""
+        """The same without constraints and without the kinetic energy of constant masses."""
         return self._action(lagrangian(self.system, self.scheme).potentials, path, at)
 
     def _action(self, terms: Sum, path: Path, at: Path):

@@ -284,15 +284,13 @@ class Collocation(Solver):
             return max_abs(x[:n_s]), max_abs(x[n_s:])
 
         def corrected(last: Increments, forces: Forces) -> Increments:
-            missing = last.x + matmul(
-                joined.over_mass(forces.inside), modes.of_rows
-            )  # what these forces do not bring about
+            moves = matmul(joined.over_mass(forces.inside), modes.of_rows)
+            missing = last.x + moves  # what these forces do not bring about
             dx, dmu = saddles.solve(-missing, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
             left = map(expected, moved, last.moved)
-            return Increments(
-                x, mu, moved, iterations, newton.status(accepted.over(left, slow_and_fast(x)), iterations)
-            )
+            result = newton.status(accepted.over(left, slow_and_fast(x)), iterations)
+            return Increments(x, mu, moved, iterations, result)
 
         def step(at: Evaluated) -> Evaluated:
             """Forces first: evaluated in one place, they are compiled once."""
@@ -309,15 +307,8 @@ class Collocation(Solver):
         x, mu = last.x.T, last.mu.T
         unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
         end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
-        status = status_of(
-            equations,
-            last.result,
-            Method.COLLOCATION,
-            last.iterations,
-            max_abs(rows),
-            max_abs(forces.g),
-            newton.tolerance,
-        )
+        left = max_abs(rows), max_abs(forces.g)
+        status = status_of(equations, last.result, Method.COLLOCATION, last.iterations, *left, newton.tolerance)
         return Solution(unknowns, end, status), own
 
     def lines(self) -> list[str]:

@@ -72,9 +72,6 @@ class Projected(Stepper):
         state, own = self.inner.project(state, own)
         return state, info, own
 
-    def project(self, state: State, own) -> tuple[State, Any]:
-        return state, own
-
     def continued(self, own, last, state: State, macro_dt):
         return self.inner.continued(own, last, state, macro_dt)
 

@@ -54,6 +54,11 @@ class Accepted(NamedTuple):
         return jnp.maximum(*(c / size for c, size in zip(changes, self.sizes(motions), strict=True)))
 
 
+def along(weights, increments):
+    """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
+    return jnp.sum(weights[..., None] * increments, axis=-2)
+
+
 def expected(moved, before):
     """The next correction, with a margin, after this one and the one before."""
     return jnp.minimum(SAFETY * moved / (before + jnp.finfo(float).tiny), 1.0) * moved
@@ -117,6 +122,9 @@ class FullMatrix(NamedTuple):
         return matvec(self.last, increments.reshape(-1))
 
 
+Matrix = DiagonalMatrix | FullMatrix
+
+
 @dataclass(frozen=True)
 class Interval:
     """What one micro interval is like, decided from structure.
@@ -151,14 +159,14 @@ class Interval:
         is_explicit = scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
         return cls(is_explicit, is_diagonal, is_constant)
 
-    def no_matrix(self, equations: StepEquations) -> DiagonalMatrix | FullMatrix:
+    def no_matrix(self, equations: StepEquations) -> Matrix:
         """The shapes of K, all zero."""
         r, n_f = equations.scheme.degree, equations.q_f.shape[0]
         if self.is_diagonal:
             return DiagonalMatrix(jnp.zeros((r, r, n_f)), jnp.zeros((r, n_f)))
         return FullMatrix(jnp.zeros((r * n_f, r * n_f)), jnp.zeros((n_f, r * n_f)))
 
-    def matrix(self, equations: StepEquations) -> DiagonalMatrix | FullMatrix:
+    def matrix(self, equations: StepEquations) -> Matrix:
         """K on the first micro interval of a macro step, on the straight path from its start."""
         system, scheme = interval_problem(equations.system, equations.scheme)
         start = equations.q_s, equations.q_f, equations.p_s, equations.p_f
@@ -208,16 +216,14 @@ def solve_saddle(solve_k, jacobian, push, rows, g):
         solve_k: K^-1, (r, n) rows to (r, n) increments.
         jacobian: (r, n_g, n) G_0, at the control nodes 0..r-1, where the multipliers act.
         push: G_1 as a function, changes (r, n) of the control points 1..r to changes (r, n_g) of the constraints.
-        rows, g: (r, n), or None if they are zero, and (r, n_g).
+        rows, g: (r, n) and (r, n_g).
     """
     r, n_g = g.shape
-    dx = jnp.zeros((r, jacobian.shape[-1])) if rows is None else -solve_k(rows)
+    dx = -solve_k(rows)
     if n_g == 0:
         return dx, g
     columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
     response = jax.vmap(solve_k)(columns.reshape(r * n_g, r, -1))
     schur = regularized(jax.vmap(push)(response).reshape(r * n_g, r * n_g))
-    if rows is not None:
-        g = g + push(dx)
-    dmu = -solve(schur.T, g.reshape(r * n_g, 1))
+    dmu = -solve(schur.T, (g + push(dx)).reshape(r * n_g, 1))
     return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)

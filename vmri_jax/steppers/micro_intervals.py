@@ -12,7 +12,7 @@ from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import DiagonalMatrix, FullMatrix, constant_mass, interval_problem
+from vmri_jax.steppers.interval import Matrix, along, constant_mass, interval_problem
 from vmri_jax.steppers.predictors import LinearPredictor
 
 
@@ -70,7 +70,7 @@ class March(NamedTuple):
 
     equations: StepEquations
     is_explicit: bool
-    matrix: DiagonalMatrix | FullMatrix
+    matrix: Matrix
     scale: Float[Numbers, "num_micro r 1"]
 
     def first_pass(self, slow, lines: Lines) -> tuple[Fast, Left]:
@@ -216,8 +216,3 @@ def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_
         moved=max_abs(dx),
         schur=schur,
     )
-
-
-def along(weights, increments):
-    """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
-    return jnp.sum(weights[..., None] * increments, axis=-2)

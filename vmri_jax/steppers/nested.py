@@ -27,15 +27,8 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import (
-    Accepted,
-    DiagonalMatrix,
-    FullMatrix,
-    Interval,
-    constant_mass,
-    expected,
-)
-from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March, along
+from vmri_jax.steppers.interval import Accepted, Interval, Matrix, along, constant_mass, expected
+from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor
 from vmri_jax.steppers.results import Method
@@ -65,7 +58,7 @@ class NestedState(NamedTuple):
     passes: fewest of a step with this matrix (UNKNOWN before one), and those of the last step.
     """
 
-    matrix: DiagonalMatrix | FullMatrix
+    matrix: Matrix
     slow: PolynomialPredictor
     lines: Lines
     missed: Pairs | Float[Array, ""]

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import inverse, matvec, max_abs, regularized
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
-from vmri_jax.steppers.interval import Accepted, constant_mass
+from vmri_jax.steppers.interval import Accepted, along, constant_mass
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
@@ -74,7 +74,7 @@ class Rattle(Solver):
         straight = h * velocity_s(equations.p_s), h * velocity_f(equations.p_f)
         scale = self._scale(equations, own)
         mu = scale * (2 * own.multiplier[0] - own.multiplier[1])
-        x = jnp.concatenate(straight) - _combined(mu, columns)
+        x = jnp.concatenate(straight) - along(mu, columns)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
         schur = inverse(regularized(jax.vmap(push)(columns).T))
         accepted = Accepted.of(equations, newton).sizes(tuple(map(max_abs, straight)))
@@ -82,7 +82,7 @@ class Rattle(Solver):
 
         def at(x, mu, g, iterations) -> Correction:
             dmu = matvec(schur, g)
-            dx = _combined(dmu, columns)
+            dx = along(dmu, columns)
             change = jnp.maximum(per_slow * max_abs(dx[:n_s]), per_fast * max_abs(dx[n_s:]))
             return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
 
@@ -93,7 +93,7 @@ class Rattle(Solver):
         first = corrected(at(x, mu, g, 0))  # nearly all steps take one: outside of the loop it is cheaper
         done = newton.iterate(corrected, first, done=1)
 
-        impulse = _combined(done.mu, jacobian) / h
+        impulse = along(done.mu, jacobian) / h
         end = equations.q_f + done.x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
         status = status_of(
             equations, done.result, Method.RATTLE, done.iterations, 0.0, max_abs(done.g), newton.tolerance
@@ -120,8 +120,3 @@ class Rattle(Solver):
 
     def lines(self) -> list[str]:
         return ["drift along the constraints (RATTLE): Newton's iteration on the multipliers"]
-
-
-def _combined(mu, rows):
-    """``sum_j mu_j rows_j``."""
-    return jnp.sum(mu[:, None] * rows, axis=0)
