@@ -9,7 +9,7 @@ from tests.support import largest_difference
 from tests.user_systems import arms_kinetic, bent_system, double_pendulum
 from vmri_jax import ConstantMass, Problem, State, System, fully_implicit, initial_state, simulate
 from vmri_jax.diagnostics import constraint_residual, velocity
-from vmri_jax.mechanics.state import legendre, project_momentum
+from vmri_jax.mechanics.projection import legendre, project_momentum
 
 
 def test_momenta_are_mass_times_velocity(fpu):

@@ -3,6 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
+
+Numbers = jax.Array | np.ndarray
+"""Arrays in annotations: ``Float[Numbers, "n_s"]`` are so many floats, in an array of JAX or of NumPy."""
+Number = Float[Numbers, ""] | float
+"""A number in annotations, of Python or as an array."""
 
 ADVICE = "give float64: lists of numbers, NumPy arrays by .astype(float), JAX arrays made after vm.configure()"
 """What to do about numbers of less than 64 bits."""
@@ -48,6 +54,10 @@ def check_precision(name: str, value) -> None:
 
 def real_array(name: str, value, ndim: int | None = None):
     """Numbers as users give them as an array of float64, of JAX if they are, else of NumPy.
+
+    Args:
+        name: what they are called in messages.
+        ndim: how many dimensions they must have, None for any.
 
     Raises:
         TypeError: what is not real.

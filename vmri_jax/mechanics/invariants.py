@@ -38,7 +38,12 @@ def energy(system: System, q_s, q_f, p_s, p_f):
 
 
 def oscillatory_energies(omega, q_f, p_f):
-    """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of unit-mass harmonic oscillators, e.g. the stiff FPU springs."""
+    """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of unit-mass harmonic oscillators, e.g. the stiff FPU springs.
+
+    Args:
+        omega: frequency, of all or of each.
+        q_f, p_f: positions and momenta of the oscillators.
+    """
     return (p_f**2 + omega**2 * q_f**2) / 2
 
 
@@ -83,7 +88,7 @@ def momentum_map(generator, q_s, q_f, p_s, p_f):
 
 
 def rotation_about(axis):
-    """Generator of rotations of points in R^3 about an axis through the origin, ``xi(q) = axis x q``."""
+    """Generator of rotations of points in R^3 about an axis (3,) through the origin, ``xi(q) = axis x q``."""
     axis = jnp.asarray(axis, dtype=float)
 
     def generator(q_s, q_f):
@@ -93,7 +98,7 @@ def rotation_about(axis):
 
 
 def translation_along(direction):
-    """Generator of translations of points in R^3, ``xi(q) = direction`` for every point."""
+    """Generator of translations of points in R^3, ``xi(q) = direction`` (3,) for every point."""
     direction = jnp.asarray(direction, dtype=float)
 
     def generator(q_s, q_f):

@@ -1,23 +1,22 @@
 """Masses: a matrix that multiplies velocities, kept as its diagonal where nothing else is in it."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from vmri_jax import kernels
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
 
 
 class Diagonal(eqx.Module):
     """A mass for each coordinate.
 
     Args:
-        masses: (n,) positive.
+        masses: positive.
     """
 
-    masses: Any
+    masses: Float[Numbers, "n"]
 
     @property
     def size(self) -> int:
@@ -46,10 +45,10 @@ class Dense(eqx.Module):
     """A mass matrix.
 
     Args:
-        matrix: (n, n) symmetric positive definite.
+        matrix: symmetric positive definite.
     """
 
-    matrix: Any
+    matrix: Float[Numbers, "n n"]
 
     @property
     def size(self) -> int:
@@ -100,8 +99,8 @@ class ConstantMass(eqx.Module):
         ValueError: a mass that is not positive, a matrix that is not symmetric positive definite, arrays of float32.
     """
 
-    slow: Any
-    fast: Any
+    slow: Float[Numbers, "n_s"] | Float[Numbers, "n_s n_s"]
+    fast: Float[Numbers, "n_f"] | Float[Numbers, "n_f n_f"]
 
     def __init__(self, slow, fast):
         self.slow, self.fast = mass_array("slow", slow), mass_array("fast", fast)

@@ -8,20 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import is_concrete, of_one_type, require_x64
-from vmri_jax.mechanics.checks import (
-    check_arrays,
-    check_flags,
-    check_number,
-    check_params,
-    check_system,
-    check_type,
-)
-from vmri_jax.mechanics.constraints import check_constraints as check_constraints
-from vmri_jax.mechanics.constraints import check_mass, project_positions
-from vmri_jax.mechanics.projection import legendre as legendre
-from vmri_jax.mechanics.projection import project_momentum as project_momentum
+from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, require_x64
+from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
+from vmri_jax.mechanics.constraints import check_constraints, check_mass, project_positions
+from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.system import System
 
 NOTICED, REFUSED = 1e-6, 1e-2
@@ -29,16 +21,18 @@ NOTICED, REFUSED = 1e-6, 1e-2
 
 
 class State(eqx.Module):
-    """Time, slow and fast positions (n_s,), (n_f,) and their conjugate momenta."""
+    """Time, positions of the slow and of the fast variables, and their conjugate momenta."""
 
-    t: Any
-    q_s: Any
-    q_f: Any
-    p_s: Any
-    p_f: Any
+    t: Number
+    q_s: Float[Numbers, "n_s"]
+    q_f: Float[Numbers, "n_f"]
+    p_s: Float[Numbers, "n_s"]
+    p_f: Float[Numbers, "n_f"]
 
 
-def initial_state(system: System, q_s, q_f, v_s, v_f, t=0.0, *, project: bool = False, tolerance=1e-9) -> State:
+def initial_state(
+    system: System, q_s, q_f, v_s, v_f, t: Number = 0.0, *, project: bool = False, tolerance=1e-9
+) -> State:
     """Consistent state from positions and velocities: ``p = dT/dv``, projected onto the hidden constraints.
 
     Args:
@@ -99,7 +93,7 @@ def _tell_of_velocities(taken: float) -> None:
 
 @dataclass(frozen=True)
 class Problem:
-    """A system with initial positions and velocities, (n_s,), (n_f,), which are kept as arrays.
+    """A system with initial positions and velocities, which are kept as arrays.
 
     drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
     project: whether `state` projects positions and velocities onto the constraints, see `initial_state`.
@@ -109,11 +103,11 @@ class Problem:
     """
 
     system: System
-    q_s: Any
-    q_f: Any
-    v_s: Any
-    v_f: Any
-    t: Any = 0.0
+    q_s: Float[Numbers, "n_s"] | list[float]
+    q_f: Float[Numbers, "n_f"] | list[float]
+    v_s: Float[Numbers, "n_s"] | list[float]
+    v_f: Float[Numbers, "n_f"] | list[float]
+    t: Number = 0.0
     drawing: Any = None
     project: bool = False
 

@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from vmri_jax.mechanics import invariants
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -116,9 +118,9 @@ class _At(NamedTuple):
 
     state: State
     own: Any
-    step: Any
-    result: Any
-    failed_at: Any
+    step: Int[Numbers, ""]
+    result: Int[Numbers, ""]
+    failed_at: Int[Numbers, ""]
 
 
 def _step_of(stepper: Plan, t_start, macro_dt, save_micro: bool):
@@ -156,4 +158,4 @@ def _node(system: System, tolerance, at: _At):
     result = jnp.where(breaks, cause, at.result)
     failed_at = jnp.where(breaks, jnp.maximum(at.step - 1, 0), at.failed_at)
     values = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))
-    return (state.t, *values), at._replace(result=result, failed_at=failed_at)
+    return (jnp.asarray(state.t), *values), at._replace(result=result, failed_at=failed_at)

@@ -185,7 +185,7 @@ class Simulation:
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that makes such a run and waits for it, for a clock.
 
-        It takes the fallback if the run needs it.
+        It takes the fallback if the run needs it. Arguments as of a call.
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
         arguments = jax.device_put(arguments[:3]) + arguments[3:]
@@ -269,7 +269,7 @@ class Simulation:
         return traced_run(self)
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
-        """Before the first step, or before any as if it was the first one."""
+        """Before the first step; or from a state before step number `step`, as if that was the first one."""
         start = self.start_arrays if state is None else _arrays(state)
         memory = self.engine_for(fell_back, 1).start(self.leaves, start, self.macro_dt)
         return Checkpoint(step, State(*start), memory, fell_back)

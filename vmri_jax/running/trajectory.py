@@ -3,13 +3,15 @@
 import dataclasses
 import json
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.files import replaced
@@ -24,7 +26,7 @@ MICRO = ("t_micro", "q_f_micro")
 
 
 class RunInfo(NamedTuple):
-    """What the solver did from one saved node to the next, each (k - 1,).
+    """What the solver did from one saved node to the next.
 
     Attributes:
         method: code of the most expensive method that a step took, see `Method`.
@@ -32,41 +34,41 @@ class RunInfo(NamedTuple):
         residual: largest residual that a step left, relative to the momentum, and of the constraints.
     """
 
-    method: Any
-    iterations: Any
-    residual: Any
+    method: Int[Numbers, "k-1"]
+    iterations: Int[Numbers, "k-1"]
+    residual: Float[Numbers, "k-1"]
 
 
 class Trajectory(eqx.Module):
-    """Trajectory at the saved macro nodes; every leading axis is the saved node, the first one the start.
+    """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has an axis of lanes before.
 
     Attributes:
-        t: (k,) times.
-        q_s, q_f, p_s, p_f: (k, n) positions and momenta; NaN after a failure.
-        energy: (k,) Hamiltonian.
-        constraint_residual: (k, 2) largest |g| and largest |G v|.
-        info: `RunInfo`, what the solver did since the node before.
-        t_micro, q_f_micro: (k - 1, num_micro) and (k - 1, num_micro, n_f), the micro nodes of the macro step that ends
-            at each saved node (its start excluded); None unless asked for.
+        q_s, q_f, p_s, p_f: positions and momenta; NaN after a failure.
+        energy: Hamiltonian.
+        constraint_residual: largest |g| and largest |G v|.
+        info: what the solver did since the node before.
+        t_micro, q_f_micro: the micro nodes of the macro step that ends at each saved node (its start excluded); None unless
+            asked for.
         result: status of the run, a `Result`; the first that was no success.
         failed_at: index of the macro step that failed, -1 if none did.
     """
 
-    t: Any
-    q_s: Any
-    q_f: Any
-    p_s: Any
-    p_f: Any
-    energy: Any
-    constraint_residual: Any
+    t: Float[Numbers, "k"]
+    q_s: Float[Numbers, "k n_s"]
+    q_f: Float[Numbers, "k n_f"]
+    p_s: Float[Numbers, "k n_s"]
+    p_f: Float[Numbers, "k n_f"]
+    energy: Float[Numbers, "k"]
+    constraint_residual: Float[Numbers, "k 2"]
     info: RunInfo
-    result: Any
-    failed_at: Any
-    t_micro: Any = None
-    q_f_micro: Any = None
+    result: Int[Numbers, ""]
+    failed_at: Int[Numbers, ""]
+    t_micro: Float[Numbers, "k-1 num_micro"] | None = None
+    q_f_micro: Float[Numbers, "k-1 num_micro n_f"] | None = None
 
     @property
     def success(self):
+        """Whether no step failed (of every run, in a batch)."""
         return self.result <= Result.CONVERGED_AT_ROUNDOFF
 
     @property
@@ -109,9 +111,8 @@ class Trajectory(eqx.Module):
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
         arrays.pop("drawing", None)
-        fields = {field.name for field in dataclasses.fields(cls)} - {"info"} | set(RunInfo._fields)
-        missing = fields - set(arrays) - set(MICRO)
-        if missing or set(arrays) - fields:
+        missing = _FIELDS - set(arrays) - set(MICRO)
+        if missing or set(arrays) - _FIELDS:
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
@@ -186,9 +187,11 @@ def from_arrays(arrays: list, saves: int | None = None) -> Trajectory:
     return from_named_arrays({name: first(name, value) for name, value in named_arrays(whole).items()})
 
 
+_FIELDS = {field.name for field in dataclasses.fields(Trajectory)} - {"info"} | set(RunInfo._fields)
+_ONE = np.zeros(())
 _STRUCTURES = {
-    leaves.num_leaves: leaves
-    for micro in (None, 0)
-    for leaves in [jax.tree.structure(Trajectory(*NODES, RunInfo(0, 0, 0), 0, 0, micro, micro))]
+    len(jax.tree.leaves(trajectory)): jax.tree.structure(trajectory)
+    for micro in (None, _ONE)
+    for trajectory in [from_named_arrays(dict.fromkeys(_FIELDS, _ONE) | dict.fromkeys(MICRO, micro))]
 }
 """Of trajectories without and with micro nodes, by the number of their arrays."""

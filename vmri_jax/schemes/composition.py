@@ -12,13 +12,13 @@ Integration* (2006), V.3.2.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
 from vmri_jax.schemes.scheme import Description, Scheme
 
 
@@ -101,11 +101,11 @@ class Composition(eqx.Module):
 
     Args:
         scheme: what every stage does.
-        coefficients: (s,) parts c_i of the macro step, sum 1; may be traced.
+        coefficients: parts c_i of the macro step, sum 1; may be traced.
     """
 
     scheme: Scheme
-    coefficients: Any
+    coefficients: Float[Numbers, "s"]
 
     @property
     def num_stages(self) -> int:
@@ -144,7 +144,7 @@ class Composition(eqx.Module):
         return _order(np.asarray(self.coefficients), self.scheme.order, self.scheme.is_symmetric)
 
     def describe(self) -> Description:
-        """Order, symmetry, evaluations and solves per macro step; prints as a table."""
+        """As of a `Scheme`; the rules are those of a stage."""
         return self.scheme.describe().repeated(self.num_stages, self.order, self.is_symmetric)
 
 

@@ -73,12 +73,6 @@ class Term:
     def __neg__(self):
         return replace(self, sign=-self.sign)
 
-    def __add__(self, other):
-        return Sum((self,)) + other
-
-    def __sub__(self, other):
-        return Sum((self,)) - other
-
 
 @dataclass(frozen=True)
 class QuadraticKinetic:
@@ -153,10 +147,10 @@ class Sum:
     def __neg__(self):
         return Sum(tuple(-term for term in self.terms))
 
-    def __add__(self, other):
-        return Sum(self.terms + (other.terms if isinstance(other, Sum) else (other,)))
+    def __add__(self, other: "Sum"):
+        return Sum(self.terms + other.terms)
 
-    def __sub__(self, other):
+    def __sub__(self, other: "Sum"):
         return self + (-other)
 
 
@@ -213,7 +207,7 @@ def _on_position_nodes(function, arguments, placed, scheme, system, name: str) -
 
 
 def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
-    """The discrete Lagrangian ``L_d(slow, fast, macro_dt, t=0) -> ()`` as a function of absolute control points.
+    """The discrete Lagrangian ``L_d(slow, fast, macro_dt) -> ()`` as a function of absolute control points.
 
     Args:
         slow: (r + 1, n_s) slow control points of the macro interval.
@@ -244,7 +238,7 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
 def discrete_legendre(system: System, scheme: Scheme) -> Callable:
     """Discrete Legendre transforms ``(slow, fast, macro_dt) -> ((p_s, p_f) at the start, (p_s, p_f) at the end)``.
 
-    ``p = -D_first L_d`` and ``p+ = D_last L_d`` (without constraint forces).
+    ``p = -D_first L_d`` and ``p+ = D_last L_d`` (without constraint forces). Arguments as of `discrete_lagrangian`.
     """
     slots = jax.grad(discrete_lagrangian(system, scheme), argnums=(0, 1))
 

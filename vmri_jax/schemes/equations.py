@@ -10,13 +10,15 @@ Everything is multiplied by the micro step h, and the multipliers absorb their w
 matrix and the constraint Jacobian for every step size.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from vmri_jax.mechanics.arrays import Number, Numbers
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import Sum, lagrangian
@@ -29,29 +31,32 @@ class Unknowns(NamedTuple):
 
     | field | unknown | residual |
     |---|---|---|
-    | slow (r, n_s) | increments of S_1..S_r | slow equations at S_0..S_{r-1} |
-    | slow_multiplier (r, n_gs) | scaled, at S_0..S_{r-1} | g_s at S_1..S_r |
-    | fast (num_micro, r, n_f) | increments in each micro interval | fast equations at its nodes 0..r-1 |
-    | multiplier (num_micro, r, n_g) | scaled, at its nodes 0..r-1 | g at its nodes 1..r |
+    | slow | increments of S_1..S_r | slow equations at S_0..S_{r-1} |
+    | slow_multiplier | scaled, at S_0..S_{r-1} | g_s at S_1..S_r |
+    | fast | increments in each micro interval | fast equations at its nodes 0..r-1 |
+    | multiplier | scaled, at its nodes 0..r-1 | g at its nodes 1..r |
     """
 
-    slow: Any
-    slow_multiplier: Any
-    fast: Any
-    multiplier: Any
+    slow: Float[Numbers, "r n_s"]
+    slow_multiplier: Float[Numbers, "r n_gs"]
+    fast: Float[Numbers, "num_micro r n_f"]
+    multiplier: Float[Numbers, "num_micro r n_g"]
 
 
 class StepEquations(eqx.Module):
-    """The nonlinear equations of one macro step from given positions and (kicked) momenta."""
+    """The nonlinear equations of one macro step from given positions and (kicked) momenta.
+
+    The methods take x, the `Unknowns`; `path`, which is varied, and `at`, the same path held fixed where forces are evaluated.
+    """
 
     system: System
     scheme: Scheme
-    t: Any
-    q_s: Any
-    q_f: Any
-    p_s: Any
-    p_f: Any
-    macro_dt: Any
+    t: Number
+    q_s: Float[Numbers, "n_s"]
+    q_f: Float[Numbers, "n_f"]
+    p_s: Float[Numbers, "n_s"]
+    p_f: Float[Numbers, "n_f"]
+    macro_dt: Number
 
     @classmethod
     def of(cls, system: System, scheme: Scheme, state: State, macro_dt) -> "StepEquations":
@@ -60,26 +65,28 @@ class StepEquations(eqx.Module):
 
     @property
     def micro_dt(self):
+        """Length h of a micro interval."""
         return self.macro_dt / self.scheme.num_micro
 
     @property
     def force_nodes(self) -> Nodes:
+        """Where forces are evaluated."""
         return velocity_nodes(self.scheme.force, self.scheme.num_micro, self.scheme.degree)
 
     def path(self, x: Unknowns) -> Path:
-        """The path of the unknowns: fast starts are running sums of the increments over whole intervals."""
-        return Path(self.t, self.macro_dt, self.q_s, x.slow, self.q_f + sum_before(x.fast[:, -1]), x.fast)
+        """The path of the unknowns."""
+        return self.path_of(x.slow, x.fast)
+
+    def path_of(self, slow, fast) -> Path:
+        """The path of these increments: fast starts are their running sums over whole intervals."""
+        return Path(self.t, self.macro_dt, self.q_s, slow, self.q_f + sum_before(fast[:, -1]), fast)
 
     def action(self, path: Path, at: Path, x: Unknowns):
         """Augmented action times h; forces act on the virtual displacement of `path`, evaluated along `at`."""
-        return self.unconstrained(path, at) - self.constraint_work(path, x)
-
-    def unconstrained(self, path: Path, at: Path):
-        """The action times h without constraints."""
-        return self._action(lagrangian(self.system, self.scheme), path, at)
+        return self._action(lagrangian(self.system, self.scheme), path, at) - self.constraint_work(path, x)
 
     def without_kinetic(self, path: Path, at: Path):
-        """The same without the kinetic energy of constant masses."""
+        """The same without constraints and without the kinetic energy of constant masses."""
         return self._action(lagrangian(self.system, self.scheme).potentials, path, at)
 
     def _action(self, terms: Sum, path: Path, at: Path):
@@ -144,7 +151,7 @@ def sum_before(increments):
     return jnp.concatenate([jnp.zeros_like(increments[:1]), jnp.cumsum(increments[:-1], axis=0)])
 
 
-def multiplier_scales(scheme: Scheme, macro_dt, before=0.0):
+def multiplier_scales(scheme: Scheme, macro_dt, before: Number = 0.0):
     """What turns multipliers into unknowns: ``h H w_j`` (num_micro, r, 1) and ``num_micro h H w_i`` (r, 1).
 
     Args:

@@ -16,8 +16,10 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from vmri_jax.kernels import matmul
+from vmri_jax.mechanics.arrays import Number, Numbers
 from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, Rule, lobatto
 
 
@@ -54,18 +56,18 @@ class Path(eqx.Module):
 
     Args:
         t, macro_dt: start and length of the interval.
-        slow_start: (n_s,) slow position at the start.
-        slow: (r, n_s) increments of the slow control points 1..r from the start.
-        fast_start: (num_micro, n_f) fast position at the start of each micro interval.
-        fast: (num_micro, r, n_f) increments of the fast control points from the start of their interval.
+        slow_start: slow position at the start.
+        slow: increments of the slow control points 1..r from the start.
+        fast_start: fast position at the start of each micro interval.
+        fast: increments of the fast control points from the start of their interval.
     """
 
-    t: Any
-    macro_dt: Any
-    slow_start: Any
-    slow: Any
-    fast_start: Any
-    fast: Any
+    t: Number
+    macro_dt: Number
+    slow_start: Float[Numbers, "n_s"]
+    slow: Float[Numbers, "r n_s"]
+    fast_start: Float[Numbers, "num_micro n_f"]
+    fast: Float[Numbers, "num_micro r n_f"]
 
     @classmethod
     def from_control_points(cls, slow, fast, t, macro_dt) -> "Path":
@@ -77,10 +79,12 @@ class Path(eqx.Module):
 
     @property
     def degree(self) -> int:
+        """Polynomial degree r."""
         return self.slow.shape[0]
 
     @property
     def num_micro(self) -> int:
+        """Micro intervals."""
         return self.fast.shape[0]
 
     def control_points(self):
@@ -112,10 +116,11 @@ class NodeGroup:
     c: float
     first: int
     stop: int
-    weights: Any
+    weights: Float[Numbers, "size"]
 
     @property
     def size(self) -> int:
+        """Number of nodes."""
         return self.stop - self.first
 
 
@@ -133,6 +138,7 @@ class Nodes:
 
     @cached_property
     def weights(self):
+        """Of all nodes, group after group."""
         return jnp.concatenate([jnp.asarray(g.weights) for g in self.groups])
 
     def theta(self, group: NodeGroup) -> np.ndarray:

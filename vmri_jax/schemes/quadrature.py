@@ -17,9 +17,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from numpy.polynomial import legendre
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
 
 NODE_TOLERANCE = 1e-12
 """Nodes closer than this are the same node."""
@@ -37,7 +38,7 @@ class Rule(eqx.Module):
     """
 
     nodes: tuple[float, ...] = eqx.field(static=True)
-    weights: Any
+    weights: Float[Numbers, "nodes"]
     __array_ufunc__ = None  # so that numpy scalars leave `alpha * rule` to __rmul__
 
     def __init__(self, nodes, weights):
@@ -78,7 +79,11 @@ class Rule(eqx.Module):
         return sum(w * function(node) for node, w in zip(self.nodes, self.weights, strict=True))
 
     def repeat(self, count: int) -> "Rule":
-        """Composite rule: this one on each of ``count`` equal subintervals, shared end nodes merged."""
+        """Composite rule: this one on each of ``count`` equal subintervals, shared end nodes merged.
+
+        Args:
+            count: at least 1.
+        """
         _check_count("repeat", count, 1, "count")
         nodes = tuple((m + node) / count for m in range(count) for node in self.nodes)
         return _merge(nodes, [self.weights / count] * count)
@@ -123,7 +128,11 @@ def _merge(nodes: tuple[float, ...], weights: list) -> Rule:
 
 
 def interpolatory(nodes) -> Rule:
-    """Rule on the given n nodes that is exact for polynomials of degree n - 1."""
+    """Rule on n nodes that is exact for polynomials of degree n - 1.
+
+    Args:
+        nodes: increasing numbers in [0, 1].
+    """
     return Rule(nodes, interpolatory_weights(nodes))
 
 
@@ -155,7 +164,12 @@ def lobatto(n: int) -> Rule:
 
 
 def radau(n: int, end: Literal["left", "right"] = "right") -> Rule:
-    """Gauss-Radau rule: n nodes including one end, order 2n - 1."""
+    """Gauss-Radau rule: n nodes including one end, order 2n - 1.
+
+    Args:
+        n: number of nodes.
+        end: which one is a node.
+    """
     _check_count("radau", n, 1)
     if end not in ("left", "right"):
         raise ValueError(f"radau: end is {end!r}; it must be 'left' or 'right'.")
@@ -169,7 +183,12 @@ def radau(n: int, end: Literal["left", "right"] = "right") -> Rule:
 
 
 def affine(alpha) -> Rule:
-    """``alpha * left + (1 - alpha) * right``; order 2 for alpha = 1/2, else 1. alpha may be traced."""
+    """``alpha * left + (1 - alpha) * right``; order 2 for alpha = 1/2, else 1.
+
+    Args:
+        alpha: weight of the start of the interval, 1 - alpha is that of its end; may be traced. At 1/2 it is the trapezoidal
+            rule, at 1 and 0 only one end is left. See `vmri_jax.schemes.scheme` for what this means for a step.
+    """
     real_array("affine: alpha", alpha, 0)
     return alpha * left + (1 - alpha) * right
 
@@ -206,6 +225,27 @@ class PlacedRule(eqx.Module):
     def only_ends(self) -> bool:
         """Whether every node is an end of the interval the rule is placed on."""
         return all(min(node, 1 - node) <= NODE_TOLERANCE for node in self.rule.nodes)
+
+    def in_words(self) -> str:
+        """The rule by its name, and where it is."""
+        how = ", at averaged fast positions" if self.mollified else ""
+        how += ", corrected by its gradient" if self.gradient_corrected else ""
+        return f"{_name(self.rule)} on {'the macro' if self.grid == 'macro' else 'every micro'} interval{how}"
+
+
+def _name(rule: Rule) -> str:
+    """The name of a rule, else what it consists of."""
+    n = len(rule.nodes)
+    known = {"left end": left, "right end": right, "midpoint": midpoint, "trapezoidal rule": trapezoidal}
+    known |= {"Simpson's rule": simpson, f"Gauss rule of {n} nodes": gauss(n)}
+    known |= {f"Radau rule of {n} nodes with the {end} end": radau(n, end) for end in ("left", "right")}
+    known |= {f"Lobatto rule of {n} nodes": lobatto(n)} if n > 1 else {}
+    for name, other in known.items():
+        both = zip((rule.nodes, rule.weights), (other.nodes, other.weights), strict=True)
+        if len(other.nodes) == n and all(np.allclose(a, b, rtol=0, atol=NODE_TOLERANCE) for a, b in both):
+            return name
+    weights = ", ".join(f"{weight:.4g}" for weight in np.asarray(rule.weights))
+    return f"rule of nodes {', '.join(f'{node:.4g}' for node in rule.nodes)} with weights {weights}"
 
 
 def macro(rule: Rule) -> PlacedRule:

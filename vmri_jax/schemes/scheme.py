@@ -10,6 +10,11 @@ A scheme is data. The reference schemes and the Galerkin family are points in on
 | `fully_explicit(num_micro, alpha)` | macro(affine(alpha)) | micro(affine(alpha)) | yes | 2 at alpha = 1/2, else 1 |
 | `takahashi_imada(num_micro)` | gradient_corrected(macro(trapezoidal)) | gradient_corrected(micro(trapezoidal)) | yes | 2, frequencies 4 |
 | `galerkin(num_micro, degree, rule)` | micro(rule) | micro(rule) | no | min(2 degree, rule order) |
+
+**alpha** is the part of a kick that is given at the start of an interval of length T, the rest of it at the end: the rule
+`vmri_jax.schemes.quadrature.affine`, ``T (alpha f(0) + (1 - alpha) f(T))``. At 1/2, the default, it is the trapezoidal rule: of order 2
+and symmetric, as in the methods of Verlet and r-RESPA. At 1 and at 0 there is one kick, before or after the motion: the two symplectic
+Euler methods, of order 1, each the adjoint of the other. Any other number has order 1, too. It may be traced, for sweeps and derivatives.
 """
 
 from dataclasses import dataclass, replace
@@ -120,7 +125,10 @@ class Scheme(eqx.Module):
         return np.arange(1, self.num_micro + 1) / self.num_micro
 
     def describe(self) -> "Description":
-        """Order, symmetry, evaluations and solves per macro step; prints as a table."""
+        """Rules, order, symmetry, evaluations and solves per macro step; prints as a table.
+
+        What it does with a system is in ``vm.plan(system, scheme, state).describe()``.
+        """
         drifts = self.degree == 1 and self.fast.only_ends and self.fast.grid == "micro"
         kicked = self.degree == 1 and self.slow.only_ends and self.slow.grid == "macro"
         free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
@@ -129,7 +137,13 @@ class Scheme(eqx.Module):
         )
         fast *= 1 + self.slow.mollified  # along the motion that is averaged
         fast += self.slow.gradient_corrected and self.fast.gradient_corrected  # in the term of both
-        return Description(self.order, self.is_symmetric, 1, self.num_micro, self.degree, slow, fast, free, 1)
+        placed = self.kinetic, self.slow, self.fast, self.force, self.constraint, self.slow_constraint
+        rules = {name: rule.in_words() for name, rule in zip(TERMS, placed, strict=True)}
+        return Description(self.order, self.is_symmetric, rules, 1, self.num_micro, self.degree, slow, fast, free, 1)
+
+
+TERMS = ("T", "V", "W", "F", "g", "g_s")
+"""What has a rule: the kinetic energy, the slow and the fast potential, forces, constraints."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +151,7 @@ class Description:
     """What a scheme promises and what a macro step costs. Evaluations are per pass where equations are solved.
 
     order, symmetric: of convergence; whether time-reversible.
+    rules: in words, by what they integrate or where it is held, one of `TERMS`.
     stages, num_micro, degree: steps of the scheme per macro step, micro steps per macro step, degree of the path.
     slow_evaluations, fast_evaluations: gradients of V and of W, and products of their Hessians with a vector, which cost about
         as much; at a node that two macro steps share, once.
@@ -147,6 +162,7 @@ class Description:
 
     order: int
     symmetric: bool
+    rules: dict[str, str]
     stages: int
     num_micro: int
     degree: int
@@ -167,6 +183,7 @@ class Description:
             "order": f"{self.order}, {'symmetric' if self.symmetric else 'not symmetric'}",
             "path": f"{self.num_micro} micro steps of degree {self.degree} {per}"
             + (f", in {self.stages} stages" if self.stages > 1 else ""),
+            **self.rules,
             "gradients of V": f"{self.slow_evaluations} {per}",
             "gradients of W": f"{self.fast_evaluations} {per}",
             "solves": f"{self.solves or 'none'} {per}; with constraints {self.constrained_solves}",
@@ -214,6 +231,9 @@ def fully_implicit(num_micro: int) -> Scheme:
     """V and W at the midpoint of every micro interval. Order 2, symmetric, implicit.
 
     Evaluations per macro step and Newton iteration: V num_micro, W num_micro.
+
+    Args:
+        num_micro: micro steps per macro step.
     """
     return Scheme(num_micro, kinetic=micro(midpoint), slow=micro(midpoint), fast=micro(midpoint))
 
@@ -223,6 +243,10 @@ def explicit_slow(num_micro: int, alpha=0.5) -> Scheme:
 
     Evaluations per macro step: V once (the right node of a step is the left node of the next), W num_micro per
     Newton iteration. Unstable near the impulse resonances omega H = k pi.
+
+    Args:
+        num_micro: micro steps per macro step.
+        alpha: part of the kick by V at the start of the macro step, see the top of this module.
     """
     return Scheme(num_micro, kinetic=micro(midpoint), slow=macro(affine(alpha)), fast=micro(midpoint))
 
@@ -233,6 +257,9 @@ def mollified_impulse(num_micro: int, alpha=0.5) -> Scheme:
     Order 2 and symmetric at alpha = 1/2, else order 1. Evaluations per macro step: V once; W num_micro per Newton
     iteration as before, and as many again for the average, with their derivative: cheap where W is quadratic, else an
     exact solve per micro step. See `vmri_jax.schemes.quadrature.mollified`.
+
+    Args:
+        num_micro, alpha: as of `explicit_slow`.
     """
     return Scheme(num_micro, kinetic=micro(midpoint), slow=mollified(macro(affine(alpha))), fast=micro(midpoint))
 
@@ -242,6 +269,10 @@ def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
 
     Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints: V once and
     W num_micro times per macro step, no Newton. Stable only for omega h < 2.
+
+    Args:
+        num_micro: micro steps per macro step.
+        alpha: part of the kicks at the start, by V of the macro step and by W of every micro step; see the top of this module.
     """
     return Scheme(num_micro, kinetic=micro(midpoint), slow=macro(affine(alpha)), fast=micro(affine(alpha)))
 
@@ -254,6 +285,9 @@ def takahashi_imada(num_micro: int) -> Scheme:
     correction leaves out, frequencies are of order 2. Explicit for constant masses, which it needs, without constraints, and stable
     for ``omega h < 2 sqrt(3)``. Evaluations per macro step: V once and W num_micro times, each with a product of its Hessian, and one
     such product of W more.
+
+    Args:
+        num_micro: micro steps per macro step.
     """
     return Scheme(
         num_micro,
@@ -271,6 +305,11 @@ def galerkin(num_micro: int, degree: int, rule: Rule | str = "gauss") -> Scheme:
 
     On small constrained systems the cheapest way to small errors is a single interval of high degree, e.g.
     ``galerkin(1, 12, "lobatto")`` with five or six nodes to a period of the fastest vibration: steps of two periods.
+
+    Args:
+        num_micro: micro steps per macro step.
+        degree: r, of the polynomials.
+        rule: "gauss", "lobatto" or a rule of one's own.
     """
     degree = _positive_integer("degree", degree)
     if isinstance(rule, str):

@@ -17,11 +17,12 @@ potentials are curved along. Forces are exact, so that all of this decides only 
 
 from dataclasses import dataclass
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import inverse, matmul, max_abs, regularized
 from vmri_jax.mechanics.structure import curved_directions
@@ -35,7 +36,7 @@ from vmri_jax.steppers.solved import Solution, Solver, status_of
 from vmri_jax.steppers.time_modes import TimeModes, product, taken, times_i
 
 
-class CollocatedInterval:
+class JoinedEquations:
     """The equations of the step, with the variables joined, q = (q_s, q_f), and nodes as the last axis.
 
     num_curved: how many variables, the last ones, the Hessian is taken by: the fast ones where there are any.
@@ -143,14 +144,14 @@ class CollocatedInterval:
 class Forces(NamedTuple):
     """What increments and multipliers make of a step.
 
-    inside (n, r): forces at the nodes 0..r-1, times h, at node 0 with the momentum that arrives.
-    last (n,): forces at the end of the step, times h.
-    g (n_c, r): constraints at the nodes 1..r.
+    inside: forces at the nodes 0..r-1, times h, at node 0 with the momentum that arrives.
+    last: forces at the end of the step, times h.
+    g: constraints at the nodes 1..r.
     """
 
-    inside: Any
-    last: Any
-    g: Any
+    inside: Float[Array, "n r"]
+    last: Float[Array, "n"]
+    g: Float[Array, "n_c r"]
 
 
 class Saddles(NamedTuple):
@@ -160,31 +161,31 @@ class Saddles(NamedTuple):
     that only d rows, and those of the constraints, are solved for each mode.
 
     modes: as which everything below but `push` and `pull` is.
-    gamma (2, k): eigenvalues, for every part of a mode.
-    push: L and G (d + n_c, n), of the variables.
-    pull: ``Q = M^-1 L^T w`` and ``M^-1 G^T`` (n, d + n_c), with ``w = h^2 W''``.
-    bend: ``L Q`` (d, d).
-    denominator (d, d, k): inverses of ``|1 - gamma L Q|^2``.
-    push_bend: ``G Q`` (n_c, d).
-    pull_bend two of (d, n_c, k): ``(1 - gamma L Q)^-1 L M^-1 G^T``.
-    schur two of (n_c, n_c, k): inverse of G times x for every multiplier.
+    gamma: eigenvalues, for every part of a mode.
+    push: L and G, of the variables.
+    pull: ``Q = M^-1 L^T w`` and ``M^-1 G^T``, with ``w = h^2 W''``.
+    bend: ``L Q``.
+    denominator: inverses of ``|1 - gamma L Q|^2``.
+    push_bend: ``G Q``.
+    pull_bend: real and imaginary part of ``(1 - gamma L Q)^-1 L M^-1 G^T``.
+    schur: of the inverse of G times x for every multiplier.
     """
 
     modes: TimeModes
-    gamma: Any
-    push: Any
-    pull: Any
-    bend: Any
-    denominator: Any
-    push_bend: Any
-    pull_bend: Any
-    schur: Any
+    gamma: Float[np.ndarray, "2 k"]
+    push: Float[Array, "d+n_c n"]
+    pull: Float[Array, "n d+n_c"]
+    bend: Float[Array, "d d"]
+    denominator: Float[Array, "d d k"]
+    push_bend: Float[Array, "n_c d"]
+    pull_bend: list[Float[Array, "d n_c k"]]
+    schur: list[Float[Array, "n_c n_c k"]]
 
     @classmethod
-    def at(cls, interval: CollocatedInterval, modes: TimeModes, t, q) -> "Saddles":
+    def at(cls, joined: JoinedEquations, modes: TimeModes, t, q) -> "Saddles":
         """With Hessian and Jacobian at a point."""
-        along, jacobian = interval.directions, interval.jacobian(t, q)
-        bend, pull = interval.over_mass(interval.h**2 * interval.curvature(q)), interval.over_mass(jacobian.T)
+        along, jacobian = joined.directions, joined.jacobian(t, q)
+        bend, pull = joined.over_mass(joined.h**2 * joined.curvature(q)), joined.over_mass(jacobian.T)
         k, d, n_c = modes.gamma.shape[1], len(along), len(jacobian)
         re, im = modes.gamma[:, :, None, None]  # modes are the first axis until the end
 
@@ -233,13 +234,13 @@ class Saddles(NamedTuple):
 
 
 class Increments(NamedTuple):
-    """Increments x (n, r), multipliers mu (n_c, r), their largest corrections, how many there were, and what the last one tells."""
+    """Increments x, multipliers mu, largest corrections (slow, fast), how many there were, and what the last one tells."""
 
-    x: Any
-    mu: Any
-    moved: Any
-    iterations: Any
-    result: Any
+    x: Float[Array, "n r"]
+    mu: Float[Array, "n_c r"]
+    moved: tuple[Float[Array, ""], ...]
+    iterations: Int[Array, ""]
+    result: Int[Array, ""]
 
 
 class Evaluated(NamedTuple):
@@ -247,7 +248,7 @@ class Evaluated(NamedTuple):
 
     last: Increments
     forces: Forces
-    result: Any
+    result: Int[Array, ""]
 
 
 def at_nodes(function):
@@ -272,51 +273,42 @@ class Collocation(Solver):
 
     def solve(self, equations: StepEquations, guess: Unknowns, own: tuple) -> tuple[Solution, tuple]:
         newton = self.newton
-        interval, modes = CollocatedInterval(equations), TimeModes.of(equations.scheme)
-        n_s, (n_g, _) = interval.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
+        joined, modes = JoinedEquations(equations), TimeModes.of(equations.scheme)
+        n_s, (n_g, _) = joined.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
         x = jnp.concatenate([guess.slow, guess.fast[0]], axis=1).T
         mu = jnp.concatenate([guess.multiplier[0], guess.slow_multiplier], axis=1).T
-        saddles = Saddles.at(interval, modes, equations.t + interval.h / 2, interval.q + x[:, -1] / 2)
+        saddles = Saddles.at(joined, modes, equations.t + joined.h / 2, joined.q + x[:, -1] / 2)
         accepted = Accepted.of(equations, newton)
 
         def slow_and_fast(x):
             return max_abs(x[:n_s]), max_abs(x[n_s:])
 
         def corrected(last: Increments, forces: Forces) -> Increments:
-            missing = last.x + matmul(
-                interval.over_mass(forces.inside), modes.of_rows
-            )  # what these forces do not bring about
+            moves = matmul(joined.over_mass(forces.inside), modes.of_rows)
+            missing = last.x + moves  # what these forces do not bring about
             dx, dmu = saddles.solve(-missing, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
             left = map(expected, moved, last.moved)
-            return Increments(
-                x, mu, moved, iterations, newton.status(accepted.over(left, slow_and_fast(x)), iterations)
-            )
+            result = newton.status(accepted.over(left, slow_and_fast(x)), iterations)
+            return Increments(x, mu, moved, iterations, result)
 
         def step(at: Evaluated) -> Evaluated:
             """Forces first: evaluated in one place, they are compiled once."""
             last, fixed = at.last, newton.fixed_iterations
-            forces = interval.forces(last.x, last.mu)
+            forces = joined.forces(last.x, last.mu)
             goes_on = last.result == RUNNING if fixed is None else last.iterations < fixed
             return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
 
-        running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(interval.q), jnp.zeros_like(mu))
+        running, none = jnp.asarray(RUNNING), Forces(jnp.zeros_like(x), jnp.zeros_like(joined.q), jnp.zeros_like(mu))
         start = Increments(x, mu, (jnp.zeros(()),) * 2, jnp.asarray(0), running)
         last, forces, _ = newton.iterate(step, Evaluated(start, none, running), -1)  # forces once more than corrections
 
-        p, rows = interval.momentum(last.x, forces), interval.residual(last.x, forces)
+        p, rows = joined.momentum(last.x, forces), joined.residual(last.x, forces)
         x, mu = last.x.T, last.mu.T
         unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
         end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
-        status = status_of(
-            equations,
-            last.result,
-            Method.COLLOCATION,
-            last.iterations,
-            max_abs(rows),
-            max_abs(forces.g),
-            newton.tolerance,
-        )
+        left = max_abs(rows), max_abs(forces.g)
+        status = status_of(equations, last.result, Method.COLLOCATION, last.iterations, *left, newton.tolerance)
         return Solution(unknowns, end, status), own
 
     def lines(self) -> list[str]:

@@ -5,7 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
@@ -21,11 +23,11 @@ class ComposedState(NamedTuple):
 class Composed(Stepper):
     """``Psi_H = Phi_{c_s H} o ... o Phi_{c_1 H}``.
 
-    coefficients: (s,) parts c_i of the macro step.
+    coefficients: parts c_i of the macro step.
     stage: the stepper Phi.
     """
 
-    coefficients: Any
+    coefficients: Float[Numbers, "s"]
     stage: Stepper
 
     def init(self, state: State, macro_dt) -> ComposedState:
@@ -69,9 +71,6 @@ class Projected(Stepper):
         state, info, own = self.inner.move(state, own, macro_dt)
         state, own = self.inner.project(state, own)
         return state, info, own
-
-    def project(self, state: State, own) -> tuple[State, Any]:
-        return state, own
 
     def continued(self, own, last, state: State, macro_dt):
         return self.inner.continued(own, last, state, macro_dt)

@@ -14,8 +14,10 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import max_abs
+from vmri_jax.mechanics.arrays import Number
 from vmri_jax.mechanics.constraints import is_rank_deficient
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.newton import Newton, arrowhead, dense
@@ -119,12 +121,12 @@ class Part(NamedTuple):
     rates: unknowns of the longest part that has been solved, per length (multipliers: per length squared).
     """
 
-    length: Any
-    stride: Any
+    length: Float[Array, ""]
+    stride: Float[Array, ""]
     rates: Unknowns
     x: Unknowns
-    result: Any
-    iterations: Any
+    result: Int[Array, ""]
+    iterations: Int[Array, ""]
 
     def after(self, x: Unknowns, result, iterations, left) -> "Part":
         """The part to try next, after this one gave x; `left` iterations were left for it."""
@@ -150,10 +152,10 @@ class Iterate(NamedTuple):
     x: Unknowns
     before: Unknowns
     direction: Unknowns
-    update: Any
-    damping: Any
-    iterations: Any
-    result: Any
+    update: Number
+    damping: Float[Array, ""]
+    iterations: Int[Array, ""]
+    result: Int[Array, ""]
 
 
 def _size(equations: StepEquations, d: Unknowns, x: Unknowns, tolerance):

@@ -6,13 +6,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from vmri_jax.kernels import inverse, matvec, max_abs, regularized, solve
+from vmri_jax.mechanics.arrays import Number
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
-from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
 from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
@@ -30,12 +32,13 @@ class Accepted(NamedTuple):
     slow, fast: round-off.
     """
 
-    tolerance: Any
-    slow: Any
-    fast: Any
+    tolerance: Number
+    slow: Float[Array, ""]
+    fast: Float[Array, ""]
 
     @classmethod
     def of(cls, equations: StepEquations, newton) -> "Accepted":
+        """For a step from its positions."""
         floors = (ROUNDOFF * jnp.finfo(float).eps * max_abs(q) for q in (equations.q_s, equations.q_f))
         return cls(newton.tolerance / SAFETY, *floors)
 
@@ -49,6 +52,11 @@ class Accepted(NamedTuple):
     def over(self, changes, motions):
         """Changes (slow, fast) over what is accepted of them with such motions; the larger of the two."""
         return jnp.maximum(*(c / size for c, size in zip(changes, self.sizes(motions), strict=True)))
+
+
+def along(weights, increments):
+    """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
+    return jnp.sum(weights[..., None] * increments, axis=-2)
 
 
 def expected(moved, before):
@@ -83,11 +91,12 @@ def implicit_terms(system: System, scheme: Scheme) -> list[Term]:
 class DiagonalMatrix(NamedTuple):
     """K of a micro interval for every coordinate alone.
 
-    inverse: (r, r, n_f) of the rows of slots 0..r-1. last: (r, n_f) the row of slot r, which is the momentum handed on.
+    inverse: of the rows of slots 0..r-1.
+    last: the row of slot r, which is the momentum handed on.
     """
 
-    inverse: Any
-    last: Any
+    inverse: Float[Array, "r r n_f"]
+    last: Float[Array, "r n_f"]
 
     def solve(self, rows):
         """The increments (r, n_f) for given rows (r, n_f)."""
@@ -99,10 +108,10 @@ class DiagonalMatrix(NamedTuple):
 
 
 class FullMatrix(NamedTuple):
-    """K of a micro interval: inverse (r n_f, r n_f) and last (n_f, r n_f), as in `DiagonalMatrix`."""
+    """K of a micro interval, as in `DiagonalMatrix` with the increments in a row."""
 
-    inverse: Any
-    last: Any
+    inverse: Float[Array, "r*n_f r*n_f"]
+    last: Float[Array, "n_f r*n_f"]
 
     def solve(self, rows):
         """The increments (r, n_f) for given rows (r, n_f)."""
@@ -111,6 +120,9 @@ class FullMatrix(NamedTuple):
     def outgoing(self, increments):
         """Change (n_f,) of the last slot with the increments."""
         return matvec(self.last, increments.reshape(-1))
+
+
+Matrix = DiagonalMatrix | FullMatrix
 
 
 @dataclass(frozen=True)
@@ -147,21 +159,21 @@ class Interval:
         is_explicit = scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
         return cls(is_explicit, is_diagonal, is_constant)
 
-    def no_matrix(self, equations: StepEquations) -> DiagonalMatrix | FullMatrix:
+    def no_matrix(self, equations: StepEquations) -> Matrix:
         """The shapes of K, all zero."""
         r, n_f = equations.scheme.degree, equations.q_f.shape[0]
         if self.is_diagonal:
             return DiagonalMatrix(jnp.zeros((r, r, n_f)), jnp.zeros((r, n_f)))
         return FullMatrix(jnp.zeros((r * n_f, r * n_f)), jnp.zeros((n_f, r * n_f)))
 
-    def matrix(self, equations: StepEquations) -> DiagonalMatrix | FullMatrix:
+    def matrix(self, equations: StepEquations) -> Matrix:
         """K on the first micro interval of a macro step, on the straight path from its start."""
         system, scheme = interval_problem(equations.system, equations.scheme)
         start = equations.q_s, equations.q_f, equations.p_s, equations.p_f
         local = StepEquations(system, scheme, equations.t, *start, equations.micro_dt)
         velocities = constant_mass(system).velocity(equations.p_s, equations.p_f)
         slow, fast = (local.macro_dt * control_nodes(scheme.degree)[1:, None] * v for v in velocities)
-        path = local.path(Unknowns(slow, None, fast[None], None))
+        path = local.path_of(slow, fast[None])
         return _diagonal_matrix(local, path) if self.is_diagonal else _full_matrix(local, path)
 
 
@@ -204,16 +216,14 @@ def solve_saddle(solve_k, jacobian, push, rows, g):
         solve_k: K^-1, (r, n) rows to (r, n) increments.
         jacobian: (r, n_g, n) G_0, at the control nodes 0..r-1, where the multipliers act.
         push: G_1 as a function, changes (r, n) of the control points 1..r to changes (r, n_g) of the constraints.
-        rows, g: (r, n), or None if they are zero, and (r, n_g).
+        rows, g: (r, n) and (r, n_g).
     """
     r, n_g = g.shape
-    dx = jnp.zeros((r, jacobian.shape[-1])) if rows is None else -solve_k(rows)
+    dx = -solve_k(rows)
     if n_g == 0:
         return dx, g
     columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
     response = jax.vmap(solve_k)(columns.reshape(r * n_g, r, -1))
     schur = regularized(jax.vmap(push)(response).reshape(r * n_g, r * n_g))
-    if rows is not None:
-        g = g + push(dx)
-    dmu = -solve(schur.T, g.reshape(r * n_g, 1))
+    dmu = -solve(schur.T, (g + push(dx)).reshape(r * n_g, 1))
     return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)

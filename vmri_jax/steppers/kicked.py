@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import State
 from vmri_jax.schemes.discrete_lagrangian import Term
 from vmri_jax.steppers.results import Result
@@ -15,9 +16,13 @@ from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
 
 
 class KickedState(NamedTuple):
-    """gradients: of every kick, ``(dL/dq_s, dL/dq_f)`` at the node that two steps share. inner: of the inner stepper."""
+    """What a step hands to the next one.
 
-    gradients: Any
+    gradients: of every kick, ``(dL/dq_s, dL/dq_f)`` at the node that two steps share.
+    inner: what the inner stepper carries.
+    """
+
+    gradients: tuple[tuple[Float[Numbers, "n_s"], Float[Numbers, "n_f"]], ...]
     inner: Any
 
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.interval import DiagonalMatrix, FullMatrix, Interval
+from vmri_jax.steppers.interval import Interval, Matrix
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.stepper import Status, StepInfo, Stepper
 
@@ -22,15 +22,13 @@ class Linear(Stepper):
     scheme: Scheme
     interval: Interval
 
-    def init(self, state: State, macro_dt) -> DiagonalMatrix | FullMatrix:
+    def init(self, state: State, macro_dt) -> Matrix:
         return self.interval.matrix(StepEquations.of(self.system, self.scheme, state, macro_dt))
 
-    def move(
-        self, state: State, own: DiagonalMatrix | FullMatrix, macro_dt
-    ) -> tuple[State, StepInfo, DiagonalMatrix | FullMatrix]:
+    def move(self, state: State, own: Matrix, macro_dt) -> tuple[State, StepInfo, Matrix]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         h, rest = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
-        path = equations.path(Unknowns(jnp.zeros((self.scheme.degree, 0)), None, rest[None], None))
+        path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), rest[None])
         d = jax.grad(equations.without_kinetic)(path, path)
         rows = jnp.concatenate([d.fast_start - d.fast[0].sum(0) + h * state.p_f, d.fast[0, :-1]])
         increments = -own.solve(rows)
@@ -40,9 +38,6 @@ class Linear(Stepper):
         none = jnp.zeros((1, self.scheme.degree, 0)), jnp.zeros((self.scheme.degree, 0))
         info = StepInfo(*Status.direct(Method.LINEAR), q_f[None], *none)
         return State(state.t + macro_dt, state.q_s, q_f, state.p_s, p_f), info, own
-
-    def continued(self, own, last, state: State, macro_dt):
-        return own  # the matrix of a stage belongs to its length
 
     def lines(self) -> list[str]:
         return ["linear equations: one product with a matrix computed once"]

@@ -1,16 +1,18 @@
 """One pass over the micro intervals of a macro step: each corrected once, in order, for a given slow path."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from vmri_jax.kernels import inverse, matvec, max_abs, regularized
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
-from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
+from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import DiagonalMatrix, FullMatrix, constant_mass, interval_problem
+from vmri_jax.steppers.interval import Matrix, along, constant_mass, interval_problem
 from vmri_jax.steppers.predictors import LinearPredictor
 
 
@@ -18,16 +20,16 @@ class Left(NamedTuple):
     """What a pass leaves, or what arrives at a micro interval in it.
 
     q_f, p_f: position and momentum times h at the end of the last interval.
-    start, increments: gradient (n_s,), (r, n_s) of h times the action by the start and the increments of the slow path,
-        without their kinetic energy.
+    start, increments: gradient of h times the action by the start and the increments of the slow path, without their
+        kinetic energy.
     moved: largest correction of an increment.
     """
 
-    q_f: Any
-    p_f: Any
-    start: Any
-    increments: Any
-    moved: Any
+    q_f: Float[Numbers, "n_f"]
+    p_f: Float[Numbers, "n_f"]
+    start: Float[Array, "n_s"]
+    increments: Float[Array, "r n_s"]
+    moved: Float[Array, ""]
 
 
 class Lines(NamedTuple):
@@ -44,17 +46,17 @@ class Lines(NamedTuple):
 class Fast(NamedTuple):
     """Unknowns of the micro intervals and what is kept of them, with the intervals as first axis.
 
-    increments (n, r, n_f), multiplier (n, r, n_g): the unknowns, multipliers scaled.
-    nodes: (n, r, n_f) positions at the nodes 1..r.
-    bends: (n, r, n_f) or (n, r, 0), see `Lines`.
-    schur: (n, r n_g, r n_g) inverses of ``G K^-1 G^T`` from the first pass.
+    increments, multiplier: the unknowns, multipliers scaled.
+    nodes: positions at the nodes 1..r.
+    bends: see `Lines`.
+    schur: inverses of ``G K^-1 G^T`` from the first pass.
     """
 
-    increments: Any
-    multiplier: Any
-    nodes: Any
-    bends: Any
-    schur: Any
+    increments: Float[Array, "num_micro r n_f"]
+    multiplier: Float[Array, "num_micro r n_g"]
+    nodes: Float[Numbers, "num_micro r n_f"]
+    bends: Float[Array, "num_micro r n_f"] | Float[Array, "num_micro r 0"]
+    schur: Float[Array, "num_micro r*n_g r*n_g"]
 
 
 class March(NamedTuple):
@@ -63,13 +65,13 @@ class March(NamedTuple):
     equations: of the macro step.
     is_explicit: whether fast increments follow from the multipliers, see `Interval`.
     matrix: K of the micro intervals.
-    scale: (num_micro, r, 1) what turns multipliers into unknowns.
+    scale: what turns multipliers into unknowns.
     """
 
     equations: StepEquations
     is_explicit: bool
-    matrix: DiagonalMatrix | FullMatrix
-    scale: Any
+    matrix: Matrix
+    scale: Float[Numbers, "num_micro r 1"]
 
     def first_pass(self, slow, lines: Lines) -> tuple[Fast, Left]:
         """With fast unknowns from where the intervals before lead to, for slow increments (r, n_s)."""
@@ -82,12 +84,9 @@ class March(NamedTuple):
             mu, increments = scale * lines.multiplier.next(m), straight
             if not self.is_explicit:
                 increments = straight + self.equations.micro_dt**2 * lines.bend.next(m)
-            done, left = self._corrected(slow, arriving, m, basis, increments, mu)
-            bend = jnp.zeros((r, 0))
-            if not self.is_explicit:
-                bend = (done.increments - straight) / self.equations.micro_dt**2
-            lines = Lines(lines.multiplier.add(m, done.multiplier / scale), lines.bend.add(m, bend))
-            return (left, lines), done._replace(bends=bend)
+            done, left = self._corrected(slow, arriving, m, basis, straight, increments, mu)
+            lines = Lines(lines.multiplier.add(m, done.multiplier / scale), lines.bend.add(m, done.bends))
+            return (left, lines), done
 
         (left, _), fast = jax.lax.scan(interval, (self._start(slow), lines), (*self._intervals(), self.scale))
         return fast, left
@@ -97,13 +96,10 @@ class March(NamedTuple):
 
         def interval(arriving, at):
             m, basis, before = at
-            known = before.increments, before.multiplier, before.schur
-            done, left = self._corrected(slow, arriving, m, basis, *known)
             straight = control_nodes(len(slow))[1:, None] * velocity(arriving.p_f)
-            bend = before.bends
-            if not self.is_explicit:
-                bend = (done.increments - straight) / self.equations.micro_dt**2
-            return left, done._replace(bends=bend)
+            known = before.increments, before.multiplier, before.schur
+            done, left = self._corrected(slow, arriving, m, basis, straight, *known)
+            return left, done
 
         velocity = constant_mass(self.equations.system).fast_mass.inverse().times
         left, fast = jax.lax.scan(interval, self._start(slow), (*self._intervals(), fast))
@@ -119,7 +115,7 @@ class March(NamedTuple):
         zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(slow), jnp.zeros(())
         return Left(equations.q_f, equations.micro_dt * equations.p_f, *zero)
 
-    def _corrected(self, slow, arriving: Left, m, basis, increments, mu, schur=None) -> tuple[Fast, Left]:
+    def _corrected(self, slow, arriving: Left, m, basis, straight, increments, mu, schur=None) -> tuple[Fast, Left]:
         """Interval m, corrected once by a Newton step on its exact residual, and what it leaves."""
         equations, h, n = self.equations, self.equations.micro_dt, self.equations.scheme.num_micro
         q_s, steps = equations.q_s + along(basis[0], slow), along(basis[1:] - basis[0], slow)
@@ -140,7 +136,8 @@ class March(NamedTuple):
 
         left = Left(q_f, p_f, start, rows, jnp.maximum(arriving.moved, done.moved))
         nodes = arriving.q_f + done.increments
-        return Fast(done.increments, done.multiplier, nodes, None, done.schur), left
+        bends = jnp.zeros((len(slow), 0)) if self.is_explicit else (done.increments - straight) / h**2
+        return Fast(done.increments, done.multiplier, nodes, bends, done.schur), left
 
 
 def kick_weight(term: Term, h):
@@ -151,20 +148,20 @@ def kick_weight(term: Term, h):
 class Corrected(NamedTuple):
     """A micro interval after its correction.
 
-    increments (r, n_f), multiplier (r, n_g): its unknowns.
+    increments, multiplier: its unknowns.
     p_f: momentum times h that it hands on.
-    start, steps: gradient (n_s,), (r, n_s) of h times its action by the start and the increments of its slow path.
+    start, steps: gradient of h times its action by the start and the increments of its slow path.
     moved: largest correction of an increment.
     schur: inverse of ``G K^-1 G^T``.
     """
 
-    increments: Any
-    multiplier: Any
-    p_f: Any
-    start: Any
-    steps: Any
-    moved: Any
-    schur: Any
+    increments: Float[Array, "r n_f"]
+    multiplier: Float[Array, "r n_g"]
+    p_f: Float[Array, "n_f"]
+    start: Float[Array, "n_s"]
+    steps: Float[Array, "r n_s"]
+    moved: Float[Array, ""]
+    schur: Float[Array, "r*n_g r*n_g"]
 
 
 def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_explicit: bool) -> Corrected:
@@ -188,7 +185,7 @@ def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_
         increments = -matrix.solve(p_f - pull_f)
 
     def gradient(increments):
-        path = local.path(Unknowns(steps, None, increments[None], None))
+        path = local.path_of(steps, increments[None])
         return jax.grad(local.without_kinetic)(path, path)
 
     d, change = jax.linearize(gradient, increments)
@@ -219,8 +216,3 @@ def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_
         moved=max_abs(dx),
         schur=schur,
     )
-
-
-def along(weights, increments):
-    """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
-    return jnp.sum(weights[..., None] * increments, axis=-2)

@@ -17,29 +17,23 @@ motion is smooth. A pass costs one gradient of each term at each of its nodes; n
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import (
-    Accepted,
-    DiagonalMatrix,
-    FullMatrix,
-    Interval,
-    constant_mass,
-    expected,
-)
-from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March, along
+from vmri_jax.steppers.interval import Accepted, Interval, Matrix, along, constant_mass, expected
+from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.secant import SIZE, Pairs
-from vmri_jax.steppers.slow_equations import SlowEquations
+from vmri_jax.steppers.slow_equations import SlowEquations, Tied
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
 SMALL = 16
@@ -57,18 +51,18 @@ class NestedState(NamedTuple):
     """What a macro step hands to the next one.
 
     matrix: K of the micro intervals.
-    slow: slow unknowns (r n_s + r n_gs,) of the last steps.
+    slow: slow increments and slow multipliers of the last steps.
     lines: multipliers and bends of the last micro intervals.
     missed: what the cheap matrix of the slow equations misses: secant pairs with constraints, else the part of an update
         that it leaves to the next one.
-    passes: (2,) fewest of a step with this matrix (UNKNOWN before one), and those of the last step.
+    passes: fewest of a step with this matrix (UNKNOWN before one), and those of the last step.
     """
 
-    matrix: DiagonalMatrix | FullMatrix
+    matrix: Matrix
     slow: PolynomialPredictor
     lines: Lines
-    missed: Any
-    passes: Any
+    missed: Pairs | Float[Array, ""]
+    passes: Int[Array, "2"]
 
 
 class Pass(NamedTuple):
@@ -80,17 +74,17 @@ class Pass(NamedTuple):
     residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
     """
 
-    slow: Any
-    slow_multiplier: Any
+    slow: Float[Array, "r n_s"]
+    slow_multiplier: Float[Array, "r n_gs"]
     fast: Fast
     left: Left
-    d: Any
-    tied: Any
-    missed: Any
-    impulse: Any
-    residual: Any
-    passes: Any
-    result: Any
+    d: Float[Array, "r*(n_s+n_gs)"]
+    tied: Tied | None
+    missed: Pairs | Float[Array, ""]
+    impulse: Float[Array, "n_s"]
+    residual: tuple[Float[Array, ""], Float[Array, ""]]
+    passes: Int[Array, ""]
+    result: Int[Array, ""]
 
 
 @dataclass(frozen=True)
@@ -199,15 +193,17 @@ class _Passes:
         return self._with_pairs(last) if self.equations.system.is_constrained else self._with_forces(last)
 
     def _with_pairs(self, last: Pass) -> Pass:
-        pairs, size = last.missed, self.r * self.n_s
+        known, size = last.missed, self.r * self.n_s
+        assert isinstance(known, Pairs)
         is_hard = (self.own.passes[1] > EASY) | (last.passes >= EASY)
-        d = jax.lax.cond(is_hard, lambda: pairs.corrected(last.d, size), lambda: last.d)
+        d = jax.lax.cond(is_hard, lambda: known.corrected(last.d, size), lambda: last.d)
         now = self._moved_by(d, last)
         noise = NOISE * jnp.finfo(float).eps * (max_abs(self.equations.q_s) + max_abs(last.slow))
-        pairs = jax.lax.cond(is_hard, lambda: pairs.add(d, now.d - last.d, noise, size), lambda: pairs)
+        pairs = jax.lax.cond(is_hard, lambda: known.add(d, now.d - last.d, noise, size), lambda: known)
         return now._replace(missed=pairs)
 
     def _with_forces(self, last: Pass) -> Pass:
+        assert not isinstance(last.missed, Pairs)
         part = jnp.where(last.passes == 1, last.missed**2, last.missed)  # the fast unknowns take three passes anyway
         is_hard = part * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0)) > 1
         wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part

@@ -13,6 +13,7 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.quadrature import PlacedRule, micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.interval import constant_mass
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def slow_part(system: System, scheme: Scheme, potential: Callable | None, num_fa
         potential: V, None where it only kicks.
     """
     alone = System(
-        ConstantMass(jnp.zeros(0), _constant(system).slow),
+        ConstantMass(jnp.zeros(0), constant_mass(system).slow),
         fast_potential=None if potential is None else PotentialOfSlow(potential, num_fast),
         constraint=None if system.slow_constraint is None else Rheonomic(ConstraintOfSlow(system.slow_constraint)),
         params=system.params,
@@ -71,7 +72,7 @@ def fast_part(system: System, scheme: Scheme, potential: Callable | None, num_sl
         potential: W, None where it only kicks at the macro nodes.
     """
     alone = System(
-        ConstantMass(jnp.zeros(0), _constant(system).fast),
+        ConstantMass(jnp.zeros(0), constant_mass(system).fast),
         fast_potential=potential,
         constraint=None if system.constraint is None else Rheonomic(ConstraintOfFast(system.constraint, num_slow)),
         params=system.params,
@@ -102,7 +103,7 @@ class ConstraintAtRest:
 def fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     """The fast variables under W and g with the slow ones at rest in q_s, and the scheme of one micro interval of them."""
     alone = System(
-        ConstantMass(jnp.zeros(0), _constant(system).fast),
+        ConstantMass(jnp.zeros(0), constant_mass(system).fast),
         fast_potential=None if system.fast_potential is None else PotentialAtRest(system.fast_potential),
         constraint=None if system.constraint is None else ConstraintAtRest(system.constraint),  # pyright: ignore[reportArgumentType]
         params=(system.params, q_s),
@@ -115,8 +116,3 @@ def _single(fast: PlacedRule) -> Scheme:
     """A scheme of fast variables alone on one interval."""
     drift = micro(midpoint)
     return Scheme(1, kinetic=drift, slow=drift, fast=fast)
-
-
-def _constant(system: System) -> ConstantMass:
-    assert isinstance(system.kinetic, ConstantMass)
-    return system.kinetic

@@ -13,7 +13,7 @@ The cheapest stepper that the rules and the system allow is found from outside t
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.parts import fast_alone, fast_part, slow_part
 from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Fallback, Solved, Solver
-from vmri_jax.steppers.stepper import StepInfo, Stepper
+from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class _Choice:
 class Plan:
     """A stepper with what it was planned for: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)``.
 
-    ``print`` shows it in words.
+    ``print`` shows it in words, ``print(plan.describe())`` with the rules of the scheme.
 
     Attributes:
         system, scheme, newton: as they were given.
@@ -83,6 +83,15 @@ class Plan:
     def has_fallback(self) -> bool:
         """Whether some solver inside may give way to another one."""
         return any(isinstance(solver, Fallback) for solver in _solvers(self.stepper))
+
+    def describe(self) -> str:
+        """What the scheme does with the system: the rules of what it has, order, symmetry, and how a step is taken."""
+        system = self.system
+        has = {"T": system.kinetic, "V": system.slow_potential, "W": system.fast_potential, "F": system.force}
+        has |= {"g": system.constraint, "g_s": system.slow_constraint}
+        scheme = self.scheme.describe()
+        scheme = replace(scheme, rules={name: rule for name, rule in scheme.rules.items() if has[name] is not None})
+        return "\n".join([str(scheme), "a step:", *indented(self.stepper.lines())])
 
     def __str__(self) -> str:
         return str(self.stepper)

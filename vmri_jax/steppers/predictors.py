@@ -1,8 +1,9 @@
 """Where unknowns go on: the slow ones from step to step, the fast ones from micro interval to micro interval."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 ORDER = 10
 """Highest order of the polynomials."""
@@ -16,12 +17,11 @@ class PolynomialPredictor(NamedTuple):
     The polynomial of order k through the last k + 1 values goes on with ``d_0 + ... + d_k``, and d_(k+1) is by how much that
     of the step before missed x_n. Few or rough steps ask for a low order, smooth ones for a high one.
 
-    differences: (ORDER + 2, n).
-    misses: (ORDER + 1,) the worst miss of every order in the steps before, fading: one lucky step is not to decide.
+    misses: the worst miss of every order in the steps before, fading: one lucky step is not to decide.
     """
 
-    differences: Any
-    misses: Any
+    differences: Float[Array, "ORDER+2 n"]
+    misses: Float[Array, "ORDER+1"]
 
     @classmethod
     def constant(cls, x) -> "PolynomialPredictor":
@@ -56,12 +56,12 @@ class LinearPredictor(NamedTuple):
     A kick at the macro nodes, or half of their constraint force, lets the first value of every macro step stand out from
     its neighbours.
 
-    last: (2, ...) of the last two intervals, the last one first, without what stands out.
-    jump: (...) by how much the first one of a macro step stands out.
+    last: of the last two intervals, the last one first, without what stands out.
+    jump: by how much the first one of a macro step stands out.
     """
 
-    last: Any
-    jump: Any
+    last: Float[Array, "2 r n"]
+    jump: Float[Array, "r n"]
 
     @classmethod
     def zero(cls, shape: tuple[int, ...]) -> "LinearPredictor":

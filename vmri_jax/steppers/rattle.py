@@ -6,14 +6,15 @@ after this is RATTLE (Andersen 1983).
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import inverse, matvec, max_abs, regularized
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
-from vmri_jax.steppers.interval import Accepted, constant_mass
+from vmri_jax.steppers.interval import Accepted, along, constant_mass
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
@@ -25,25 +26,25 @@ LEAST = 0.1
 class RattleState(NamedTuple):
     """What a step hands to the next one.
 
-    multiplier: (2, n_g + n_gs) multipliers of the last steps, the last one first.
+    multiplier: of all constraints in the last two steps, the last one first.
     before: length of the last step, 0 where the momenta have been projected since. Otherwise its half of the constraint force at
         the node between the two steps is left to the next one.
     """
 
-    multiplier: Any
-    before: Any
+    multiplier: Float[Array, "2 n_g+n_gs"]
+    before: Float[Array, ""]
 
 
 class Correction(NamedTuple):
-    """Increments x (n_s + n_f,), scaled multipliers mu, constraint values g there, and the corrections that g asks for."""
+    """Increments x of all variables, scaled multipliers mu, constraint values g there, and the corrections that g asks for."""
 
-    x: Any
-    mu: Any
-    g: Any
-    dx: Any
-    dmu: Any
-    iterations: Any
-    result: Any
+    x: Float[Array, "n_s+n_f"]
+    mu: Float[Array, "n_g+n_gs"]
+    g: Float[Array, "n_g+n_gs"]
+    dx: Float[Array, "n_s+n_f"]
+    dmu: Float[Array, "n_g+n_gs"]
+    iterations: Int[Array, ""]
+    result: Int[Array, ""]
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Rattle(Solver):
         straight = h * velocity_s(equations.p_s), h * velocity_f(equations.p_f)
         scale = self._scale(equations, own)
         mu = scale * (2 * own.multiplier[0] - own.multiplier[1])
-        x = jnp.concatenate(straight) - _combined(mu, columns)
+        x = jnp.concatenate(straight) - along(mu, columns)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
         schur = inverse(regularized(jax.vmap(push)(columns).T))
         accepted = Accepted.of(equations, newton).sizes(tuple(map(max_abs, straight)))
@@ -81,7 +82,7 @@ class Rattle(Solver):
 
         def at(x, mu, g, iterations) -> Correction:
             dmu = matvec(schur, g)
-            dx = _combined(dmu, columns)
+            dx = along(dmu, columns)
             change = jnp.maximum(per_slow * max_abs(dx[:n_s]), per_fast * max_abs(dx[n_s:]))
             return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
 
@@ -92,7 +93,7 @@ class Rattle(Solver):
         first = corrected(at(x, mu, g, 0))  # nearly all steps take one: outside of the loop it is cheaper
         done = newton.iterate(corrected, first, done=1)
 
-        impulse = _combined(done.mu, jacobian) / h
+        impulse = along(done.mu, jacobian) / h
         end = equations.q_f + done.x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
         status = status_of(
             equations, done.result, Method.RATTLE, done.iterations, 0.0, max_abs(done.g), newton.tolerance
@@ -119,8 +120,3 @@ class Rattle(Solver):
 
     def lines(self) -> list[str]:
         return ["drift along the constraints (RATTLE): Newton's iteration on the multipliers"]
-
-
-def _combined(mu, rows):
-    """``sum_j mu_j rows_j``."""
-    return jnp.sum(mu[:, None] * rows, axis=0)

@@ -17,10 +17,12 @@ class Result(IntEnum):
 
     @property
     def success(self) -> bool:
+        """Whether the step can be used."""
         return self <= Result.CONVERGED_AT_ROUNDOFF
 
     @property
     def message(self) -> str:
+        """What happened, likely causes, what to do."""
         return _MESSAGES[self]
 
 

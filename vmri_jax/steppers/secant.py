@@ -5,9 +5,10 @@ of d measure it: the best combination of pairs that cancels d says where to go i
 as in the interface quasi-Newton methods of fluid-structure interaction (Degroote, Bathe, Vierendeels 2009).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 SIZE = 4
 """Pairs that are kept."""
@@ -16,20 +17,21 @@ FILTER = 1e-3
 
 
 class Pairs(NamedTuple):
-    """moves, changes (size, n): of x and of d between two iterations, the last pair first, changes of length one.
+    """Moves of x and changes of d between two iterations, the last pair first, changes of length one.
 
     Lengths and fits are those of the first `measured` entries: the others (multipliers) have another unit.
     """
 
-    moves: Any
-    changes: Any
+    moves: Float[Array, "size n"]
+    changes: Float[Array, "size n"]
 
     @classmethod
     def none(cls, n: int, size: int = SIZE) -> "Pairs":
+        """Nothing learned of n unknowns yet."""
         return cls(jnp.zeros((size, n)), jnp.zeros((size, n)))
 
     def add(self, move, change, noise, measured: int) -> "Pairs":
-        """With one more pair, unless its change is below the noise."""
+        """With one more pair (n,), (n,), unless its change is below the noise."""
         length = jnp.sqrt(jnp.sum(change[:measured] ** 2))
         scale = 1 / jnp.where(length > noise, length, 1.0)
         new = Pairs(

@@ -11,11 +11,12 @@ step it is as large as they are, and an update can be solved for with it (`SlowE
 
 from collections.abc import Callable
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from vmri_jax.kernels import inverse, matmul, max_abs, solve
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
@@ -35,12 +36,12 @@ ENOUGH = 1e-5
 class Tied(NamedTuple):
     """The masses K_s of the slow variables and those tied to them have the inverse ``(1 - U P) K_s^-1``.
 
-    responses: U (r n_g, r, n_s), slow increments by each multiplier of the first micro interval.
-    multipliers: P (r n_g, r, n_s), those multipliers by the slow increments that K_s alone would give.
+    responses: U, slow increments by each multiplier of the first micro interval.
+    multipliers: P, those multipliers by the slow increments that K_s alone would give.
     """
 
-    responses: Any
-    multipliers: Any
+    responses: Float[Array, "r*n_g r n_s"]
+    multipliers: Float[Array, "r*n_g r n_s"]
 
 
 class SlowEquations(NamedTuple):
@@ -48,11 +49,12 @@ class SlowEquations(NamedTuple):
 
     equations: StepEquations
     kinetic: QuadraticKinetic
-    inverse_form: Any
+    inverse_form: Float[Array, "r r"]
     inverse_mass: Callable
 
     @classmethod
     def of(cls, equations: StepEquations) -> "SlowEquations":
+        """With the inverse of the masses."""
         kinetic = lagrangian(equations.system, equations.scheme).kinetic
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
         return cls(equations, kinetic, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)

@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from vmri_jax.kernels import max_abs
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.projection import project_momentum
 from vmri_jax.mechanics.state import State
@@ -25,7 +27,7 @@ class Solution(NamedTuple):
     """Unknowns x of a macro step, (q_f, p_s, p_f) at its end, and how they were found."""
 
     x: Unknowns
-    end: tuple[Any, Any, Any]
+    end: tuple[Float[Numbers, "n_f"], Float[Numbers, "n_s"], Float[Numbers, "n_f"]]
     status: Status
 
 
@@ -62,13 +64,13 @@ class SolvedState(NamedTuple):
     """Where the next iteration starts.
 
     velocity: (v_s, v_f) after the last projection; with constant masses it follows from the momenta instead.
-    multiplier, slow_multiplier: (n_g,), (n_gs,) Lagrange multipliers at the last control nodes that have any.
+    multiplier, slow_multiplier: Lagrange multipliers at the last control nodes that have any.
     solver: what the solver carries.
     """
 
-    velocity: tuple[Any, Any]
-    multiplier: Any
-    slow_multiplier: Any
+    velocity: tuple[Float[Numbers, "n_s"], Float[Numbers, "n_f"]]
+    multiplier: Float[Array, "n_g"]
+    slow_multiplier: Float[Array, "n_gs"]
     solver: Any
 
 
@@ -154,9 +156,13 @@ class Fallback(Solver):
 
 
 def status_of(equations: StepEquations, result, method, iterations, rows, g, tolerance) -> Status:
-    """How a solver ended, from the largest row of the momentum equations times h and the largest constraint value.
+    """How a solver ended. Increments that converged with constraints that are not kept mean rows that contradict each other.
 
-    Increments that converged with constraints that are not kept mean rows that contradict each other.
+    Args:
+        result, method, iterations: as in `StepInfo`.
+        rows: largest row of the momentum equations, times h.
+        g: largest constraint value.
+        tolerance: of Newton; constraints may miss zero by more where it is loose.
     """
     if equations.system.is_constrained:
         violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)

@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
 from vmri_jax.steppers.results import Method, Result
 
@@ -19,18 +21,18 @@ class StepInfo(eqx.Module):
     method: code of the stepper that ran, see `Method`; with "auto" ARROWHEAD says that the first choice did not converge.
     iterations: Newton iterations or passes, the most that any of its solves took; 0 for explicit steps.
     residual: largest residual left, relative to the momentum, and of the constraints; 0 where equations are linear.
-    q_f_micro: (num_micro, n_f) fast positions at the micro nodes, the start excluded.
-    multiplier, slow_multiplier: (num_micro, r, n_g) and (r, n_gs) Lagrange multipliers at the control nodes; of the
-        stages of a composition one after the other, (s r, n_gs).
+    q_f_micro: fast positions at the micro nodes, the start excluded.
+    multiplier, slow_multiplier: Lagrange multipliers at the control nodes; of a composition with s stages those of all, s r
+        slow ones.
     """
 
-    result: Any
-    method: Any
-    iterations: Any
-    residual: Any
-    q_f_micro: Any
-    multiplier: Any
-    slow_multiplier: Any
+    result: Int[Numbers, ""]
+    method: Int[Numbers, ""]
+    iterations: Int[Numbers, ""]
+    residual: Float[Numbers, ""]
+    q_f_micro: Float[Numbers, "num_micro n_f"]
+    multiplier: Float[Numbers, "num_micro r n_g"]
+    slow_multiplier: Float[Numbers, "r n_gs"]
 
     @property
     def status(self) -> "Status":
@@ -41,10 +43,10 @@ class StepInfo(eqx.Module):
 class Status(NamedTuple):
     """How a step ended: the first four fields of `StepInfo`."""
 
-    result: Any
-    method: Any
-    iterations: Any
-    residual: Any
+    result: Int[Numbers, ""]
+    method: Int[Numbers, ""]
+    iterations: Int[Numbers, ""]
+    residual: Float[Numbers, ""]
 
     @classmethod
     def direct(cls, method: Method) -> "Status":
@@ -60,7 +62,8 @@ class Status(NamedTuple):
 class Stepper(ABC):
     """Takes macro steps: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)`` again and again.
 
-    `own` is what a stepper carries from step to step, a NamedTuple that its file documents.
+    Arguments of its methods are the `State` at the start of a step, `own`, which is what a stepper carries from step to step, a
+    NamedTuple that its file documents, and the length of the step.
     """
 
     def init(self, state: State, macro_dt) -> Any:

@@ -5,10 +5,11 @@ eigenvectors of A^-1 B (Butcher 1976; Hairer, Wanner, *Solving Ordinary Differen
 as all real parts before all imaginary ones, so that rows fill vector registers.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from vmri_jax.schemes.path import lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import interpolatory_weights
@@ -24,19 +25,19 @@ class TimeModes(NamedTuple):
     What has one entry per part of a mode has all real parts before all imaginary ones. Two real modes share what a complex one
     takes, and parts of no mode fill vector registers.
 
-    gamma (2, modes): eigenvalues.
-    mode (k,): which mode it is a part of.
-    of_rows: (r, r) ``A^-1``, from the rows of the momentum equations to increments.
-    of_values: (r, k) from values at the nodes to modes.
-    increments, multipliers: (k, r) from modes to increments, and (through A) to multipliers.
+    gamma: eigenvalues.
+    mode: which mode it is a part of.
+    of_rows: ``A^-1``, from the rows of the momentum equations to increments.
+    of_values: from values at the nodes to modes.
+    increments, multipliers: from modes to increments, and (through A) to multipliers.
     """
 
-    gamma: Any
-    mode: Any
-    of_rows: Any
-    of_values: Any
-    increments: Any
-    multipliers: Any
+    gamma: Float[np.ndarray, "2 modes"]
+    mode: Int[np.ndarray, "k"]
+    of_rows: Float[np.ndarray, "r r"]
+    of_values: Float[np.ndarray, "r k"]
+    increments: Float[np.ndarray, "k r"]
+    multipliers: Float[np.ndarray, "k r"]
 
     @classmethod
     def of(cls, scheme: Scheme) -> "TimeModes":

@@ -61,6 +61,7 @@ class Record(NamedTuple):
 
     @classmethod
     def of(cls, at: Checkpoint, saved: int = 0, result: int = int(Result.CONVERGED), failed_at: int = -1) -> "Record":
+        """With what a checkpoint consists of."""
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((at.state, at.memory))]
         return cls(saved, result, failed_at, at.step, at.fell_back, leaves)
 

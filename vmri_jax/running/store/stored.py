@@ -10,10 +10,8 @@ import numpy as np
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
-from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, from_named_arrays
+from vmri_jax.running.trajectory import MICRO, NODES, RunInfo, Trajectory, from_named_arrays
 from vmri_jax.steppers.results import Result, SimulationError
-
-MICRO = ("t_micro", "q_f_micro")
 
 
 class StoredTrajectory:
@@ -26,6 +24,14 @@ class StoredTrajectory:
     Args:
         path: folder of the store.
 
+    Attributes:
+        num_steps: macro steps that the run was to make.
+        save_every: macro steps from one saved node to the next.
+        chunk: saved intervals that are written together.
+        step: macro steps on disk.
+        result: status up to there, the first that was no success.
+        failed_at: index of the macro step that failed, -1 if none did.
+
     Raises:
         FileNotFoundError: nothing there.
         ValueError: something else than a store, or a damaged one.
@@ -34,7 +40,11 @@ class StoredTrajectory:
     def __init__(self, path):
         self.path = Path(path)
         self.attributes: dict[str, Any] = read_attributes(self.path)
+        self.num_steps: int = self.attributes["num_steps"]
+        self.save_every: int = self.attributes["save_every"]
+        self.chunk: int = self.attributes["chunk"]
         self.record: Record = read_record(self.path)
+        self.step, self.result, self.failed_at = self.record.step, Result(self.record.result), self.record.failed_at
 
     @classmethod
     def open(cls, path) -> "StoredTrajectory":
@@ -44,36 +54,6 @@ class StoredTrajectory:
     def __repr__(self) -> str:
         state = "complete" if self.complete else "failed" if not self.success else "not complete"
         return f"StoredTrajectory({str(self.path)!r}: {self.step} of {self.num_steps} macro steps, {state})"
-
-    @property
-    def num_steps(self) -> int:
-        """Macro steps that the run was to make."""
-        return self.attributes["num_steps"]
-
-    @property
-    def save_every(self) -> int:
-        """Macro steps from one saved node to the next."""
-        return self.attributes["save_every"]
-
-    @property
-    def chunk(self) -> int:
-        """Saved intervals that are written together."""
-        return self.attributes["chunk"]
-
-    @property
-    def step(self) -> int:
-        """Macro steps on disk."""
-        return self.record.step
-
-    @property
-    def result(self) -> Result:
-        """Status up to there, the first that was no success."""
-        return Result(self.record.result)
-
-    @property
-    def failed_at(self) -> int:
-        """Index of the macro step that failed, -1 if none did."""
-        return self.record.failed_at
 
     @property
     def success(self) -> bool:

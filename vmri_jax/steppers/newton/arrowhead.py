@@ -7,10 +7,11 @@ is block lower triangular. So a forward march gives the response of the chain to
 response to each slow increment; inserted into the slow equations they leave a small border system.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import saddle
 from vmri_jax.schemes.equations import StepEquations, Unknowns
@@ -20,15 +21,15 @@ from vmri_jax.steppers.newton.linearization import Blocks, linearize
 class Factors(NamedTuple):
     """What does not depend on the residual.
 
-    chain (num_micro, k, k): inverse of each chain block, k = r (n_f + n_g)
-    response (num_micro, k, r n_s): of the chain unknowns to the slow increments
-    border: LU factors of the slow equations once the chain is eliminated
+    chain: inverse of each chain block, k = r (n_f + n_g)
+    response: of the chain unknowns to the slow increments
+    border: LU factors of the slow equations once the chain is eliminated, None if there are none
     """
 
     blocks: Blocks
-    chain: Any
-    response: Any
-    border: Any
+    chain: Float[Array, "num_micro k k"]
+    response: Float[Array, "num_micro k r*n_s"]
+    border: tuple[Float[Array, "b b"], Int[Array, "b"]] | None
 
 
 def factor(equations: StepEquations, x: Unknowns) -> Factors:

@@ -5,11 +5,12 @@ interpolation matrices of the path. Row bases are the slots (Lagrange basis l_0.
 (start of the interval and increments), so that a block maps changes of the unknowns to changes of ``h D_j A``.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
@@ -19,23 +20,23 @@ from vmri_jax.schemes.path import NodeGroup, Nodes, control_node_groups, lagrang
 class Blocks(NamedTuple):
     """Local blocks of the Newton matrix (index order: row slot, row coordinate, column slot, column coordinate).
 
-    ff (num_micro, r+1, n_f, r+1, n_f): fast slots against [start, increments 1..r] of the same micro interval
-    fs (num_micro, r+1, n_f, r, n_s): fast slots against slow increments
-    sf (num_micro, r+1, n_s, r+1, n_f): slow slots against [start, increments] of each micro interval
-    ss (r+1, n_s, r, n_s): slow slots against slow increments
-    g_s, g_f (num_micro, r+1, n_g, n): constraint Jacobian at the control nodes 0..r of each micro interval
-    g_slow (r+1, n_gs, n_s): slow constraint Jacobian at the slow control nodes
-    basis (num_micro, r+1, r+1): slow Lagrange basis l_i at the control nodes
+    ff: fast slots against [start, increments 1..r] of the same micro interval
+    fs: fast slots against slow increments
+    sf: slow slots against [start, increments] of each micro interval
+    ss: slow slots against slow increments
+    g_s, g_f: constraint Jacobian at the control nodes 0..r of each micro interval
+    g_slow: slow constraint Jacobian at the slow control nodes
+    basis: slow Lagrange basis l_i at the control nodes
     """
 
-    ff: Any
-    fs: Any
-    sf: Any
-    ss: Any
-    g_s: Any
-    g_f: Any
-    g_slow: Any
-    basis: Any
+    ff: Float[Array, "num_micro r+1 n_f r+1 n_f"]
+    fs: Float[Array, "num_micro r+1 n_f r n_s"]
+    sf: Float[Array, "num_micro r+1 n_s r+1 n_f"]
+    ss: Float[Array, "r+1 n_s r n_s"]
+    g_s: Float[Array, "num_micro r+1 n_g n_s"]
+    g_f: Float[Array, "num_micro r+1 n_g n_f"]
+    g_slow: Float[Array, "r+1 n_gs n_s"]
+    basis: Float[Array, "num_micro r+1 r+1"]
 
 
 def linearize(equations: StepEquations, x: Unknowns) -> Blocks:

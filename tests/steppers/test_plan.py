@@ -1,0 +1,59 @@
+"""Plans in words."""
+
+import pytest
+
+from vmri_jax import (
+    compose,
+    explicit_slow,
+    fully_explicit,
+    galerkin,
+    mollified_impulse,
+    plan,
+    quadrature,
+    takahashi_imada,
+)
+
+FPU_EXPLICIT = """\
+order           1, not symmetric
+path            5 micro steps of degree 1 per macro step
+T               midpoint on every micro interval
+V               rule of nodes 0, 1 with weights 0.3, 0.7 on the macro interval
+W               rule of nodes 0, 1 with weights 0.3, 0.7 on every micro interval
+gradients of V  1 per macro step
+gradients of W  5 per macro step
+solves          none per macro step; with constraints 1
+a step:
+  kicks of V at both ends
+    slow variables, one step:
+      free flight: q + H v, nothing to solve
+    fast variables, 5 micro steps:
+      kicks of W at both ends
+        free flight: q + H v, nothing to solve"""
+
+
+def test_a_plan_describes_what_the_scheme_does_with_the_system(fpu):
+    assert plan(fpu.system, fully_explicit(5, alpha=0.3), fpu.state()).describe() == FPU_EXPLICIT
+
+
+def test_only_terms_of_the_system_are_described(tsp):
+    rows = plan(tsp.system, compose(explicit_slow(4), "yoshida4"), tsp.state()).describe().splitlines()
+    step = rows.index("a step:")
+    assert [row.split()[0] for row in rows[2:step]] == ["T", "V", "W", "g", "g_s", "gradients", "gradients", "solves"]
+    assert rows[step + 1] == "  composition of 3 stages, each:"
+
+
+@pytest.mark.parametrize(
+    ("scheme", "words"),
+    [
+        (explicit_slow(5), "trapezoidal rule on the macro interval"),
+        (explicit_slow(5, 1.0), "rule of nodes 0, 1 with weights 1, 0 on the macro interval"),
+        (mollified_impulse(5), "trapezoidal rule on the macro interval, at averaged fast positions"),
+        (takahashi_imada(5), "trapezoidal rule on the macro interval, corrected by its gradient"),
+        (galerkin(5, 3), "Gauss rule of 3 nodes on every micro interval"),
+        (galerkin(5, 3, "lobatto"), "Lobatto rule of 4 nodes on every micro interval"),
+        (galerkin(5, 2, quadrature.radau(2)), "Radau rule of 2 nodes with the right end on every micro interval"),
+        (galerkin(5, 2, quadrature.simpson), "Simpson's rule on every micro interval"),
+    ],
+)
+def test_rules_in_words(scheme, words):
+    assert scheme.describe().rules["V"] == words
