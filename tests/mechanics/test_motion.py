@@ -41,7 +41,9 @@ def test_a_pendulum_by_the_formula():
     assert np.allclose(found.a_f, pull / MASS - np.array([0.0, GRAVITY]), rtol=1e-13)
 
 
-@pytest.mark.parametrize("make", [double_pendulum, None], ids=["mass that depends on the positions", "driven and damped"])
+@pytest.mark.parametrize(
+    "make", [double_pendulum, None], ids=["mass that depends on the positions", "driven and damped"]
+)
 def test_accelerations_are_those_of_runs(make):
     if make is None:
         system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), None, weight, Rheonomic(swinging), force=drag)
@@ -54,7 +56,9 @@ def test_accelerations_are_those_of_runs(make):
     middle = State(*(a[1] for a in (run.t, run.q_s, run.q_f, run.p_s, run.p_f)))
     found = motion(system, middle)
     for q, a in ((run.q_s, found.a_s), (run.q_f, found.a_f)):
-        assert np.allclose((q[2] - 2 * q[1] + q[0]) / h**2, a, rtol=1e-4, atol=1e-4)  # measured 2e-5, of the difference itself
+        assert np.allclose(
+            (q[2] - 2 * q[1] + q[0]) / h**2, a, rtol=1e-4, atol=1e-4
+        )  # measured 2e-5, of the difference itself
 
 
 def test_powers_are_the_rate_of_energy():
@@ -68,4 +72,6 @@ def test_powers_are_the_rate_of_energy():
     assert np.abs(change).max() > 1.0
     assert np.abs(work).max(axis=0).min() > 0.1  # forces and constraints both take part
     assert np.allclose(change, work.sum(axis=1), atol=2e-5 * np.abs(change).max())
-    assert float(energy(system, *(a[-1] for a in (run.q_s, run.q_f, run.p_s, run.p_f)))) == pytest.approx(float(run.energy[-1]))
+    assert float(energy(system, *(a[-1] for a in (run.q_s, run.q_f, run.p_s, run.p_f)))) == pytest.approx(
+        float(run.energy[-1])
+    )

@@ -103,10 +103,10 @@ class Problem:
     """
 
     system: System
-    q_s: Float[Numbers, "n_s"] | list[float]
-    q_f: Float[Numbers, "n_f"] | list[float]
-    v_s: Float[Numbers, "n_s"] | list[float]
-    v_f: Float[Numbers, "n_f"] | list[float]
+    q_s: Any
+    q_f: Any
+    v_s: Any
+    v_f: Any
     t: Number = 0.0
     drawing: Any = None
     project: bool = False
