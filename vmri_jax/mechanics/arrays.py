@@ -79,6 +79,13 @@ def real_array(name: str, value, ndim: int | None = None):
     return array
 
 
+def whole_number(what: str, value, least: int = 1, otherwise: str = "") -> int:
+    """An integer of at least `least`; messages call it `what`, and say what else may be given."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{what} is {value!r}; it must be an integer of at least {least}{otherwise}.")
+    return int(value)
+
+
 def double_array(name: str, value):
     """`real_array` of numbers in double precision: the digits that an array of float32 lacks cannot be had back.
 

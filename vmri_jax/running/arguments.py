@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
-from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_type, require_x64
+from vmri_jax.mechanics.arrays import is_concrete, real_array, require_x64, whole_number
+from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_type
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
@@ -45,9 +45,8 @@ def check_step_size(scheme: Scheme | Composition, macro_dt, micro_dt):
 
 def check_counts(num_steps, save_every) -> None:
     """Whole numbers of steps, the last of which is saved."""
-    for name, value in (("num_steps", num_steps), ("save_every", save_every)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"simulate: {name} is {value!r}; it must be an integer of at least 1.")
+    whole_number("simulate: num_steps", num_steps)
+    whole_number("simulate: save_every", save_every)
     if num_steps % save_every:
         raise ValueError(
             f"simulate: num_steps = {num_steps} is not a multiple of save_every = {save_every}; the last saved node would "

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.checks import check_params, check_type
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
@@ -139,8 +139,8 @@ def _check_devices(devices, chunk) -> None:
             f"simulate_batch: devices is {devices}, but JAX has {jax.device_count()}; call vm.configure(devices={devices}) "
             "before JAX starts."
         )
-    if chunk is not None and (not isinstance(chunk, int) or chunk < 1):
-        raise ValueError(f"simulate_batch: chunk is {chunk!r}; it must be an integer of at least 1, or None.")
+    if chunk is not None:
+        whole_number("simulate_batch: chunk", chunk, otherwise=", or None")
 
 
 def _chunk(run: Simulation) -> int:

@@ -27,13 +27,13 @@ class Interrupted(KeyboardInterrupt):
 
 
 @contextmanager
-def interrupts_noted(active: bool = True) -> Iterator[Callable[[], bool]]:
+def interrupts_noted() -> Iterator[Callable[[], bool]]:
     """Within, a first Ctrl-C is only noted and a second one raises; yields the function that says whether there was one.
 
     Where Python allows no handlers (outside the main thread), or somebody else handles Ctrl-C, nothing changes.
     """
     own = signal.default_int_handler
-    active = active and threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is own
+    active = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is own
     noted = []
 
     def note(number, frame) -> None:

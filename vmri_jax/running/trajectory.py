@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vmri_jax.mechanics.arrays import Numbers
-from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.mechanics.arrays import Numbers, require_x64
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.files import replaced
 from vmri_jax.steppers.results import Result

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import legendre
 
-from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
+from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array, whole_number
 
 NODE_TOLERANCE = 1e-12
 """Nodes closer than this are the same node."""
@@ -84,7 +84,7 @@ class Rule(eqx.Module):
         Args:
             count: at least 1.
         """
-        _check_count("repeat", count, 1, "count")
+        whole_number("repeat: the count", count)
         nodes = tuple((m + node) / count for m in range(count) for node in self.nodes)
         return _merge(nodes, [self.weights / count] * count)
 
@@ -152,13 +152,13 @@ def _roots(series) -> np.ndarray:
 
 def gauss(n: int) -> Rule:
     """Gauss-Legendre rule: n interior nodes, order 2n."""
-    _check_count("gauss", n, 1)
+    whole_number("gauss: the number of nodes", n)
     return interpolatory((_roots(np.eye(n + 1)[n]) + 1) / 2)
 
 
 def lobatto(n: int) -> Rule:
     """Gauss-Lobatto rule: n >= 2 nodes including both ends, order 2n - 2."""
-    _check_count("lobatto", n, 2)
+    whole_number("lobatto: the number of nodes", n, 2)
     interior = _roots(legendre.legder(np.eye(n)[n - 1])) if n > 2 else np.zeros(0)
     return interpolatory((np.concatenate([[-1.0], interior, [1.0]]) + 1) / 2)
 
@@ -170,7 +170,7 @@ def radau(n: int, end: Literal["left", "right"] = "right") -> Rule:
         n: number of nodes.
         end: which one is a node.
     """
-    _check_count("radau", n, 1)
+    whole_number("radau: the number of nodes", n)
     if end not in ("left", "right"):
         raise ValueError(f"radau: end is {end!r}; it must be 'left' or 'right'.")
     interior = np.zeros(0)
@@ -191,11 +191,6 @@ def affine(alpha) -> Rule:
     """
     real_array("affine: alpha", alpha, 0)
     return alpha * left + (1 - alpha) * right
-
-
-def _check_count(name: str, n: int, least: int, what: str = "number of nodes") -> None:
-    if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < least:
-        raise ValueError(f"{name}: the {what} is {n!r}; it must be an integer of at least {least}.")
 
 
 left = Rule((0.0,), (1.0,))

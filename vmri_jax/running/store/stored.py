@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.mechanics.arrays import require_x64
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
 from vmri_jax.running.trajectory import MICRO, NODES, RunInfo, Trajectory, from_named_arrays

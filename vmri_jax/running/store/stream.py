@@ -8,8 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -88,7 +87,7 @@ def stream(
         "num_steps": num_steps,
         "save_every": save_every,
         "save_micro": save_micro,
-        "chunk": _chunk(run) if chunk is None else _given(chunk),
+        "chunk": _chunk(run) if chunk is None else whole_number("stream: chunk", chunk, otherwise=", or None"),
         "identity": identity(run, run.state),
         "made_with": environment(),
     }
@@ -203,9 +202,3 @@ def _chunk(run: Simulation) -> int:
     numbers = 2 * (n_s + n_f) + 8 + (num_micro * (n_f + 1) if run.save_micro else 0)
     wanted = max(run.num_saves // PARTS, LEAST_MICRO_STEPS // (num_micro * run.save_every))
     return max(1, min(wanted, run.num_saves, MOST_BYTES // (8 * numbers)))
-
-
-def _given(chunk) -> int:
-    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1:
-        raise ValueError(f"stream: chunk is {chunk!r}; it must be an integer of at least 1, or None.")
-    return int(chunk)
