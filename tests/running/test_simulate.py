@@ -22,8 +22,11 @@ from vmri_jax import (
     galerkin,
     initial_state,
     macro_step,
+    plan,
     simulate,
 )
+from vmri_jax.running.engine import engine
+from vmri_jax.scene import Body, Scene, Spring
 
 SCHEME = explicit_slow(3)
 H = 0.03
@@ -238,3 +241,50 @@ def test_potential_that_is_nan_where_its_gradient_is_not():
     assert failure.value.step == 3  # 4 steps of 0.3 pass the wall at 1
     assert np.isfinite(trajectory.q_s[:4]).all()
     assert np.isnan(trajectory.q_s[4:]).all()
+
+
+@pytest.mark.parametrize("given", ["problem", "scene", "system"])
+def test_a_problem_or_a_scene_is_enough(given, fpu):
+    if given == "scene":
+        bodies = [Body("heavy", 10.0, 0.0, pace="slow"), Body("light", 1.0, 1.0, pace="fast")]
+        moved = Scene(bodies, [Spring(("heavy", "light"), 100.0, 0.5)])
+        system, state = moved.system(), moved.state()
+    else:
+        moved, system, state = fpu, fpu.system, fpu.state()
+    start = (system, fully_implicit(2), state) if given == "system" else (moved, fully_implicit(2))
+    run = simulate(*start, macro_dt=0.05, t_end=0.2)
+    expected = simulate(system, fully_implicit(2), state, macro_dt=0.05, num_steps=4)
+    assert np.array_equal(run.q_f, expected.q_f)
+    assert str(plan(*start)) == str(plan(system, fully_implicit(2), state))
+
+
+def test_ends_of_runs(fpu):
+    def until(t_end, **changes):
+        return simulate(fpu, fully_implicit(2), **{"macro_dt": 0.1, "t_end": t_end} | changes)
+
+    assert float(until(0.3).t[-1]) == pytest.approx(0.3, abs=1e-15)
+    for arguments, message in (
+        (
+            {"t_end": 0.25},
+            r"there are 2.5 macro steps of 0.1, no whole number. Take macro_dt = 0.08333333333, or give num_steps",
+        ),
+        ({"t_end": -1.0}, r"t_end is -1, less than a macro step of 0.1 after the start at 0"),
+        ({"t_end": 1.0, "num_steps": 10}, r"got both of num_steps and t_end"),
+        ({"t_end": None}, r"got neither of num_steps and t_end"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            until(**arguments)
+    with pytest.raises(TypeError, match=r"simulate: a System has no start; give a State, .* or a Problem"):
+        simulate(fpu.system, fully_implicit(2), macro_dt=0.1, num_steps=1)
+
+
+def test_lengths_of_runs_share_a_program(fpu):
+    def run(num_steps):
+        return simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=num_steps)
+
+    longest, known = run(36), engine.cache_info().misses
+    runs = [run(n) for n in (33, 34, 35)]
+    assert engine.cache_info().misses == known
+    assert [len(run.t) for run in runs] == [34, 35, 36]
+    assert all(np.array_equal(run.q_f, longest.q_f[: len(run.t)]) for run in runs)
+    assert all(len(run.info.iterations) == len(run.t) - 1 for run in runs)

@@ -1,13 +1,15 @@
 """Numbers as users give them: real, and float64."""
 
+from typing import Any, TypeAlias
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-Numbers = jax.Array | np.ndarray
+Numbers: TypeAlias = Any
 """Arrays in annotations: ``Float[Numbers, "n_s"]`` are so many floats, in an array of JAX or of NumPy."""
-Number = Float[Numbers, ""] | float
+Number: TypeAlias = Float[Numbers, ""] | float
 """A number in annotations, of Python or as an array."""
 
 ADVICE = "give float64: lists of numbers, NumPy arrays by .astype(float), JAX arrays made after vm.configure()"

@@ -67,7 +67,7 @@ def motion(system: System, state: State) -> Motion:
     mass = jax.jacfwd(momentum, argnums=1)(q, v)
     forces = jax.grad(lagrangian)(q, v) - jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
     if system.force is not None:
-        forces += jnp.append(*system.forces(t, state.q_s, state.q_f, v_s, v_f))
+        forces += jnp.concatenate(system.forces(t, state.q_s, state.q_f, v_s, v_f))
     jacobian = jax.jacrev(constraints, argnums=1)(t, q)
     gamma = jax.jvp(rates, (t, q), (jnp.ones_like(t), v))[1]
 

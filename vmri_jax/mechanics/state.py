@@ -2,7 +2,7 @@
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -122,6 +122,43 @@ class Problem:
         """The consistent initial `State` (see `initial_state`); None for `project` of the problem."""
         project = self.project if project is None else project
         return initial_state(self.system, self.q_s, self.q_f, self.v_s, self.v_f, self.t, project=project)
+
+
+class HasProblem(Protocol):
+    """What can be made a problem, as a scene."""
+
+    def problem(self) -> Problem: ...
+
+
+Movable = System | Problem | HasProblem
+"""What can be simulated: a system needs a state as well."""
+
+
+def start_of(what: str, system, state=None) -> tuple[System, State]:
+    """The system and the state of what is to move.
+
+    Args:
+        what: the function that was called, for messages.
+        system: a `System`, a `Problem`, or anything whose ``problem()`` is one, as a scene's.
+        state: where it starts; None for the start of the problem.
+
+    Raises:
+        TypeError: something else; a system without a state.
+    """
+    if callable(getattr(system, "problem", None)):
+        system = system.problem()
+    if isinstance(system, Problem):
+        system, state = system.system, system.state() if state is None else state
+    if not isinstance(system, System):
+        raise TypeError(
+            f"{what}: system is {type(system).__name__}; give a vmri_jax.Problem or a Scene, or a System and a State."
+        )
+    if not isinstance(state, State):
+        got = "a System has no start" if state is None else f"state is {type(state).__name__}"
+        raise TypeError(
+            f"{what}: {got}; give a State, e.g. from initial_state(...), or a Problem(system, q_s, q_f, v_s, v_f) alone."
+        )
+    return system, state
 
 
 @jax.jit

@@ -3,33 +3,57 @@
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array, require_x64, whole_number
-from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_type
+from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params
 from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 
+WHOLE = 1e-9
+"""Part by which a number of steps may miss a whole number."""
 
-def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro=False):
-    """Refuse bad arguments of `simulate`; returns macro_dt."""
+
+def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro=False):
+    """Refuse bad arguments of `simulate`; returns macro_dt and num_steps."""
     require_x64()
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(
             f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
         )
-    check_type("simulate: system", system, System, "a vmri_jax.System")
-    check_type("simulate: state", state, State, "a State, e.g. from initial_state(...)")
     check_params(system.params)
     if not isinstance(newton, Newton | None):
         raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(method='dense').")
     check_flags(save_micro=save_micro)
     dt = check_step_size(scheme, macro_dt, micro_dt)
     check_number("simulate: the t of state", state.t)
+    if (num_steps is None) == (t_end is None):
+        got = "neither" if num_steps is None else "both"
+        raise ValueError(f"simulate: got {got} of num_steps and t_end; give exactly one of them.")
+    if num_steps is None:
+        num_steps = steps_until(t_end, state.t, dt)
     check_counts(num_steps, save_every)
     if is_concrete(vars(state)):
         check_vectors(state)
-    return dt
+    return dt, num_steps
+
+
+def steps_until(t_end, t, macro_dt) -> int:
+    """The number of macro steps from t to t_end."""
+    if not is_concrete((t_end, t, macro_dt)):
+        raise ValueError("simulate: t_end needs times that are known; under transformations of JAX give num_steps.")
+    check_number("simulate: t_end", t_end)
+    steps = float((t_end - t) / macro_dt)
+    whole = round(steps)
+    if whole < 1:
+        raise ValueError(
+            f"simulate: t_end is {t_end:g}, less than a macro step of {macro_dt:g} after the start at {t:g}."
+        )
+    if abs(steps - whole) > WHOLE * whole:
+        raise ValueError(
+            f"simulate: from {t:g} to t_end = {t_end:g} there are {steps:.6g} macro steps of {macro_dt:g}, no whole number. "
+            f"Take macro_dt = {float(t_end - t) / np.ceil(steps):.10g}, or give num_steps."
+        )
+    return whole
 
 
 def check_step_size(scheme: Scheme | Composition, macro_dt, micro_dt):

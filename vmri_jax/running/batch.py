@@ -9,8 +9,8 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from vmri_jax.mechanics.arrays import real_array, whole_number
-from vmri_jax.mechanics.checks import check_params, check_type
-from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.checks import check_params
+from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import Engine
 from vmri_jax.running.memory import check_memory
@@ -27,13 +27,14 @@ FEWEST, MOST = 64, 1024
 
 
 def simulate_batch(
-    system: System,
+    system: Movable,
     scheme: Scheme | Composition,
     states: State,
     *,
     macro_dt=None,
     micro_dt=None,
-    num_steps: int,
+    num_steps: int | None = None,
+    t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
     params=None,
@@ -47,11 +48,11 @@ def simulate_batch(
     its status in ``.result`` and ``.failed_at``; others do not notice, and nothing is raised. Lanes that the nested march does not solve are run again with the exact arrowhead.
 
     Args:
-        system, scheme: what moves, and how.
+        system, scheme: what moves, a `System`, `Problem` or scene, and how.
         states: a `State` whose arrays have a leading batch axis, e.g. ``jax.vmap(make)(q_s, ...)`` or
             ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``.
         macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
-        num_steps, save_every, save_micro, newton: as in `simulate`.
+        num_steps, t_end, save_every, save_micro, newton: as in `simulate`; t_end with one step size for all.
         params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
         devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
@@ -60,12 +61,16 @@ def simulate_batch(
         ValueError, TypeError: bad arguments, before anything is computed.
     """
     lanes = _check_states(states)
-    check_type("simulate_batch: system", system, System, "a vmri_jax.System")
+    first = jax.tree.map(lambda a: np.asarray(a)[0], states)
+    system, _ = start_of("simulate_batch", system, first)
     if params is not None:
         _check_params(system, params, lanes)
-    first = jax.tree.map(lambda a: np.asarray(a)[0], states)
+    if t_end is not None and any(np.ndim(step) for step in (macro_dt, micro_dt) if step is not None):
+        raise ValueError(
+            "simulate_batch: t_end with a step size for each lane; give num_steps, the same for all lanes."
+        )
     run = simulation(
-        system, scheme, first, newton, _first(macro_dt), _first(micro_dt), num_steps, save_every, save_micro
+        system, scheme, first, newton, _first(macro_dt), _first(micro_dt), num_steps, t_end, save_every, save_micro
     )
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
     dt = np.asarray(real_array(f"simulate_batch: {name}", dt))

@@ -13,7 +13,7 @@ from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_flags, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
-from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import check_run
 from vmri_jax.running.engine import Engine, engine
@@ -29,20 +29,23 @@ from vmri_jax.steppers.results import Method, Result, SimulationError
 
 
 def simulate(
-    system: System,
+    system: Movable,
     scheme: Scheme | Composition,
-    state: State,
+    state: State | None = None,
     *,
     macro_dt=None,
     micro_dt=None,
-    num_steps: int,
+    num_steps: int | None = None,
+    t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
     newton: Newton | None = None,
     throw: bool = True,
     progress: bool = False,
 ) -> Trajectory:
-    """Simulate `num_steps` macro steps and save every `save_every`-th macro node.
+    """Simulate `num_steps` macro steps, or up to `t_end`, and save every `save_every`-th macro node.
+
+        run = vm.simulate(problem, vm.fully_implicit(10), macro_dt=0.01, t_end=10.0)
 
     Compiled once per system structure and scheme structure, and for every eighth or so of the number of saved nodes: step sizes,
     parameters, rule weights, initial states and `save_every` may vary without compiling again. Works under ``jax.vmap`` over state,
@@ -50,10 +53,11 @@ def simulate(
     Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "nested".
 
     Args:
-        system, scheme: what moves, and how.
-        state: start, from `initial_state` or a former run.
+        system: what moves and where it starts, a `Problem` or a scene; or a `System`, with a state.
+        scheme: how.
+        state: start, from `initial_state` or a former run; None for that of the problem.
         macro_dt, micro_dt: step size, exactly one of them (``macro_dt = num_micro * micro_dt``).
-        num_steps: macro steps, a multiple of `save_every`.
+        num_steps, t_end: macro steps, a multiple of `save_every`, or the time that they end at; exactly one of them.
         save_every: macro steps from one saved node to the next.
         save_micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
         newton: how implicit equations are solved.
@@ -71,27 +75,28 @@ def simulate(
         Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
     """
     check_flags(throw=throw, progress=progress)
-    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     if not run.is_concrete:
         return run.traced()
     run.check()
     check_memory("simulate", run.state, scheme.num_micro, run.room, save_micro)
     trajectory = run.in_parts() if progress else run()
     if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
-        check_constraints(system, state, "simulate: the state")
+        check_constraints(run.system, run.state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, save_every)
     return trajectory
 
 
 def prepare(
-    system: System,
+    system: Movable,
     scheme: Scheme | Composition,
-    state: State,
+    state: State | None = None,
     *,
     macro_dt=None,
     micro_dt=None,
-    num_steps: int,
+    num_steps: int | None = None,
+    t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
     newton: Newton | None = None,
@@ -110,7 +115,7 @@ def prepare(
     Raises:
         ValueError, TypeError: bad arguments, as of `simulate`.
     """
-    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     if not run.is_concrete:
         raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
@@ -303,10 +308,15 @@ class Simulation:
         return join(pieces)
 
 
-def simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro) -> Simulation:
+def simulation(
+    system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro
+) -> Simulation:
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     warn_if_slow()
-    macro_dt = check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    system, state = start_of("simulate", system, state)
+    macro_dt, num_steps = check_run(
+        system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro
+    )
     newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
     leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))

@@ -62,8 +62,8 @@ class Trajectory(eqx.Module):
     info: RunInfo
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
-    t_micro: Float[Numbers, "k-1 num_micro"] | None = None
-    q_f_micro: Float[Numbers, "k-1 num_micro n_f"] | None = None
+    t_micro: Float[Numbers, "k-1 num_micro"] = None
+    q_f_micro: Float[Numbers, "k-1 num_micro n_f"] = None
 
     @property
     def success(self):

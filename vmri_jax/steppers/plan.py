@@ -18,7 +18,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
@@ -98,9 +98,9 @@ class Plan:
 
 
 def plan(
-    system: System,
+    system: Movable,
     scheme: Scheme | Composition,
-    state: State,
+    state: State | None = None,
     newton: Newton | None = None,
     *,
     fallback: bool = True,
@@ -108,7 +108,7 @@ def plan(
     """How macro steps of a system under a scheme are taken; ``print`` shows it in words.
 
     Args:
-        system, scheme: what moves, and how.
+        system, scheme: what moves, a `Problem` or a scene, or a `System` with a state, and how.
         state: any state of the system; only the shapes of its arrays matter.
         newton: how implicit equations are solved.
         fallback: whether a first choice that does not converge gives way to another one, which takes long to compile.
@@ -116,6 +116,7 @@ def plan(
     Raises:
         ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
     """
+    system, state = start_of("plan", system, state)
     newton = newton or Newton()
     choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None)
     stepper: Stepper = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)

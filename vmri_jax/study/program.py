@@ -42,7 +42,7 @@ class Program:
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
         self.newton, self.state = newton or Newton(), problem.state()
-        check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, 1)
+        check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, None, 1)
         self.compile_seconds = float("nan")
 
     @cached_property

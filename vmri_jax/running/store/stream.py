@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.store import layout
@@ -30,14 +29,15 @@ MOST_BYTES = 2**26
 
 
 def stream(
-    system: System,
+    system: Movable,
     scheme: Scheme | Composition,
-    state: State,
+    state: State | None = None,
     *,
     out: str | os.PathLike,
     macro_dt=None,
     micro_dt=None,
-    num_steps: int,
+    num_steps: int | None = None,
+    t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
     newton: Newton | None = None,
@@ -55,7 +55,7 @@ def stream(
     to the uninterrupted one to the last bit. The memory needed is that of one chunk.
 
     Args:
-        system, scheme, state, macro_dt, micro_dt, save_every, save_micro, newton: as in `simulate`.
+        system, scheme, state, macro_dt, micro_dt, t_end, save_every, save_micro, newton: as in `simulate`.
         out: folder of the store, a zarr group; conventionally named .zarr.
         num_steps: macro steps. A resumed run may be given more of them than before: then it is made longer.
         chunk: saved intervals that are computed and written together, kept by the store; None for a hundredth of the run,
@@ -78,7 +78,8 @@ def stream(
         Interrupted: Ctrl-C; the chunk at work was finished first (a second Ctrl-C does not wait for it).
     """
     path = Path(out)
-    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, save_every, save_micro)
+    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    num_steps = run.num_steps
     if not run.is_concrete:
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
     run.check("stream: the state")
