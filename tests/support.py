@@ -72,17 +72,16 @@ def phase(states) -> np.ndarray:
     return np.concatenate([getattr(states, name) for name in NAMES], axis=-1)
 
 
-def area_change(ends, dimension: int, step: float = 0.01) -> float:
-    """Largest change of the symplectic form from the first to the second of the states ``ends(x)``, x coordinates near zero."""
-    start, end = slopes(lambda x: np.concatenate([phase(state) for state in ends(x)]), dimension, step).reshape(
-        2, -1, dimension
-    )
+def area_change(ends, dimension: int) -> float:
+    """Largest change of the symplectic form between the two states ``ends(x)``, x coordinates near zero, over its size."""
+    derivative = slopes(lambda x: np.stack([phase(state) for state in ends(x)], axis=1), dimension)
 
-    def form(derivative):
-        dq, dp = np.split(derivative, 2)
+    def form(states):
+        dq, dp = np.split(states, 2)
         return dq.T @ dp - dp.T @ dq
 
-    return float(np.abs(form(end) - form(start)).max())
+    start, end = form(derivative[:, :, 0]), form(derivative[:, :, 1])
+    return relative_difference(end, start)
 
 
 def states_near(problem, dimension: int):
