@@ -4,18 +4,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.stability.systems import double_pendulum
+from tests.stability.systems import swinging
 from tests.support import compiled_step, largest_difference, without_fallback
 from tests.user_systems import two_oscillators
 from vmri_jax import (
-    Problem,
     Scheme,
     discrete_legendre,
     explicit_slow,
     fully_explicit,
     fully_implicit,
     galerkin,
-    initial_state,
     macro,
     micro,
     quadrature,
@@ -61,9 +59,9 @@ def test_the_step_is_the_discrete_legendre_transform(fpu, scheme):
 @pytest.mark.parametrize("degree", [1, 2])
 def test_constraints_hold_at_every_micro_node(degree):
     """Of a double pendulum whose first rod is slow."""
-    system = double_pendulum()
-    start = initial_state(system, [0.6, -0.8], [0.6, -1.8], [0.4, 0.3], [-0.5, 0.3])
-    end, info = step(Problem(system, start.q_s, start.q_f, [0.4, 0.3], [-0.5, 0.3]), galerkin(3, degree), 0.03)
+    problem = swinging()
+    system, start = problem.system, problem.state()
+    end, info = step(problem, galerkin(3, degree), 0.03)
     if degree == 1:  # the slow path is linear
         for m in range(3):
             q_s = start.q_s + (m + 1) / 3 * (end.q_s - start.q_s)
