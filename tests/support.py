@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import Newton, State, macro_step, simulate, systems
+from vmri_jax import Newton, State, initial_state, macro_step, simulate, systems
 from vmri_jax.schemes.composition import stage_scheme
 
 DATA = Path(__file__).parent / "data"
@@ -43,6 +43,60 @@ def without_fallback(system, scheme) -> Newton:
     potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
     local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
     return Newton("nested") if system.has_constant_mass and local else Newton()
+
+
+STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+"""Weights of central differences of order 8."""
+
+
+def slopes(function, dimension: int, step: float = 0.01) -> np.ndarray:
+    """Derivative at zero of a function of `dimension` numbers by differences of order 8, which compiles nothing."""
+
+    def along(direction):
+        differences = ((k, function(k * step * direction) - function(-k * step * direction)) for k in STENCIL)
+        return sum(STENCIL[k] / step * difference for k, difference in differences)
+
+    return np.stack([along(direction) for direction in np.eye(dimension)], axis=1)
+
+
+NAMES = "q_s", "q_f", "p_s", "p_f"
+
+
+def node(run, k: int) -> State:
+    """The state at a saved node of a run."""
+    return jax.tree.map(lambda a: np.asarray(a)[k], State(run.t, run.q_s, run.q_f, run.p_s, run.p_f))
+
+
+def phase(states) -> np.ndarray:
+    """Positions and momenta of a state, or of all nodes of a run, side by side."""
+    return np.concatenate([getattr(states, name) for name in NAMES], axis=-1)
+
+
+def area_change(ends, dimension: int) -> float:
+    """Largest change of the symplectic form between the two states ``ends(x)``, x coordinates near zero, over its size."""
+    derivative = slopes(lambda x: np.stack([phase(state) for state in ends(x)], axis=1), dimension)
+
+    def form(states):
+        dq, dp = np.split(states, 2)
+        return dq.T @ dp - dp.T @ dq
+
+    start, end = form(derivative[:, :, 0]), form(derivative[:, :, 1])
+    return relative_difference(end, start)
+
+
+def states_near(problem, dimension: int):
+    """``state(x)`` on the constraints: positions and velocities moved by x along tangents, then projected."""
+    system, n_s = problem.system, problem.q_s.size
+    q, v = np.concatenate([problem.q_s, problem.q_f]), np.concatenate([problem.v_s, problem.v_f])
+    rows = jax.jacrev(lambda q: system.constraints(0.0, q[:n_s], q[n_s:]))(jnp.asarray(q)).reshape(-1, q.size)
+    tangents = np.linalg.svd(rows)[2][len(rows) :]
+    assert dimension == 2 * len(tangents)
+
+    def state(x) -> State:
+        moved_q, moved_v = (z + dx @ tangents for z, dx in zip((q, v), np.split(np.asarray(x), 2), strict=True))
+        return initial_state(system, *np.split(moved_q, [n_s]), *np.split(moved_v, [n_s]), project=True)
+
+    return state
 
 
 def relative_difference(value, expected) -> float:

@@ -28,8 +28,8 @@ STRUCTURES = {
     "arrowhead": rs.Structure(
         1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="arrowhead"
     ),
-    "kinetic function": rs.Structure(
-        2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", num_micro=2
+    "kinetic function and all else": rs.Structure(
+        2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=2
     ),
     "own rules": rs.Structure(
         1, 1, 2, "coupled", **SPRINGS, force="drive", scheme="mixed", num_micro=2, degree=2, method="dense"
@@ -47,7 +47,7 @@ METHODS = {
     "march that moves": "NESTED",
     "collocation": "COLLOCATION",
     "arrowhead": "ARROWHEAD",
-    "kinetic function": "ARROWHEAD",
+    "kinetic function and all else": "ARROWHEAD",
     "own rules": "DENSE",
     "composition": "NESTED",
 }

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from vmri_jax import ConstantMass, State, System, initial_state
+from vmri_jax import ConstantMass, Problem, State, System, initial_state
 
 
 def weight(q_s, q_f, params):
@@ -33,3 +33,8 @@ def hanging(system: System, up: float = -1.0) -> State:
     """At rest, the rods straight down, or up."""
     rest = [0.0, 0.0]
     return initial_state(system, [0.0, up], [0.0, 2 * up], rest, rest)
+
+
+def swinging() -> Problem:
+    """The two bobs in motion."""
+    return Problem(double_pendulum(), *jnp.array([[0.6, -0.8], [0.6, -1.8], [0.4, 0.3], [-0.5, 0.3]]))

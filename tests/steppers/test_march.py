@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from jax.extend.core import jaxprs_in_params
 
+from tests.stability.systems import swinging
 from tests.support import compiled_step, largest_difference
-from tests.user_systems import FULL_MASS, double_pendulum, two_oscillators
+from tests.user_systems import FULL_MASS, cart, double_pendulum, two_oscillators
 from vmri_jax import (
     Method,
     Newton,
@@ -47,13 +48,14 @@ def positions(run):
         ("tsp", galerkin(3, 2, "lobatto"), 0.006, 4.5),  # measured 3.9
         ("tsp", galerkin(2, 3), 0.006, 5),  # measured 4.3
         ("tsp", fully_explicit(5), 0.02, 4),  # measured 3.4
-        ("sam", explicit_slow(5), 0.01, 5),  # measured 4.3
+        ("pendulum", explicit_slow(5), 0.01, 6),  # measured 5.3
+        pytest.param("sam", explicit_slow(5), 0.01, 5, marks=pytest.mark.full),  # measured 4.3
         pytest.param("sam", galerkin(2, 2), 0.002, 9, marks=pytest.mark.full),
     ],
 )
 def test_it_solves_the_equations_of_the_step(name, scheme, macro_dt, passes, request):
     """What the arrowhead finds, in few passes; with a loose tolerance within that tolerance."""
-    problem = request.getfixturevalue(name)
+    problem = swinging() if name == "pendulum" else request.getfixturevalue(name)
 
     def run(newton):
         return simulate(problem.system, scheme, problem.state(), macro_dt=macro_dt, num_steps=20, newton=newton)
@@ -226,18 +228,18 @@ def test_a_fallback_keeps_what_was_computed(fpu):
 
 
 @pytest.mark.parametrize("method", ["nested", "arrowhead"])
-def test_fixed_iterations(tsp, method):
+def test_fixed_iterations(method):
+    problem = cart()
+
     def run(count):
         newton = Newton(method, fixed_iterations=count)
-        return simulate(
-            tsp.system, fully_explicit(5), tsp.state(), macro_dt=0.002, num_steps=20, newton=newton, throw=False
-        )
+        step = {"macro_dt": 0.01, "num_steps": 20, "newton": newton, "throw": False}
+        return simulate(problem.system, fully_explicit(5), problem.state(), **step)
 
-    free = simulate(tsp.system, fully_explicit(5), tsp.state(), macro_dt=0.002, num_steps=20)
-    enough = run(6)
+    free, enough = run(None), run(6)
     assert enough.success
     assert np.all(np.asarray(enough.info.iterations) == 6)
-    assert largest_difference(enough.q_f, free.q_f) < 1e-12  # measured 2e-15
+    assert largest_difference(enough.q_f, free.q_f) < 1e-14  # measured 1e-16
     assert Result(int(run(1).result)) is Result.STAGNATED
 
 
