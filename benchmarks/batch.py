@@ -13,10 +13,11 @@ from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent, step
 from benchmarks.peers import cases, ours
 from benchmarks.peers.compare import OURS, batch_case
 from benchmarks.peers.scan import candidates, scan
-from benchmarks.report import Claim, Report
+from benchmarks.report import Claim, Report, growing, spread
 from benchmarks.worker import starts
 
-COLUMNS = ("system", "program", "batch", "ns/trajectory/micro step", "low", "high", "to C", "iterations", "result")
+TIME = "ns/trajectory/micro step"
+COLUMNS = ("system", "program", "batch", TIME, "low", "high", "to C", "iterations", "result")
 NUM_MICRO = 10
 HELD = 256
 """The batch size that is held against C."""
@@ -30,8 +31,7 @@ class Case:
 
     target: the most that a trajectory in a batch of HELD may take over C.
     fixed: whether a fixed number of iterations is also run.
-    as_accurate: a problem of `benchmarks.peers.cases` on which the batch is also held against C at the error that C has with this
-        micro_dt, by any step and order.
+    as_accurate: the problem of `benchmarks.peers.cases` on which a batch of any step and order has to reach C's error.
     """
 
     system: str
@@ -43,8 +43,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run: cases, batch sizes, samples of each program, seconds of a run, CPU devices,
-    and micro steps of all trajectories together in the first guess."""
+    """How much is run; micro_steps are those of all trajectories together in the first guess of a run's length."""
 
     cases: tuple[Case, ...]
     batches: tuple[int, ...]
@@ -68,16 +67,7 @@ def sizes(name: str, devices: int = 1) -> Size:
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each case."""
-    rows, claims, notes = [], [], c_loops.missing()
-    for case in size.cases:
-        some_rows, some_claims = _measure(case, size, tell)
-        rows += some_rows
-        claims += some_claims
-        if case.as_accurate and c_loops.compiler() is not None:
-            row, claim = _as_accurate(case, case.as_accurate, size, tell)
-            rows.append(row)
-            claims.append(claim)
-        yield Report("batch", name, rows, claims, notes)
+    return growing("batch", name, (_measure(case, size, tell) for case in size.cases), c_loops.missing())
 
 
 def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, devices: int) -> Callable:
@@ -99,6 +89,16 @@ def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, dev
 
 
 def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
+    """All batch sizes, and a batch as accurate as C."""
+    rows, claims = _all_sizes(case, size, tell)
+    if case.as_accurate and c_loops.compiler() is not None:
+        row, claim = _as_accurate(case, case.as_accurate, size, tell)
+        rows.append(row)
+        claims.append(claim)
+    return rows, claims
+
+
+def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
     problem = programs.problem(case.system)
     newtons = {"default": vm.Newton()}
     if case.fixed:
@@ -122,7 +122,6 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     rows, claims = [], []
     for key, sample in ns.items():
         option, _, batch = key.partition(" ")
-        spread = quartiles(sample)
         info = _info(results[key]) if key in results else {"iterations": None, "result": ""}
         to_c = ratio(sample, ns["C"]) if "C" in ns else None
         rows.append(
@@ -131,9 +130,7 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
                 "program": option,
                 "batch": int(batch or 1),
                 "micro_dt": case.micro_dt,
-                "ns/trajectory/micro step": spread.value,
-                "low": spread.low,
-                "high": spread.high,
+                **spread(TIME, quartiles(sample)),
                 "to C": to_c and to_c.value,
                 **info,
             }
@@ -156,10 +153,9 @@ def _as_accurate(case: Case, problem: str, size: Size, tell: Tell) -> tuple[dict
     best = min(found, key=lambda point: np.median(timed[point.label]))
     per_lane = [s / HELD for s in timed[best.label]]
     to_c = ratio(per_lane, timed["C"])
-    ns = quartiles(per_lane, 1e9 / steps)
     row = {"system": case.system, "program": "as accurate as C", "batch": HELD, "micro_dt": case.micro_dt}
-    row |= {"ns/trajectory/micro step": ns.value, "low": ns.low, "high": ns.high, "to C": to_c.value}
-    row |= {"iterations": None, "result": best.label, "error": best.error, "error of C": error}
+    row |= spread(TIME, quartiles(per_lane, 1e9 / steps)) | {"to C": to_c.value, "iterations": None}
+    row |= {"result": best.label, "error": best.error, "error of C": error}
     what = f"{case.system}, batch of {HELD}, as accurate as C (error {error:.0e}): over C"
     return row, Claim(what, to_c, at_most=case.target)
 
@@ -184,5 +180,5 @@ def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
 
 
 def _info(trajectory: vm.Trajectory) -> dict:
-    worst = int(np.max(np.asarray(trajectory.result)))
-    return {"iterations": int(np.max(np.asarray(trajectory.info.iterations))), "result": vm.Result(worst).name}
+    worst = vm.Result(int(np.max(trajectory.result)))
+    return {"iterations": int(np.max(trajectory.info.iterations)), "result": worst.name}

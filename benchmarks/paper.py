@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from benchmarks.curves import Case
-from benchmarks.gail2014.reference import PAPER_MINIMA
+from benchmarks.gail2014.reference import paper_minimum
 
 TITLES = {
     "cost_fig4": "Fig. 4 of the reference study redone",
@@ -38,12 +38,6 @@ def cases(
         for length in lengths
     )
     return dict(zip(TITLES, (four, five), strict=True))
-
-
-def paper_minimum(scheme: str, num_springs: int) -> int | None:
-    """The cheapest num_micro in Fig. 5, None where the paper does not say."""
-    found = [n for low, high, n in PAPER_MINIMA[scheme] if low <= num_springs <= high]
-    return found[0] if found else None
 
 
 def at_paper_steps(case: Case) -> Case:

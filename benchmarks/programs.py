@@ -18,11 +18,8 @@ SCHEMES: dict[str, Callable[[int], vm.Scheme]] = {
 def problem(name: str, amplitude: float = 1.0) -> vm.Problem:
     """``"TSP"``, ``"SAM"``, or the chain with so many springs, ``"FPU l=50"``; its start may be made smaller."""
     problem = Case("", name).problem()
-    return (
-        problem
-        if amplitude == 1.0
-        else replace(problem, **{key: amplitude * getattr(problem, key) for key in ("q_s", "q_f", "v_s", "v_f")})
-    )
+    start = {key: amplitude * getattr(problem, key) for key in ("q_s", "q_f", "v_s", "v_f")}
+    return replace(problem, **start)
 
 
 def unknowns(problem: vm.Problem, num_micro: int) -> int:
@@ -37,16 +34,8 @@ def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, newton: vm.
     Args:
         step: ``macro_dt`` or ``micro_dt``; ``run(num_steps, macro_dt=...)`` takes another one.
     """
-    arguments = problem.system, scheme, problem.state()
-    if hasattr(vm, "prepare"):
-        prepared = vm.prepare(*arguments, **step, num_steps=1, newton=newton)  # pyright: ignore[reportAttributeAccessIssue]
-        return lambda num_steps, **other: prepared(num_steps=num_steps, **other)
-
-    def run(num_steps: int, **other) -> vm.Trajectory:
-        steps: dict = (other or step) | {"num_steps": num_steps, "save_every": num_steps}
-        return vm.simulate(*arguments, **steps, newton=newton, throw=False)
-
-    return run
+    prepared = vm.prepare(problem.system, scheme, problem.state(), **step, num_steps=1, newton=newton)
+    return lambda num_steps, **other: prepared(num_steps=num_steps, **other)
 
 
 def failed(trajectory: vm.Trajectory) -> bool:

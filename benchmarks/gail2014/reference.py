@@ -22,6 +22,14 @@ PAPER_MINIMA = {  # cheapest num_micro by scheme: (smallest l, largest l, num_mi
     "explicit slow": ((70, 110, 12), (120, 180, 8), (190, 200, 1)),
     "fully explicit": ((70, 130, 8), (140, 200, 4)),
 }
+
+
+def paper_minimum(scheme: str, num_springs: int) -> int | None:
+    """The cheapest num_micro in Fig. 5, None where the paper does not say."""
+    found = [n for low, high, n in PAPER_MINIMA[scheme] if low <= num_springs <= high]
+    return found[0] if found else None
+
+
 SCHEMES = {
     "fully implicit": vm.fully_implicit,
     "explicit slow": partial(vm.explicit_slow, alpha=0.0),
@@ -139,15 +147,14 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
 
 
 def _chain_panel(size: Size, scheme: str, num_springs: int) -> CostPanel:
-    minima = [n for low, high, n in PAPER_MINIMA[scheme] if low <= num_springs <= high]
     chain = partial(systems.fermi_pasta_ulam, num_springs)
     feasible = tuple(n for n in size.chain_num_micro if num_springs * (n + 1) <= size.largest_dense)
     return CostPanel(
         title=f"{scheme}, l = {num_springs}",
-        dense=chain if scheme == "fully implicit" else partial(unstructured_chain, num_springs),
+        dense=chain if scheme == "fully implicit" else lambda: unstructured(chain()),
         structured=chain,
         scheme=SCHEMES[scheme],
-        paper_minimum=minima[0] if minima else None,
+        paper_minimum=paper_minimum(scheme, num_springs),
         dense_num_micro=feasible,
         num_micro=size.chain_num_micro,
         micro_dt=0.01,
@@ -162,9 +169,8 @@ def kinetic_energy(q_s, q_f, v_s, v_f, params):
     return (v_s @ v_s + v_f @ v_f) / 2
 
 
-def unstructured_chain(num_springs: int) -> vm.Problem:
-    """The FPU chain with T as a plain function: every scheme then solves for all unknowns of a macro step at once."""
-    problem = systems.fermi_pasta_ulam(num_springs)
+def unstructured(problem: vm.Problem) -> vm.Problem:
+    """A chain with T as a plain function: every scheme then solves for all unknowns of a macro step at once."""
     return replace(problem, system=problem.system.replace(kinetic=kinetic_energy))
 
 

@@ -47,8 +47,7 @@ def by_family(found: Mapping[str, Sequence[Point]], peers: Sequence[str]) -> dic
 
 def draw(found: Mapping[str, Sequence[Point]], peers: Sequence[str], title: str) -> Figure:
     """One panel per case."""
-    with plots.style():
-        figure = plots.NotebookFigure(figsize=(max(7.2, 0.7 + 3.4 * len(found)), 4.7))
+    with plots.new_figure(max(7.2, 0.7 + 3.4 * len(found)), 4.7, title, plots.LIGHT) as figure:
         panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
         handles: dict = {}
         lowest = min((p.settled for points in found.values() for p in points), default=SHOWN[0])
@@ -60,7 +59,6 @@ def draw(found: Mapping[str, Sequence[Point]], peers: Sequence[str], title: str)
         ordered = [peer for peer in peers if peer in handles]
         columns = min(len(ordered), 5)
         figure.legend([handles[peer] for peer in ordered], ordered, loc="outside lower center", ncols=columns)
-        figure.suptitle(title, x=0.01, ha="left")
     return figure
 
 
