@@ -24,11 +24,7 @@ SINGLE, CALL, PREPARED, COLD, GRADIENT, README = 1.1, 250e-6, 25e-6, 4.0, 8.0, 1
 
 @dataclass(frozen=True)
 class Entry:
-    """A case and its targets.
-
-    ratio: the most that `after` may take over `before`.
-    seconds: the most that `after` may take.
-    """
+    """A case and the most that `after` may take: as a ratio to `before`, and in seconds."""
 
     case: Case
     ratio: float | None = None
@@ -42,7 +38,6 @@ class Entry:
 
 
 def _single() -> list[Entry]:
-    """Runs long enough for the call not to count."""
     simple = ("fully_explicit 10", "fully_implicit 10", "explicit_slow 10")
     cases = [Case("single", f"FPU l={n}", scheme, 0.01) for n in (3, 50, 200) for scheme in simple]
     cases += [Case("single", "FPU l=3", scheme, 0.01) for scheme in ("mollified_impulse 10", "takahashi_imada 4")]
@@ -56,8 +51,6 @@ def _single() -> list[Entry]:
 
 
 def _batch() -> list[Entry]:
-    """Batches of `LANES`: those of order 2 with constraints may become slower, Lobatto on the pendulum is to become faster."""
-
     def entry(system: str, scheme: str, macro_dt: float, most: float) -> Entry:
         return Entry(Case("batch", system, scheme, macro_dt, lanes=LANES), ratio=most)
 
@@ -69,7 +62,6 @@ def _batch() -> list[Entry]:
 
 
 def _calls(kind: str, seconds: float) -> list[Entry]:
-    """Short runs with a known program."""
     cases = (
         Case(kind, "FPU l=3", "fully_explicit 10", 0.01, num_steps=100),
         Case(kind, "TSP", "fully_implicit 10", 0.002, num_steps=100),
@@ -107,13 +99,7 @@ QUICK = {
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run.
-
-    before, after: the two sides.
-    groups: entries by name of the group.
-    repeats, fresh: samples of a run and of a new process.
-    seconds: of a run, about.
-    """
+    """The two sides, entries by group, samples of a run and of a new process, and seconds of a run."""
 
     before: Seat
     after: Seat
@@ -149,7 +135,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     about: dict = {side: {"commit": seat.commit, "checkout": str(seat.checkout)} for side, seat in seats.items()}
     about["clock"] = "processor time, on a shared core" if PROCESSOR_TIME in size.after.options else "wall time"
     rows, claims = [], []
-    notes = [", ".join(f"{side}: {seat.commit}" for side, seat in seats.items())]
+    notes = [", ".join(f"{side}: {about[side]['commit']}" for side in seats)]
     for group, entry, outcome in _outcomes(size, seats, tell):
         rows += _rows(group, entry, outcome)
         claims += _claims(group, entry, outcome)
@@ -189,23 +175,18 @@ def _rows(group: str, entry: Entry, outcome: Outcome) -> list[dict]:
         pairs += [(f"{BEFORE}, configured", f"{AFTER}, configured")]
     rows = []
     for before, after in pairs:
-        samples = outcome.samples
+        samples, made = outcome.samples, outcome.made.values()
         row = {"group": group, "case": entry.label + after.removeprefix(AFTER)}
-        row |= {f"{side}, ms": _milliseconds(samples.get(key)) for side, key in ((BEFORE, before), (AFTER, after))}
+        for side, key in ((BEFORE, before), (AFTER, after)):
+            row[f"{side}, ms"] = 1e3 * float(np.median(samples[key])) if key in samples else None
         if before in samples and after in samples:
             found = ratio(samples[after], samples[before])
             row |= {"after/before": found.value, "quartiles": f"{found.low:.3g} to {found.high:.3g}"}
-        made = list(outcome.made.values())
-        row |= {
-            "steps": max((m["num_steps"] for m in made), default=None),
-            "differs": outcome.difference(after, before),
-        }
-        rows.append(row | {"result": ", ".join(sorted({m["result"] for m in made}))})
+        row["steps"] = max((m["num_steps"] for m in made), default=None)
+        row["differs"] = outcome.difference(after, before)
+        row["result"] = ", ".join(sorted({m["result"] for m in made}))
+        rows.append(row)
     return rows
-
-
-def _milliseconds(samples: list[float] | None) -> float | None:
-    return None if samples is None else 1e3 * float(np.median(samples))
 
 
 def _claims(group: str, entry: Entry, outcome: Outcome) -> list[Claim]:
@@ -218,7 +199,6 @@ def _claims(group: str, entry: Entry, outcome: Outcome) -> list[Claim]:
     if group == "readme":
         for side in (BEFORE, AFTER):
             found = ratio(samples[side], samples[f"{side}, configured"])
-            claims.append(
-                Claim(f"README of {side}, as printed over configured", found, README if side == AFTER else None)
-            )
+            most = README if side == AFTER else None
+            claims.append(Claim(f"README of {side}, as printed over configured", found, at_most=most))
     return claims

@@ -1,7 +1,4 @@
-"""Hand-written C loops, the speed floor of the three systems: compiled when first used, called through ctypes.
-
-Each integrates the very `Problem` that `vmri_jax` integrates, and nothing else: no saved nodes, no status, no energy.
-"""
+"""Hand-written C loops, the speed floor of the three systems: compiled when first used, called through ctypes."""
 
 import ctypes
 import dataclasses
@@ -83,34 +80,26 @@ def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int)
         ValueError: another system, masses other than one, or less than one step.
     """
     kinetic = problem.system.kinetic
-    unit = all(np.array_equal(np.asarray(m), np.ones(len(problem.q_s))) for m in (kinetic.slow, kinetic.fast))  # pyright: ignore[reportAttributeAccessIssue]
-    _check(
-        "fpu",
-        unit and getattr(problem.system.slow_potential, "function", None) is soft_springs,
-        num_micro,
-        num_macro_steps,
-    )
+    unit = all(np.all(np.asarray(m) == 1.0) for m in (kinetic.slow, kinetic.fast))  # pyright: ignore[reportAttributeAccessIssue]
+    _check("fpu", unit and _is(problem.system.slow_potential, soft_springs), num_micro, num_macro_steps)
     omega = float(problem.system.params["omega"])
     return _loop("fpu", problem, len(problem.q_s), omega, num_micro, micro_dt, num_macro_steps)
 
 
 def tsp(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:
-    """RATTLE, `fully_explicit(1)`, on a `triple_spherical_pendulum` (not the quartic one).
-
-    Args:
-        tolerance: largest value of a constraint, in its own unit (``(|q|^2 - l^2) / 2``), that counts as satisfied.
+    """RATTLE, `fully_explicit(1)`, on a `triple_spherical_pendulum`, constraints ``(|q|^2 - l^2) / 2`` up to the tolerance.
 
     Raises:
         NoCompiler: there is no C compiler.
         ValueError: another system, or less than one step.
     """
-    _check("tsp", getattr(problem.system.fast_potential, "function", None) is spring, num_steps)
+    _check("tsp", _is(problem.system.fast_potential, spring), num_steps)
     return _rattle("tsp", problem, ("lengths", "stiffness", "gravity"), micro_dt, num_steps, tolerance)
 
 
 def sam(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:
     """RATTLE, `fully_explicit(1)`, on a `simple_atomic_model`; arguments and errors as for `tsp`."""
-    _check("sam", getattr(problem.system.slow_potential, "function", None) is slow_forces, num_steps)
+    _check("sam", _is(problem.system.slow_potential, slow_forces), num_steps)
     return _rattle("sam", problem, ("stiffness", "length", "gravity"), micro_dt, num_steps, tolerance)
 
 
@@ -118,6 +107,10 @@ def _rattle(name: str, problem: Problem, parameters, *arguments) -> CLoop:
     params = {key: np.asarray(value, dtype=float) for key, value in problem.system.params.items()}
     values = (params[key] if params[key].ndim else float(params[key]) for key in parameters)
     return _loop(name, problem, params["masses"], *values, *arguments)
+
+
+def _is(potential, function) -> bool:
+    return getattr(potential, "function", None) is function
 
 
 def _check(name: str, right_system: bool, *counts: int) -> None:

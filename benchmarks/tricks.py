@@ -33,7 +33,7 @@ COLUMNS = ("trick", *SCHEMES, *(f"{system}{BATCH}" for system in SCHEMES), "most
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run: names of functions, cases, samples, seconds of a run."""
+    """Names of functions, cases, samples, and seconds of a run."""
 
     tricks: tuple[str, ...]
     cases: tuple[Case, ...]

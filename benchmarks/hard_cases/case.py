@@ -1,14 +1,16 @@
-"""A hard case is the function that measures it, with its set-up and its criterion."""
+"""A hard case is the function that measures it."""
 
+import inspect
 from collections.abc import Callable
 
 from vmri_jax.check import Case, Outcome
 
 
-def hard_case(number: int, title: str, setup: str, criterion: str, draw=None) -> Callable[..., Case]:
-    """Makes a `Case` of ``run(full)``; arguments as of `Case`."""
+def hard_case(number: int, title: str, draw=None) -> Callable[..., Case]:
+    """Makes a `Case` of ``run(full)``, whose docstring says the set-up and, after an empty line, the criterion."""
 
     def made(run: Callable[[bool], Outcome]) -> Case:
+        setup, criterion = inspect.cleandoc(run.__doc__ or "").split("\n\n")
         return Case(number, title, setup, criterion, run, draw)
 
     return made

@@ -10,14 +10,12 @@ from vmri_jax.check import Outcome
 from vmri_jax.check.measures import constraints, energy, run, status
 
 
-@hard_case(
-    11,
-    "singular configuration",
-    "four-bar linkage through its collinear position, straight 20-link chain",
-    "no NaN, constraint below 1e-10, energy error at most 10 x that of a generic start, or round-off",
-    draw=draw_singular,
-)
+@hard_case(11, "singular configuration", draw_singular)
 def singular_configuration(full: bool) -> Outcome:
+    """four-bar linkage through its collinear position, straight 20-link chain
+
+    no NaN, constraint below 1e-10, energy error at most 10 x that of a generic start, or round-off
+    """
     scheme, steps = vm.fully_implicit(5), 2_000 if full else 200
     micro = 2 * np.arcsin(0.01 / 2)  # what the crank turns in a micro step of 0.01 without forces
 
@@ -57,13 +55,12 @@ def _meets_zero(scheme, macro_steps: int = 8) -> float:
     return b
 
 
-@hard_case(
-    12,
-    "near-inextensible chain",
-    "50 masses, k = 1e6, num_micro 20: fully_implicit, H = 0.02; fully_explicit, H = 0.001, 1e5 steps",
-    "strain at most 3 x that of the load at rest and no growth in 1e5 steps, relative energy error below 1e-3",
-)
+@hard_case(12, "near-inextensible chain")
 def stiff_springs_in_a_chain(full: bool) -> Outcome:
+    """50 masses, k = 1e6, num_micro 20: fully_implicit, H = 0.02; fully_explicit, H = 0.001, 1e5 steps
+
+    strain at most 3 x that of the load at rest and no growth in 1e5 steps, relative energy error below 1e-3
+    """
     problem, steps = stiff_chain(), 2_000 if full else 50
     params = problem.system.params
     weight = params["gravity"] * (params["load"] + 50 * params["mass"])

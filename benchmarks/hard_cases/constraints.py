@@ -27,13 +27,12 @@ def both_rods(q_s, q_f, params):
     return jnp.concatenate([first_rod(q_s, params), second_rod(q_s, q_f, params)])
 
 
-@hard_case(
-    8,
-    "slow-only constraint on micro nodes",
-    "triple pendulum, first rod passed as `constraint`",
-    "refused with the row, the reason (rank deficit num_micro - 1) and the fix",
-)
+@hard_case(8, "slow-only constraint on micro nodes")
 def slow_only_constraint(full: bool) -> Outcome:
+    """triple pendulum, first rod passed as `constraint`
+
+    refused with the row, the reason (rank deficit num_micro - 1) and the fix
+    """
     problem = vm.systems.triple_spherical_pendulum()
     system = problem.system.replace(constraint=both_rods, slow_constraint=None)
     said = refusal(replace(problem, system=system))
@@ -43,13 +42,12 @@ def slow_only_constraint(full: bool) -> Outcome:
     return Outcome(f"refused, with {words}" if said else "not refused", all(found.values()), found)
 
 
-@hard_case(
-    9,
-    "rank-deficient fast Jacobian",
-    "g = (|q_1|^2 + eps z_2^2 - l^2)/2, eps = 1 to 1e-8, and 0",
-    "eps >= 1e-4 converges, 0 is recognised as slow-only",
-)
+@hard_case(9, "rank-deficient fast Jacobian")
 def weak_fast_jacobian(full: bool) -> Outcome:
+    """g = (|q_1|^2 + eps z_2^2 - l^2)/2, eps = 1 to 1e-8, and 0
+
+    eps >= 1e-4 converges, 0 is recognised as slow-only
+    """
     macro_dt, values, said = 1e-3, {}, {}
     for eps in (1.0, 1e-2, 1e-4, 1e-6, 1e-8):
         trajectory = run(nearly_slow_constraint(eps), vm.fully_implicit(5), macro_dt, 10_000 if full else 1_000)
@@ -68,13 +66,12 @@ def weak_fast_jacobian(full: bool) -> Outcome:
     )
 
 
-@hard_case(
-    10,
-    "redundant constraints",
-    "four-bar linkage with its coupler given twice",
-    "positions equal to 1e-10 with and without, or a refusal that names the rows",
-)
+@hard_case(10, "redundant constraints")
 def redundant_constraints(full: bool) -> Outcome:
+    """four-bar linkage with its coupler given twice
+
+    positions equal to 1e-10 with and without, or a refusal that names the rows
+    """
     once, twice = (four_bar(angle=-1.0, kappa=20.0, redundant=redundant) for redundant in (False, True))
     if said := refusal(twice):
         named = "rows [1, 3]" in said

@@ -14,13 +14,12 @@ from vmri_jax.check.measures import energy, long_run, run, status
 from vmri_jax.study.timing import interleaved
 
 
-@hard_case(
-    19,
-    "stiff penalty contact",
-    "ball on a floor of k = 1e8, 100 bounces, num_micro 20, H = 1e-4",
-    "height within 1 %, no energy jump above 1e-3",
-)
+@hard_case(19, "stiff penalty contact")
 def penalty_contact(full: bool) -> Outcome:
+    """ball on a floor of k = 1e8, 100 bounces, num_micro 20, H = 1e-4
+
+    height within 1 %, no energy jump above 1e-3
+    """
     problem, macro_dt, bounces = bouncing_ball(), 1e-4, 100 if full else 3
     period = 2 * np.sqrt(2 * 1.0 / 9.81)
     steps = int((bounces + 0.5) * period / macro_dt) // 20 * 20
@@ -43,13 +42,12 @@ def penalty_contact(full: bool) -> Outcome:
     )
 
 
-@hard_case(
-    21,
-    "norm at zero",
-    "triple pendulum with l_3 = 0.01, points 1e-2 to 1e-8 apart, and coincident",
-    "finite gradients; coincident points fail plainly",
-)
+@hard_case(21, "norm at zero")
 def norm_at_zero(full: bool) -> Outcome:
+    """triple pendulum with l_3 = 0.01, points 1e-2 to 1e-8 apart, and coincident
+
+    finite gradients; coincident points fail plainly
+    """
     problem = vm.systems.triple_spherical_pendulum(lengths=(10.0, 2.0, 0.01))
     steps, scheme, newton = 500 if full else 50, vm.fully_explicit(2), vm.Newton(method="nested")
 
@@ -79,13 +77,12 @@ def norm_at_zero(full: bool) -> Outcome:
     )
 
 
-@hard_case(
-    22,
-    "close encounter",
-    "two bodies, e = 0.9, centre of mass in a trap",
-    "relative energy error below 1e-5 at a stated cost",
-)
+@hard_case(22, "close encounter")
 def close_encounter(full: bool) -> Outcome:
+    """two bodies, e = 0.9, centre of mass in a trap
+
+    relative energy error below 1e-5 at a stated cost
+    """
     problem, orbits = two_body(0.9), 100 if full else 5
     settings = {
         "impulse, kahan-li8": (vm.compose(vm.fully_explicit(10), "kahan-li8"), 200),

@@ -14,13 +14,12 @@ EXACT = vm.Newton(method="arrowhead")
 """Newton's iteration with the exact matrix, whose iterations are counted."""
 
 
-@hard_case(
-    5,
-    "explicit limit",
-    "FPU chain, fully_explicit, omega h = 1.9, 2.0, 2.1",
-    "stable, marginal, and a clean error",
-)
+@hard_case(5, "explicit limit")
 def explicit_limit(full: bool) -> Outcome:
+    """FPU chain, fully_explicit, omega h = 1.9, 2.0, 2.1
+
+    stable, marginal, and a clean error
+    """
     problem, num_micro, steps = vm.systems.fermi_pasta_ulam(), 2, 20_000 if full else 5_000
     scheme = vm.fully_explicit(num_micro)  # with more micro steps omega h = 1.9 meets an impulse resonance
     below, at, beyond = (run(problem, scheme, num_micro * wh / 50.0, steps, save_every=20) for wh in (1.9, 2.0, 2.1))
@@ -35,13 +34,12 @@ def explicit_limit(full: bool) -> Outcome:
     )
 
 
-@hard_case(
-    6,
-    "large macro step",
-    "FPU chain, fully_implicit, num_micro 100, H = 1 and H = 2",
-    "at most 8 Newton iterations; H = 2 fails plainly or stays bounded",
-)
+@hard_case(6, "large macro step")
 def large_macro_step(full: bool) -> Outcome:
+    """FPU chain, fully_implicit, num_micro 100, H = 1 and H = 2
+
+    at most 8 Newton iterations; H = 2 fails plainly or stays bounded
+    """
     problem, scheme, steps = vm.systems.fermi_pasta_ulam(), vm.fully_implicit(100), 100 if full else 20
     one, two = (run(problem, scheme, h, steps, newton=EXACT) for h in (1.0, 2.0))
     at_first = int(np.max(np.asarray(one.info.iterations)[:20]))
@@ -62,13 +60,12 @@ def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int) -> vm.Tr
     return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, newton=EXACT)
 
 
-@hard_case(
-    7,
-    "large constrained step",
-    "triple pendulum, H = 0.05 and H = 0.2",
-    "at most 4 Newton iterations; H = 0.2 goes on or fails plainly, constraints kept",
-)
+@hard_case(7, "large constrained step")
 def large_constrained_step(full: bool) -> Outcome:
+    """triple pendulum, H = 0.05 and H = 0.2
+
+    at most 4 Newton iterations; H = 0.2 goes on or fails plainly, constraints kept
+    """
     problem = vm.systems.triple_spherical_pendulum()
     usual, large = (_pendulum_run(problem, h, 400 if full else 40) for h in (0.05, 0.2))
     kept = float(np.nanmax(np.asarray(large.constraint_residual)[:, 0]))
@@ -79,13 +76,12 @@ def large_constrained_step(full: bool) -> Outcome:
     )
 
 
-@hard_case(
-    13,
-    "mass ratios 1e4 to 1e8",
-    "triple pendulum, H = 0.01",
-    "at most 5 Newton iterations, scaled condition below 100",
-)
+@hard_case(13, "mass ratios 1e4 to 1e8")
 def mass_ratios(full: bool) -> Outcome:
+    """triple pendulum, H = 0.01
+
+    at most 5 Newton iterations, scaled condition below 100
+    """
     values = {}
     for ratio in (1e4, 1e6, 1e8):
         problem = vm.systems.triple_spherical_pendulum(masses=(ratio, 1.0, 1.0))
@@ -101,13 +97,12 @@ def mass_ratios(full: bool) -> Outcome:
     )
 
 
-@hard_case(
-    14,
-    "tiny steps",
-    "triple pendulum, H from 0.1 to 1e-6",
-    "scaled condition flat, round-off floor stated",
-)
+@hard_case(14, "tiny steps")
 def tiny_steps(full: bool) -> Outcome:
+    """triple pendulum, H from 0.1 to 1e-6
+
+    scaled condition flat, round-off floor stated
+    """
     problem = vm.systems.triple_spherical_pendulum()
     state, steps = problem.state(), 10.0 ** -np.arange(1.0, 7.0)
     conditions = np.array([step_condition(problem.system, PENDULUM, state, h) for h in steps])
@@ -122,13 +117,12 @@ def tiny_steps(full: bool) -> Outcome:
     )
 
 
-@hard_case(
-    15,
-    "very many micro steps",
-    "FPU chain, H = 0.1, num_micro 200 to 5000",
-    "time linear (slope 1 within 0.15), equal to the dense solve to 1e-11",
-)
+@hard_case(15, "very many micro steps")
 def many_micro_steps(full: bool) -> Outcome:
+    """FPU chain, H = 0.1, num_micro 200 to 5000
+
+    time linear (slope 1 within 0.15), equal to the dense solve to 1e-11
+    """
     problem, macro_dt, micro = vm.systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
 
     def end(num_micro, steps, newton=None):  # one saved node: one program for each num_micro

@@ -14,14 +14,12 @@ from vmri_jax.check.known_methods import apart_from, midpoint_integrator, rattle
 from vmri_jax.check.measures import difference, run, status
 
 
-@hard_case(
-    23,
-    "three scales",
-    "FPU chain with omega = 50, 70, 5000, fully_implicit, h = 0.02, t = 50",
-    "stable at omega_3 h = 100; I_1, I_2 within 0.05 of a resolved run",
-    draw=draw_oscillatory_energies,
-)
+@hard_case(23, "three scales", draw_oscillatory_energies)
 def three_time_scales(full: bool) -> Outcome:
+    """FPU chain with omega = 50, 70, 5000, fully_implicit, h = 0.02, t = 50
+
+    stable at omega_3 h = 100; I_1, I_2 within 0.05 of a resolved run
+    """
     problem, omega = three_scales(), np.array([50.0, 70.0, 5000.0])
     coarse = run(problem, vm.fully_implicit(5), 0.1, 500)  # omega_3 h = 100
     fine = run(problem, vm.fully_explicit(100), 0.01, 5000, save_every=10)  # omega_3 h = 0.5
@@ -42,13 +40,12 @@ def slow_alone(q_s, q_f, params):
     return jnp.sum(q_s**4) / 4 + jnp.sum(jnp.cos(q_s))
 
 
-@hard_case(
-    24,
-    "zero coupling",
-    "FPU chain with V = V(q_s)",
-    "slow motion independent of num_micro to 1e-13",
-)
+@hard_case(24, "zero coupling")
 def no_coupling(full: bool) -> Outcome:
+    """FPU chain with V = V(q_s)
+
+    slow motion independent of num_micro to 1e-13
+    """
     problem = vm.systems.fermi_pasta_ulam()
     problem = replace(problem, system=problem.system.replace(slow_potential=slow_alone))
     steps, values = 10_000 if full else 1_000, {}
@@ -59,13 +56,12 @@ def no_coupling(full: bool) -> Outcome:
     return Outcome(f"num_micro 10 against 1, {steps} steps: {words}", max(values.values()) < 1e-13, values)
 
 
-@hard_case(
-    25,
-    "reductions",
-    "num_micro = 1",
-    "midpoint variational integrator, Verlet, RATTLE to 1e-12",
-)
+@hard_case(25, "reductions")
 def reductions(full: bool) -> Outcome:
+    """num_micro = 1
+
+    midpoint variational integrator, Verlet, RATTLE to 1e-12
+    """
     chain, pendulum = vm.systems.fermi_pasta_ulam(), vm.systems.triple_spherical_pendulum()
     steps = 200 if full else 25
     values = {

@@ -8,7 +8,7 @@ import numpy as np
 from exudyn import itemInterface as items
 from exudyn.advancedUtilities import CreateSymbolicUserFunction
 
-from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers.cases import Case, Ladder, steps_ladder
 from benchmarks.peers.mechanics import from_masses, to_masses
 
 SOLVERS = {
@@ -41,13 +41,13 @@ def ladders(case: Case) -> list[Ladder]:
 
             return run
 
-        return Ladder(name, "steps", step_counts(8 * case.t_end, 1e7 * case.t_end), build)
+        return steps_ladder(case, name, build, first=8.0)
 
     return [ladder(name) for name in SOLVERS if case.is_chain or name != "RK67"]
 
 
 def prepare(case: Case):
-    """The assembled system, its nodes, and its springs with what is needed for their potentials."""
+    """The assembled system, its nodes, and the potentials of its springs."""
     exu.SetWriteToConsole(False)
     mbs: Any = exu.SystemContainer().AddSystem()
     nodes, springs = (_chain if case.is_chain else _particles)(case, mbs)

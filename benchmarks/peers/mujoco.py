@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers.cases import Case, Ladder, steps_ladder
 from benchmarks.peers.mechanics import Particles, from_masses, to_masses
 
 INERTIA = 1e-10
@@ -36,7 +36,7 @@ def ladders(case: Case) -> list[Ladder]:
 
             return run
 
-        return Ladder(name, "steps", step_counts(8 * case.t_end, 1e7 * case.t_end), build)
+        return steps_ladder(case, name, build, first=8.0)
 
     return [ladder(name) for name in INTEGRATORS]
 

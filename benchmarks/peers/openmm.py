@@ -4,7 +4,7 @@
 import numpy as np
 import openmm as mm
 
-from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers.cases import Case, Ladder, steps_ladder
 from benchmarks.peers.mechanics import from_masses, to_masses
 
 NUM_MICRO = (1, 4)
@@ -36,7 +36,7 @@ def ladders(case: Case) -> list[Ladder]:
 
             return run
 
-        return Ladder(f"MTS {num_micro}", "steps", step_counts(4 * case.t_end, 1e7 * case.t_end), build)
+        return steps_ladder(case, f"MTS {num_micro}", build)
 
     return [ladder(n) for n in NUM_MICRO]
 
