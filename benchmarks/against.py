@@ -19,7 +19,7 @@ TWO = ("fully_explicit 10", "explicit_slow 10", "fully_implicit 10")
 COMPOSED = ("kahan-li6 of fully_explicit 2", "kahan-li8 of fully_explicit 2")
 LANES = 256
 SINGLE, CALL, PREPARED, COLD, GRADIENT, README = 1.1, 250e-6, 25e-6, 4.0, 8.0, 1.2
-"""Targets: after over before of single runs; seconds of calls, of first results and of the first gradient; README over configured."""
+"""Targets: ratio of single runs; seconds of calls, of first results and gradients; README over configured."""
 
 
 @dataclass(frozen=True)
@@ -71,18 +71,17 @@ def _calls(kind: str, seconds: float) -> list[Entry]:
     return [Entry(case, seconds=seconds) for case in cases]
 
 
-def _first() -> list[Entry]:
-    steps = {"FPU l=3": 0.01, "TSP": 0.002, "SAM": 0.002}
-    cases = [Case("first", system, scheme, dt, num_steps=2) for system, dt in steps.items() for scheme in TWO]
-    return [Entry(case, seconds=COLD) for case in cases]
-
-
+FIRST = [
+    Entry(Case("first", system, scheme, macro_dt, num_steps=2), seconds=COLD)
+    for system, macro_dt in (("FPU l=3", 0.01), ("TSP", 0.002), ("SAM", 0.002))
+    for scheme in TWO
+]
 GRADIENTS = [Entry(Case("gradient", "TSP", "fully_implicit 10", 0.002, num_steps=20), seconds=GRADIENT)]
 GROUPS = {
     "single": _single(),
     "batch": _batch(),
     "call": _calls("call", CALL) + _calls("prepared", PREPARED),
-    "first": _first(),
+    "first": FIRST,
     "gradient": GRADIENTS,
     "readme": [Entry(Case("readme", "crane", "fully_implicit 10"))],
 }
@@ -110,11 +109,7 @@ class Size:
 
 
 def sizes(name: str, before: Path, python: Path | None = None, only: Sequence[str] = (), shared: bool = False) -> Size:
-    """ "quick" or "full"; `only` some of `GROUPS`; `shared` counts seconds of the workers alone, on a core that they share.
-
-    Raises:
-        ValueError: no such group, or there is no `vmri_jax` in `before`.
-    """
+    """ "quick" or "full"; `only` some of `GROUPS`; `shared` counts processor time."""
     if not (before / "vmri_jax").is_dir():
         raise ValueError(f"against: {before} has no folder vmri_jax; give a checkout of this repository.")
     if unknown := [group for group in only if group not in GROUPS]:
@@ -152,7 +147,10 @@ def _outcomes(size: Size, seats: dict[str, Seat], tell: Tell) -> Iterator[tuple[
                 yield f"{group}, cold", entry, first_results(seats, entry.case, size.fresh)
         if group == "first":
             continue
-        warm = _printed(seats) if group == "readme" else seats
+        warm = dict(seats)
+        if group == "readme":  # as printed, and after the settings have been made
+            warm = {side: replace(seat, options=("--as-imported", *seat.options)) for side, seat in seats.items()}
+            warm |= {f"{side}, configured": seat for side, seat in seats.items()}
         with ExitStack() as stack:
             workers = {name: stack.enter_context(Worker(seat)) for name, seat in warm.items()}
             for entry in entries:
@@ -160,12 +158,6 @@ def _outcomes(size: Size, seats: dict[str, Seat], tell: Tell) -> Iterator[tuple[
                 case = replace(entry.case, seconds=size.seconds)
                 unbound = replace(entry, seconds=None) if group == "gradient" else entry
                 yield entry.case.kind, unbound, take_turns(workers, case, size.repeats)
-
-
-def _printed(seats: dict[str, Seat]) -> dict[str, Seat]:
-    """Each side as its README has it, and after the settings have been made."""
-    printed = {side: replace(seat, options=("--as-imported", *seat.options)) for side, seat in seats.items()}
-    return printed | {f"{side}, configured": seat for side, seat in seats.items()}
 
 
 def _rows(group: str, entry: Entry, outcome: Outcome) -> list[dict]:

@@ -20,15 +20,7 @@ def write(folder: Path, commit: str) -> None:
 
 
 def assemble(folder: Path, commit: str) -> dict:
-    """All that the benchmarks wrote into a folder, without what only figures need.
-
-    Args:
-        folder: where the JSON files are; ``against.json`` has `commit` on its side `before`.
-        commit: of the code that was measured.
-
-    Raises:
-        ValueError: a file is missing, or ``against.json`` is of another commit.
-    """
+    """All that the benchmarks wrote into a folder; ``against.json`` has the commit on its side `before`."""
     missing = [name for name in (*PARTS, "against") if not (folder / f"{name}.json").exists()]
     if missing:
         raise ValueError(

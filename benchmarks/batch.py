@@ -8,7 +8,6 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks import c_loops, programs
-from benchmarks.floor import c_loop
 from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent, steps_for
 from benchmarks.peers import cases, ours
 from benchmarks.peers.compare import OURS, batch_case
@@ -43,7 +42,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run; micro_steps are those of all trajectories together in the first guess of a run's length."""
+    """How much is run; micro_steps are those of a whole batch in the first guess of a run's length."""
 
     cases: tuple[Case, ...]
     batches: tuple[int, ...]
@@ -113,7 +112,7 @@ def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Cla
             runs[key], work[key] = partial(simulate, steps), batch * steps * NUM_MICRO
             results[key] = runs[key]()
     if c_loops.compiler() is not None:
-        loop = partial(c_loop, case.system, problem, NUM_MICRO, case.micro_dt)
+        loop = partial(c_loops.c_loop, case.system, problem, NUM_MICRO, case.micro_dt)
         steps = steps_for(lambda n: loop(n)(), size.seconds, 10)
         runs["C"], work["C"] = loop(steps), steps * NUM_MICRO
     timed = interleaved(runs, size.repeats)
@@ -122,7 +121,7 @@ def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Cla
     rows, claims = [], []
     for key, sample in ns.items():
         option, _, batch = key.partition(" ")
-        info = _info(results[key]) if key in results else {"iterations": None, "result": ""}
+        run = results.get(key)
         to_c = ratio(sample, ns["C"]) if "C" in ns else None
         rows.append(
             {
@@ -132,7 +131,8 @@ def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Cla
                 "micro_dt": case.micro_dt,
                 **spread(TIME, quartiles(sample)),
                 "to C": to_c and to_c.value,
-                **info,
+                "iterations": int(np.max(run.info.iterations)) if run else None,
+                "result": vm.Result(int(np.max(run.result))).name if run else "",
             }
         )
         if to_c and key != "C" and int(batch) == HELD:
@@ -141,11 +141,11 @@ def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Cla
 
 
 def _as_accurate(case: Case, problem: str, size: Size, tell: Tell) -> tuple[dict, Claim]:
-    """One trajectory of a batch that is as accurate as C, by the cheapest setting of one scheme of high degree."""
+    """One trajectory of a batch that is as accurate as C, by the cheapest setting of a scheme of high degree."""
     tell(f"{case.system}, as accurate as C")
     single, (truth, lanes) = cases.case(problem), batch_case(problem, HELD)
     steps = round(single.t_end / case.micro_dt)
-    loop = c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, steps // NUM_MICRO)
+    loop = c_loops.c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, steps // NUM_MICRO)
     error = single.error(np.concatenate(loop()[:2]))
     ladders = ours.batch_ladders(truth, *lanes, schemes={f"Lobatto {DEGREE}": vm.galerkin(1, DEGREE, "lobatto")})
     found = candidates(scan(OURS, ladders, truth, 1.0, (error,)), error)
@@ -168,7 +168,7 @@ def _steps(simulate: Callable, batch: int, size: Size) -> int:
 
 
 def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
-    """As many as keep a single run of a thousand steps converged, from what the default takes on average upwards."""
+    """As many as keep a single run of a thousand steps converged."""
     scheme, state, steps = vm.fully_explicit(NUM_MICRO), problem.state(), 1000
     run = vm.simulate(problem.system, scheme, state, micro_dt=case.micro_dt, num_steps=steps)
     taken = np.asarray(run.info.iterations)
@@ -177,8 +177,3 @@ def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
         if not programs.failed(simulate(steps)):
             return iterations
     return max(1, int(taken.max()))
-
-
-def _info(trajectory: vm.Trajectory) -> dict:
-    worst = vm.Result(int(np.max(trajectory.result)))
-    return {"iterations": int(np.max(trajectory.info.iterations)), "result": worst.name}

@@ -1,4 +1,4 @@
-"""Hand-written C loops, the speed floor of the three systems: compiled when first used, called through ctypes."""
+"""Hand-written C loops, the speed floor of the three systems, compiled when first used."""
 
 import ctypes
 import dataclasses
@@ -73,12 +73,7 @@ class CLoop:
 
 
 def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int) -> CLoop:
-    """`fully_explicit(num_micro)` on a `fermi_pasta_ulam` chain: the impulse method, every micro step a sweep.
-
-    Raises:
-        NoCompiler: there is no C compiler.
-        ValueError: another system, masses other than one, or less than one step.
-    """
+    """`fully_explicit(num_micro)` on a `fermi_pasta_ulam` chain of unit masses: the impulse method."""
     kinetic = problem.system.kinetic
     unit = all(np.all(np.asarray(m) == 1.0) for m in (kinetic.slow, kinetic.fast))  # pyright: ignore[reportAttributeAccessIssue]
     _check("fpu", unit and _is(problem.system.slow_potential, soft_springs), num_micro, num_macro_steps)
@@ -87,12 +82,7 @@ def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int)
 
 
 def tsp(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:
-    """RATTLE, `fully_explicit(1)`, on a `triple_spherical_pendulum`, constraints ``(|q|^2 - l^2) / 2`` up to the tolerance.
-
-    Raises:
-        NoCompiler: there is no C compiler.
-        ValueError: another system, or less than one step.
-    """
+    """RATTLE, `fully_explicit(1)`, on a `triple_spherical_pendulum`, constraints below the tolerance."""
     _check("tsp", _is(problem.system.fast_potential, spring), num_steps)
     return _rattle("tsp", problem, ("lengths", "stiffness", "gravity"), micro_dt, num_steps, tolerance)
 
@@ -126,6 +116,13 @@ def _loop(name: str, problem: Problem, *arguments) -> CLoop:
     state = problem.state()
     q, p = np.concatenate([state.q_s, state.q_f]), np.concatenate([state.p_s, state.p_f])
     return CLoop(function, q, p, len(state.q_s), arguments)
+
+
+def c_loop(system: str, problem: Problem, num_micro: int, micro_dt: float, num_steps: int) -> CLoop:
+    """The C loop over `num_steps` macro steps: the impulse method, or RATTLE with every step a micro step."""
+    if system.startswith("FPU"):
+        return fpu(problem, num_micro, micro_dt, num_steps)
+    return {"TSP": tsp, "SAM": sam}[system](problem, micro_dt, num_steps * num_micro)
 
 
 @functools.cache

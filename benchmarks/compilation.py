@@ -37,27 +37,22 @@ def sizes(name: str) -> Size:
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
-    """Start one process after the other; a report after each scheme."""
+    """Measure all of it, a report after each scheme."""
     pairs = product(size.systems, size.schemes)
     return growing("compile", name, (_measure(system, scheme, size, tell) for system, scheme in pairs))
 
 
 def _measure(system: str, scheme: str, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
-    """The num_micro take turns."""
+    """In processes of their own; the num_micro take turns."""
     found: dict[int, list[dict]] = {n: [] for n in size.num_micro}
     for _ in range(size.repeats):
         for n in size.num_micro:
             tell(f"{system}, {scheme}, num_micro {n}")
-            found[n].append(_fresh(system, scheme, n))
+            words = f"{scheme.replace(' ', '_')} {n}"
+            with Worker(Seat()) as worker:
+                made = worker.make(Case("compile", system, words, macro_dt=n * MICRO_DT, num_steps=2))
+                found[n].append(made["found"] | {"process": time.perf_counter() - worker.started})
     return [_row(system, scheme, n, found[n]) for n in size.num_micro], _claims(f"{system}, {scheme}", found)
-
-
-def _fresh(system: str, scheme: str, num_micro: int) -> dict:
-    """What a worker finds in a process of its own."""
-    words = f"{scheme.replace(' ', '_')} {num_micro}"
-    with Worker(Seat()) as worker:
-        made = worker.make(Case("compile", system, words, macro_dt=num_micro * MICRO_DT, num_steps=2))
-        return made["found"] | {"process": time.perf_counter() - worker.started}
 
 
 def _row(system: str, scheme: str, num_micro: int, found: list[dict]) -> dict:

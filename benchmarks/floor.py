@@ -58,13 +58,6 @@ def sizes(name: str) -> Size:
     return Size(pairs, 7, 0.1) if name == "quick" else Size(pairs, 25, 0.2)
 
 
-def c_loop(system: str, problem: vm.Problem, num_micro: int, micro_dt: float, num_steps: int) -> c_loops.CLoop:
-    """The C loop over `num_steps` macro steps: the impulse method, or RATTLE with every step a micro step."""
-    if system.startswith("FPU"):
-        return c_loops.fpu(problem, num_micro, micro_dt, num_steps)
-    return {"TSP": c_loops.tsp, "SAM": c_loops.sam}[system](problem, micro_dt, num_steps * num_micro)
-
-
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each pair; without a compiler nothing is held against C."""
     return growing("floor", name, (_measure(pair, size, tell) for pair in size.pairs), c_loops.missing())
@@ -82,7 +75,7 @@ def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     first = pair.schemes[0]
     if c_loops.compiler() is not None:
         steps["C"], results["C"] = steps[first], ""
-        runs["C"] = c_loop(pair.system, problem, pair.num_micro, pair.micro_dt, steps["C"])
+        runs["C"] = c_loops.c_loop(pair.system, problem, pair.num_micro, pair.micro_dt, steps["C"])
     timed = interleaved(runs, size.repeats)
     ns = {name: [1e9 * s / (steps[name] * pair.num_micro) for s in timed[name]] for name in runs}
 

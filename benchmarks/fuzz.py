@@ -1,4 +1,4 @@
-"""Fuzzing: random systems, most of them hard; every run must end in a valid trajectory, a named status or a clear refusal.
+"""Random systems, most of them hard: every run ends in a valid trajectory, a named status or a clear refusal.
 
 Runs happen in a process of their own, which is replaced where it hangs or dies. Outcomes are written as they come.
 """
@@ -46,7 +46,7 @@ def calls(runs: list[int], seed: int) -> Iterator[tuple[int, ...]]:
 
 
 def verdicts(of: rs.Structure, draws: list[rs.Draw]) -> list[str]:
-    """What becomes of each draw, see `judge` and `refusal`; those of a batch share masses and scheme of the first."""
+    """What becomes of each draw; those of a batch share masses and scheme of the first."""
     try:
         first, problems = draws[0], [rs.problem(of, at) for at in draws]
         how = {

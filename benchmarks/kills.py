@@ -1,4 +1,4 @@
-"""A streaming run killed at random moments: every completed chunk readable, every resumed run the same to the last bit."""
+"""A streaming run killed at random moments: resumed it is the same to the last bit."""
 
 import multiprocessing
 import shutil
@@ -51,7 +51,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 
 def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict], list[bool]]:
-    """One row per kill; and whether the runs that were completed meanwhile are identical to the uninterrupted one."""
+    """One row per kill; and whether the completed runs are identical to the uninterrupted one."""
     context = multiprocessing.get_context("forkserver")  # children start from a process that has imported everything
     context.set_forkserver_preload(["benchmarks.kills"])
     random = np.random.default_rng(size.seed)

@@ -29,7 +29,7 @@ def cases(num_micro: tuple[int, ...]) -> tuple[Case, ...]:
 
 
 def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> tuple[list[dict], list[Claim]]:
-    """Time and, from MEMORY_FROM on, temporary memory of the macro steps of a case: rows, and slopes in logarithms."""
+    """Time and temporary memory of the macro steps of a case: rows, and slopes in logarithms."""
     found = curves.measure(case, repeats, seconds, tell)
     problem = programs.problem(case.system)
     num_micro, _ = found.curve("auto")

@@ -37,7 +37,7 @@ def sizes(name: str, count: int, seed: int) -> Size:
 
 
 class Comparison(NamedTuple):
-    """One system: how its step was solved, how the run ended, and the largest differences relative to the largest values."""
+    """One system: how it was solved, how the run ended, largest differences over largest values."""
 
     method: str
     kind: str

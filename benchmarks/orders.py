@@ -1,4 +1,4 @@
-"""Observed orders: Galerkin schemes and compositions on all systems, against solutions of the continuous equations."""
+"""Observed orders: Galerkin schemes and compositions on all systems."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,8 +17,7 @@ COLUMNS = ("system", "scheme", "num_micro", "order", "of q", "+-", "of p", "+- "
 TRUTH = Path(__file__).parent.parent / "tests" / "data" / "ground_truth"
 TOLERANCE = 0.25
 COARSEST, FLOOR, OF_MULTIPLIERS = 1e-4, 4e-13, 5
-"""Errors between the first two, relative to the largest position or momentum, are fitted: below is round-off, above the
-steps are not yet small. Round-off of the multipliers makes the floor of the momenta so many times higher."""
+"""Relative errors between the first two are fitted; multipliers make the floor of momenta so many times higher."""
 ACCUMULATED = 200
 """Round-off has doubled after so many steps."""
 RATIO, POINTS = 2**0.35, 3

@@ -29,11 +29,7 @@ def unknowns(problem: vm.Problem, num_micro: int) -> int:
 
 
 def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, newton: vm.Newton | None = None, **step):
-    """``run(num_steps)``: a prepared run that saves the last node only; one that fails is seen in its ``result``.
-
-    Args:
-        step: ``macro_dt`` or ``micro_dt``; ``run(num_steps, macro_dt=...)`` takes another one.
-    """
+    """``run(num_steps)``, a prepared run with ``macro_dt`` or ``micro_dt`` that saves the last node only."""
     prepared = vm.prepare(problem.system, scheme, problem.state(), **step, num_steps=1, newton=newton)
     return lambda num_steps, **other: prepared(num_steps=num_steps, **other)
 

@@ -1,4 +1,4 @@
-"""What a benchmark hands over: rows and claims as tables, a JSON file with machine and versions, figures."""
+"""What a benchmark hands over: tables of rows and claims, a JSON file with machine and versions, figures."""
 
 import json
 import math
@@ -47,13 +47,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Report:
-    """All that one benchmark found.
-
-    rows: one dictionary per program.
-    notes: what was left out, and why.
-    figures: by file name, functions that draw.
-    about: what else belongs into the file.
-    """
+    """All that one benchmark found; figures are functions that draw, by file name, about is what else belongs into the file."""
 
     name: str
     size: str

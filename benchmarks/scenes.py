@@ -1,4 +1,4 @@
-"""Scenes: what an effect costs that is not there, what it costs to write a system as a scene, orders under forces."""
+"""Scenes: what an effect costs that is not there, a scene against a system by hand, orders under forces."""
 
 import copy
 import time
@@ -185,7 +185,7 @@ def presence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 # --- orders ----------------------------------------------------------------------------------------------------------
 def orders(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
-    """Errors and energy balance (change of energy less work of the forces) of bodies under forces, as the step shrinks."""
+    """Errors and energy balance (change of energy less work of the forces) of bodies under forces."""
     rows = []
     for label, scheme, steps in size.orders:
         tell(label)

@@ -1,4 +1,4 @@
-"""Worker processes that take turns, sample by sample: checkouts, or forms of the kernels, compared in one run."""
+"""Worker processes that take turns, sample by sample: checkouts, or forms of the kernels."""
 
 import json
 import os
@@ -23,7 +23,7 @@ class Refused(RuntimeError):
 
 @dataclass(frozen=True)
 class Seat:
-    """Where a worker sits: the checkout whose `vmri_jax` it imports, its interpreter, options of ``worker.py``, variables."""
+    """Where a worker sits: the checkout whose `vmri_jax` it imports, and how it is started."""
 
     checkout: Path = HERE.parent
     python: Path = Path(sys.executable)
@@ -38,7 +38,7 @@ class Seat:
 
 
 class Worker:
-    """A process in a `Seat`, on the cores of this process and without a cache of programs; close it, or use it as a context."""
+    """A process in a `Seat`, without a cache of programs; it ends with its context."""
 
     def __init__(self, seat: Seat):
         environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false", **seat.environment}
@@ -89,14 +89,14 @@ class Worker:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one case gave: samples in seconds and answers of `Worker.make`, by seat; why other seats have none."""
+    """What one case gave by seat: samples in seconds, answers of `Worker.make`, or why there are none."""
 
     samples: dict[str, list[float]]
     made: dict[str, dict]
     refused: dict[str, str]
 
     def difference(self, a: str, b: str) -> float | None:
-        """Largest difference of the ends of two seats, relative to the largest number of b; None where one has none."""
+        """Largest difference of the ends of two seats, relative to the largest number of b."""
         if a not in self.made or b not in self.made:
             return None
         x, y = (np.array(self.made[name]["end"]) for name in (a, b))

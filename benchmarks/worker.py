@@ -31,7 +31,7 @@ CLOCK = time.process_time if PROCESSOR_TIME in sys.argv else time.perf_counter
 SPREAD = 0.01
 """Of the velocities in a batch."""
 COMPARED = 8
-"""Macro steps after which two sides are compared: round-off has not grown by then, also where the motion is chaotic."""
+"""Macro steps after which two sides are compared: round-off has not grown by then."""
 COMPILED = "/jax/core/compile/backend_compile_duration"
 """JAX's own name of that event."""
 CALLS = 20
@@ -72,7 +72,7 @@ class Case:
 
 
 class Timed:
-    """A run that takes turns with others: its steps, what a short call computes, the status of a call, what else it found."""
+    """A run that takes turns with others; `end` is what a short call computes, `result` the status of a call."""
 
     num_steps: int
     end: np.ndarray
@@ -167,7 +167,7 @@ class First(Timed):
 
 
 class Compile(Timed):
-    """Seconds of the start, of the first call and of a later one; compilations over changes of steps, parameters and start."""
+    """Seconds of start, first call and later call; compilations over other steps, parameters and starts."""
 
     def __init__(self, case: Case):
         problem, scheme = case.problem(), case.made_scheme()

@@ -18,7 +18,7 @@ TEMPLATE = Path(__file__).parent / "report.html.j2"
 
 @dataclass(frozen=True)
 class FigureResult:
-    """One figure of the report: its line of the paper, its line of today, its checks and files, or why it failed."""
+    """One figure of the report: what the paper saw, what was seen, checks and images, or why it failed."""
 
     name: str
     title: str
@@ -52,12 +52,9 @@ def reproduce(
     progress: Progress = silent,
     figure_done: Callable[[FigureResult], None] | None = None,
 ) -> Report:
-    """Run the reference study, or `only` these figures of it, and write figures, tables and ``report.html`` into `out`.
+    """Run the study, or `only` some figures, and write figures, tables and ``report.html`` after each of them.
 
-    A figure that fails is reported as failed; the others are kept. The report is rewritten after every figure.
-
-    Raises:
-        ValueError: an unknown size or figure name.
+    A figure that fails is reported as failed; the others are kept.
     """
     chosen = choose_figures(reference_figures(size), only)
     out = Path(out)

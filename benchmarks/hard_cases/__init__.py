@@ -1,4 +1,4 @@
-"""The 28 hard cases: where multirate variational integrators break, how each is set up, and what counts as a pass."""
+"""The 28 hard cases: where multirate variational integrators break, and what counts as a pass."""
 
 from benchmarks.hard_cases import chains, constraints, encounters, guards, large_steps, long_runs, resonance, scales
 from vmri_jax.check import Case

@@ -7,7 +7,7 @@ from vmri_jax.check import Case, Outcome
 
 
 def hard_case(number: int, title: str, draw=None) -> Callable[..., Case]:
-    """Makes a `Case` of ``run(full)``, whose docstring says the set-up and, after an empty line, the criterion."""
+    """Makes a `Case` of ``run(full)``, whose docstring is the set-up, an empty line and the criterion."""
 
     def made(run: Callable[[bool], Outcome]) -> Case:
         setup, criterion = inspect.cleandoc(run.__doc__ or "").split("\n\n")

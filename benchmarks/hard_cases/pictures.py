@@ -8,7 +8,7 @@ from vmri_jax.check.case import Details
 
 
 def draw_windows(details: Details, theme: plots.Theme) -> Figure:
-    """Unstable intervals of omega H / pi of the linear model, one line per num_micro; narrow ones at least a hairline."""
+    """Unstable intervals of omega H / pi of the linear model, one line per num_micro."""
     with plots.new_figure(7.2, 2.6, "", theme) as figure:
         axes = figure.subplots()
         for k, ((_, windows), color) in enumerate(zip(details.items(), theme.curves, strict=False)):

@@ -1,7 +1,4 @@
-"""Systems that are hard to integrate: linkages, chains, contact, a close encounter, three time scales.
-
-Factories of `Problem`, written as a user would write them: functions at module level, numbers in the params.
-"""
+"""Systems that are hard to integrate: linkages, chains, contact, a close encounter, three time scales."""
 
 from dataclasses import replace
 
@@ -71,7 +68,7 @@ def four_bars_and_one_again(q_s, q_f, params):
 
 
 def four_bar(angle: float, kappa: float = 0.0, redundant: bool = False) -> vm.Problem:
-    """Parallelogram linkage (fast), with a heavy slide (slow) on a spring; collinear, hence singular, at angle 0.
+    """Parallelogram linkage (fast), with a heavy slide (slow) on a spring; singular at angle 0.
 
     Args:
         angle: of the crank at the start; it turns with speed 1.
@@ -133,7 +130,7 @@ def stiff_links(q_f, params):
 
 
 def stiff_chain(num_masses: int = 50) -> vm.Problem:
-    """Near-inextensible chain of unit masses in the plane (fast) with a load on a soft spring (slow), let go sideways."""
+    """Near-inextensible chain of unit masses (fast) with a load on a soft spring (slow), let go sideways."""
     length, angle = 0.2, 0.3
     params = arrays(length=length, mass=1.0, stiffness=1e6, gravity=9.81, load=100.0, kappa=500.0, soft_length=1.0)
     down = np.array([np.sin(angle), -np.cos(angle)])
@@ -172,10 +169,7 @@ def gravitation(q_f, params):
 
 
 def two_body(eccentricity: float = 0.9) -> vm.Problem:
-    """Two bodies that attract each other: centre of mass in a soft trap (slow), relative position (fast); period 2 pi.
-
-    Started at the apocentre; the pericentre is at 1 - e.
-    """
+    """Centre of mass of two bodies in a soft trap (slow), relative position (fast) from the apocentre; period 2 pi."""
     masses, params = vm.ConstantMass([4.0] * 2, [1.0] * 2), arrays(kappa=0.01, mu=1.0)
     system = vm.System(masses, trap, gravitation, params=params)
     speed = np.sqrt((1 - eccentricity) / (1 + eccentricity))

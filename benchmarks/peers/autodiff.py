@@ -1,11 +1,9 @@
-"""Equations of motion made by automatic differentiation from the Lagrangian and the constraints that ours is given.
-
-Index-reduced: accelerations and multipliers solve
+"""Equations of motion by automatic differentiation of the Lagrangian and the constraints that ours is given:
 
     [M  G^T] [  a   ]   [ -grad(V + W)     ]
     [G   0 ] [lambda] = [ -(d/dt G) v      ]
 
-with G the Jacobian of the constraints. Nothing is eliminated by hand.
+with G the Jacobian of the constraints.
 """
 
 import jax
@@ -15,7 +13,7 @@ from benchmarks.peers.cases import Case
 
 
 def acceleration(case: Case):
-    """``a(q, v)``, arrays (n,), slow coordinates first; without constraints ``-grad(V + W)`` over the masses per coordinate."""
+    """``a(q, v)``, arrays (n,), slow coordinates first."""
     system, n_s = case.problem.system, case.problem.q_s.size
     mass = jax.hessian(lambda v: kinetic(case, v))(jnp.asarray(case.v))
     force = jax.grad(lambda q: -potential(case, q))

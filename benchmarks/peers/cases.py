@@ -27,7 +27,7 @@ class NotRepresentable(ValueError):
 
 @dataclass(frozen=True)
 class Case:
-    """Integrate `problem` from its start to `t_end`; q_end (n,) are positions there, slow ones first, of a far better solution."""
+    """Integrate `problem` to `t_end`; q_end (n,) are positions there of a far better solution, slow ones first."""
 
     name: str
     system: str

@@ -1,4 +1,4 @@
-"""Our integrators against what people use instead: the time to reach an error, in one interleaved run per problem."""
+"""Our integrators against what people use instead: the time to reach an error."""
 
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -64,11 +64,7 @@ class Size:
 
 
 def sizes(name: str, only: Sequence[str] = (), peers: Sequence[str] = ()) -> Size:
-    """ "quick" or "full"; `only` these cases, e.g. "TSP t=1" or "TSP", and `peers`.
-
-    Raises:
-        ValueError: there is no such case or peer.
-    """
+    """ "quick" or "full"; `only` these cases, e.g. "TSP t=1" or "TSP", and `peers`."""
     chosen = _chosen(cases.NAMES, only)
     batches = _chosen([f"{case}, batch" for case in BATCH_CASES], only)
     if not chosen and not batches:
@@ -166,7 +162,7 @@ def _note(report: Report, text: str) -> None:
 
 @dataclass(frozen=True)
 class Timed:
-    """The fastest setting of one peer at one level; the ratio of its time to ours is 0 where ours never gets there."""
+    """The fastest setting of one peer at one level; `to_ours` is 0 where ours never gets there."""
 
     point: Point
     samples: list[float]
@@ -174,7 +170,7 @@ class Timed:
 
 
 def _time(points: Mapping[str, Sequence[Point]], levels, size: Size) -> dict[tuple[str, float], Timed]:
-    """Interleaved times of all candidates: the fast ones together, the slow ones together, each with ours."""
+    """Times of all candidates in turn: the fast ones together, the slow ones together, each with ours."""
     chosen = {(peer, level): candidates(mine, level) for peer, mine in points.items() for level in levels}
     fastest = {key: some[0].seconds for key, some in chosen.items() if some}
     found: dict[tuple[str, float], Timed] = {}

@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""diffrax: adaptive Runge-Kutta methods (Dopri8, Tsit5) and the semi-implicit Euler method, each compiled once."""
+"""diffrax: adaptive Runge-Kutta methods (Dopri8, Tsit5) and the semi-implicit Euler method."""
 
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ SOLVERS: tuple[Any, ...] = (diffrax.Dopri8, diffrax.Tsit5)
 
 
 def ladders(case: Case, equations=by_hand) -> list[Ladder]:
-    """Tolerances for the adaptive methods; steps for the semi-implicit one, which wants forces without velocities."""
+    """Tolerances for the adaptive methods, steps for the semi-implicit one."""
     start = (jnp.asarray(case.q), jnp.asarray(case.v))
 
     def adaptive(solver) -> Ladder:

@@ -1,4 +1,4 @@
-"""Equations of motion for the peers that take any right-hand side, written by hand, in the form that runs fastest."""
+"""Equations of motion for the peers that take any right-hand side, by hand, in their fastest form."""
 
 import jax.numpy as jnp
 import numpy as np

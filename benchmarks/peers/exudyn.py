@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""Exudyn: implicit trapezoidal rule with constraints at velocity level, and generalized-alpha; RK67 where nothing constrains."""
+"""Exudyn: trapezoidal rule with constraints at velocity level, generalized-alpha, and RK67 for the chain."""
 
 from typing import Any
 
@@ -62,7 +62,7 @@ def positions(case: Case, mbs, nodes) -> np.ndarray:
 
 
 def energy(case: Case) -> float:
-    """Of the start: Exudyn's positions and velocities at the nodes, and its lengths or coordinates of the springs."""
+    """Of the start, from Exudyn's nodes and lengths of the springs."""
     mbs, nodes, springs = prepare(case)
     values = [mbs.GetNodeOutput(node, exu.OutputVariableType.Coordinates_t) for node in nodes]
     masses = np.ones(len(nodes)) if case.is_chain else np.array(case.particles.masses)
@@ -91,7 +91,7 @@ def _settings(case: Case, num_steps: int):
 
 
 def _chain(case: Case, mbs):
-    """Its masses on a line; the quartic springs are symbolic functions, which Exudyn evaluates without Python."""
+    """Its masses on a line; symbolic functions for the quartic springs are evaluated without Python."""
     markers, nodes = [], []
     for x, v in zip(to_masses(case.q), to_masses(case.v), strict=True):
         node = mbs.AddNode(items.Node1D(referenceCoordinates=[0.0], initialCoordinates=[x], initialVelocities=[v]))

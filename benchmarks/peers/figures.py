@@ -13,18 +13,8 @@ from vmri_jax import plots
 
 FAMILIES = {"FPU": "Fermi-Pasta-Ulam chain", "TSP": "Triple spherical pendulum", "SAM": "Simple atomic model"}
 COLORS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#66c9a9",
-    "#a3508a",
-    "#d3a5c5",
-    "#b98700",
-    "#56a0d3",
-    "#8a6d5a",
-    "#d680a8",
-    "#5f6b75",
-    "#9aa5ae",
+    *("#0072b2", "#d55e00", "#009e73", "#66c9a9", "#a3508a", "#d3a5c5"),
+    *("#b98700", "#56a0d3", "#8a6d5a", "#d680a8", "#5f6b75", "#9aa5ae"),
 )
 SHOWN = (2e-10, 5e-2)
 """Errors between which a figure goes, or less where none is so small."""

@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""heyoka: Taylor's method of adaptive step and order, compiled for the equations; multipliers eliminated by hand."""
+"""heyoka: Taylor's method of adaptive step and order, compiled for equations without multipliers."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from benchmarks.peers.cases import Case, Ladder, tolerances
 from benchmarks.peers.mechanics import chain_accelerations, chain_gaps
 
 COMPACT = 50
-"""From so many coordinates on loops are compiled instead of one long program, which would take minutes to compile."""
+"""From so many coordinates on loops are compiled; one long program would take minutes."""
 
 
 def equations(case: Case) -> tuple[list, list[tuple[Any, Any]]]:
@@ -41,7 +41,7 @@ def ladders(case: Case) -> list[Ladder]:
 
 
 def energy(case: Case) -> float:
-    """Of the start: heyoka's own expression for the Hamiltonian of the chain, else springs and weights as it knows them."""
+    """Of the start, by an expression of heyoka."""
     variables, _ = equations(case)
     q, v = variables[: case.q.size], variables[case.q.size :]
     kinetic = hy.sum([m / 2 * x**2 for m, x in zip(case.masses, v, strict=True)])
@@ -61,7 +61,7 @@ def _potential(case: Case, q: list):
 
 
 def batch_ladders(case: Case, states, q, v) -> list[Ladder]:
-    """Its batch mode, as many lanes as the processor has in a vector, one batch after the other or as an ensemble."""
+    """Its batch mode, a vector of the processor at once, one batch after the other or as an ensemble."""
     size, n = hy.recommended_simd_size(), case.q.size
     starts = np.concatenate([q, v], axis=1).reshape(-1, size, 2 * n).transpose(0, 2, 1)  # (batches, 2 n, lanes)
 

@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""JAX MD: velocity Verlet at constant energy (`simulate.nve`); it has no constraints and no multirate integrator."""
+"""JAX MD: velocity Verlet (`simulate.nve`); it has no constraints and no multirate integrator."""
 
 from functools import partial
 from typing import Any

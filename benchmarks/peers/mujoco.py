@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""MuJoCo: rods are ball joints of a tree, exact by construction; springs are tendons; RK4 and its semi-implicit Euler."""
+"""MuJoCo: rods are ball joints of a tree, springs are tendons; RK4 and its semi-implicit Euler."""
 
 from collections.abc import Sequence
 

@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""OpenMM: its r-RESPA integrator with constraints (MTSIntegrator), on the Reference platform, which computes in doubles."""
+"""OpenMM: its r-RESPA integrator with constraints (MTSIntegrator), in doubles on the Reference platform."""
 
 import numpy as np
 import openmm as mm
@@ -8,10 +8,10 @@ from benchmarks.peers.cases import Case, Ladder, steps_ladder
 from benchmarks.peers.mechanics import from_masses, to_masses
 
 NUM_MICRO = (1, 4)
-"""Micro steps per macro step that are tried; every one of them is interpreted on its own, more make a step slower."""
+"""Micro steps per macro step that are tried; each is interpreted, more make a step slower."""
 SLOW, FAST = 0, 1  # force groups
 FIXED = 1e20
-"""Mass of the particle at the origin: OpenMM constrains no particle of infinite mass; this one moves less than round-off."""
+"""Mass of the particle at the origin, which cannot be infinite: it moves less than round-off."""
 TOLERANCE = 1e-13
 """Relative error of a rod; the iteration ends below it."""
 
@@ -42,7 +42,7 @@ def ladders(case: Case) -> list[Ladder]:
 
 
 def prepare(case: Case, num_micro: int):
-    """Context, positions and velocities at the start; lengths in nm, times in ps, energies in kJ/mol fit together."""
+    """Context, positions and velocities at the start, in nm, ps and kJ/mol."""
     system, x, v = _chain(case) if case.is_chain else _particles(case)
     integrator = mm.MTSIntegrator(1e-3, [(SLOW, 1), (FAST, num_micro)])
     integrator.setConstraintTolerance(TOLERANCE)

@@ -1,4 +1,4 @@
-"""vmri_jax itself: every scheme as a prepared run, which is checked and compiled once for all numbers of steps."""
+"""vmri_jax itself: every scheme as a prepared run, compiled once for all numbers of steps."""
 
 import dataclasses
 from functools import cache

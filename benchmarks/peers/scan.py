@@ -43,8 +43,10 @@ class Point:
 def scan(
     peer: str, ladders: Sequence[Ladder], case: Case, seconds: float, levels: Sequence[float] = LEVELS
 ) -> list[Point]:
-    """Climb every ladder until the error is a tenth of the finest level, a run takes longer than `seconds`, or another ladder
-    has reached the finest level in less time. Those that are among the cheapest at a level are refined there."""
+    """Climb every ladder until it is fine enough, a run takes longer than `seconds`, or another ladder was faster.
+
+    Those that are among the cheapest at a level are refined there.
+    """
     climbed: list[Climb] = []
     for ladder in ladders:
         climb = Climb(peer, ladder, case)
