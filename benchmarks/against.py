@@ -168,7 +168,7 @@ def _rows(group: str, entry: Entry, outcome: Outcome) -> list[dict]:
     rows = []
     for before, after in pairs:
         samples, made = outcome.samples, outcome.made.values()
-        row = {"group": group, "case": entry.label + after.removeprefix(AFTER)}
+        row: dict = {"group": group, "case": entry.label + after.removeprefix(AFTER)}
         for side, key in ((BEFORE, before), (AFTER, after)):
             row[f"{side}, ms"] = 1e3 * float(np.median(samples[key])) if key in samples else None
         if before in samples and after in samples:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -126,7 +127,7 @@ def _cell(value) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def each_float(value, function: Callable):
+def each_float(value, function: Callable) -> Any:
     """The same dictionaries and lists with this function of every float."""
     if isinstance(value, dict):
         return {key: each_float(item, function) for key, item in value.items()}

@@ -197,7 +197,7 @@ def _time(points: Mapping[str, Sequence[Point]], levels, size: Size) -> dict[tup
 
 
 def _row(title, peer, points: Sequence[Point], levels, timed) -> dict:
-    row = {"case": title, "peer": peer}
+    row: dict = {"case": title, "peer": peer}
     details = []
     for level in levels:
         key = f"{level:.0e}"
