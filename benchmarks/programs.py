@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,8 @@ SCHEMES: dict[str, Callable[[int], vm.Scheme]] = {
     "explicit slow": vm.explicit_slow,
     "fully explicit": vm.fully_explicit,
 }
+TRUTH = Path(__file__).parent.parent / "tests" / "data" / "ground_truth"
+FILES = {"FPU l=3": "fpu3", "FPU l=200": "fpu200", "TSP": "tsp", "SAM": "sam"}
 
 
 def problem(name: str, amplitude: float = 1.0) -> vm.Problem:
@@ -20,6 +24,17 @@ def problem(name: str, amplitude: float = 1.0) -> vm.Problem:
     problem = Case("", name).problem()
     start = {key: amplitude * getattr(problem, key) for key in ("q_s", "q_f", "v_s", "v_f")}
     return replace(problem, **start)
+
+
+def ground_truth(system: str, t_end: str) -> Path:
+    """File of a solution of high precision."""
+    return TRUTH / f"{FILES[system]}_t{t_end}.npz"
+
+
+def masses(problem: vm.Problem) -> np.ndarray:
+    """(n,) masses per coordinate, slow ones first."""
+    kinetic: Any = problem.system.kinetic
+    return np.concatenate([kinetic.slow, kinetic.fast])
 
 
 def unknowns(problem: vm.Problem, num_micro: int) -> int:

@@ -1,6 +1,7 @@
 """Cases 5 to 7 and 13 to 15: explicit limit, large and tiny steps, mass ratios, very many micro steps."""
 
 import time
+from functools import partial
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from benchmarks.hard_cases.case import hard_case
 from vmri_jax.check import Outcome
 from vmri_jax.check.measures import constraints, difference, energy, iterations, nodes, run, status
 from vmri_jax.diagnostics import step_condition
+from vmri_jax.study.timing import interleaved
 
 EXACT = vm.Newton(method="arrowhead")
 """Newton's iteration with the exact matrix, whose iterations are counted."""
@@ -130,14 +132,9 @@ def many_micro_steps(full: bool) -> Outcome:
         return nodes(run(problem, scheme, macro_dt, steps, save_every=steps, newton=newton))[-1]
 
     steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
-    for n in micro:
-        end(n, steps[n])  # compiles
-    best = dict.fromkeys(micro, np.inf)
-    for _ in range(40 if full else 20):
-        for n in micro:  # in turns; the time of the processor, which others on the machine do not stretch
-            start = time.process_time()
-            end(n, steps[n])
-            best[n] = min(best[n], (time.process_time() - start) / steps[n])
+    runs = {f"{n}": partial(end, n, steps[n]) for n in micro}
+    seconds = interleaved(runs, 40 if full else 20, min_seconds=0.0, clock=time.process_time)
+    best = {n: min(seconds[f"{n}"]) / steps[n] for n in micro}
     slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
     apart = difference(end(micro[0], 3), end(micro[0], 3, vm.Newton(method="dense")))
     return Outcome(

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,6 @@ LEVELS = (1e-2, 2e-4, 2e-6, 1e-8)
 """Largest errors ``max |q - q_ref|`` at the end that are asked for."""
 BATCH_LEVEL = 2e-4
 """The same for batches, of the worst lane."""
-TRUTH = Path(__file__).parents[2] / "tests" / "data" / "ground_truth"
-FILES = {"FPU l=3": "fpu3", "FPU l=200": "fpu200", "TSP": "tsp", "SAM": "sam"}
 NAMES = ("FPU l=3 t=1", "FPU l=3 t=100", "FPU l=200 t=1", "TSP t=1", "TSP t=10", "SAM t=1", "SAM t=10")
 
 
@@ -43,8 +40,7 @@ class Case:
     @cached_property
     def masses(self) -> np.ndarray:
         """(n,) masses per coordinate, slow ones first."""
-        kinetic: Any = self.problem.system.kinetic
-        return np.concatenate([kinetic.slow, kinetic.fast])
+        return programs.masses(self.problem)
 
     @cached_property
     def q(self) -> np.ndarray:
@@ -84,11 +80,11 @@ class Case:
 
 
 def case(name: str) -> Case:
-    """One of `NAMES`, with the reference from the folder `TRUTH`."""
+    """One of `NAMES`."""
     if name not in NAMES:
         raise ValueError(f"case: there is no {name!r}; there are {', '.join(NAMES)}.")
     system, _, t_end = name.rpartition(" t=")
-    with np.load(TRUTH / f"{FILES[system]}_t{t_end}.npz") as file:
+    with np.load(programs.ground_truth(system, t_end)) as file:
         q_end = file["q"][-1]
     return Case(name, system, programs.problem(system), float(t_end), q_end)
 
