@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -74,22 +75,22 @@ class CLoop:
 
 def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int) -> CLoop:
     """`fully_explicit(num_micro)` on a `fermi_pasta_ulam` chain of unit masses: the impulse method."""
-    kinetic = problem.system.kinetic
-    unit = all(np.all(np.asarray(m) == 1.0) for m in (kinetic.slow, kinetic.fast))  # pyright: ignore[reportAttributeAccessIssue]
-    _check("fpu", unit and _is(problem.system.slow_potential, soft_springs), num_micro, num_macro_steps)
+    kinetic: Any = problem.system.kinetic
+    unit = np.all(np.concatenate([kinetic.slow, kinetic.fast]) == 1.0)
+    _check("fpu", problem.system.slow_potential if unit else None, soft_springs, num_micro, num_macro_steps)
     omega = float(problem.system.params["omega"])
     return _loop("fpu", problem, len(problem.q_s), omega, num_micro, micro_dt, num_macro_steps)
 
 
 def tsp(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:
     """RATTLE, `fully_explicit(1)`, on a `triple_spherical_pendulum`, constraints below the tolerance."""
-    _check("tsp", _is(problem.system.fast_potential, spring), num_steps)
+    _check("tsp", problem.system.fast_potential, spring, num_steps)
     return _rattle("tsp", problem, ("lengths", "stiffness", "gravity"), micro_dt, num_steps, tolerance)
 
 
 def sam(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:
     """RATTLE, `fully_explicit(1)`, on a `simple_atomic_model`; arguments and errors as for `tsp`."""
-    _check("sam", _is(problem.system.slow_potential, slow_forces), num_steps)
+    _check("sam", problem.system.slow_potential, slow_forces, num_steps)
     return _rattle("sam", problem, ("stiffness", "length", "gravity"), micro_dt, num_steps, tolerance)
 
 
@@ -99,12 +100,8 @@ def _rattle(name: str, problem: Problem, parameters, *arguments) -> CLoop:
     return _loop(name, problem, params["masses"], *values, *arguments)
 
 
-def _is(potential, function) -> bool:
-    return getattr(potential, "function", None) is function
-
-
-def _check(name: str, right_system: bool, *counts: int) -> None:
-    if not right_system:
+def _check(name: str, potential, function, *counts: int) -> None:
+    if getattr(potential, "function", None) is not function:
         raise ValueError(f"{name}: the C loop knows only the built-in system of this name, with its own potentials.")
     if min(counts) < 1:
         raise ValueError(f"{name}: numbers of steps are {counts}; they must be at least 1.")

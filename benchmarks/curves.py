@@ -14,7 +14,7 @@ import vmri_jax as vm
 from benchmarks import programs
 from benchmarks.gail2014.reference import unstructured
 from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent, steps_for
-from benchmarks.report import spread
+from benchmarks.report import legend_below, spread
 from vmri_jax import plots
 
 TIME = "µs/micro step"
@@ -148,10 +148,8 @@ def draw(curves: list[Curves], title: str, columns: int) -> Figure:
     lines = -(-len(curves) // columns)
     with plots.new_figure(max(6.0, 0.6 + 2.6 * columns), 1.1 + 2.1 * lines, title, plots.LIGHT) as figure:
         panels = figure.subplots(lines, columns, squeeze=False, sharex=True).reshape(-1)
-        handles: dict = {}
         for axes, found in zip(panels, curves, strict=False):
             _panel(axes, found)
-            handles.update({label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)})
         for axes in panels[len(curves) :]:
             axes.set_axis_off()
         for axes in panels[max(0, len(curves) - columns) : len(curves)]:
@@ -159,7 +157,7 @@ def draw(curves: list[Curves], title: str, columns: int) -> Figure:
             axes.xaxis.set_tick_params(labelbottom=True)
         for axes in panels[::columns]:
             axes.set(ylabel="µs per micro step")
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+        legend_below(figure)
     return figure
 
 

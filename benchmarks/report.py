@@ -114,6 +114,16 @@ def growing(name: str, size: str, parts: Iterable[tuple[list[dict], list[Claim]]
         yield Report(name, size, rows, claims, list(notes))
 
 
+def legend_below(figure: Figure, names: Sequence[str] = ()) -> None:
+    """Every curve once, under the panels, in the order of these names."""
+    curves: dict = {}
+    for axes in figure.axes:
+        handles, labels = axes.get_legend_handles_labels()
+        curves |= dict(zip(labels, handles, strict=True))
+    shown = [name for name in names or curves if name in curves]
+    figure.legend([curves[name] for name in shown], shown, loc="outside lower center", ncols=min(len(shown), 5))
+
+
 @contextmanager
 def progress(title: str) -> Iterator[Tell]:
     """A line that shows what is being measured; yields the function that is told each part before it starts."""

@@ -178,13 +178,14 @@ class Compile(Timed):
 
         first, later = _seconds(call), _seconds(call)
         moved = vm.State(state.t + 1.0, state.q_s, state.q_f, 1.01 * state.p_s, 1.01 * state.p_f)
+        other = problem.system.replace(params=_other_params(problem.system))
         compiled = []
         jax.monitoring.register_event_duration_secs_listener(
             lambda event, duration_secs, **_: compiled.append(event) if event == COMPILED else None
         )
         call(num_steps=case.num_steps + 1)
         call(macro_dt=1.1 * case.macro_dt)
-        call(of=problem.system.replace(params=_other_params(problem.system)))
+        call(of=other)
         run = call(state=moved)
         self.keep(run, run)
         self.num_steps = case.num_steps
