@@ -140,7 +140,8 @@ def _one(case: Case, peers, levels, ladders_of, size: Size, report: Report, tell
     tell(f"{title}, timing")
     timed = _time(points, levels, size)
     for peer, mine in points.items():
-        row = _row(title, peer, mine, levels, timed) | {"energy differs": differs[peer]}
+        row = _row(title, peer, mine, levels, timed)
+        row["energy differs"] = differs[peer]
         if is_batch and row["levels"]:
             row["trajectories/s"] = len(case.q_end) / (1e-3 * row["levels"][0]["ms"])
         report.rows.append(row)
