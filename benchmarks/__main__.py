@@ -1,6 +1,5 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
-import json
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -18,87 +17,78 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__, pret
 Full = Annotated[bool, typer.Option("--full/--quick", help="All cases and more samples, or the few that show it.")]
 Core = Annotated[int | None, typer.Option(help="Core to keep to; by default the last one allowed, -1 for all.")]
 Out = Annotated[Path, typer.Option(help="Folder for the JSON files and the figures.")]
-Devices = Annotated[int, typer.Option(min=1, help="CPU devices to spread the batch over, each a core; 1 pins.")]
-Only = Annotated[
-    list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
-]
-Peer = Annotated[list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")]
-Groups = Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(against.GROUPS)}; may be repeated.")]
+Seed = Annotated[int, typer.Option(help="Other seeds are other systems.")]
 Table = StrEnum("Table", ("absence", "presence", "orders"))
-Tables = Annotated[list[Table] | None, typer.Option(help="Tables of scenes; may be repeated.")]
 OUT = Path("out/benchmarks")
 
 app.command()(gail2014)
 app.command()(hard)
 
 
-@app.command("cost")
-def cost_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-    """Time per micro step against num_micro; the dense solve; Fig. 4 and 5 of the reference study; linearity."""
-    prepare(core)
-    _measure("cost", cost, full, out)
+def _plain_command(name: str, module) -> None:
+    """A command without options of its own; its help is the docstring of the benchmark."""
+
+    @app.command(name, help=module.__doc__)
+    def command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
+        prepare(core)
+        _measure(name, module, full, out)
 
 
-@app.command("floor")
-def floor_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-    """Single runs against hand-written C loops."""
-    prepare(core)
-    _measure("floor", floor, full, out)
+for _name, _module in {"cost": cost, "floor": floor, "compile": compilation, "orders": orders}.items():
+    _plain_command(_name, _module)
 
 
-@app.command("batch")
-def batch_command(full: Full = False, core: Core = None, out: Out = OUT, devices: Devices = 1) -> None:
-    """Time per trajectory against the batch size, and against one run of the C loop."""
+@app.command("batch", help=batch.__doc__)
+def batch_command(
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+    devices: Annotated[int, typer.Option(min=1, help="CPU devices to spread the batch over, each a core; 1 pins.")] = 1,
+) -> None:
     prepare(core if devices == 1 else -1, devices=devices)
     _measure("batch", batch, full, out, devices=devices)
 
 
-@app.command("compile")
-def compile_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-    """Cold compile and first run in fresh processes; compilations over a sweep."""
-    prepare(core)
-    _measure("compile", compilation, full, out)
-
-
-@app.command("orders")
-def orders_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-    """Observed orders of Galerkin schemes and compositions, on all systems."""
-    prepare(core)
-    _measure("orders", orders, full, out)
-
-
 @app.command("peers")
-def peers_command(full: Full = False, core: Core = None, out: Out = OUT, only: Only = None, peer: Peer = None) -> None:
+def peers_command(
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Cases, e.g. 'TSP t=1', or all of a system, e.g. TSP; may be repeated.")
+    ] = None,
+    peer: Annotated[
+        list[str] | None, typer.Option(help="Integrators, e.g. heyoka; may be repeated. Ours always runs.")
+    ] = None,
+) -> None:
     """Time to reach an error, against other integrators; the extra `peers` installs them."""
     prepare(core)
     _measure("peers", peers, full, out, only=only or (), peers=peer or ())
 
 
-@app.command("against")
+@app.command("against", help=against.__doc__)
 def against_command(
     before: Annotated[Path, typer.Argument(help="Another checkout of this repository, to compare this one with.")],
     python: Annotated[
         Path | None, typer.Option(help="Its Python; by default that in its .venv, else this one.")
     ] = None,
-    only: Groups = None,
+    only: Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(against.GROUPS)}; may be repeated.")] = None,
     shared: Annotated[bool, typer.Option(help="Count processor time: other processes use the core too.")] = False,
     full: Full = False,
     core: Core = None,
     out: Out = OUT,
 ) -> None:
-    """Another checkout and this one, interleaved: runs, batches, calls, first results, gradients."""
     prepare(core)
     _measure("against", against, full, out, before=before, python=python, only=only or (), shared=shared)
 
 
-@app.command("tricks")
+@app.command("tricks", help=tricks.__doc__)
 def tricks_command(
     only: Annotated[list[str] | None, typer.Option(help="Functions of the kernels; may be repeated.")] = None,
     full: Full = False,
     core: Core = None,
     out: Out = OUT,
 ) -> None:
-    """What each tuned function of the kernels buys, against its plain form."""
     prepare(core)
     _measure("tricks", tricks, full, out, markdown=True, only=only or ())
 
@@ -109,14 +99,12 @@ def baseline_command(
     folder: Annotated[Path, typer.Option("--from", help="Folder with what the benchmarks wrote.")] = OUT,
 ) -> None:
     """Put all figures of one commit into benchmarks/baseline.json."""
-    found = baseline.assemble(folder, commit)
-    baseline.FILE.write_text(json.dumps(found, separators=(",", ":")).replace("},{", "},\n{") + "\n")
+    baseline.write(folder, commit)
     console.print(f"written to {baseline.FILE}")
 
 
-@app.command("kills")
+@app.command("kills", help=kills.__doc__)
 def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 100, out: Out = OUT) -> None:
-    """A streaming run killed at random moments, and resumed to the last bit."""
     prepare(cache=False)
     _measure("kills", kills, False, out, count=count)
 
@@ -124,7 +112,7 @@ def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 10
 @app.command("fuzz")
 def fuzz_command(
     count: Annotated[int, typer.Option(min=1, help="Runs in all; those done before are kept.")] = 2000,
-    seed: Annotated[int, typer.Option(help="Other seeds are other systems.")] = 0,
+    seed: Seed = 0,
     limit: Annotated[
         float, typer.Option(help="Seconds after which a run, compiling included, counts as a hang.")
     ] = 600.0,
@@ -140,9 +128,8 @@ def fuzz_command(
         for part in fuzz.reduce(seed, reduce, console.log):
             console.print(part)
         return
-    path = out / f"fuzz_{seed}.jsonl"
     with progress("fuzz") as tell:
-        found = fuzz.fuzz(count, seed, path, limit, tell)
+        found = fuzz.fuzz(count, seed, out / f"fuzz_{seed}.jsonl", limit, tell)
     fuzz.table(found, console)
     if wrong := fuzz.wrong(found):
         console.print(f"\nsimplify one with: python -m benchmarks fuzz --seed {seed} --reduce {min(wrong)}")
@@ -152,7 +139,7 @@ def fuzz_command(
 @app.command("oracle")
 def oracle_command(
     count: Annotated[int, typer.Option(min=1, help="Systems.")] = 500,
-    seed: Annotated[int, typer.Option(help="Other seeds are other systems.")] = 0,
+    seed: Seed = 0,
     core: Core = None,
     out: Out = OUT,
 ) -> None:
@@ -160,15 +147,16 @@ def oracle_command(
     prepare(core)
     from benchmarks import oracle  # only now: the textbook starts JAX
 
-    path = out / f"oracle_{seed}.json"
-    with progress("oracle") as tell:
-        found = oracle.run(count, seed, path, tell)
-    oracle.show(found, console)
-    console.print(f"written to {path}\n")
+    _measure("oracle", oracle, False, out, count=count, seed=seed)
 
 
 @app.command("scenes")
-def scenes_command(full: Full = False, core: Core = None, out: Out = OUT, only: Tables = None) -> None:
+def scenes_command(
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+    only: Annotated[list[Table] | None, typer.Option(help="Tables of scenes; may be repeated.")] = None,
+) -> None:
     """What an effect costs that a scene does not have, a scene against a system by hand, orders under forces."""
     prepare(core)
     from benchmarks import scenes  # only now: bodies are arrays, which start JAX
@@ -179,7 +167,7 @@ def scenes_command(full: Full = False, core: Core = None, out: Out = OUT, only: 
 
 @app.command("all")
 def all_command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-    """All of them, one after the other."""
+    """Floor, batch, compile and cost, one after the other."""
     prepare(core)
     for name, module in (("floor", floor), ("batch", batch), ("compile", compilation), ("cost", cost)):
         _measure(name, module, full, out)

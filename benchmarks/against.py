@@ -19,16 +19,12 @@ TWO = ("fully_explicit 10", "explicit_slow 10", "fully_implicit 10")
 COMPOSED = ("kahan-li6 of fully_explicit 2", "kahan-li8 of fully_explicit 2")
 LANES = 256
 SINGLE, CALL, PREPARED, COLD, GRADIENT, README = 1.1, 250e-6, 25e-6, 4.0, 8.0, 1.2
-"""Targets: after over before of single runs; seconds of calls, of first results and of the first gradient; README over configured."""
+"""Targets: ratio of single runs; seconds of calls, of first results and gradients; README over configured."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A case and its targets.
-
-    ratio: the most that `after` may take over `before`.
-    seconds: the most that `after` may take.
-    """
+    """A case and the most that `after` may take: as a ratio to `before`, and in seconds."""
 
     case: Case
     ratio: float | None = None
@@ -42,7 +38,6 @@ class Entry:
 
 
 def _single() -> list[Entry]:
-    """Runs long enough for the call not to count."""
     simple = ("fully_explicit 10", "fully_implicit 10", "explicit_slow 10")
     cases = [Case("single", f"FPU l={n}", scheme, 0.01) for n in (3, 50, 200) for scheme in simple]
     cases += [Case("single", "FPU l=3", scheme, 0.01) for scheme in ("mollified_impulse 10", "takahashi_imada 4")]
@@ -56,8 +51,6 @@ def _single() -> list[Entry]:
 
 
 def _batch() -> list[Entry]:
-    """Batches of `LANES`: those of order 2 with constraints may become slower, Lobatto on the pendulum is to become faster."""
-
     def entry(system: str, scheme: str, macro_dt: float, most: float) -> Entry:
         return Entry(Case("batch", system, scheme, macro_dt, lanes=LANES), ratio=most)
 
@@ -69,7 +62,6 @@ def _batch() -> list[Entry]:
 
 
 def _calls(kind: str, seconds: float) -> list[Entry]:
-    """Short runs with a known program."""
     cases = (
         Case(kind, "FPU l=3", "fully_explicit 10", 0.01, num_steps=100),
         Case(kind, "TSP", "fully_implicit 10", 0.002, num_steps=100),
@@ -79,18 +71,17 @@ def _calls(kind: str, seconds: float) -> list[Entry]:
     return [Entry(case, seconds=seconds) for case in cases]
 
 
-def _first() -> list[Entry]:
-    steps = {"FPU l=3": 0.01, "TSP": 0.002, "SAM": 0.002}
-    cases = [Case("first", system, scheme, dt, num_steps=2) for system, dt in steps.items() for scheme in TWO]
-    return [Entry(case, seconds=COLD) for case in cases]
-
-
+FIRST = [
+    Entry(Case("first", system, scheme, macro_dt, num_steps=2), seconds=COLD)
+    for system, macro_dt in (("FPU l=3", 0.01), ("TSP", 0.002), ("SAM", 0.002))
+    for scheme in TWO
+]
 GRADIENTS = [Entry(Case("gradient", "TSP", "fully_implicit 10", 0.002, num_steps=20), seconds=GRADIENT)]
 GROUPS = {
     "single": _single(),
     "batch": _batch(),
     "call": _calls("call", CALL) + _calls("prepared", PREPARED),
-    "first": _first(),
+    "first": FIRST,
     "gradient": GRADIENTS,
     "readme": [Entry(Case("readme", "crane", "fully_implicit 10"))],
 }
@@ -107,13 +98,7 @@ QUICK = {
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run.
-
-    before, after: the two sides.
-    groups: entries by name of the group.
-    repeats, fresh: samples of a run and of a new process.
-    seconds: of a run, about.
-    """
+    """The two sides, entries by group, samples of a run and of a new process, and seconds of a run."""
 
     before: Seat
     after: Seat
@@ -124,11 +109,7 @@ class Size:
 
 
 def sizes(name: str, before: Path, python: Path | None = None, only: Sequence[str] = (), shared: bool = False) -> Size:
-    """ "quick" or "full"; `only` some of `GROUPS`; `shared` counts seconds of the workers alone, on a core that they share.
-
-    Raises:
-        ValueError: no such group, or there is no `vmri_jax` in `before`.
-    """
+    """ "quick" or "full"; `only` some of `GROUPS`; `shared` counts processor time."""
     if not (before / "vmri_jax").is_dir():
         raise ValueError(f"against: {before} has no folder vmri_jax; give a checkout of this repository.")
     if unknown := [group for group in only if group not in GROUPS]:
@@ -149,7 +130,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     about: dict = {side: {"commit": seat.commit, "checkout": str(seat.checkout)} for side, seat in seats.items()}
     about["clock"] = "processor time, on a shared core" if PROCESSOR_TIME in size.after.options else "wall time"
     rows, claims = [], []
-    notes = [", ".join(f"{side}: {seat.commit}" for side, seat in seats.items())]
+    notes = [", ".join(f"{side}: {about[side]['commit']}" for side in seats)]
     for group, entry, outcome in _outcomes(size, seats, tell):
         rows += _rows(group, entry, outcome)
         claims += _claims(group, entry, outcome)
@@ -166,7 +147,10 @@ def _outcomes(size: Size, seats: dict[str, Seat], tell: Tell) -> Iterator[tuple[
                 yield f"{group}, cold", entry, first_results(seats, entry.case, size.fresh)
         if group == "first":
             continue
-        warm = _printed(seats) if group == "readme" else seats
+        warm = dict(seats)
+        if group == "readme":  # as printed, and after the settings have been made
+            warm = {side: replace(seat, options=("--as-imported", *seat.options)) for side, seat in seats.items()}
+            warm |= {f"{side}, configured": seat for side, seat in seats.items()}
         with ExitStack() as stack:
             workers = {name: stack.enter_context(Worker(seat)) for name, seat in warm.items()}
             for entry in entries:
@@ -176,12 +160,6 @@ def _outcomes(size: Size, seats: dict[str, Seat], tell: Tell) -> Iterator[tuple[
                 yield entry.case.kind, unbound, take_turns(workers, case, size.repeats)
 
 
-def _printed(seats: dict[str, Seat]) -> dict[str, Seat]:
-    """Each side as its README has it, and after the settings have been made."""
-    printed = {side: replace(seat, options=("--as-imported", *seat.options)) for side, seat in seats.items()}
-    return printed | {f"{side}, configured": seat for side, seat in seats.items()}
-
-
 def _rows(group: str, entry: Entry, outcome: Outcome) -> list[dict]:
     """One for the entry; of README's program a second one for the settings made first."""
     pairs = [(BEFORE, AFTER)]
@@ -189,23 +167,18 @@ def _rows(group: str, entry: Entry, outcome: Outcome) -> list[dict]:
         pairs += [(f"{BEFORE}, configured", f"{AFTER}, configured")]
     rows = []
     for before, after in pairs:
-        samples = outcome.samples
-        row = {"group": group, "case": entry.label + after.removeprefix(AFTER)}
-        row |= {f"{side}, ms": _milliseconds(samples.get(key)) for side, key in ((BEFORE, before), (AFTER, after))}
+        samples, made = outcome.samples, outcome.made.values()
+        row: dict = {"group": group, "case": entry.label + after.removeprefix(AFTER)}
+        for side, key in ((BEFORE, before), (AFTER, after)):
+            row[f"{side}, ms"] = 1e3 * float(np.median(samples[key])) if key in samples else None
         if before in samples and after in samples:
             found = ratio(samples[after], samples[before])
             row |= {"after/before": found.value, "quartiles": f"{found.low:.3g} to {found.high:.3g}"}
-        made = list(outcome.made.values())
-        row |= {
-            "steps": max((m["num_steps"] for m in made), default=None),
-            "differs": outcome.difference(after, before),
-        }
-        rows.append(row | {"result": ", ".join(sorted({m["result"] for m in made}))})
+        row["steps"] = max((m["num_steps"] for m in made), default=None)
+        row["differs"] = outcome.difference(after, before)
+        row["result"] = ", ".join(sorted({m["result"] for m in made}))
+        rows.append(row)
     return rows
-
-
-def _milliseconds(samples: list[float] | None) -> float | None:
-    return None if samples is None else 1e3 * float(np.median(samples))
 
 
 def _claims(group: str, entry: Entry, outcome: Outcome) -> list[Claim]:
@@ -218,7 +191,6 @@ def _claims(group: str, entry: Entry, outcome: Outcome) -> list[Claim]:
     if group == "readme":
         for side in (BEFORE, AFTER):
             found = ratio(samples[side], samples[f"{side}, configured"])
-            claims.append(
-                Claim(f"README of {side}, as printed over configured", found, README if side == AFTER else None)
-            )
+            most = README if side == AFTER else None
+            claims.append(Claim(f"README of {side}, as printed over configured", found, at_most=most))
     return claims

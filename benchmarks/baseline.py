@@ -1,9 +1,9 @@
 """The figures that later code is held against, in one file: rows and ratios of all benchmarks at one commit."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+
+from benchmarks.report import each_float
 
 FILE = Path(__file__).with_name("baseline.json")
 PARTS = ("floor", "batch", "compile", "cost", "peers")
@@ -13,16 +13,14 @@ SIDE = "before"
 DIGITS = 5
 
 
+def write(folder: Path, commit: str) -> None:
+    """Write `FILE`, one row a line."""
+    text = json.dumps(assemble(folder, commit), separators=(",", ":"))
+    FILE.write_text(text.replace("},{", "},\n{") + "\n")
+
+
 def assemble(folder: Path, commit: str) -> dict:
-    """All that the benchmarks wrote into a folder, without what only figures need.
-
-    Args:
-        folder: where the JSON files are; ``against.json`` has `commit` on its side `before`.
-        commit: of the code that was measured.
-
-    Raises:
-        ValueError: a file is missing, or ``against.json`` is of another commit.
-    """
+    """All that the benchmarks wrote into a folder; ``against.json`` has the commit on its side `before`."""
     missing = [name for name in (*PARTS, "against") if not (folder / f"{name}.json").exists()]
     if missing:
         raise ValueError(
@@ -38,22 +36,14 @@ def assemble(folder: Path, commit: str) -> dict:
         rows = [{key: value for key, value in row.items() if key != "scan"} for row in part["rows"]]
         claims = [{"what": claim["what"], **claim["seen"]} for claim in part["claims"]]
         found[name] = {"size": part["size"], "rows": rows, "ratios": claims}
-    found["calls"] = {"clock": against["clock"], "rows": [_one_side(row) for row in against["rows"] if _known(row)]}
-    return _rounded(found)
+    one_side = [
+        {key: row[key] for key in ("group", "case", "steps", "result")} | {"ms": row[f"{SIDE}, ms"]}
+        for row in against["rows"]
+        if row[f"{SIDE}, ms"] is not None
+    ]
+    return _rounded(found | {"calls": {"clock": against["clock"], "rows": one_side}})
 
 
-def _known(row: Mapping) -> bool:
-    return row[f"{SIDE}, ms"] is not None
-
-
-def _one_side(row: Mapping) -> dict:
-    return {key: row[key] for key in ("group", "case", "steps", "result")} | {"ms": row[f"{SIDE}, ms"]}
-
-
-def _rounded(value: Any) -> Any:
+def _rounded(value):
     """The same with `DIGITS` digits."""
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_rounded(item) for item in value]
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+    return each_float(value, lambda x: float(f"{x:.{DIGITS}g}"))

@@ -8,15 +8,15 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks import c_loops, programs
-from benchmarks.floor import c_loop
 from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent, steps_for
 from benchmarks.peers import cases, ours
 from benchmarks.peers.compare import OURS, batch_case
 from benchmarks.peers.scan import candidates, scan
-from benchmarks.report import Claim, Report
+from benchmarks.report import Claim, Report, growing, spread
 from benchmarks.worker import starts
 
-COLUMNS = ("system", "program", "batch", "ns/trajectory/micro step", "low", "high", "to C", "iterations", "result")
+TIME = "ns/trajectory/micro step"
+COLUMNS = ("system", "program", "batch", TIME, "low", "high", "to C", "iterations", "result")
 NUM_MICRO = 10
 HELD = 256
 """The batch size that is held against C."""
@@ -30,8 +30,7 @@ class Case:
 
     target: the most that a trajectory in a batch of HELD may take over C.
     fixed: whether a fixed number of iterations is also run.
-    as_accurate: a problem of `benchmarks.peers.cases` on which the batch is also held against C at the error that C has with this
-        micro_dt, by any step and order.
+    as_accurate: the problem of `benchmarks.peers.cases` on which a batch of any step and order has to reach C's error.
     """
 
     system: str
@@ -43,8 +42,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run: cases, batch sizes, samples of each program, seconds of a run, CPU devices,
-    and micro steps of all trajectories together in the first guess."""
+    """How much is run; micro_steps are those of a whole batch in the first guess of a run's length."""
 
     cases: tuple[Case, ...]
     batches: tuple[int, ...]
@@ -68,16 +66,7 @@ def sizes(name: str, devices: int = 1) -> Size:
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each case."""
-    rows, claims, notes = [], [], c_loops.missing()
-    for case in size.cases:
-        some_rows, some_claims = _measure(case, size, tell)
-        rows += some_rows
-        claims += some_claims
-        if case.as_accurate and c_loops.compiler() is not None:
-            row, claim = _as_accurate(case, case.as_accurate, size, tell)
-            rows.append(row)
-            claims.append(claim)
-        yield Report("batch", name, rows, claims, notes)
+    return growing("batch", name, (_measure(case, size, tell) for case in size.cases), c_loops.missing())
 
 
 def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, devices: int) -> Callable:
@@ -99,6 +88,16 @@ def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, dev
 
 
 def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
+    """All batch sizes, and a batch as accurate as C."""
+    rows, claims = _all_sizes(case, size, tell)
+    if case.as_accurate and c_loops.compiler() is not None:
+        row, claim = _as_accurate(case, case.as_accurate, size, tell)
+        rows.append(row)
+        claims.append(claim)
+    return rows, claims
+
+
+def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
     problem = programs.problem(case.system)
     newtons = {"default": vm.Newton()}
     if case.fixed:
@@ -113,7 +112,7 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
             runs[key], work[key] = partial(simulate, steps), batch * steps * NUM_MICRO
             results[key] = runs[key]()
     if c_loops.compiler() is not None:
-        loop = partial(c_loop, case.system, problem, NUM_MICRO, case.micro_dt)
+        loop = partial(c_loops.c_loop, case.system, problem, NUM_MICRO, case.micro_dt)
         steps = steps_for(lambda n: loop(n)(), size.seconds, 10)
         runs["C"], work["C"] = loop(steps), steps * NUM_MICRO
     timed = interleaved(runs, size.repeats)
@@ -122,8 +121,7 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     rows, claims = [], []
     for key, sample in ns.items():
         option, _, batch = key.partition(" ")
-        spread = quartiles(sample)
-        info = _info(results[key]) if key in results else {"iterations": None, "result": ""}
+        run = results.get(key)
         to_c = ratio(sample, ns["C"]) if "C" in ns else None
         rows.append(
             {
@@ -131,11 +129,10 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
                 "program": option,
                 "batch": int(batch or 1),
                 "micro_dt": case.micro_dt,
-                "ns/trajectory/micro step": spread.value,
-                "low": spread.low,
-                "high": spread.high,
+                **spread(TIME, quartiles(sample)),
                 "to C": to_c and to_c.value,
-                **info,
+                "iterations": int(np.max(run.info.iterations)) if run else None,
+                "result": vm.Result(int(np.max(run.result))).name if run else "",
             }
         )
         if to_c and key != "C" and int(batch) == HELD:
@@ -144,11 +141,11 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
 
 
 def _as_accurate(case: Case, problem: str, size: Size, tell: Tell) -> tuple[dict, Claim]:
-    """One trajectory of a batch that is as accurate as C, by the cheapest setting of one scheme of high degree."""
+    """One trajectory of a batch that is as accurate as C, by the cheapest setting of a scheme of high degree."""
     tell(f"{case.system}, as accurate as C")
     single, (truth, lanes) = cases.case(problem), batch_case(problem, HELD)
     steps = round(single.t_end / case.micro_dt)
-    loop = c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, steps // NUM_MICRO)
+    loop = c_loops.c_loop(case.system, single.problem, NUM_MICRO, case.micro_dt, steps // NUM_MICRO)
     error = single.error(np.concatenate(loop()[:2]))
     ladders = ours.batch_ladders(truth, *lanes, schemes={f"Lobatto {DEGREE}": vm.galerkin(1, DEGREE, "lobatto")})
     found = candidates(scan(OURS, ladders, truth, 1.0, (error,)), error)
@@ -156,10 +153,9 @@ def _as_accurate(case: Case, problem: str, size: Size, tell: Tell) -> tuple[dict
     best = min(found, key=lambda point: np.median(timed[point.label]))
     per_lane = [s / HELD for s in timed[best.label]]
     to_c = ratio(per_lane, timed["C"])
-    ns = quartiles(per_lane, 1e9 / steps)
     row = {"system": case.system, "program": "as accurate as C", "batch": HELD, "micro_dt": case.micro_dt}
-    row |= {"ns/trajectory/micro step": ns.value, "low": ns.low, "high": ns.high, "to C": to_c.value}
-    row |= {"iterations": None, "result": best.label, "error": best.error, "error of C": error}
+    row |= spread(TIME, quartiles(per_lane, 1e9 / steps)) | {"to C": to_c.value, "iterations": None}
+    row |= {"result": best.label, "error": best.error, "error of C": error}
     what = f"{case.system}, batch of {HELD}, as accurate as C (error {error:.0e}): over C"
     return row, Claim(what, to_c, at_most=case.target)
 
@@ -172,7 +168,7 @@ def _steps(simulate: Callable, batch: int, size: Size) -> int:
 
 
 def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
-    """As many as keep a single run of a thousand steps converged, from what the default takes on average upwards."""
+    """As many as keep a single run of a thousand steps converged."""
     scheme, state, steps = vm.fully_explicit(NUM_MICRO), problem.state(), 1000
     run = vm.simulate(problem.system, scheme, state, micro_dt=case.micro_dt, num_steps=steps)
     taken = np.asarray(run.info.iterations)
@@ -181,8 +177,3 @@ def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
         if not programs.failed(simulate(steps)):
             return iterations
     return max(1, int(taken.max()))
-
-
-def _info(trajectory: vm.Trajectory) -> dict:
-    worst = int(np.max(np.asarray(trajectory.result)))
-    return {"iterations": int(np.max(np.asarray(trajectory.info.iterations))), "result": vm.Result(worst).name}

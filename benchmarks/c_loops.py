@@ -1,7 +1,4 @@
-"""Hand-written C loops, the speed floor of the three systems: compiled when first used, called through ctypes.
-
-Each integrates the very `Problem` that `vmri_jax` integrates, and nothing else: no saved nodes, no status, no energy.
-"""
+"""Hand-written C loops, the speed floor of the three systems, compiled when first used."""
 
 import ctypes
 import dataclasses
@@ -14,6 +11,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -76,41 +74,23 @@ class CLoop:
 
 
 def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int) -> CLoop:
-    """`fully_explicit(num_micro)` on a `fermi_pasta_ulam` chain: the impulse method, every micro step a sweep.
-
-    Raises:
-        NoCompiler: there is no C compiler.
-        ValueError: another system, masses other than one, or less than one step.
-    """
-    kinetic = problem.system.kinetic
-    unit = all(np.array_equal(np.asarray(m), np.ones(len(problem.q_s))) for m in (kinetic.slow, kinetic.fast))  # pyright: ignore[reportAttributeAccessIssue]
-    _check(
-        "fpu",
-        unit and getattr(problem.system.slow_potential, "function", None) is soft_springs,
-        num_micro,
-        num_macro_steps,
-    )
+    """`fully_explicit(num_micro)` on a `fermi_pasta_ulam` chain of unit masses: the impulse method."""
+    kinetic: Any = problem.system.kinetic
+    unit = np.all(np.concatenate([kinetic.slow, kinetic.fast]) == 1.0)
+    _check("fpu", problem.system.slow_potential if unit else None, soft_springs, num_micro, num_macro_steps)
     omega = float(problem.system.params["omega"])
     return _loop("fpu", problem, len(problem.q_s), omega, num_micro, micro_dt, num_macro_steps)
 
 
 def tsp(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:
-    """RATTLE, `fully_explicit(1)`, on a `triple_spherical_pendulum` (not the quartic one).
-
-    Args:
-        tolerance: largest value of a constraint, in its own unit (``(|q|^2 - l^2) / 2``), that counts as satisfied.
-
-    Raises:
-        NoCompiler: there is no C compiler.
-        ValueError: another system, or less than one step.
-    """
-    _check("tsp", getattr(problem.system.fast_potential, "function", None) is spring, num_steps)
+    """RATTLE, `fully_explicit(1)`, on a `triple_spherical_pendulum`, constraints below the tolerance."""
+    _check("tsp", problem.system.fast_potential, spring, num_steps)
     return _rattle("tsp", problem, ("lengths", "stiffness", "gravity"), micro_dt, num_steps, tolerance)
 
 
 def sam(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:
     """RATTLE, `fully_explicit(1)`, on a `simple_atomic_model`; arguments and errors as for `tsp`."""
-    _check("sam", getattr(problem.system.slow_potential, "function", None) is slow_forces, num_steps)
+    _check("sam", problem.system.slow_potential, slow_forces, num_steps)
     return _rattle("sam", problem, ("stiffness", "length", "gravity"), micro_dt, num_steps, tolerance)
 
 
@@ -120,8 +100,8 @@ def _rattle(name: str, problem: Problem, parameters, *arguments) -> CLoop:
     return _loop(name, problem, params["masses"], *values, *arguments)
 
 
-def _check(name: str, right_system: bool, *counts: int) -> None:
-    if not right_system:
+def _check(name: str, potential, function, *counts: int) -> None:
+    if getattr(potential, "function", None) is not function:
         raise ValueError(f"{name}: the C loop knows only the built-in system of this name, with its own potentials.")
     if min(counts) < 1:
         raise ValueError(f"{name}: numbers of steps are {counts}; they must be at least 1.")
@@ -133,6 +113,13 @@ def _loop(name: str, problem: Problem, *arguments) -> CLoop:
     state = problem.state()
     q, p = np.concatenate([state.q_s, state.q_f]), np.concatenate([state.p_s, state.p_f])
     return CLoop(function, q, p, len(state.q_s), arguments)
+
+
+def c_loop(system: str, problem: Problem, num_micro: int, micro_dt: float, num_steps: int) -> CLoop:
+    """The C loop over `num_steps` macro steps: the impulse method, or RATTLE with every step a micro step."""
+    if system.startswith("FPU"):
+        return fpu(problem, num_micro, micro_dt, num_steps)
+    return {"TSP": tsp, "SAM": sam}[system](problem, micro_dt, num_steps * num_micro)
 
 
 @functools.cache

@@ -3,11 +3,12 @@
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from benchmarks.measure import Ratio, Tell, quartiles, ratio, silent
-from benchmarks.report import Claim, Report
+from benchmarks.report import Claim, Report, growing
 from benchmarks.seats import Seat, Worker
 from benchmarks.worker import Case
 
@@ -36,37 +37,29 @@ def sizes(name: str) -> Size:
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
-    """Start one process after the other, on the cores of this one; the two num_micro take turns; a report after each scheme."""
-    rows, claims = [], []
-    for system in size.systems:
-        for scheme in size.schemes:
-            found: dict[int, list[dict]] = {n: [] for n in size.num_micro}
-            for _ in range(size.repeats):
-                for n in size.num_micro:
-                    tell(f"{system}, {scheme}, num_micro {n}")
-                    found[n].append(_fresh(system, scheme, n))
-            rows += [_row(system, scheme, n, found[n]) for n in size.num_micro]
-            claims += _claims(f"{system}, {scheme}", found)
-            yield Report("compile", name, rows, claims, [])
+    """Measure all of it, a report after each scheme."""
+    pairs = product(size.systems, size.schemes)
+    return growing("compile", name, (_measure(system, scheme, size, tell) for system, scheme in pairs))
 
 
-def _fresh(system: str, scheme: str, num_micro: int) -> dict:
-    """What a worker finds in a process of its own."""
-    words = f"{scheme.replace(' ', '_')} {num_micro}"
-    with Worker(Seat()) as worker:
-        made = worker.make(Case("compile", system, words, macro_dt=num_micro * MICRO_DT, num_steps=2))
-        return made["found"] | {"process": time.perf_counter() - worker.started}
+def _measure(system: str, scheme: str, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
+    """In processes of their own; the num_micro take turns."""
+    found: dict[int, list[dict]] = {n: [] for n in size.num_micro}
+    for _ in range(size.repeats):
+        for n in size.num_micro:
+            tell(f"{system}, {scheme}, num_micro {n}")
+            words = f"{scheme.replace(' ', '_')} {n}"
+            with Worker(Seat()) as worker:
+                made = worker.make(Case("compile", system, words, macro_dt=n * MICRO_DT, num_steps=2))
+                found[n].append(made["found"] | {"process": time.perf_counter() - worker.started})
+    return [_row(system, scheme, n, found[n]) for n in size.num_micro], _claims(f"{system}, {scheme}", found)
 
 
 def _row(system: str, scheme: str, num_micro: int, found: list[dict]) -> dict:
-    middle = {key: float(np.median([one[key] for one in found])) for key in ("first", "later", "start", "process")}
-    return {
-        "system": system,
-        "scheme": scheme,
-        "num_micro": num_micro,
-        **{f"{key} call, s" if key in ("first", "later") else f"{key}, s": value for key, value in middle.items()},
-        "compilations": max(one["compilations"] for one in found),
-    }
+    names = {"first": "first call, s", "later": "later call, s", "start": "start, s", "process": "process, s"}
+    row = {"system": system, "scheme": scheme, "num_micro": num_micro}
+    row |= {name: float(np.median([one[key] for one in found])) for key, name in names.items()}
+    return row | {"compilations": max(one["compilations"] for one in found)}
 
 
 def _claims(label: str, found: dict[int, list[dict]]) -> list[Claim]:

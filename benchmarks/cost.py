@@ -1,6 +1,7 @@
 """Cost of accuracy in the fast variables: time per micro step against num_micro, and against the dense solve."""
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -8,22 +9,12 @@ from itertools import product
 from matplotlib.figure import Figure
 
 from benchmarks import linear, paper
-from benchmarks.curves import Case, Curves, draw, measure
+from benchmarks.curves import TIME, Case, Curves, draw, measure
 from benchmarks.measure import silent
 from benchmarks.programs import SCHEMES
 from benchmarks.report import Claim, Report
 
-COLUMNS = (
-    "case",
-    "method",
-    "num_micro",
-    "unknowns",
-    "micro_dt",
-    "µs/micro step",
-    "to cheapest",
-    "iterations",
-    "result",
-)
+COLUMNS = ("case", "method", "num_micro", "unknowns", "micro_dt", TIME, "to cheapest", "iterations", "result")
 ALL = (1, 4, 8, 12, 20, 40, 60, 100)
 ONCE = (
     Case("FPU l=3", "fully implicit", 0.001, (100,), (100,), dense=50.0),
@@ -42,7 +33,6 @@ class Size:
     paper: cases of the figures of the reference study.
     linear: cases run up to a large num_micro.
     most_unknowns: the dense solve is left out beyond.
-    repeats, seconds: samples of each program, and how long a run takes.
     """
 
     turning: dict[str, tuple[Case, ...]]
@@ -98,34 +88,38 @@ def sizes(name: str) -> Size:
 
 def run(size: Size, name: str, tell=silent) -> Iterator[Report]:
     """Measure all of it, a report after each case."""
-    parts: dict[str, list[Curves]] = {}
-    once, lines = [], []
+    everything: list[Curves] = []
+    figures: dict[str, list[Curves]] = {}
+    rows, claims = [], []
+
+    def report() -> Report:
+        drawn = {file: partial(_draw, file, part) for file, part in figures.items()}
+        return Report("cost", name, rows, claims, _notes(size, everything), drawn)
+
+    def add(curves: Curves) -> Curves:
+        everything.append(curves)
+        rows.extend(curves.rows)
+        claims.extend(_claims(curves))
+        return curves
+
     for file, cases in {**size.turning, **size.paper}.items():
         for case in cases:
-            curves = measure(case.affordable(size.most_unknowns), size.repeats, size.seconds, tell)
-            parts.setdefault(file, []).append(curves)
-            yield _report(size, name, parts, once, lines)
+            curves = add(measure(case.affordable(size.most_unknowns), size.repeats, size.seconds, tell))
+            figures.setdefault(file, []).append(curves)
+            yield report()
     for case in size.once:
-        once.append(measure(case, max(3, size.repeats // 2), size.seconds, tell))
-        yield _report(size, name, parts, once, lines)
+        add(measure(case, max(3, size.repeats // 2), size.seconds, tell))
+        yield report()
     for case in size.linear:
-        lines.append(linear.measure(case, size.repeats, size.seconds, tell))
-        yield _report(size, name, parts, once, lines)
-
-
-def _report(size: Size, name: str, parts: Mapping[str, list[Curves]], once: list[Curves], lines: list) -> Report:
-    everything = [*(curves for part in parts.values() for curves in part), *once]
-    claims = [claim for curves in everything for claim in _claims(curves)]
-    claims += [claim for line in lines for claim in line.claims]
-    rows = [row for curves in everything for row in curves.rows] + [row for line in lines for row in line.rows]
-    figures = {file: partial(_draw, file, part) for file, part in parts.items()}
-    return Report("cost", name, rows, claims, _notes(size, everything), figures)
+        more_rows, more_claims = linear.measure(case, size.repeats, size.seconds, tell)
+        rows += more_rows
+        claims += more_claims
+        yield report()
 
 
 def _draw(file: str, part: list[Curves]) -> Figure:
-    per_scheme = len({curves.case.system for curves in part})
     if file in paper.TITLES:
-        return draw(part, paper.TITLES[file], per_scheme)
+        return draw(part, paper.TITLES[file], len({curves.case.system for curves in part}))
     dt = " and ".join(f"{h:g}" for h in dict.fromkeys(curves.case.micro_dt for curves in part))
     return draw(part, f"Computing time does not turn up (micro steps {dt})", len(SCHEMES))
 
@@ -149,7 +143,7 @@ def _notes(size: Size, everything: list[Curves]) -> list[str]:
         f"{row['case']}, num_micro {row['num_micro']} ({row['result']})"
         for curves in everything
         for row in curves.rows
-        if row["µs/micro step"] != row["µs/micro step"]
+        if math.isnan(row[TIME])
     ]
     if missing:
         notes.append(f"Runs that failed and were not timed: {'; '.join(missing)}.")

@@ -12,10 +12,12 @@ from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 
 import vmri_jax as vm
 from benchmarks import programs
-from benchmarks.gail2014.reference import kinetic_energy
+from benchmarks.gail2014.reference import unstructured
 from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent, steps_for
+from benchmarks.report import legend_below, spread
 from vmri_jax import plots
 
+TIME = "µs/micro step"
 FROM = 10
 """From so many micro steps on the default solve is held against the dense one."""
 
@@ -28,10 +30,8 @@ class Case:
     turn: the most that the largest num_micro may cost per micro step, over the cheapest.
     dense: the least that the dense solve must cost over the default one, from FROM micro steps on.
     paper_minimum: the num_micro that was cheapest in the reference study.
-    t_end: simulated time, by default as much as makes a run long enough; where macro steps are so large that Newton's
-        iteration is bound to fail some day, as much as they last.
-    amplitude: of the start of a chain; small where its largest macro steps are beyond the stability of explicit schemes,
-        whose cost does not depend on the motion.
+    t_end: simulated time, by default as much as makes a run long enough.
+    amplitude: of the start of a chain; with a small one explicit schemes are stable at large macro steps.
     """
 
     system: str
@@ -90,8 +90,7 @@ class Curves:
 def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Curves:
     """Time every program of a case in turn; those whose run fails are left out of the samples.
 
-    The default solve takes every num_micro over the same whole number of macro steps, of about `seconds`; the dense
-    one, much slower, a few macro steps.
+    The default solve takes every num_micro over the same simulated time, the dense one, much slower, a few macro steps.
     """
     problem = programs.problem(case.system, case.amplitude)
     runs, results, total = {}, {}, 0
@@ -106,11 +105,12 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
                 total = unit * max(1, round(case.t_end / case.micro_dt / unit))
         runs["auto", n] = partial(run, total // n), total
         results["auto", n] = run(total // n)
+    dense, whole = vm.Newton(method="dense"), problem
+    if case.system.startswith("FPU") and case.scheme != "fully implicit":
+        whole = unstructured(problem)  # explicit schemes solve for the whole macro step too, as the paper did
     for n in case.dense_num_micro:
         tell(f"{case.label}, num_micro {n}, dense")
-        scheme = programs.SCHEMES[case.scheme](n)
-        dense = vm.Newton(method="dense")
-        run = programs.program(_unstructured(problem, case), scheme, dense, micro_dt=case.micro_dt)
+        run = programs.program(whole, programs.SCHEMES[case.scheme](n), dense, micro_dt=case.micro_dt)
         num_steps = steps_for(run, seconds / 2, 3, 300)
         runs["dense", n] = partial(run, num_steps), num_steps * n
         results["dense", n] = run(num_steps)
@@ -125,16 +125,9 @@ def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Cu
     return curves
 
 
-def _unstructured(problem: vm.Problem, case: Case) -> vm.Problem:
-    """A chain with T as a plain function: explicit schemes then solve for the whole macro step too, as the paper did."""
-    if not case.system.startswith("FPU") or case.scheme == "fully implicit":
-        return problem
-    return replace(problem, system=problem.system.replace(kinetic=kinetic_energy))
-
-
 def _row(curves: Curves, problem, method: str, n: int, micro_steps: int, trajectory: vm.Trajectory) -> dict:
     case, us = curves.case, curves.samples.get((method, n))
-    spread = quartiles(us or [math.nan])
+    seen = quartiles(us or [math.nan])
     _, all_of_them = curves.curve(method)
     return {
         "case": case.label,
@@ -143,11 +136,9 @@ def _row(curves: Curves, problem, method: str, n: int, micro_steps: int, traject
         "unknowns": programs.unknowns(problem, n),
         "micro_dt": case.micro_dt,
         "micro steps": micro_steps,
-        "µs/micro step": spread.value,
-        "low": spread.low,
-        "high": spread.high,
-        "to cheapest": spread.value / float(all_of_them.min()) if us else math.nan,
-        "iterations": int(np.max(np.asarray(trajectory.info.iterations))),
+        **spread(TIME, seen),
+        "to cheapest": seen.value / float(all_of_them.min()) if us else math.nan,
+        "iterations": int(np.max(trajectory.info.iterations)),
         "result": vm.Result(int(trajectory.result)).name,
     }
 
@@ -155,13 +146,10 @@ def _row(curves: Curves, problem, method: str, n: int, micro_steps: int, traject
 def draw(curves: list[Curves], title: str, columns: int) -> Figure:
     """One panel per case: the default solve, the dense one, the cheapest point of each, and the paper's."""
     lines = -(-len(curves) // columns)
-    with plots.style():
-        figure = plots.NotebookFigure(figsize=(max(6.0, 0.6 + 2.6 * columns), 1.1 + 2.1 * lines))
+    with plots.new_figure(max(6.0, 0.6 + 2.6 * columns), 1.1 + 2.1 * lines, title, plots.LIGHT) as figure:
         panels = figure.subplots(lines, columns, squeeze=False, sharex=True).reshape(-1)
-        handles: dict = {}
         for axes, found in zip(panels, curves, strict=False):
             _panel(axes, found)
-            handles.update({label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)})
         for axes in panels[len(curves) :]:
             axes.set_axis_off()
         for axes in panels[max(0, len(curves) - columns) : len(curves)]:
@@ -169,8 +157,7 @@ def draw(curves: list[Curves], title: str, columns: int) -> Figure:
             axes.xaxis.set_tick_params(labelbottom=True)
         for axes in panels[::columns]:
             axes.set(ylabel="µs per micro step")
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
-        figure.suptitle(title, x=0.01, ha="left")
+        legend_below(figure)
     return figure
 
 

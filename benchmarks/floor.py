@@ -8,8 +8,8 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks import c_loops, programs
-from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent, steps_for
-from benchmarks.report import Claim, Report
+from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent, steps_for
+from benchmarks.report import Claim, Report, growing, spread
 
 COLUMNS = ("system", "program", "num_micro", "micro steps", "ns/micro step", "low", "high", "to C", "result")
 NUM_MICRO = 10
@@ -17,7 +17,7 @@ NUM_MICRO = 10
 
 @dataclass(frozen=True)
 class Pair:
-    """One system: explicit runs, and those of other schemes, all against the C loop.
+    """One system under some schemes.
 
     target: the most that the first scheme may take over C.
     implicit: the most that the other schemes may take over the first one.
@@ -38,7 +38,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run: pairs, samples of each program, seconds of a run."""
+    """Pairs, samples of each program, and seconds of a run."""
 
     pairs: tuple[Pair, ...]
     repeats: int
@@ -47,7 +47,7 @@ class Size:
 
 def sizes(name: str) -> Size:
     """ "quick" or "full"; the pairs are the same."""
-    explicit, every = ("fully explicit",), ("fully explicit", "explicit slow", "fully implicit")
+    explicit, every = ("fully explicit",), tuple(reversed(programs.SCHEMES))
     chains = tuple(Pair(f"FPU l={length}", 0.001, n, explicit, 2.5) for length in (3, 50, 200) for n in (NUM_MICRO, 60))
     pairs = (
         *chains,
@@ -58,25 +58,9 @@ def sizes(name: str) -> Size:
     return Size(pairs, 7, 0.1) if name == "quick" else Size(pairs, 25, 0.2)
 
 
-def c_loop(system: str, problem: vm.Problem, num_micro: int, micro_dt: float, num_steps: int) -> c_loops.CLoop:
-    """The C loop over `num_steps` macro steps: the impulse method, or RATTLE with every step a micro step.
-
-    Raises:
-        NoCompiler: there is no C compiler.
-    """
-    if system.startswith("FPU"):
-        return c_loops.fpu(problem, num_micro, micro_dt, num_steps)
-    return {"TSP": c_loops.tsp, "SAM": c_loops.sam}[system](problem, micro_dt, num_steps * num_micro)
-
-
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
-    """Measure all of it, a report after each pair; without a compiler only the implicit schemes are held against the explicit one."""
-    rows, claims, notes = [], [], c_loops.missing()
-    for pair in size.pairs:
-        some_rows, some_claims = _measure(pair, size, tell)
-        rows += some_rows
-        claims += some_claims
-        yield Report("floor", name, rows, claims, notes)
+    """Measure all of it, a report after each pair; without a compiler nothing is held against C."""
+    return growing("floor", name, (_measure(pair, size, tell) for pair in size.pairs), c_loops.missing())
 
 
 def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
@@ -91,7 +75,7 @@ def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     first = pair.schemes[0]
     if c_loops.compiler() is not None:
         steps["C"], results["C"] = steps[first], ""
-        runs["C"] = c_loop(pair.system, problem, pair.num_micro, pair.micro_dt, steps["C"])
+        runs["C"] = c_loops.c_loop(pair.system, problem, pair.num_micro, pair.micro_dt, steps["C"])
     timed = interleaved(runs, size.repeats)
     ns = {name: [1e9 * s / (steps[name] * pair.num_micro) for s in timed[name]] for name in runs}
 
@@ -99,20 +83,17 @@ def _measure(pair: Pair, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
     claims = [Claim(f"{pair.label}: {first} over C", to_c[first], at_most=pair.target)] if to_c else []
     for other in pair.schemes[1:]:
         claims.append(Claim(f"{pair.label}: {other} over {first}", ratio(ns[other], ns[first]), at_most=pair.implicit))
-    return [_row(pair, name, steps[name], ns[name], to_c.get(name), results[name]) for name in runs], claims
-
-
-def _row(pair: Pair, name: str, steps: int, ns: list[float], to_c: Ratio | None, result: str) -> dict:
-    spread = quartiles(ns)
-    return {
-        "system": pair.system,
-        "program": name,
-        "num_micro": pair.num_micro,
-        "micro_dt": pair.micro_dt,
-        "micro steps": steps * pair.num_micro,
-        "ns/micro step": spread.value,
-        "low": spread.low,
-        "high": spread.high,
-        "to C": None if to_c is None else to_c.value,
-        "result": result,
-    }
+    rows = [
+        {
+            "system": pair.system,
+            "program": name,
+            "num_micro": pair.num_micro,
+            "micro_dt": pair.micro_dt,
+            "micro steps": steps[name] * pair.num_micro,
+            **spread("ns/micro step", quartiles(sample)),
+            "to C": to_c[name].value if to_c else None,
+            "result": results[name],
+        }
+        for name, sample in ns.items()
+    ]
+    return rows, claims

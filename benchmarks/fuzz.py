@@ -1,18 +1,19 @@
-"""Fuzzing: random systems, most of them hard; every run must end in a valid trajectory, a named status or a clear refusal.
+"""Random systems, most of them hard: every run ends in a valid trajectory, a named status or a clear refusal.
 
-Runs happen in a process of their own, which is ended where one takes longer than allowed and replaced where it dies. Outcomes
-are written as they come, so that a run that was stopped goes on where it was.
+Runs happen in a process of their own, which is replaced where it hangs or dies. Outcomes are written as they come.
 """
 
 import dataclasses
 import json
 import linecache
 import multiprocessing
+import traceback
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from random import Random
 
+import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -45,10 +46,7 @@ def calls(runs: list[int], seed: int) -> Iterator[tuple[int, ...]]:
 
 
 def verdicts(of: rs.Structure, draws: list[rs.Draw]) -> list[str]:
-    """What becomes of each draw: the name of its `Result`, "REFUSED" with an error of ours, or what is wrong.
-
-    A structure with lanes takes so many draws at once, with the masses and the scheme of the first.
-    """
+    """What becomes of each draw; those of a batch share masses and scheme of the first."""
     try:
         first, problems = draws[0], [rs.problem(of, at) for at in draws]
         how = {
@@ -69,26 +67,19 @@ def verdicts(of: rs.Structure, draws: list[rs.Draw]) -> list[str]:
 
 
 def _batch(problems, made, draws, how) -> list[vm.Trajectory]:
-    """Lanes that `initial_state` refuses start from the state it would have projected, unprojected."""
+    """Lanes that `initial_state` refuses start at rest, where nobody checks them."""
     starts = []
     for at in problems:
         try:
             starts.append(at.state())
         except ValueError:
-            v = np.zeros_like(at.q_s), np.zeros_like(at.q_f)
-            starts.append(vm.State(at.t, at.q_s, at.q_f, *v))
-    stacked = [
-        {name: np.stack([np.asarray(x[name]) for x in lanes]) for name in lanes[0]}
-        for lanes in ([vars(s) for s in starts], [p.system.params for p in problems])
-    ]
+            starts.append(vm.State(at.t, at.q_s, at.q_f, np.zeros_like(at.q_s), np.zeros_like(at.q_f)))
+    states, params = (
+        jax.tree.map(lambda *lanes: np.stack(lanes), *some) for some in (starts, [p.system.params for p in problems])
+    )
     dt = np.array([at.macro_dt for at in draws])
-    runs = vm.simulate_batch(problems[0].system, made, vm.State(**stacked[0]), params=stacked[1], macro_dt=dt, **how)
-    fields = {f.name: getattr(runs, f.name) for f in dataclasses.fields(runs) if getattr(runs, f.name) is not None}
-    info = fields.pop("info")
-    return [
-        vm.Trajectory(**{k: a[i] for k, a in fields.items()}, info=type(info)(*(a[i] for a in info)))
-        for i in range(len(draws))
-    ]
+    runs = vm.simulate_batch(problems[0].system, made, states, params=params, macro_dt=dt, **how)
+    return [jax.tree.map(lambda a, i=i: a[i], runs) for i in range(len(draws))]
 
 
 HONEST = "REFUSED", *vm.Result.__members__
@@ -97,11 +88,9 @@ HONEST = "REFUSED", *vm.Result.__members__
 
 def refusal(error: Exception) -> str:
     """ "REFUSED" for a ValueError or TypeError that this package raised itself, else what it was and where."""
-    at = error.__traceback__
-    while at is not None and at.tb_next is not None:
-        at = at.tb_next
-    where = at.tb_frame.f_globals.get("__name__", "?") if at is not None else "?"
-    raised = at is not None and "raise" in linecache.getline(at.tb_frame.f_code.co_filename, at.tb_lineno)
+    frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
+    where = frame.f_globals.get("__name__", "?")
+    raised = "raise" in linecache.getline(frame.f_code.co_filename, line)
     if isinstance(error, ValueError | TypeError) and where.split(".")[0] == "vmri_jax" and raised:
         return "REFUSED"
     return f"foreign error: {type(error).__name__} in {where}: {str(error)[:200]}"
@@ -145,8 +134,6 @@ def compute(seed: int, runs: tuple[int, ...]) -> list[str]:
 
 def _work(connection, seed: int, runs: list[int]) -> None:
     """Tell what is computed next, and what came of it."""
-    import jax
-
     jax.config.update("jax_enable_x64", True)
     structure, seen = None, 0
     for together in calls(runs, seed):
@@ -194,10 +181,8 @@ def outcomes(seed: int, runs: list[int], limit: float) -> Iterator[tuple[int, st
 def fuzz(count: int, seed: int, path: Path, limit: float, tell: Tell = silent) -> dict[int, str]:
     """Outcomes of the runs 0 to count - 1; those that `path` has are not computed again."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    found = {}
-    if path.exists():
-        found = {entry["run"]: entry["outcome"] for entry in map(json.loads, path.read_text().splitlines())}
-    found = {run: outcome for run, outcome in found.items() if run < count}
+    lines = path.read_text().splitlines() if path.exists() else []
+    found = {entry["run"]: entry["outcome"] for entry in map(json.loads, lines) if entry["run"] < count}
     for run in found:
         tell(f"run {run}")
     with path.open("a") as file:
@@ -239,11 +224,12 @@ def reduce(seed: int, run: int, tell: Tell = silent) -> tuple[rs.Structure, rs.D
         return verdicts(structure, [draw] * (structure.lanes or 1))[0]
 
     wrong = outcome(structure, draw)
-    simpler = [
-        (0, f.name, f.default) for f in dataclasses.fields(structure) if f.name not in ("dimension", "slow", "fast")
-    ]
+    wanted = dataclasses.fields(structure)
+    simpler = [(0, f.name, f.default) for f in wanted if f.name not in ("dimension", "slow", "fast")]
     simpler += [(1, f.name, f.default) for f in dataclasses.fields(draw) if f.default is not dataclasses.MISSING]
-    simpler += [(1, name, tuple(x(i) for i in range(len(draw.positions)))) for name, x in _SIMPLE.items()]
+    points = range(len(draw.positions))
+    simple = {"velocities": [0.0 for _ in points], "masses": [1.0 for _ in points], "positions": map(float, points)}
+    simpler += [(1, name, tuple(values)) for name, values in simple.items()]
     for which, name, value in simpler:
         case = [structure, draw]
         if getattr(case[which], name) == value:
@@ -253,6 +239,3 @@ def reduce(seed: int, run: int, tell: Tell = silent) -> tuple[rs.Structure, rs.D
         if kind(outcome(*case)) == kind(wrong):
             structure, draw = case
     return structure, draw, outcome(structure, draw)
-
-
-_SIMPLE = {"velocities": lambda i: 0.0, "masses": lambda i: 1.0, "positions": float}

@@ -1,4 +1,4 @@
-"""A streaming run killed at random moments: every completed chunk readable, every resumed run the same to the last bit."""
+"""A streaming run killed at random moments: resumed it is the same to the last bit."""
 
 import multiprocessing
 import shutil
@@ -51,7 +51,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 
 def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict], list[bool]]:
-    """One row per kill; and whether the runs that were completed meanwhile are identical to the uninterrupted one."""
+    """One row per kill; and whether the completed runs are identical to the uninterrupted one."""
     context = multiprocessing.get_context("forkserver")  # children start from a process that has imported everything
     context.set_forkserver_preload(["benchmarks.kills"])
     random = np.random.default_rng(size.seed)
@@ -83,11 +83,11 @@ def kill_often(size: Size, folder: Path, tell: Tell = silent) -> tuple[list[dict
             row = {"kill": len(rows) + 1, "after, s": time.perf_counter() - begin, "chunks": after}
             rows.append(row | {"new": after - before, "moment": _moment(path, after), "identical": same})
         else:
-            runs.append(child.exitcode == 0 and _complete(path, expected))
+            runs.append(_complete(child, path, expected))
             shutil.rmtree(path)
     child = start(path)
     child.join(PATIENCE)
-    runs.append(child.exitcode == 0 and _complete(path, expected))
+    runs.append(_complete(child, path, expected))
     return rows, runs
 
 
@@ -115,7 +115,8 @@ def _child(out: str, cache: str) -> None:
 
 def _chunks(path: Path) -> int:
     """Completed chunks."""
-    return (len(vm.StoredTrajectory(path)) - 1) // PER_CHUNK if path.exists() and len(vm.StoredTrajectory(path)) else 0
+    nodes = len(vm.StoredTrajectory(path)) if path.exists() else 0
+    return max(0, nodes - 1) // PER_CHUNK
 
 
 def _moment(path: Path, chunks: int) -> str:
@@ -138,13 +139,15 @@ def _wait_for_chunk(child, path: Path, known: int) -> None:
         time.sleep(0.002)
 
 
-def _complete(path: Path, expected: vm.Trajectory) -> bool:
+def _complete(child, path: Path, expected: vm.Trajectory) -> bool:
+    """Whether the child ended well, and wrote the expected run."""
     stored = vm.StoredTrajectory(path)
-    return stored.complete and len(stored) == len(expected.t) and _identical(stored.load(), expected)
+    whole = child.exitcode == 0 and stored.complete and len(stored) == len(expected.t)
+    return whole and _identical(stored.load(), expected)
 
 
 def _identical(part: vm.Trajectory, expected: vm.Trajectory) -> bool:
     """Whether every array is the beginning of the expected one, bit by bit."""
-    whole = {name: np.asarray(a) for name, a in named_arrays(expected).items() if name not in STATUS}
-    begun = {name: np.asarray(a) for name, a in named_arrays(part).items() if name not in STATUS}
-    return all(a.tobytes() == whole[name][: len(a)].tobytes() for name, a in begun.items())
+    begun, whole = named_arrays(part), named_arrays(expected)
+    pairs = [(np.asarray(begun[name]), np.asarray(whole[name])) for name in begun if name not in STATUS]
+    return all(a.tobytes() == b[: len(a)].tobytes() for a, b in pairs)

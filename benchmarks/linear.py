@@ -1,7 +1,5 @@
 """Linear in num_micro: time and temporary memory of one macro step up to thousands of micro steps."""
 
-from dataclasses import dataclass
-
 import jax
 import numpy as np
 
@@ -13,31 +11,6 @@ from benchmarks.report import Claim
 
 MEMORY_FROM = 100
 """Below so many micro steps what does not depend on num_micro counts as well."""
-
-
-@dataclass(frozen=True)
-class Line:
-    """Microseconds (one list per num_micro) and, from MEMORY_FROM on, temporary bytes of one macro step."""
-
-    case: Case
-    num_micro: np.ndarray
-    us: np.ndarray
-    bytes: np.ndarray
-    rows: list[dict]
-
-    @property
-    def claims(self) -> list[Claim]:
-        """Slopes in logarithms."""
-        what = f"{self.case.label}: slope of log {{}} against log num_micro up to {self.num_micro.max():g}"
-        slopes = [slope(self.num_micro, sample) for sample in self.us.T]
-        low, high = np.quantile(slopes, (0.25, 0.75))
-        seconds = Ratio(slope(self.num_micro, np.median(self.us, axis=1)), float(low), float(high))
-        many = self.num_micro[self.num_micro >= MEMORY_FROM]
-        claims = [Claim(what.format("time"), seconds, 1.1, 0.9)]
-        if many.size > 1:
-            memory = slope(many, self.bytes)
-            claims.append(Claim(what.format("memory"), Ratio(memory, memory, memory), 1.1))
-        return claims
 
 
 def slope(x, y) -> float:
@@ -55,17 +28,24 @@ def cases(num_micro: tuple[int, ...]) -> tuple[Case, ...]:
     )
 
 
-def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> Line:
-    """Time the macro steps of a case, and read the temporary memory off their compiled programs."""
+def measure(case: Case, repeats: int, seconds: float, tell: Tell = silent) -> tuple[list[dict], list[Claim]]:
+    """Time and temporary memory of the macro steps of a case: rows, and slopes in logarithms."""
     found = curves.measure(case, repeats, seconds, tell)
     problem = programs.problem(case.system)
     num_micro, _ = found.curve("auto")
     many = num_micro[num_micro >= MEMORY_FROM]
-    size = np.array([temporary_bytes(problem, programs.SCHEMES[case.scheme](int(n)), case.micro_dt) for n in many])
+    size = {int(n): temporary_bytes(problem, programs.SCHEMES[case.scheme](int(n)), case.micro_dt) for n in many}
     us = np.array([found.samples["auto", int(n)] for n in num_micro]) * num_micro[:, None]
-    by_n = dict(zip(many.tolist(), size.tolist(), strict=True))
-    rows = [row | {"bytes": by_n.get(row["num_micro"])} for row in found.rows]
-    return Line(case, num_micro, us, size, rows)
+    rows = [row | {"bytes": size.get(row["num_micro"])} for row in found.rows]
+
+    what = f"{case.label}: slope of log {{}} against log num_micro up to {num_micro.max():g}"
+    low, high = np.quantile([slope(num_micro, sample) for sample in us.T], (0.25, 0.75))
+    seen = Ratio(slope(num_micro, np.median(us, axis=1)), float(low), float(high))
+    claims = [Claim(what.format("time"), seen, 1.1, 0.9)]
+    if many.size > 1:
+        memory = slope(many, list(size.values()))
+        claims.append(Claim(what.format("memory"), Ratio(memory, memory, memory), 1.1))
+    return rows, claims
 
 
 def temporary_bytes(problem: vm.Problem, scheme: vm.Scheme, micro_dt: float) -> int:

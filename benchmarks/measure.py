@@ -18,10 +18,7 @@ def quartiles(samples: Sequence[float], scale: float = 1.0) -> Ratio:
 
 
 def pin(core: int | None) -> int | None:
-    """Keep this process to one core, by default the last one it may use; a negative one leaves it free.
-
-    Returns the core, None if the process is free or the system does not know how to pin.
-    """
+    """Keep this process to one core, by default the last one it may use; a negative one leaves it free: None."""
     if not hasattr(os, "sched_setaffinity") or (core is not None and core < 0):
         return None
     allowed = os.sched_getaffinity(0)

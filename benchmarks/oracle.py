@@ -1,22 +1,20 @@
 """Every stepper against the textbook: random tame systems, the largest difference per stepper."""
 
-import json
 from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from random import Random
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 import vmri_jax as vm
-from benchmarks.measure import Tell, machine, silent
+from benchmarks.measure import Tell, silent
+from benchmarks.report import Report
 from tests.verification import random_systems as rs
 from vmri_jax import textbook
 
+COLUMNS = ("method", "kind of step", "systems", "positions", "momenta", "worst")
 DRAWS = 5
 """Systems of a structure, which share its compiled programs."""
 FORGET = 10
@@ -26,8 +24,20 @@ STEPS, EVERY = 4, 2
 simulate_textbook = jax.jit(partial(textbook.simulate, num_steps=STEPS))
 
 
+class Size(NamedTuple):
+    """Systems, and the seed that they are drawn from."""
+
+    count: int
+    seed: int
+
+
+def sizes(name: str, count: int, seed: int) -> Size:
+    """So many systems, whatever the name."""
+    return Size(count, seed)
+
+
 class Comparison(NamedTuple):
-    """One system: how its step was solved, how the run ended, and the largest differences relative to the largest values."""
+    """One system: how it was solved, how the run ended, largest differences over largest values."""
 
     method: str
     kind: str
@@ -45,8 +55,9 @@ def compare(of: rs.Structure, draw: rs.Draw) -> Comparison:
     run = vm.simulate(problem.system, scheme, state, **how)
     expected = simulate_textbook(problem.system, scheme, state, draw.macro_dt)
     method = vm.Method(int(np.max(run.info.method))).name
+    kind = kind_of_step(vm.plan(problem.system, scheme, state, newton))
     differences = [_relative(run, expected, names) for names in (("q_s", "q_f"), ("p_s", "p_f"))]
-    return Comparison(method, kind_of_step(of), vm.Result(int(run.result)).name, *differences)
+    return Comparison(method, kind, vm.Result(int(run.result)).name, *differences)
 
 
 def _relative(run: vm.Trajectory, expected: vm.State, names: tuple[str, str]) -> float:
@@ -57,22 +68,11 @@ def _relative(run: vm.Trajectory, expected: vm.State, names: tuple[str, str]) ->
     return float(difference) if np.isfinite(difference) else np.inf
 
 
-def kind_of_step(of: rs.Structure) -> str:
-    """What kind of step a structure asks for, in words."""
-    held = of.constraint or of.slow_constraint
-    kicked = of.scheme in ("explicit slow", "fully explicit", "takahashi imada")
-    plain = of.kinetic in ("diagonal", "matrix") and not of.force
-    if of.composition:
-        return "composition"
-    if plain and kicked and of.scheme != "explicit slow" and not held:
-        return "explicit"
-    if plain and kicked and of.constraint in (None, "anchored"):
-        return "slow and fast apart"
-    if plain and kicked and of.scheme != "explicit slow" and of.num_micro == 1:
-        return "drift along constraints"
-    if plain and of.num_micro == 1 and of.degree > 1 and of.scheme != "mixed":
-        return "one interval of high degree"
-    return "slow and fast together"
+def kind_of_step(plan: vm.Plan) -> str:
+    """The outermost stepper of a plan in words, kicks aside."""
+    lines = [line.strip() for line in str(plan).splitlines()]
+    inside = next(line for line in lines if not line.startswith("kicks of"))
+    return inside.partition(":")[0]
 
 
 def systems(count: int, seed: int) -> Iterator[tuple[int, rs.Structure, rs.Draw]]:
@@ -82,20 +82,19 @@ def systems(count: int, seed: int) -> Iterator[tuple[int, rs.Structure, rs.Draw]
         yield number, of, rs.tame_draw(Random(f"{seed} tame draw {number}"), of)
 
 
-def run(count: int, seed: int, path: Path, tell: Tell = silent) -> list[dict]:
-    """Compare so many systems; what is known by then is written after each structure."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """Compare all of them, a report after each structure."""
     found = []
-    for number, of, draw in systems(count, seed):
+    for number, of, draw in systems(size.count, size.seed):
         tell(f"system {number}")
         if number % (DRAWS * FORGET) == 0:
             rs.functions.cache_clear()
             jax.clear_caches()
         found.append({"system": number} | compare(of, draw)._asdict())
-        if number % DRAWS == DRAWS - 1 or number == count - 1:
-            report = {"machine": machine(), "seed": seed, "steppers": summary(found), "systems": found}
-            path.write_text(json.dumps(report, indent=1))
-    return found
+        if number % DRAWS == DRAWS - 1 or number == size.count - 1:
+            notes = [f"{len(found)} systems against the textbook"]
+            about = {"seed": size.seed, "systems": found}
+            yield Report(f"oracle_{size.seed}", name, summary(found), [], notes, about=about)
 
 
 def summary(found: list[dict]) -> list[dict]:
@@ -107,14 +106,3 @@ def summary(found: list[dict]) -> list[dict]:
         worst = max(those, key=lambda one: max(one["positions"], one["momenta"]))["system"]
         rows.append({"method": method, "kind of step": kind, "systems": len(those)} | largest | {"worst": worst})
     return rows
-
-
-def show(found: list[dict], console: Console) -> None:
-    """Print the summary."""
-    table = Table(title=f"{len(found)} systems against the textbook", title_justify="left", box=None)
-    rows = summary(found)
-    for name in rows[0]:
-        table.add_column(name)
-    for row in rows:
-        table.add_row(*(f"{value:.1e}" if isinstance(value, float) else str(value) for value in row.values()))
-    console.print(table)

@@ -1,8 +1,8 @@
-"""Observed orders: Galerkin schemes and compositions on all systems, against solutions of the continuous equations."""
+"""Observed orders: Galerkin schemes and compositions on all systems."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from itertools import product
 
 import numpy as np
 
@@ -14,11 +14,10 @@ from vmri_jax.diagnostics import fit_order
 from vmri_jax.study import Program, ReferenceSolution
 
 COLUMNS = ("system", "scheme", "num_micro", "order", "of q", "+-", "of p", "+- ", "points", "finest error", "holds")
-TRUTH = Path(__file__).parent.parent / "tests" / "data" / "ground_truth"
+DEGREES, COMPOSITIONS = (1, 2, 3, 4), ("suzuki4", "kahan-li6", "kahan-li8")
 TOLERANCE = 0.25
 COARSEST, FLOOR, OF_MULTIPLIERS = 1e-4, 4e-13, 5
-"""Errors between the first two, relative to the largest position or momentum, are fitted: below is round-off, above the
-steps are not yet small. Round-off of the multipliers makes the floor of the momenta so many times higher."""
+"""Relative errors between the first two are fitted; multipliers make the floor of momenta so many times higher."""
 ACCUMULATED = 200
 """Round-off has doubled after so many steps."""
 RATIO, POINTS = 2**0.35, 3
@@ -38,37 +37,23 @@ class Case:
     num_micro: int
 
 
-@dataclass(frozen=True)
-class Size:
-    """What is run."""
-
-    cases: tuple[Case, ...]
-
-
-def sizes(name: str) -> Size:
+def sizes(name: str) -> list[Case]:
     """ "quick": degrees 1 to 4 with 4 micro steps and compositions; "full": also 1 and 10 micro steps."""
     cases = []
-    for system in ("FPU l=3", "TSP", "SAM"):
-        for rule in ("gauss", "lobatto"):
-            for num_micro in (4,) if name == "quick" else (1, 4, 10):
-                for degree in (1, 2, 3, 4):
-                    scheme = vm.galerkin(num_micro, degree, rule)
-                    cases.append(Case(system, f"galerkin {degree}, {rule}", scheme, num_micro))
-    bases: dict[str, Callable[[int], vm.Scheme]] = {
-        "fully explicit": vm.fully_explicit,
-        "explicit slow": vm.explicit_slow,
-    }
-    for base, make in bases.items():
-        for system in ("FPU l=3", "TSP"):
-            for composition in ("suzuki4", "kahan-li6", "kahan-li8"):
-                cases.append(Case(system, f"{base}, {composition}", vm.compose(make(5), composition), 5))
-    return Size(tuple(cases))
+    numbers = (4,) if name == "quick" else (1, 4, 10)
+    for system, rule, num_micro, degree in product(("FPU l=3", "TSP", "SAM"), ("gauss", "lobatto"), numbers, DEGREES):
+        scheme = vm.galerkin(num_micro, degree, rule)
+        cases.append(Case(system, f"galerkin {degree}, {rule}", scheme, num_micro))
+    for base, system, composition in product(("fully explicit", "explicit slow"), ("FPU l=3", "TSP"), COMPOSITIONS):
+        scheme = vm.compose(programs.SCHEMES[base](5), composition)
+        cases.append(Case(system, f"{base}, {composition}", scheme, 5))
+    return cases
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each scheme."""
     rows = []
-    for case in size.cases:
+    for case in cases:
         tell(f"{case.system}, {case.label}, {case.num_micro}")
         rows.append(measure(case))
         good = sum(row["holds"] != "no" for row in rows)
@@ -78,13 +63,10 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 def truth(system: str) -> ReferenceSolution:
     """Positions and momenta up to t = 1, good to about 1e-14."""
-    problem = programs.problem(system)
-    with np.load(TRUTH / {"FPU l=3": "fpu3_t1.npz", "TSP": "tsp_t1.npz", "SAM": "sam_t1.npz"}[system]) as file:
+    with np.load(programs.ground_truth(system, "1")) as file:
         stride = (len(file["t"]) - 1) // NODES
         q, v = file["q"][::stride], file["v"][::stride]
-    kinetic = problem.system.kinetic
-    masses = np.concatenate([np.asarray(kinetic.slow), np.asarray(kinetic.fast)])  # pyright: ignore[reportAttributeAccessIssue]
-    return ReferenceSolution(q, masses * v)
+    return ReferenceSolution(q, programs.masses(programs.problem(system)) * v)
 
 
 def measure(case: Case) -> dict:

@@ -1,10 +1,10 @@
-"""Figures 4 and 5 of the reference study: where its dense solve was cheapest, and what the default solve does there."""
+"""Figures 4 and 5 of the reference study: where its dense solve was cheapest."""
 
 from collections.abc import Mapping
 from dataclasses import replace
 
 from benchmarks.curves import Case
-from benchmarks.gail2014.reference import PAPER_MINIMA
+from benchmarks.gail2014.reference import paper_minimum
 
 TITLES = {
     "cost_fig4": "Fig. 4 of the reference study redone",
@@ -13,7 +13,7 @@ TITLES = {
 FPU_DT, SAM_DT = 0.01, 0.001
 """Micro steps of the paper."""
 T_END = 24.0
-"""Simulated time of a fully implicit chain: Newton's iteration does not stand its largest macro steps, of length 1, long."""
+"""Simulated time of a fully implicit chain: with macro steps of length 1 Newton's iteration soon fails."""
 AMPLITUDE = 1e-3
 """Start of an explicit chain, over that of the paper: with this one macro steps of length 1 are stable."""
 
@@ -21,13 +21,7 @@ AMPLITUDE = 1e-3
 def cases(
     small: tuple[int, ...], chain: tuple[int, ...], chain_lengths: Mapping[str, tuple[int, ...]]
 ) -> dict[str, tuple[Case, ...]]:
-    """The cases of both figures.
-
-    Args:
-        small: num_micro in Fig. 4 (the chain with three springs and the simple atomic model, fully implicit).
-        chain: num_micro in Fig. 5.
-        chain_lengths: numbers of springs in Fig. 5 by scheme.
-    """
+    """The cases of both figures: num_micro in Fig. 4 and in Fig. 5, and numbers of springs in Fig. 5 by scheme."""
     four = (
         at_paper_steps(Case("FPU l=3", "fully implicit", FPU_DT, small, small, 1.8, 5.0, 60)),
         Case("SAM", "fully implicit", SAM_DT, small, small, 1.8, 10.0, 20),
@@ -38,12 +32,6 @@ def cases(
         for length in lengths
     )
     return dict(zip(TITLES, (four, five), strict=True))
-
-
-def paper_minimum(scheme: str, num_springs: int) -> int | None:
-    """The cheapest num_micro in Fig. 5, None where the paper does not say."""
-    found = [n for low, high, n in PAPER_MINIMA[scheme] if low <= num_springs <= high]
-    return found[0] if found else None
 
 
 def at_paper_steps(case: Case) -> Case:

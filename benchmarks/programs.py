@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,16 +15,26 @@ SCHEMES: dict[str, Callable[[int], vm.Scheme]] = {
     "explicit slow": vm.explicit_slow,
     "fully explicit": vm.fully_explicit,
 }
+TRUTH = Path(__file__).parent.parent / "tests" / "data" / "ground_truth"
+FILES = {"FPU l=3": "fpu3", "FPU l=200": "fpu200", "TSP": "tsp", "SAM": "sam"}
 
 
 def problem(name: str, amplitude: float = 1.0) -> vm.Problem:
     """``"TSP"``, ``"SAM"``, or the chain with so many springs, ``"FPU l=50"``; its start may be made smaller."""
     problem = Case("", name).problem()
-    return (
-        problem
-        if amplitude == 1.0
-        else replace(problem, **{key: amplitude * getattr(problem, key) for key in ("q_s", "q_f", "v_s", "v_f")})
-    )
+    start = {key: amplitude * getattr(problem, key) for key in ("q_s", "q_f", "v_s", "v_f")}
+    return replace(problem, **start)
+
+
+def ground_truth(system: str, t_end: str) -> Path:
+    """File of a solution of high precision."""
+    return TRUTH / f"{FILES[system]}_t{t_end}.npz"
+
+
+def masses(problem: vm.Problem) -> np.ndarray:
+    """(n,) masses per coordinate, slow ones first."""
+    kinetic: Any = problem.system.kinetic
+    return np.concatenate([kinetic.slow, kinetic.fast])
 
 
 def unknowns(problem: vm.Problem, num_micro: int) -> int:
@@ -32,21 +44,9 @@ def unknowns(problem: vm.Problem, num_micro: int) -> int:
 
 
 def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, newton: vm.Newton | None = None, **step):
-    """``run(num_steps)``: a prepared run that saves the last node only; one that fails is seen in its ``result``.
-
-    Args:
-        step: ``macro_dt`` or ``micro_dt``; ``run(num_steps, macro_dt=...)`` takes another one.
-    """
-    arguments = problem.system, scheme, problem.state()
-    if hasattr(vm, "prepare"):
-        prepared = vm.prepare(*arguments, **step, num_steps=1, newton=newton)  # pyright: ignore[reportAttributeAccessIssue]
-        return lambda num_steps, **other: prepared(num_steps=num_steps, **other)
-
-    def run(num_steps: int, **other) -> vm.Trajectory:
-        steps: dict = (other or step) | {"num_steps": num_steps, "save_every": num_steps}
-        return vm.simulate(*arguments, **steps, newton=newton, throw=False)
-
-    return run
+    """``run(num_steps)``, a prepared run with ``macro_dt`` or ``micro_dt`` that saves the last node only."""
+    prepared = vm.prepare(problem.system, scheme, problem.state(), **step, num_steps=1, newton=newton)
+    return lambda num_steps, **other: prepared(num_steps=num_steps, **other)
 
 
 def failed(trajectory: vm.Trajectory) -> bool:

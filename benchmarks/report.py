@@ -1,12 +1,13 @@
-"""What a benchmark hands over: rows and claims as tables, a JSON file with machine and versions, figures."""
+"""What a benchmark hands over: tables of rows and claims, a JSON file with machine and versions, figures."""
 
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -20,10 +21,7 @@ console = Console(width=None if sys.stdout.isatty() else 160)
 
 @dataclass(frozen=True)
 class Claim:
-    """One ratio held against its target.
-
-    at_most, at_least: the target; None where there is none on that side.
-    """
+    """One ratio held against its target, which may have no bound on a side."""
 
     what: str
     seen: Ratio
@@ -50,13 +48,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Report:
-    """All that one benchmark found.
-
-    rows: one dictionary per program.
-    notes: what was left out, and why.
-    figures: by file name, functions that draw.
-    about: what else belongs into the file.
-    """
+    """All that one benchmark found; figures are functions that draw, by file name, about is what else belongs into the file."""
 
     name: str
     size: str
@@ -73,7 +65,8 @@ class Report:
         claims = [asdict(claim) | {"holds": claim.holds} for claim in self.claims]
         found = {"benchmark": self.name, "size": self.size, "machine": machine(), **self.about, "claims": claims}
         found |= {"notes": self.notes, "rows": self.rows}
-        path.write_text(json.dumps(_finite(found), indent=1))
+        finite = each_float(found, lambda x: x if math.isfinite(x) else None)  # JSON knows no NaN
+        path.write_text(json.dumps(finite, indent=1))
         for name, draw in self.figures.items():
             figure = draw()
             _signature(figure)
@@ -107,6 +100,30 @@ class Report:
             yield [("ratio", "seen (quartiles)", "target", "holds"), *claims]
 
 
+def spread(what: str, seen: Ratio) -> dict:
+    """Columns of a row: a median by its name, and its quartiles."""
+    return {what: seen.value, "low": seen.low, "high": seen.high}
+
+
+def growing(name: str, size: str, parts: Iterable[tuple[list[dict], list[Claim]]], notes: Sequence[str] = ()):
+    """A report after each part, which has rows and claims, of all parts by then."""
+    rows, claims = [], []
+    for more_rows, more_claims in parts:
+        rows += more_rows
+        claims += more_claims
+        yield Report(name, size, rows, claims, list(notes))
+
+
+def legend_below(figure: Figure, names: Sequence[str] = ()) -> None:
+    """Every curve once, under the panels, in the order of these names."""
+    curves: dict = {}
+    for axes in figure.axes:
+        handles, labels = axes.get_legend_handles_labels()
+        curves |= dict(zip(labels, handles, strict=True))
+    shown = [name for name in names or curves if name in curves]
+    figure.legend([curves[name] for name in shown], shown, loc="outside lower center", ncols=min(len(shown), 5))
+
+
 @contextmanager
 def progress(title: str) -> Iterator[Tell]:
     """A line that shows what is being measured; yields the function that is told each part before it starts."""
@@ -120,13 +137,13 @@ def _cell(value) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _finite(value):
-    """The same with None for NaN, which JSON does not know."""
+def each_float(value, function: Callable) -> Any:
+    """The same dictionaries and lists with this function of every float."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: each_float(item, function) for key, item in value.items()}
     if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return [each_float(item, function) for item in value]
+    return function(value) if isinstance(value, float) else value
 
 
 def _signature(figure: Figure) -> None:

@@ -1,4 +1,4 @@
-"""Scenes: what an effect costs that is not there, what it costs to write a system as a scene, orders under forces."""
+"""Scenes: what an effect costs that is not there, a scene against a system by hand, orders under forces."""
 
 import copy
 import time
@@ -36,8 +36,7 @@ TOLERANCES = {"of q, p": 0.2, "of balance": 0.3}
 class Size:
     """How much is run.
 
-    anew: caches are emptied before every so many scenes without an effect: these are traced and compiled once more,
-        where `jax.jit` may otherwise find that it has the program.
+    anew: every so many scenes without an effect are compiled once more.
     schemes, num_micro, micro_dt, num_steps, repeats: of the systems that are timed.
     orders: schemes and numbers of steps under forces.
     """
@@ -104,10 +103,13 @@ def absence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
             }
         )
     by_hand = _by_hand(scheme, tell)
+    same = sum(row["same"] == "yes" for row in rows)
+    by_formula = sum(row["unknowns"] == row["formula"] for row in rows)
+    called = sum(row["calls without"] == 0 < row["calls with"] for row in rows)
     notes = [
-        f"{sum(row['same'] == 'yes' for row in rows)} of {len(rows)} effects: without it the program is the one that never had it.",
-        f"{sum(row['unknowns'] == row['formula'] for row in rows)} of {len(rows)}: unknowns by r n_s + r n_gs + num_micro r (n_f + n_g).",
-        f"{sum(row['calls without'] == 0 < row['calls with'] for row in rows)} of {len(rows)}: called with it, never without.",
+        f"{same} of {len(rows)} effects: without it the program is the one that never had it.",
+        f"{by_formula} of {len(rows)}: unknowns by r n_s + r n_gs + num_micro r (n_f + n_g).",
+        f"{called} of {len(rows)}: called with it, never without.",
         *(f"{what}: operations {a[0]}, bytes {a[1]}; by hand {b[0]}, {b[1]}." for what, (a, b) in by_hand.items()),
     ]
     yield Report("scene_absence", name, rows, [], notes)
@@ -165,13 +167,14 @@ def presence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
             tell(f"{system}, {scheme}")
             problems = {"scene": scene().problem(), "by hand": programs.problem(system)}
             made, macro_dt = programs.SCHEMES[scheme](size.num_micro), size.num_micro * size.micro_dt
-            arguments = {key: (problem.system, made, problem.state(), macro_dt) for key, problem in problems.items()}
-            prepared = {key: prepare_steps(*some, num_steps=size.num_steps) for key, some in arguments.items()}
-            compiled = {key: run.compiled() for key, run in prepared.items()}
+            prepared = {
+                key: prepare_steps(problem.system, made, problem.state(), macro_dt, num_steps=size.num_steps)
+                for key, problem in problems.items()
+            }
             timed = {key: run.timed() for key, run in prepared.items()}
             seconds = interleaved(timed, size.repeats, clock=time.process_time)
-            for key, program in compiled.items():
-                us = quartiles(seconds[key], 1e6 / size.num_steps / size.num_micro)
+            for key, run in prepared.items():
+                program, us = run.compiled(), quartiles(seconds[key], 1e6 / size.num_steps / size.num_micro)
                 row = {"system": system, "scheme": scheme, "program": key, "µs/micro step": us.value}
                 row |= {"quartiles": f"{us.low:.3g} to {us.high:.3g}", "operations": sum(operations(program).values())}
                 rows.append(row | {"bytes": temporary_bytes(program)})
@@ -182,7 +185,7 @@ def presence(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 # --- orders ----------------------------------------------------------------------------------------------------------
 def orders(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
-    """Errors and energy balance (change of energy less work of the forces) of bodies under forces, as the step shrinks."""
+    """Errors and energy balance (change of energy less work of the forces) of bodies under forces."""
     rows = []
     for label, scheme, steps in size.orders:
         tell(label)

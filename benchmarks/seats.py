@@ -1,4 +1,4 @@
-"""Worker processes that take turns, sample by sample: checkouts, or forms of the kernels, compared in one run."""
+"""Worker processes that take turns, sample by sample: checkouts, or forms of the kernels."""
 
 import json
 import os
@@ -23,13 +23,7 @@ class Refused(RuntimeError):
 
 @dataclass(frozen=True)
 class Seat:
-    """Where a worker sits.
-
-    checkout: the folder whose `vmri_jax` it imports.
-    python: the interpreter.
-    options: of ``worker.py``.
-    environment: variables that are set for it.
-    """
+    """Where a worker sits: the checkout whose `vmri_jax` it imports, and how it is started."""
 
     checkout: Path = HERE.parent
     python: Path = Path(sys.executable)
@@ -39,16 +33,12 @@ class Seat:
     @property
     def commit(self) -> str:
         """Of the checkout, with a plus sign if files differ from it."""
-        name = self._git("rev-parse", "--short=10", "HEAD")
-        return name + ("+" if self._git("status", "--porcelain", "--untracked-files=no") else "")
-
-    def _git(self, *arguments: str) -> str:
-        command = ["git", "-C", str(self.checkout), *arguments]
+        command = ["git", "-C", str(self.checkout), "describe", "--always", "--abbrev=10", "--exclude=*", "--dirty=+"]
         return subprocess.run(command, capture_output=True, text=True).stdout.strip()
 
 
 class Worker:
-    """A process in a `Seat`, on the cores of this process and without a cache of programs; close it, or use it as a context."""
+    """A process in a `Seat`, without a cache of programs; it ends with its context."""
 
     def __init__(self, seat: Seat):
         environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false", **seat.environment}
@@ -99,14 +89,14 @@ class Worker:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one case gave: samples in seconds and answers of `Worker.make`, by seat; why other seats have none."""
+    """What one case gave by seat: samples in seconds, answers of `Worker.make`, or why there are none."""
 
     samples: dict[str, list[float]]
     made: dict[str, dict]
     refused: dict[str, str]
 
     def difference(self, a: str, b: str) -> float | None:
-        """Largest difference of the ends of two seats, relative to the largest number of b; None where one has none."""
+        """Largest difference of the ends of two seats, relative to the largest number of b."""
         if a not in self.made or b not in self.made:
             return None
         x, y = (np.array(self.made[name]["end"]) for name in (a, b))
@@ -114,10 +104,7 @@ class Outcome:
 
 
 def take_turns(workers: Mapping[str, Worker], case: Case, repeats: int) -> Outcome:
-    """Run a case on every worker, as many steps on all of them, and time it in turns.
-
-    Every round starts with another worker.
-    """
+    """Run a case on every worker, as many steps on all of them, and time it in turns."""
     made, refused = {}, {}
     for name, worker in workers.items():
         try:
@@ -125,10 +112,9 @@ def take_turns(workers: Mapping[str, Worker], case: Case, repeats: int) -> Outco
             case = replace(case, num_steps=made[name]["num_steps"])
         except Refused as error:
             refused[name] = str(error)
-    names = list(made)
-    samples: dict[str, list[float]] = {name: [] for name in names}
+    samples: dict[str, list[float]] = {name: [] for name in made}
     for i in range(repeats):
-        for name in _rotated(names, i):
+        for name in _rotated(list(made), i):
             samples[name].append(workers[name].sample())
     return Outcome(samples, made, refused)
 
@@ -151,5 +137,6 @@ def first_results(seats: Mapping[str, Seat], case: Case, repeats: int) -> Outcom
 
 
 def _rotated(names: Sequence[str], i: int) -> list[str]:
+    """Every round starts with another one."""
     start = i % max(1, len(names))
     return [*names[start:], *names[:start]]

@@ -1,4 +1,4 @@
-"""What each tuned function of the kernels buys: the tuned kernels against the same with one function in its plain form."""
+"""What each tuned function of the kernels buys, against its plain form."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -33,7 +33,7 @@ COLUMNS = ("trick", *SCHEMES, *(f"{system}{BATCH}" for system in SCHEMES), "most
 
 @dataclass(frozen=True)
 class Size:
-    """How much is run: names of functions, cases, samples, seconds of a run."""
+    """Names of functions, cases, samples, and seconds of a run."""
 
     tricks: tuple[str, ...]
     cases: tuple[Case, ...]
@@ -53,11 +53,7 @@ def names() -> tuple[str, ...]:
 
 
 def sizes(name: str, only: Sequence[str] = ()) -> Size:
-    """ "quick" or "full"; `only` these functions.
-
-    Raises:
-        ValueError: no such function in both forms.
-    """
+    """ "quick" or "full"; `only` these functions."""
     known = names()
     if unknown := [trick for trick in only if trick not in known]:
         raise ValueError(f"tricks: the kernels do not share {', '.join(unknown)}; they share {', '.join(known)}.")
@@ -66,7 +62,7 @@ def sizes(name: str, only: Sequence[str] = ()) -> Size:
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
-    """Time all of it, a report after each case: over the tuned kernels, what the same run takes without a trick."""
+    """Time all of it without each trick, over the tuned kernels; a report after each case."""
     tuned = Seat(environment={"VMRI_KERNELS": "cpu"})
     seats = {TUNED: tuned, ALL_PLAIN: Seat(environment={"VMRI_KERNELS": "plain"})}
     seats |= {trick: replace(tuned, options=("--plain", trick)) for trick in size.tricks}
@@ -86,7 +82,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 
 def _row(trick: str, ratios: dict[Case, Ratio]) -> dict:
-    """The most that a trick buys on each system, over the schemes; by the lower quartile of the most it stays or goes."""
+    """The most that a trick buys on each system; by its lower quartile it stays or goes."""
     row: dict = {"trick": trick}
     for column in COLUMNS[1:-2]:
         of_column = [found.value for case, found in ratios.items() if _column(case) == column]

@@ -1,7 +1,7 @@
 """One side of a comparison: a process that runs what it is told, when it is its turn.
 
-Started by its path with a checkout as current directory, ``python .../benchmarks/worker.py``: it imports the `vmri_jax` of that checkout and
-nothing of this folder. A line of JSON on standard input is a question, a line on standard output the answer; `benchmarks.seats` asks.
+``python .../benchmarks/worker.py`` imports the `vmri_jax` of the checkout that it is started in, and nothing of this folder.
+Questions and answers are lines of JSON on standard input and output; `benchmarks.seats` asks.
 """
 
 import argparse
@@ -31,7 +31,7 @@ CLOCK = time.process_time if PROCESSOR_TIME in sys.argv else time.perf_counter
 SPREAD = 0.01
 """Of the velocities in a batch."""
 COMPARED = 8
-"""Macro steps after which two sides are compared: round-off has not grown by then, also where the motion is chaotic."""
+"""Macro steps after which two sides are compared: round-off has not grown by then."""
 COMPILED = "/jax/core/compile/backend_compile_duration"
 """JAX's own name of that event."""
 CALLS = 20
@@ -72,13 +72,7 @@ class Case:
 
 
 class Timed:
-    """A run that takes turns with others.
-
-    num_steps: what a call does.
-    end: what a short call computes.
-    result: status of a call.
-    found: what else it found.
-    """
+    """A run that takes turns with others; `end` is what a short call computes, `result` the status of a call."""
 
     num_steps: int
     end: np.ndarray
@@ -96,30 +90,28 @@ class Timed:
         self.result = vm.Result(int(np.max(np.asarray(whole.result)))).name
 
 
+def last_node(macro_dt: float, num_steps: int) -> dict:
+    """Arguments of a run that saves its last node only."""
+    return {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps}
+
+
 def simulator(case: Case):
-    """``simulate(num_steps)`` by `vm.simulate`; it saves the last node only."""
+    """``simulate(num_steps)`` by `vm.simulate`."""
     problem, scheme = case.problem(), case.made_scheme()
     state = problem.state()
-
-    def simulate(num_steps: int):
-        steps = {"macro_dt": case.macro_dt, "num_steps": num_steps, "save_every": num_steps}
-        return vm.simulate(problem.system, scheme, state, **steps, throw=False)
-
-    return simulate
+    return lambda n: vm.simulate(problem.system, scheme, state, **last_node(case.macro_dt, n), throw=False)
 
 
 class Single(Timed):
     """`vm.simulate`: seconds of the steps, what a call of one step takes at least being subtracted."""
+
+    simulator = staticmethod(simulator)
 
     def __init__(self, case: Case):
         self.simulate = self.simulator(case)
         self.num_steps = case.num_steps or _steps_for(self.simulate, case.seconds)
         self.keep(self.simulate(COMPARED), self.simulate(self.num_steps))
         self.call = min(_seconds(self.simulate, 1) for _ in range(CALLS))
-
-    def simulator(self, case: Case):
-        """``simulate(num_steps)``."""
-        return simulator(case)
 
     def sample(self) -> float:
         """Of `num_steps - 1` steps."""
@@ -138,12 +130,11 @@ class Call(Single):
 class Prepared(Call):
     """What a call of a prepared run takes besides its steps."""
 
-    def simulator(self, case: Case):
+    @staticmethod
+    def simulator(case: Case):
         """The same by `vm.prepare`."""
-        problem, prepare = case.problem(), getattr(vm, "prepare", None)
-        if prepare is None:
-            raise NotImplementedError("there is no vm.prepare")
-        run = prepare(problem.system, case.made_scheme(), problem.state(), macro_dt=case.macro_dt, num_steps=1)
+        problem = case.problem()
+        run = vm.prepare(problem.system, case.made_scheme(), problem.state(), macro_dt=case.macro_dt, num_steps=1)
         return lambda num_steps: run(num_steps=num_steps)
 
 
@@ -155,8 +146,7 @@ class Batch(Timed):
         states = starts(problem, case.lanes)
 
         def simulate(num_steps: int):
-            steps = {"macro_dt": case.macro_dt, "num_steps": num_steps, "save_every": num_steps}
-            return vm.simulate_batch(problem.system, scheme, states, **steps)
+            return vm.simulate_batch(problem.system, scheme, states, **last_node(case.macro_dt, num_steps))
 
         self.simulate = simulate
         self.num_steps = case.num_steps or _steps_for(simulate, case.seconds, first=COMPARED, factor=16)
@@ -177,37 +167,33 @@ class First(Timed):
 
 
 class Compile(Timed):
-    """Seconds of the start, of the first call of `vm.simulate` and of a later one; compilations over a sweep.
-
-    The sweep changes number of steps, step size, parameters and start.
-    """
+    """Seconds of start, first call and later call; compilations over other steps, parameters and starts."""
 
     def __init__(self, case: Case):
         problem, scheme = case.problem(), case.made_scheme()
         started, state = _seconds(problem.state), problem.state()
 
         def call(macro_dt=case.macro_dt, num_steps=case.num_steps, of=problem.system, state=state):
-            steps = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps}
-            return vm.simulate(of, scheme, state, **steps)
+            return vm.simulate(of, scheme, state, **last_node(macro_dt, num_steps))
 
         first, later = _seconds(call), _seconds(call)
         moved = vm.State(state.t + 1.0, state.q_s, state.q_f, 1.01 * state.p_s, 1.01 * state.p_f)
-        heavier = problem.system.replace(params=_heavier(problem.system))
+        other = problem.system.replace(params=_other_params(problem.system))
         compiled = []
         jax.monitoring.register_event_duration_secs_listener(
             lambda event, duration_secs, **_: compiled.append(event) if event == COMPILED else None
         )
         call(num_steps=case.num_steps + 1)
         call(macro_dt=1.1 * case.macro_dt)
-        call(of=heavier)
+        call(of=other)
         run = call(state=moved)
         self.keep(run, run)
         self.num_steps = case.num_steps
         self.found = {"start": started, "first": first, "later": later, "compilations": 1 + len(compiled)}
 
 
-def _heavier(system) -> dict:
-    """Parameters that leave a start where it may be: lengths are parameters of systems with constraints."""
+def _other_params(system) -> dict:
+    """Under constraints only another gravity, since a start depends on the lengths."""
     if system.constraint is None:
         return {key: 1.01 * value for key, value in system.params.items()}
     return system.params | {"gravity": system.params["gravity"] + 1}
@@ -218,8 +204,7 @@ class Gradient(Timed):
 
     def __init__(self, case: Case):
         problem, scheme = case.problem(), case.made_scheme()
-        state = problem.state()
-        steps = {"macro_dt": case.macro_dt, "num_steps": case.num_steps, "save_every": case.num_steps}
+        state, steps = problem.state(), last_node(case.macro_dt, case.num_steps)
 
         @jax.jit
         @jax.grad

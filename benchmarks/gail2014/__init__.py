@@ -1,1 +1,1 @@
-"""The reference study: figures of Gail, Leyendecker and Ober-Bloebaum (2014), run again and held against the paper."""
+"""The reference study: the figures of Gail, Leyendecker and Ober-Bloebaum (2014), run again."""

@@ -10,14 +10,7 @@ from matplotlib.figure import Figure
 
 import vmri_jax as vm
 from vmri_jax import plots
-from vmri_jax.study import (
-    ConvergenceStudy,
-    CostStudy,
-    ReferenceSolution,
-    convergence_study,
-    cost_study,
-    reference_solution,
-)
+from vmri_jax.study import ConvergenceStudy, CostStudy, convergence_study, cost_study, reference_solution
 from vmri_jax.study.progress import Progress, part
 
 ORDER_TOLERANCE = 0.2
@@ -29,10 +22,7 @@ SETTLED = 10
 
 @dataclass(frozen=True)
 class Check:
-    """One number held against what is expected of it.
-
-    source: who expects it, e.g. "paper" or "theory".
-    """
+    """One number held against what the source, e.g. "paper" or "theory", expects of it."""
 
     quantity: str
     expected: str
@@ -43,13 +33,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Findings:
-    """What measuring a figure gave.
-
-    seen: one line, made from the numbers.
-    checks: numbers against expectations.
-    draw: ``draw(title, theme)`` makes the figure.
-    study: the numbers.
-    """
+    """What measuring a figure gave; `seen` is one line, ``draw(title, theme)`` makes the figure."""
 
     seen: str
     checks: tuple[Check, ...]
@@ -59,15 +43,12 @@ class Findings:
 
 @dataclass(frozen=True)
 class ConvergenceFigure:
-    """Errors against the macro step.
+    """Errors of schemes against the macro step.
 
     name, title: on the command line and in the report.
     paper: what the paper saw, one line.
     problem: makes the problem; figures with the same function share its reference solution.
-    schemes: schemes by label.
-    orders: expected order by label.
-    source: who expects them.
-    macro_dt, t_end: as in `convergence_study`.
+    orders: what the source expects.
     """
 
     name: str
@@ -86,10 +67,8 @@ class ConvergenceFigure:
         if self.problem not in references:
             progress("reference solution", 0, 1)
             references[self.problem] = reference_solution(problem, self.t_end)
-        reference: ReferenceSolution = references[self.problem]
-        study = convergence_study(
-            problem, self.schemes, self.macro_dt, self.t_end, reference=reference, progress=progress
-        )
+        how = {"reference": references[self.problem], "progress": progress}
+        study = convergence_study(problem, self.schemes, self.macro_dt, self.t_end, **how)
         orders = sorted(set(self.orders.values()))
         return Findings(
             seen=self._seen(study),
@@ -120,12 +99,8 @@ class ConvergenceFigure:
 class CostPanel:
     """Computing time of one scheme on one system, by the dense and by the structured solve.
 
-    dense: makes the problem that the dense solver gets; one that leaves no structure to exploit solves the whole macro
-        step at once for every scheme, as the paper does.
-    structured: makes the problem for the default solver.
+    dense, structured: make the problem that each solver gets; dense_num_micro and dense_t_end are those of the first.
     paper_minimum: the num_micro that was cheapest in the paper, None if it does not say.
-    dense_num_micro, num_micro: the values run with each.
-    dense_t_end, t_end: simulated times of a timed run of each.
     """
 
     title: str
@@ -200,9 +175,8 @@ def _seen_cost(panel: CostPanel, study: CostStudy) -> str:
     parts = []
     for label, solver in study.curves:
         best, least, last, ratio = _summary(study, label, solver)
-        parts.append(
-            f"{solver} cheapest at {best} ({least:.{0 if least > 100 else 2}f} µs) and {ratio:.1f} × that at {last}"
-        )
+        us = f"{least:.{0 if least > 100 else 2}f} µs"
+        parts.append(f"{solver} cheapest at {best} ({us}) and {ratio:.1f} × that at {last}")
     return f"{panel.title}: " + ", ".join(parts)
 
 
@@ -213,15 +187,9 @@ def _cost_checks(panel: CostPanel, study: CostStudy) -> list[Check]:
         seen = f"{ratio:.1f} × its minimum at {last}"
         checks.append(Check(f"{panel.title}, dense: cost turns up again", "yes", "paper", seen, bool(ratio > UPTURN)))
         if panel.paper_minimum is not None:
-            checks.append(
-                Check(
-                    f"{panel.title}, dense: cheapest number of micro steps",
-                    f"{panel.paper_minimum}",
-                    "paper",
-                    f"{best}",
-                    panel.paper_minimum / 2 <= best <= 2 * panel.paper_minimum,
-                )
-            )
+            quantity = f"{panel.title}, dense: cheapest number of micro steps"
+            agrees = panel.paper_minimum / 2 <= best <= 2 * panel.paper_minimum
+            checks.append(Check(quantity, f"{panel.paper_minimum}", "paper", f"{best}", agrees))
     num_micro, cost = study.curve(panel.title, "arrowhead")
     settled = int(np.argmin(np.abs(num_micro - SETTLED)))
     ratio = cost[-1] / cost[settled]

@@ -1,8 +1,8 @@
-"""The reference study as data: which figures there are, what they run, and what was seen when they were first drawn.
+"""The reference study as data: which figures there are, what they run, and what the paper saw.
 
 Gail, Leyendecker, Ober-Bloebaum (2014), "On the role of quadrature rules and system dimensions in variational multirate
 integrators"; orders of higher degree from Ober-Bloebaum, Wenger, Gail, Leyendecker (2024), arXiv:2406.12991. The explicit
-schemes of the paper have order 1, hence alpha != 1/2; alpha = 0 stands for them.
+schemes of the paper have order 1: they have alpha = 0 here.
 """
 
 from collections.abc import Mapping
@@ -22,6 +22,14 @@ PAPER_MINIMA = {  # cheapest num_micro by scheme: (smallest l, largest l, num_mi
     "explicit slow": ((70, 110, 12), (120, 180, 8), (190, 200, 1)),
     "fully explicit": ((70, 130, 8), (140, 200, 4)),
 }
+
+
+def paper_minimum(scheme: str, num_springs: int) -> int | None:
+    """The cheapest num_micro in Fig. 5, None where the paper does not say."""
+    found = [n for low, high, n in PAPER_MINIMA[scheme] if low <= num_springs <= high]
+    return found[0] if found else None
+
+
 SCHEMES = {
     "fully implicit": vm.fully_implicit,
     "explicit slow": partial(vm.explicit_slow, alpha=0.0),
@@ -37,7 +45,6 @@ class Size:
     fpu_num_micro, sam_num_micro: micro steps per macro step in Fig. 4.
     chain_lengths, chain_num_micro: l by scheme, and micro steps per macro step, in Fig. 5.
     largest_dense: most unknowns for which the dense solve is run.
-    repeats: timed runs of each program, of which the median counts.
     degree_num_micro: micro steps per macro step in the figures of degree 2 and 3.
     """
 
@@ -79,14 +86,7 @@ SIZES = {
 
 
 def reference_figures(size: str = "quick") -> tuple[ConvergenceFigure | CostFigure, ...]:
-    """The figures of the reference study in the order of the report.
-
-    Args:
-        size: "quick" (few values of num_micro and l) or "full" (the lists of the paper, may take an hour).
-
-    Raises:
-        ValueError: another size.
-    """
+    """The figures in the order of the report, "quick" with few values or "full" with the lists of the paper."""
     if size not in SIZES:
         raise ValueError(f"reference_figures: size is {size!r}; it must be one of {', '.join(SIZES)}.")
     chosen = SIZES[size]
@@ -94,30 +94,11 @@ def reference_figures(size: str = "quick") -> tuple[ConvergenceFigure | CostFigu
 
 
 def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
-    small = CostPanel(
-        title="FPU, l = 3",
-        dense=systems.fermi_pasta_ulam,
-        structured=systems.fermi_pasta_ulam,
-        scheme=vm.fully_implicit,
-        paper_minimum=60,
-        dense_num_micro=size.fpu_num_micro,
-        num_micro=size.fpu_num_micro,
-        micro_dt=0.01,
-        dense_t_end=20.0,
-        t_end=20.0,
-        repeats=size.repeats,
-    )
-    atoms = replace(
-        small,
-        title="SAM",
-        dense=systems.simple_atomic_model,
-        structured=systems.simple_atomic_model,
-        paper_minimum=20,
-        dense_num_micro=size.sam_num_micro,
-        num_micro=size.sam_num_micro,
-        micro_dt=0.001,
-        dense_t_end=0.2,
-        t_end=1.0,
+    chain, atoms = systems.fermi_pasta_ulam, systems.simple_atomic_model
+    n, m = size.fpu_num_micro, size.sam_num_micro
+    small = (
+        CostPanel("FPU, l = 3", chain, chain, vm.fully_implicit, 60, n, n, 0.01, 20.0, 20.0, size.repeats),
+        CostPanel("SAM", atoms, atoms, vm.fully_implicit, 20, m, m, 0.001, 0.2, 1.0, size.repeats),
     )
     chains = tuple(_chain_panel(size, name, length) for name in SCHEMES for length in size.chain_lengths[name])
     return (
@@ -126,7 +107,7 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
             "Computing time against micro steps",
             "FPU with l = 3 is cheapest at 60 micro steps per macro step (183 unknowns), the simple atomic model at 20 "
             "(307 unknowns); then the dense solve makes the curves turn up again.",
-            (small, atoms),
+            small,
         ),
         CostFigure(
             "fig5",
@@ -139,15 +120,14 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
 
 
 def _chain_panel(size: Size, scheme: str, num_springs: int) -> CostPanel:
-    minima = [n for low, high, n in PAPER_MINIMA[scheme] if low <= num_springs <= high]
     chain = partial(systems.fermi_pasta_ulam, num_springs)
     feasible = tuple(n for n in size.chain_num_micro if num_springs * (n + 1) <= size.largest_dense)
     return CostPanel(
         title=f"{scheme}, l = {num_springs}",
-        dense=chain if scheme == "fully implicit" else partial(unstructured_chain, num_springs),
+        dense=chain if scheme == "fully implicit" else lambda: unstructured(chain()),
         structured=chain,
         scheme=SCHEMES[scheme],
-        paper_minimum=minima[0] if minima else None,
+        paper_minimum=paper_minimum(scheme, num_springs),
         dense_num_micro=feasible,
         num_micro=size.chain_num_micro,
         micro_dt=0.01,
@@ -162,9 +142,8 @@ def kinetic_energy(q_s, q_f, v_s, v_f, params):
     return (v_s @ v_s + v_f @ v_f) / 2
 
 
-def unstructured_chain(num_springs: int) -> vm.Problem:
-    """The FPU chain with T as a plain function: every scheme then solves for all unknowns of a macro step at once."""
-    problem = systems.fermi_pasta_ulam(num_springs)
+def unstructured(problem: vm.Problem) -> vm.Problem:
+    """A chain with T as a plain function: every scheme then solves for all unknowns of a macro step at once."""
     return replace(problem, system=problem.system.replace(kinetic=kinetic_energy))
 
 
@@ -173,9 +152,9 @@ def _both(scheme, **arguments) -> dict[str, vm.Scheme]:
 
 
 def _convergence_figure(
-    problem, macro_dt, name: str, title: str, paper: str, schemes: dict, orders: dict[str, int] | int, source="paper"
+    problem, macro_dt, name: str, title: str, paper: str, schemes: dict[str, vm.Scheme], source="paper"
 ) -> ConvergenceFigure:
-    orders = orders if isinstance(orders, dict) else dict.fromkeys(schemes, orders)
+    orders = {label: scheme.order for label, scheme in schemes.items()}
     return ConvergenceFigure(name, title, paper, problem, schemes, orders, source, macro_dt)
 
 
@@ -189,11 +168,11 @@ def _fpu_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
         for label, scheme in _both(family, alpha=0.5).items()
     }
     return (
-        figure("fig6", "FPU, fully explicit", saw.format(1), _both(vm.fully_explicit, alpha=0.0), 1),
-        figure("fig7", "FPU, explicit slow", saw.format(1), _both(vm.explicit_slow, alpha=0.0), 1),
-        figure("fig8", "FPU, fully implicit", saw.format(2), _both(vm.fully_implicit), 2),
-        figure("fpu-half", "FPU, explicit schemes with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
-        finer("fpu-degree", "FPU, degree 2 and 3", _NOT_IN_PAPER, *_degrees(size.degree_num_micro), "theory"),
+        figure("fig6", "FPU, fully explicit", saw.format(1), _both(vm.fully_explicit, alpha=0.0)),
+        figure("fig7", "FPU, explicit slow", saw.format(1), _both(vm.explicit_slow, alpha=0.0)),
+        figure("fig8", "FPU, fully implicit", saw.format(2), _both(vm.fully_implicit)),
+        figure("fpu-half", "FPU, explicit schemes with α = 1/2", _NOT_IN_PAPER, half, "theory"),
+        finer("fpu-degree", "FPU, degree 2 and 3", _NOT_IN_PAPER, _degrees(size.degree_num_micro), "theory"),
     )
 
 
@@ -203,19 +182,18 @@ def _tsp_figures(size: Size) -> tuple[ConvergenceFigure, ...]:
     tsp = "Triple spherical pendulum"
     half = _both(vm.fully_explicit, alpha=0.5)
     return (
-        figure("fig9", f"{tsp}, fully implicit", "order 2.", _both(vm.fully_implicit), 2),
-        figure("fig10", f"{tsp}, fully explicit", "order 1.", _both(vm.fully_explicit, alpha=0.0), 1),
-        figure("tsp-half", f"{tsp}, fully explicit with α = 1/2", _NOT_IN_PAPER, half, 2, "theory"),
-        finer("tsp-degree", f"{tsp}, degree 2 and 3", _NOT_IN_PAPER, *_degrees(size.degree_num_micro), "theory"),
+        figure("fig9", f"{tsp}, fully implicit", "order 2.", _both(vm.fully_implicit)),
+        figure("fig10", f"{tsp}, fully explicit", "order 1.", _both(vm.fully_explicit, alpha=0.0)),
+        figure("tsp-half", f"{tsp}, fully explicit with α = 1/2", _NOT_IN_PAPER, half, "theory"),
+        finer("tsp-degree", f"{tsp}, degree 2 and 3", _NOT_IN_PAPER, _degrees(size.degree_num_micro), "theory"),
     )
 
 
 _NOT_IN_PAPER = "not in the paper; the theory says order min(2 × degree, order of the quadrature)."
 
 
-def _degrees(num_micro: tuple[int, ...]) -> tuple[dict[str, vm.Scheme], dict[str, int]]:
-    """Galerkin schemes of degree 2 and 3 with Gauss quadrature, and their orders 4 and 6."""
-    schemes = {
+def _degrees(num_micro: tuple[int, ...]) -> dict[str, vm.Scheme]:
+    """Galerkin schemes of degree 2 and 3 with Gauss quadrature, of order 4 and 6."""
+    return {
         f"degree {degree}, {n} micro steps": vm.galerkin(n, degree, "gauss") for degree in (2, 3) for n in num_micro
     }
-    return schemes, {label: scheme.order for label, scheme in schemes.items()}

@@ -4,6 +4,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from benchmarks.gail2014.figures import Check, ConvergenceFigure, CostFigure
@@ -17,7 +18,7 @@ TEMPLATE = Path(__file__).parent / "report.html.j2"
 
 @dataclass(frozen=True)
 class FigureResult:
-    """One figure of the report: its line of the paper, its line of today, its checks and files, or why it failed."""
+    """One figure of the report: what the paper saw, what was seen, checks and images, or why it failed."""
 
     name: str
     title: str
@@ -51,19 +52,9 @@ def reproduce(
     progress: Progress = silent,
     figure_done: Callable[[FigureResult], None] | None = None,
 ) -> Report:
-    """Run the reference study and write figures (PNG, SVG), tables (CSV) and ``report.html`` into `out`.
+    """Run the study, or `only` some figures, and write figures, tables and ``report.html`` after each of them.
 
-    A figure that fails is reported as failed; the others are kept. The report is rewritten after every figure.
-
-    Args:
-        out: folder, made if it does not exist.
-        size: "quick" or "full", see `reference_figures`.
-        only: names of the figures to run, all if empty.
-        progress: told what is running.
-        figure_done: called with every result.
-
-    Raises:
-        ValueError: an unknown size or figure name.
+    A figure that fails is reported as failed; the others are kept.
     """
     chosen = choose_figures(reference_figures(size), only)
     out = Path(out)
@@ -92,6 +83,7 @@ def choose_figures(
 
 def _run_figure(figure, out: Path, references: dict, progress: Progress) -> FigureResult:
     start = time.perf_counter()
+    result = partial(FigureResult, figure.name, figure.title, figure.paper)
     try:
         findings = figure.measure(progress, references)
         findings.study.to_csv(out / f"{figure.name}.csv")
@@ -99,21 +91,12 @@ def _run_figure(figure, out: Path, references: dict, progress: Progress) -> Figu
         (out / f"{figure.name}.svg").write_bytes(svg(findings.draw("", plots.LIGHT), plots.LIGHT))
         images = embedded(lambda theme: findings.draw("", theme))
     except Exception as error:  # whatever it is, the other figures are worth having
-        seconds, message = time.perf_counter() - start, f"{type(error).__name__}: {error}"
-        details = "".join(traceback.format_exception(error))
-        return FigureResult(figure.name, figure.title, figure.paper, "", (), seconds, error=message, traceback=details)
-    seconds = time.perf_counter() - start
-    return FigureResult(figure.name, figure.title, figure.paper, findings.seen, findings.checks, seconds, *images)
+        message, details = f"{type(error).__name__}: {error}", "".join(traceback.format_exception(error))
+        return result("", (), time.perf_counter() - start, error=message, traceback=details)
+    return result(findings.seen, findings.checks, time.perf_counter() - start, *images)
 
 
 def _write_html(path: Path, results: list[FigureResult], size: str, seconds: float) -> None:
-    checks = [check for figure in results for check in figure.checks]
-    write_page(
-        path,
-        TEMPLATE,
-        figures=results,
-        agreeing=sum(check.agrees for check in checks),
-        num_checks=len(checks),
-        size=size,
-        minutes=seconds / 60,
-    )
+    agreeing = [check.agrees for figure in results for check in figure.checks]
+    about = {"agreeing": sum(agreeing), "num_checks": len(agreeing), "size": size, "minutes": seconds / 60}
+    write_page(path, TEMPLATE, figures=results, **about)

@@ -1,11 +1,14 @@
 """Cases 8 to 10: constraints that are slow only, that hardly see the fast variables, that are redundant."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.systems import four_bar, nearly_slow_constraint
-from vmri_jax.check import Case, Outcome
+from vmri_jax.check import Outcome
 from vmri_jax.check.measures import constraints, difference, iterations, nodes, run, status
 from vmri_jax.systems.triple_spherical_pendulum import first_rod, second_rod
 
@@ -24,19 +27,27 @@ def both_rods(q_s, q_f, params):
     return jnp.concatenate([first_rod(q_s, params), second_rod(q_s, q_f, params)])
 
 
+@hard_case(8, "slow-only constraint on micro nodes")
 def slow_only_constraint(full: bool) -> Outcome:
-    """A constraint of slow variables alone on the micro grid is refused, with what to do instead."""
+    """triple pendulum, first rod passed as `constraint`
+
+    refused with the row, the reason (rank deficit num_micro - 1) and the fix
+    """
     problem = vm.systems.triple_spherical_pendulum()
     system = problem.system.replace(constraint=both_rods, slow_constraint=None)
-    said = refusal(vm.Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f))
+    said = refusal(replace(problem, system=system))
     parts = {"row": "row(s) [0]", "reason": "rank deficit num_micro - 1", "fix": "slow_constraint(q_s, params)"}
     found = {name: text in said for name, text in parts.items()}
     words = ", ".join(name for name, there in found.items() if there)
     return Outcome(f"refused, with {words}" if said else "not refused", all(found.values()), found)
 
 
+@hard_case(9, "rank-deficient fast Jacobian")
 def weak_fast_jacobian(full: bool) -> Outcome:
-    """A constraint that the fast variables enter ever more weakly."""
+    """g = (|q_1|^2 + eps z_2^2 - l^2)/2, eps = 1 to 1e-8, and 0
+
+    eps >= 1e-4 converges, 0 is recognised as slow-only
+    """
     macro_dt, values, said = 1e-3, {}, {}
     for eps in (1.0, 1e-2, 1e-4, 1e-6, 1e-8):
         trajectory = run(nearly_slow_constraint(eps), vm.fully_implicit(5), macro_dt, 10_000 if full else 1_000)
@@ -55,17 +66,17 @@ def weak_fast_jacobian(full: bool) -> Outcome:
     )
 
 
+@hard_case(10, "redundant constraints")
 def redundant_constraints(full: bool) -> Outcome:
-    """A constraint given twice: the same motion, or a refusal that names the rows."""
+    """four-bar linkage with its coupler given twice
+
+    positions equal to 1e-10 with and without, or a refusal that names the rows
+    """
     once, twice = (four_bar(angle=-1.0, kappa=20.0, redundant=redundant) for redundant in (False, True))
-    said = refusal(twice)
-    if said:
+    if said := refusal(twice):
         named = "rows [1, 3]" in said
-        return Outcome(
-            f"refused, rows {'named' if named else 'not named'}: {said.partition(' in the ')[0]}",
-            named,
-            {"named": named},
-        )
+        words = f"refused, rows {'named' if named else 'not named'}: {said.partition(' in the ')[0]}"
+        return Outcome(words, named, {"named": named})
     runs = [run(problem, vm.fully_implicit(5), 0.05, 1000 if full else 200) for problem in (once, twice)]
     apart = difference(*(nodes(trajectory) for trajectory in runs))
     return Outcome(
@@ -73,28 +84,3 @@ def redundant_constraints(full: bool) -> Outcome:
         runs[1].success and apart < 1e-10,
         {"apart": apart, "constraint": constraints(runs[1])[0]},
     )
-
-
-CONSTRAINTS = (
-    Case(
-        8,
-        "slow-only constraint on micro nodes",
-        "triple pendulum, first rod passed as `constraint`",
-        "refused with the row, the reason (rank deficit num_micro - 1) and the fix",
-        slow_only_constraint,
-    ),
-    Case(
-        9,
-        "rank-deficient fast Jacobian",
-        "g = (|q_1|^2 + eps z_2^2 - l^2)/2, eps = 1 to 1e-8, and 0",
-        "eps >= 1e-4 converges, 0 is recognised as slow-only",
-        weak_fast_jacobian,
-    ),
-    Case(
-        10,
-        "redundant constraints",
-        "four-bar linkage with its coupler given twice",
-        "positions equal to 1e-10 with and without, or a refusal that names the rows",
-        redundant_constraints,
-    ),
-)

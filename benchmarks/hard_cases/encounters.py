@@ -7,14 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.systems import bouncing_ball, two_body
-from vmri_jax.check import Case, Outcome
+from vmri_jax.check import Outcome
 from vmri_jax.check.measures import energy, long_run, run, status
 from vmri_jax.study.timing import interleaved
 
 
+@hard_case(19, "stiff penalty contact")
 def penalty_contact(full: bool) -> Outcome:
-    """A ball that bounces on a stiff floor: rebound height, and the jump of the energy at each contact."""
+    """ball on a floor of k = 1e8, 100 bounces, num_micro 20, H = 1e-4
+
+    height within 1 %, no energy jump above 1e-3
+    """
     problem, macro_dt, bounces = bouncing_ball(), 1e-4, 100 if full else 3
     period = 2 * np.sqrt(2 * 1.0 / 9.81)
     steps = int((bounces + 0.5) * period / macro_dt) // 20 * 20
@@ -37,8 +42,12 @@ def penalty_contact(full: bool) -> Outcome:
     )
 
 
+@hard_case(21, "norm at zero")
 def norm_at_zero(full: bool) -> Outcome:
-    """A spring of nearly no length: derivatives stay finite, coincident points fail plainly."""
+    """triple pendulum with l_3 = 0.01, points 1e-2 to 1e-8 apart, and coincident
+
+    finite gradients; coincident points fail plainly
+    """
     problem = vm.systems.triple_spherical_pendulum(lengths=(10.0, 2.0, 0.01))
     steps, scheme, newton = 500 if full else 50, vm.fully_explicit(2), vm.Newton(method="nested")
 
@@ -68,8 +77,12 @@ def norm_at_zero(full: bool) -> Outcome:
     )
 
 
+@hard_case(22, "close encounter")
 def close_encounter(full: bool) -> Outcome:
-    """A Kepler orbit of high eccentricity: energy error, and what it costs."""
+    """two bodies, e = 0.9, centre of mass in a trap
+
+    relative energy error below 1e-5 at a stated cost
+    """
     problem, orbits = two_body(0.9), 100 if full else 5
     settings = {
         "impulse, kahan-li8": (vm.compose(vm.fully_explicit(10), "kahan-li8"), 200),
@@ -82,28 +95,3 @@ def close_encounter(full: bool) -> Outcome:
         seconds = min(interleaved({"": lambda s=scheme, n=per_orbit: run(problem, s, 2 * np.pi / n, 5 * n).q_f}, 3)[""])
         said.append(f"{name} {values[name]:.1e} at {per_orbit} steps, {seconds / 5 * 1e6:.0f} us an orbit")
     return Outcome(f"relative energy error: {'; '.join(said)}", values["impulse, kahan-li8"] < 1e-5, values)
-
-
-CONTACT = Case(
-    19,
-    "stiff penalty contact",
-    "ball on a floor of k = 1e8, 100 bounces, num_micro 20, H = 1e-4",
-    "height within 1 %, no energy jump above 1e-3",
-    penalty_contact,
-)
-ENCOUNTERS = (
-    Case(
-        21,
-        "norm at zero",
-        "triple pendulum with l_3 = 0.01, points 1e-2 to 1e-8 apart, and coincident",
-        "finite gradients; coincident points fail plainly",
-        norm_at_zero,
-    ),
-    Case(
-        22,
-        "close encounter",
-        "two bodies, e = 0.9, centre of mass in a trap",
-        "relative energy error below 1e-5 at a stated cost",
-        close_encounter,
-    ),
-)

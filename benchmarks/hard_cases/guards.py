@@ -1,30 +1,26 @@
 """Cases 27 and 28: single precision, one bad lane in a batch."""
 
 import vmri_jax as vm
-from vmri_jax.check import Case, Outcome
+from benchmarks.hard_cases.case import hard_case
+from vmri_jax.check import Outcome
 from vmri_jax.check.guards import bad_lane, single_precision
 
 
+@hard_case(27, "float32")
+def float32(full: bool) -> Outcome:
+    """64-bit mode off, and float32 data
+
+    refused with the one-line fix
+    """
+    return single_precision(vm.systems.fermi_pasta_ulam())
+
+
+@hard_case(28, "one bad lane in a batch")
 def one_bad_lane(full: bool) -> Outcome:
-    """One absurd start among those of a batch of the FPU chain."""
+    """256 starts of the FPU chain, one of them absurd
+
+    the bad lane reports its failure, the others equal their single runs to 1e-12
+    """
     problem = vm.systems.fermi_pasta_ulam()
     newton = vm.Newton() if full else vm.Newton(method="nested")  # by default a lane that fails is tried again, exactly
     return bad_lane(problem, vm.fully_implicit(5), 0.01, 100, newton, compared=256 if full else 4)
-
-
-GUARDS = (
-    Case(
-        27,
-        "float32",
-        "64-bit mode off, and float32 data",
-        "refused with the one-line fix",
-        lambda full: single_precision(vm.systems.fermi_pasta_ulam()),
-    ),
-    Case(
-        28,
-        "one bad lane in a batch",
-        "256 starts of the FPU chain, one of them absurd",
-        "the bad lane reports its failure, the others equal their single runs to 1e-12",
-        one_bad_lane,
-    ),
-)

@@ -1,20 +1,27 @@
 """Cases 5 to 7 and 13 to 15: explicit limit, large and tiny steps, mass ratios, very many micro steps."""
 
 import time
+from functools import partial
 
 import numpy as np
 
 import vmri_jax as vm
-from vmri_jax.check import Case, Outcome
+from benchmarks.hard_cases.case import hard_case
+from vmri_jax.check import Outcome
 from vmri_jax.check.measures import constraints, difference, energy, iterations, nodes, run, status
 from vmri_jax.diagnostics import step_condition
+from vmri_jax.study.timing import interleaved
 
 EXACT = vm.Newton(method="arrowhead")
 """Newton's iteration with the exact matrix, whose iterations are counted."""
 
 
+@hard_case(5, "explicit limit")
 def explicit_limit(full: bool) -> Outcome:
-    """The explicit chain below, at and above omega h = 2."""
+    """FPU chain, fully_explicit, omega h = 1.9, 2.0, 2.1
+
+    stable, marginal, and a clean error
+    """
     problem, num_micro, steps = vm.systems.fermi_pasta_ulam(), 2, 20_000 if full else 5_000
     scheme = vm.fully_explicit(num_micro)  # with more micro steps omega h = 1.9 meets an impulse resonance
     below, at, beyond = (run(problem, scheme, num_micro * wh / 50.0, steps, save_every=20) for wh in (1.9, 2.0, 2.1))
@@ -29,8 +36,12 @@ def explicit_limit(full: bool) -> Outcome:
     )
 
 
+@hard_case(6, "large macro step")
 def large_macro_step(full: bool) -> Outcome:
-    """Newton's iterations where the macro step is many fast periods long."""
+    """FPU chain, fully_implicit, num_micro 100, H = 1 and H = 2
+
+    at most 8 Newton iterations; H = 2 fails plainly or stays bounded
+    """
     problem, scheme, steps = vm.systems.fermi_pasta_ulam(), vm.fully_implicit(100), 100 if full else 20
     one, two = (run(problem, scheme, h, steps, newton=EXACT) for h in (1.0, 2.0))
     at_first = int(np.max(np.asarray(one.info.iterations)[:20]))
@@ -51,8 +62,12 @@ def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int) -> vm.Tr
     return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, newton=EXACT)
 
 
+@hard_case(7, "large constrained step")
 def large_constrained_step(full: bool) -> Outcome:
-    """Newton's iterations of the pendulum at steps far above the usual ones."""
+    """triple pendulum, H = 0.05 and H = 0.2
+
+    at most 4 Newton iterations; H = 0.2 goes on or fails plainly, constraints kept
+    """
     problem = vm.systems.triple_spherical_pendulum()
     usual, large = (_pendulum_run(problem, h, 400 if full else 40) for h in (0.05, 0.2))
     kept = float(np.nanmax(np.asarray(large.constraint_residual)[:, 0]))
@@ -63,8 +78,12 @@ def large_constrained_step(full: bool) -> Outcome:
     )
 
 
+@hard_case(13, "mass ratios 1e4 to 1e8")
 def mass_ratios(full: bool) -> Outcome:
-    """Iterations and condition as the slow mass grows against the fast ones."""
+    """triple pendulum, H = 0.01
+
+    at most 5 Newton iterations, scaled condition below 100
+    """
     values = {}
     for ratio in (1e4, 1e6, 1e8):
         problem = vm.systems.triple_spherical_pendulum(masses=(ratio, 1.0, 1.0))
@@ -80,8 +99,12 @@ def mass_ratios(full: bool) -> Outcome:
     )
 
 
+@hard_case(14, "tiny steps")
 def tiny_steps(full: bool) -> Outcome:
-    """Condition and round-off as the macro step shrinks to 1e-6."""
+    """triple pendulum, H from 0.1 to 1e-6
+
+    scaled condition flat, round-off floor stated
+    """
     problem = vm.systems.triple_spherical_pendulum()
     state, steps = problem.state(), 10.0 ** -np.arange(1.0, 7.0)
     conditions = np.array([step_condition(problem.system, PENDULUM, state, h) for h in steps])
@@ -96,8 +119,12 @@ def tiny_steps(full: bool) -> Outcome:
     )
 
 
+@hard_case(15, "very many micro steps")
 def many_micro_steps(full: bool) -> Outcome:
-    """Time per macro step against num_micro, and the dense solve as an oracle."""
+    """FPU chain, H = 0.1, num_micro 200 to 5000
+
+    time linear (slope 1 within 0.15), equal to the dense solve to 1e-11
+    """
     problem, macro_dt, micro = vm.systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
 
     def end(num_micro, steps, newton=None):  # one saved node: one program for each num_micro
@@ -105,14 +132,9 @@ def many_micro_steps(full: bool) -> Outcome:
         return nodes(run(problem, scheme, macro_dt, steps, save_every=steps, newton=newton))[-1]
 
     steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
-    for n in micro:
-        end(n, steps[n])  # compiles
-    best = dict.fromkeys(micro, np.inf)
-    for _ in range(40 if full else 20):
-        for n in micro:  # in turns; the time of the processor, which others on the machine do not stretch
-            start = time.process_time()
-            end(n, steps[n])
-            best[n] = min(best[n], (time.process_time() - start) / steps[n])
+    runs = {f"{n}": partial(end, n, steps[n]) for n in micro}
+    seconds = interleaved(runs, 40 if full else 20, min_seconds=0.0, clock=time.process_time)
+    best = {n: min(seconds[f"{n}"]) / steps[n] for n in micro}
     slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
     apart = difference(end(micro[0], 3), end(micro[0], 3, vm.Newton(method="dense")))
     return Outcome(
@@ -120,51 +142,3 @@ def many_micro_steps(full: bool) -> Outcome:
         abs(slope - 1) <= 0.15 and apart < 1e-11,
         {"slope": slope, "from_dense": apart, **{f"seconds_{n}": s for n, s in best.items()}},
     )
-
-
-EXPLICIT_LIMIT = Case(
-    5,
-    "explicit limit",
-    "FPU chain, fully_explicit, omega h = 1.9, 2.0, 2.1",
-    "stable, marginal, and a clean error",
-    explicit_limit,
-)
-LARGE_STEPS = (
-    Case(
-        6,
-        "large macro step",
-        "FPU chain, fully_implicit, num_micro 100, H = 1 and H = 2",
-        "at most 8 Newton iterations; H = 2 fails plainly or stays bounded",
-        large_macro_step,
-    ),
-    Case(
-        7,
-        "large constrained step",
-        "triple pendulum, H = 0.05 and H = 0.2",
-        "at most 4 Newton iterations; H = 0.2 goes on or fails plainly, constraints kept",
-        large_constrained_step,
-    ),
-)
-SCALES_OF_STEPS = (
-    Case(
-        13,
-        "mass ratios 1e4 to 1e8",
-        "triple pendulum, H = 0.01",
-        "at most 5 Newton iterations, scaled condition below 100",
-        mass_ratios,
-    ),
-    Case(
-        14,
-        "tiny steps",
-        "triple pendulum, H from 0.1 to 1e-6",
-        "scaled condition flat, round-off floor stated",
-        tiny_steps,
-    ),
-    Case(
-        15,
-        "very many micro steps",
-        "FPU chain, H = 0.1, num_micro 200 to 5000",
-        "time linear (slope 1 within 0.15), equal to the dense solve to 1e-11",
-        many_micro_steps,
-    ),
-)

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
-from vmri_jax.check import Case, Outcome
+from benchmarks.hard_cases.case import hard_case
+from vmri_jax.check import Outcome
 from vmri_jax.check.measures import (
     constraints,
     difference,
@@ -31,8 +32,12 @@ def hanging_pendulum() -> vm.Problem:
     return vm.Problem(problem.system, jnp.array([0.0, 0.0, -l_1]), q_f, v_s, v_f)
 
 
+@hard_case(16, "constraints for long", draw_energy)
 def constraints_for_long(full: bool) -> Outcome:
-    """Constraints and energy of a pendulum, from a hanging start and from one that becomes chaotic."""
+    """triple pendulum, fully_implicit, num_micro 5, H = 0.01, 1e6 steps
+
+    position constraint below 1e-12, relative energy shift below 1e-6 per 1e5 steps; no drift seen in chaotic motion
+    """
     steps = 1_000_000 if full else 200_000  # in fewer chaotic motion alone may move the mean by half of the band
     wild, calm = vm.systems.triple_spherical_pendulum(), hanging_pendulum()
     trajectory, regular = (long_run(problem, vm.fully_implicit(5), 0.01, steps) for problem in (wild, calm))
@@ -54,8 +59,12 @@ def constraints_for_long(full: bool) -> Outcome:
     )
 
 
+@hard_case(17, "energy for long", draw_energy)
 def energy_for_long(full: bool) -> Outcome:
-    """The energy band of the whole run against that of its first tenth."""
+    """FPU chain, fully_implicit, num_micro 10, H = 0.03, 1e6 steps
+
+    energy band of the whole run at most twice that of its first tenth
+    """
     steps = 1_000_000 if full else 100_000
     trajectory = long_run(vm.systems.fermi_pasta_ulam(), vm.fully_implicit(10), CHAIN_DT, steps)
     e = np.abs(np.asarray(trajectory.energy) - trajectory.energy[0])
@@ -70,8 +79,12 @@ def energy_for_long(full: bool) -> Outcome:
     )
 
 
+@hard_case(18, "loose Newton tolerance", draw_energy)
 def loose_tolerance(full: bool) -> Outcome:
-    """The drift of the energy against the tolerance, where the matrix of Newton's iteration is a crude one."""
+    """case 17 with tolerance 1e-4, 1e-8, 1e-12 (method nested), and by default
+
+    drift shrinks with the tolerance, the default shows none
+    """
     steps, problem = 1_000_000 if full else 100_000, vm.systems.fermi_pasta_ulam()
     changes, details = {}, {}
     newtons = {name: vm.Newton("nested", tolerance=float(name)) for name in ("1e-4", "1e-8", "1e-12")}
@@ -89,8 +102,12 @@ def loose_tolerance(full: bool) -> Outcome:
     )
 
 
+@hard_case(20, "chaotic pendulum")
 def chaotic_pendulum(full: bool) -> Outcome:
-    """The fall from nearly upright: constraints and energy; the order before chaos sets in."""
+    """triple pendulum, upright but for 1e-3, t = 100
+
+    constraints below 1e-12, energy error below 1 % of the fall; order 2 on t <= 1
+    """
     problem = vm.systems.triple_spherical_pendulum()
     lengths = np.asarray(problem.system.params["lengths"])
     tilt = np.array([np.sin(1e-3), 0.0, np.cos(1e-3)])
@@ -116,38 +133,3 @@ def chaotic_pendulum(full: bool) -> Outcome:
 def _energy_picture(trajectory: vm.Trajectory) -> dict:
     e = np.asarray(trajectory.energy)
     return {"t": trajectory.t, "energy error": e - e[0]}
-
-
-LONG_RUNS = (
-    Case(
-        16,
-        "constraints for long",
-        "triple pendulum, fully_implicit, num_micro 5, H = 0.01, 1e6 steps",
-        "position constraint below 1e-12, relative energy shift below 1e-6 per 1e5 steps; no drift seen in chaotic motion",
-        constraints_for_long,
-        draw_energy,
-    ),
-    Case(
-        17,
-        "energy for long",
-        "FPU chain, fully_implicit, num_micro 10, H = 0.03, 1e6 steps",
-        "energy band of the whole run at most twice that of its first tenth",
-        energy_for_long,
-        draw_energy,
-    ),
-    Case(
-        18,
-        "loose Newton tolerance",
-        "case 17 with tolerance 1e-4, 1e-8, 1e-12 (method nested), and by default",
-        "drift shrinks with the tolerance, the default shows none",
-        loose_tolerance,
-        draw_energy,
-    ),
-)
-CHAOS = Case(
-    20,
-    "chaotic pendulum",
-    "triple pendulum, upright but for 1e-3, t = 100",
-    "constraints below 1e-12, energy error below 1 % of the fall; order 2 on t <= 1",
-    chaotic_pendulum,
-)

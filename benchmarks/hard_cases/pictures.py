@@ -8,9 +8,8 @@ from vmri_jax.check.case import Details
 
 
 def draw_windows(details: Details, theme: plots.Theme) -> Figure:
-    """Unstable intervals of omega H / pi of the linear model, one line per num_micro; narrow ones at least a hairline."""
-    with plots.style(theme):
-        figure = plots.NotebookFigure(figsize=(7.2, 2.6))
+    """Unstable intervals of omega H / pi of the linear model, one line per num_micro."""
+    with plots.new_figure(7.2, 2.6, "", theme) as figure:
         axes = figure.subplots()
         for k, ((_, windows), color) in enumerate(zip(details.items(), theme.curves, strict=False)):
             bars = [(start / np.pi, (stop - start) / np.pi) for start, stop in windows]
@@ -23,8 +22,7 @@ def draw_windows(details: Details, theme: plots.Theme) -> Figure:
 
 def draw_singular(details: Details, theme: plots.Theme) -> Figure:
     """Height of the crank through the collinear position, and the falling chain, started straight."""
-    with plots.style(theme):
-        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+    with plots.new_figure(7.2, 3.2, "", theme) as figure:
         left, right = figure.subplots(1, 2)
         left.plot(details["t"], details["height"], color=theme.curves[0])
         left.axhline(0.0, color=theme.ink, linewidth=0.5, linestyle=":")
@@ -40,8 +38,7 @@ def draw_singular(details: Details, theme: plots.Theme) -> Figure:
 
 def draw_oscillatory_energies(details: Details, theme: plots.Theme) -> Figure:
     """Oscillatory energies of the three stiff springs, large steps over resolved ones."""
-    with plots.style(theme):
-        figure = plots.NotebookFigure(figsize=(7.2, 3.2))
+    with plots.new_figure(7.2, 3.2, "", theme) as figure:
         axes = figure.subplots()
         for i, color in zip(range(2), theme.curves, strict=False):
             axes.plot(details["t"], details["fine"][:, i], color=color, linewidth=0.7, alpha=0.5)

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.pictures import draw_windows
 from benchmarks.hard_cases.systems import cubic_chain, swapped_chain
-from vmri_jax.check import Case, Outcome
+from vmri_jax.check import Outcome
 from vmri_jax.check.measures import energy, long_run, status
 from vmri_jax.stability import advise, linear_model, stability_map
 
@@ -17,8 +18,17 @@ STARTS = 9
 """Runs of a chaotic motion whose median counts."""
 
 
+def advised(advice) -> str:
+    """In words."""
+    return "let pass" if advice.ok else "advised against"
+
+
+@hard_case(1, "impulse resonance", draw_windows)
 def impulse_resonance(full: bool) -> Outcome:
-    """The first unstable step of explicit_slow for each num_micro, from the multipliers of the linear model."""
+    """linear model, kappa = 25, omega = 50, explicit_slow, omega H to 4 pi
+
+    first unstable omega H / pi within 0.005 of 1.248 (2), 1.089 (3), 1.025 (5), 0.999 (10), 0.993 (20); advice
+    """
     model = linear_model(omega=50.0, kappa=25.0)
     expected = FIRST_UNSTABLE if full else {n: FIRST_UNSTABLE[n] for n in (2, 5)}
     omega_H = np.linspace(0.05, 4 * np.pi, 250)
@@ -26,18 +36,22 @@ def impulse_resonance(full: bool) -> Outcome:
     first = {n: found.first_unstable(n) / np.pi for n in expected}
     first_window = found.windows(5)[0]
     macro_dt = (first_window.start + first_window.stop) / 2 / found.omega
-    warned = not advise(model.system, vm.explicit_slow(5), model.state(), macro_dt).ok
+    advice = advise(model.system, vm.explicit_slow(5), model.state(), macro_dt)
     words = ", ".join(f"{value:.3f} ({n})" for n, value in first.items())
     return Outcome(
-        f"first unstable omega H / pi (num_micro): {words}; a step in the window is {'advised against' if warned else 'let pass'}",
-        warned and all(abs(first[n] - expected[n]) < 0.005 for n in expected),
-        {f"first_unstable_{n}": value for n, value in first.items()} | {"warned": warned},
+        f"first unstable omega H / pi (num_micro): {words}; a step in the window is {advised(advice)}",
+        not advice.ok and all(abs(first[n] - expected[n]) < 0.005 for n in expected),
+        {f"first_unstable_{n}": value for n, value in first.items()} | {"warned": not advice.ok},
         {str(n): np.array([(window.start, window.stop) for window in found.windows(n)]) for n in expected},
     )
 
 
+@hard_case(2, "FPU at omega H = pi")
 def chain_at_half_period(full: bool) -> Outcome:
-    """The chain where omega H is pi: what advice says, and what the implicit scheme does."""
+    """FPU chain, H = 0.0628, num_micro 30, t = 200
+
+    explicit_slow advised against; fully_implicit energy error below 3e-3
+    """
     problem, macro_dt, num_micro = vm.systems.fermi_pasta_ulam(), 0.0628, 30
     steps = round((200 if full else 50) / macro_dt)
     implicit = long_run(problem, vm.fully_implicit(num_micro), macro_dt, steps)
@@ -45,15 +59,19 @@ def chain_at_half_period(full: bool) -> Outcome:
     advice = advise(problem.system, vm.explicit_slow(num_micro), problem.state(), macro_dt)
     error = energy(implicit, steps).band
     return Outcome(
-        f"explicit_slow {'advised against' if not advice.ok else 'let pass'} (it ends in {status(kicked)}); fully_implicit: largest "
+        f"explicit_slow {advised(advice)} (it ends in {status(kicked)}); fully_implicit: largest "
         f"energy error {error:.2g} to t = {steps * macro_dt:.0f}",
         not advice.ok and implicit.success and error < 3e-3,
         {"energy_error": error, "warned": not advice.ok, "explicit_slow_failed_at": kicked.failed_at},
     )
 
 
+@hard_case(3, "implicit combination resonance")
 def combination_resonance(full: bool) -> Outcome:
-    """A slow growth of the implicit scheme: in the multipliers, in a run, in the advice."""
+    """linear model, kappa = 25, fully_implicit, omega h = 0.1, num_micro 57
+
+    growth 8.4e-4 per step found, and advised against
+    """
     model, scheme, num_micro = linear_model(omega=50.0, kappa=25.0), vm.fully_implicit(57), 57
     at = 0.1 * num_micro
     found = stability_map(model, scheme, [0.99 * at, at])
@@ -64,19 +82,19 @@ def combination_resonance(full: bool) -> Outcome:
     measured = np.polyfit(k[len(k) // 3 :], np.log(e[len(k) // 3 :]) / 2, 1)[0]  # energies grow as squares
     advice = advise(model.system, scheme, model.state(), at / 50.0)
     return Outcome(
-        f"growth {growth:.2e} per step from the eigenvalues, {measured:.2e} in a run of {steps} steps; "
-        f"{'advised against' if not advice.ok else 'let pass'}",
+        f"growth {growth:.2e} per step from the eigenvalues, {measured:.2e} in a run of {steps} steps; {advised(advice)}",
         abs(growth / 8.4e-4 - 1) < 0.2 and abs(measured / growth - 1) < 0.2 and not advice.ok,
         {"growth": growth, "growth_of_run": measured, "warned": not advice.ok},
     )
 
 
+@hard_case(4, "nonlinear resonance T/3, T/4")
 def nonlinear_resonance(full: bool) -> Outcome:
-    """Drift of the energy where omega H is a third and a quarter of a turn.
+    """FPU chain with cubic coupling, explicit_slow, omega H = 2 pi / 3 and pi / 2, 1e5 steps
 
-    The motion is chaotic and its energy wanders up and down in a wide band, at random in a single run: the drift is the median of
-    runs whose starts differ by round-off.
+    relative energy drift below 1e-6 per step, or flagged
     """
+    # the motion is chaotic: its energy wanders, and the drift is a median over starts that differ by round-off
     problem, scheme, steps = cubic_chain(), vm.explicit_slow(10), 100_000
     starts = [replace(problem, q_s=problem.q_s * (1 + k * 1e-14)) for k in range(STARTS)]
     values, said, fine = {}, [], True
@@ -92,8 +110,12 @@ def nonlinear_resonance(full: bool) -> Outcome:
     return Outcome(f"relative energy drift (median of {STARTS} starts) at {'; at '.join(said)}", fine, values)
 
 
+@hard_case(26, "swapped labels")
 def swapped_labels(full: bool) -> Outcome:
-    """The chain with slow and fast exchanged: bounded, and noticed by the advice."""
+    """FPU chain with slow and fast variables exchanged
+
+    bounded energy error; the advice suggests the swap
+    """
     problem, scheme, macro_dt = swapped_chain(), vm.fully_implicit(10), 0.03
     steps = 100_000 if full else 10_000
     trajectory = long_run(problem, scheme, macro_dt, steps)
@@ -106,45 +128,3 @@ def swapped_labels(full: bool) -> Outcome:
         trajectory.success and band < 0.5 and suggested,
         {"band": band, "suggested": suggested},
     )
-
-
-RESONANCES = (
-    Case(
-        1,
-        "impulse resonance",
-        "linear model, kappa = 25, omega = 50, explicit_slow, omega H to 4 pi",
-        "first unstable omega H / pi within 0.005 of "
-        + ", ".join(f"{v} ({n})" for n, v in FIRST_UNSTABLE.items())
-        + "; advice",
-        impulse_resonance,
-        draw_windows,
-    ),
-    Case(
-        2,
-        "FPU at omega H = pi",
-        "FPU chain, H = 0.0628, num_micro 30, t = 200",
-        "explicit_slow advised against; fully_implicit energy error below 3e-3",
-        chain_at_half_period,
-    ),
-    Case(
-        3,
-        "implicit combination resonance",
-        "linear model, kappa = 25, fully_implicit, omega h = 0.1, num_micro 57",
-        "growth 8.4e-4 per step found, and advised against",
-        combination_resonance,
-    ),
-    Case(
-        4,
-        "nonlinear resonance T/3, T/4",
-        "FPU chain with cubic coupling, explicit_slow, omega H = 2 pi / 3 and pi / 2, 1e5 steps",
-        "relative energy drift below 1e-6 per step, or flagged",
-        nonlinear_resonance,
-    ),
-)
-SWAPPED = Case(
-    26,
-    "swapped labels",
-    "FPU chain with slow and fast variables exchanged",
-    "bounded energy error; the advice suggests the swap",
-    swapped_labels,
-)

@@ -1,18 +1,25 @@
 """Cases 23 to 25: three time scales, no coupling, and the known methods that schemes reduce to."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
+from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.pictures import draw_oscillatory_energies
 from benchmarks.hard_cases.systems import three_scales
-from vmri_jax.check import Case, Outcome
+from vmri_jax.check import Outcome
 from vmri_jax.check.known_methods import apart_from, midpoint_integrator, rattle
 from vmri_jax.check.measures import difference, run, status
 
 
+@hard_case(23, "three scales", draw_oscillatory_energies)
 def three_time_scales(full: bool) -> Outcome:
-    """One frequency far above what the micro steps resolve; the actions of the others against a resolved run."""
+    """FPU chain with omega = 50, 70, 5000, fully_implicit, h = 0.02, t = 50
+
+    stable at omega_3 h = 100; I_1, I_2 within 0.05 of a resolved run
+    """
     problem, omega = three_scales(), np.array([50.0, 70.0, 5000.0])
     coarse = run(problem, vm.fully_implicit(5), 0.1, 500)  # omega_3 h = 100
     fine = run(problem, vm.fully_explicit(100), 0.01, 5000, save_every=10)  # omega_3 h = 0.5
@@ -33,11 +40,14 @@ def slow_alone(q_s, q_f, params):
     return jnp.sum(q_s**4) / 4 + jnp.sum(jnp.cos(q_s))
 
 
+@hard_case(24, "zero coupling")
 def no_coupling(full: bool) -> Outcome:
-    """A slow potential of slow variables alone: the slow motion must not depend on num_micro."""
+    """FPU chain with V = V(q_s)
+
+    slow motion independent of num_micro to 1e-13
+    """
     problem = vm.systems.fermi_pasta_ulam()
-    system = problem.system.replace(slow_potential=slow_alone)
-    problem = vm.Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f)
+    problem = replace(problem, system=problem.system.replace(slow_potential=slow_alone))
     steps, values = 10_000 if full else 1_000, {}
     for make in (vm.explicit_slow, vm.fully_explicit):
         runs = [run(problem, make(n), 0.03, steps, save_every=steps) for n in (1, 10)]
@@ -46,8 +56,12 @@ def no_coupling(full: bool) -> Outcome:
     return Outcome(f"num_micro 10 against 1, {steps} steps: {words}", max(values.values()) < 1e-13, values)
 
 
+@hard_case(25, "reductions")
 def reductions(full: bool) -> Outcome:
-    """One micro step per macro step gives known integrators."""
+    """num_micro = 1
+
+    midpoint variational integrator, Verlet, RATTLE to 1e-12
+    """
     chain, pendulum = vm.systems.fermi_pasta_ulam(), vm.systems.triple_spherical_pendulum()
     steps = 200 if full else 25
     values = {
@@ -57,29 +71,3 @@ def reductions(full: bool) -> Outcome:
     }
     words = ", ".join(f"{name} {value:.0e}" for name, value in values.items())
     return Outcome(f"from the known method after {steps} steps: {words}", max(values.values()) < 1e-12, values)
-
-
-SCALES = (
-    Case(
-        23,
-        "three scales",
-        "FPU chain with omega = 50, 70, 5000, fully_implicit, h = 0.02, t = 50",
-        "stable at omega_3 h = 100; I_1, I_2 within 0.05 of a resolved run",
-        three_time_scales,
-        draw_oscillatory_energies,
-    ),
-    Case(
-        24,
-        "zero coupling",
-        "FPU chain with V = V(q_s)",
-        "slow motion independent of num_micro to 1e-13",
-        no_coupling,
-    ),
-    Case(
-        25,
-        "reductions",
-        "num_micro = 1",
-        "midpoint variational integrator, Verlet, RATTLE to 1e-12",
-        reductions,
-    ),
-)

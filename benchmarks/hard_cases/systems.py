@@ -1,13 +1,17 @@
-"""Systems that are hard to integrate: linkages, chains, contact, a close encounter, three time scales.
+"""Systems that are hard to integrate: linkages, chains, contact, a close encounter, three time scales."""
 
-Factories of `Problem`, written as a user would write them: functions at module level, numbers in the params.
-"""
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
 from vmri_jax.systems.fermi_pasta_ulam import fermi_pasta_ulam, soft_springs
+
+
+def arrays(**numbers) -> dict:
+    """Numbers as parameters of a system."""
+    return {name: jnp.asarray(value) for name, value in numbers.items()}
 
 
 def lengths_of(points):
@@ -39,8 +43,7 @@ def nearly_slow(q_s, q_f, params):
 def nearly_slow_constraint(eps: float) -> vm.Problem:
     """A slow and a fast point in R^3 with ``|q_1|^2 + eps z_2^2 = l^2``: the fast Jacobian vanishes with eps."""
     q_s, q_f = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0])
-    params = {"kappa": 1.0, "omega": 50.0, "anchor": q_f, "eps": eps, "square": 1.0 + eps}
-    params = {name: jnp.asarray(value) for name, value in params.items()}
+    params = arrays(kappa=1.0, omega=50.0, anchor=q_f, eps=eps, square=1.0 + eps)
     system = vm.System(vm.ConstantMass([10.0] * 3, [1.0] * 3), tether, stiff_cage, nearly_slow, params=params)
     return vm.Problem(system, q_s, q_f, jnp.array([0.0, 0.3, 0.0]), jnp.array([0.2, 0.0, 0.0]))
 
@@ -64,23 +67,23 @@ def four_bars_and_one_again(q_s, q_f, params):
     return jnp.concatenate([rows, rows[1:2]])
 
 
-def four_bar(angle: float = 1.0, speed: float = 1.0, kappa: float = 0.0, redundant: bool = False) -> vm.Problem:
-    """Parallelogram linkage (fast), with a heavy slide (slow) on a spring; collinear, hence singular, at angle 0.
+def four_bar(angle: float, kappa: float = 0.0, redundant: bool = False) -> vm.Problem:
+    """Parallelogram linkage (fast), with a heavy slide (slow) on a spring; singular at angle 0.
 
     Args:
-        angle, speed: of the crank at the start.
+        angle: of the crank at the start; it turns with speed 1.
         kappa: stiffness of the spring; without it the linkage turns uniformly.
         redundant: give one of the three constraints twice.
     """
-    crank, base = 1.0, 2.0
+    base = 2.0
     system = vm.System(
         vm.ConstantMass([50.0], [1.0] * 4),
         slow_potential=pull_on_crank,
         constraint=four_bars_and_one_again if redundant else four_bars,
-        params={name: jnp.asarray(v) for name, v in {"crank": crank, "base": base, "kappa": kappa}.items()},
+        params=arrays(crank=1.0, base=base, kappa=kappa),
     )
-    tip = crank * np.array([np.cos(angle), np.sin(angle)])
-    velocity = speed * crank * np.array([-np.sin(angle), np.cos(angle)])
+    tip = np.array([np.cos(angle), np.sin(angle)])
+    velocity = np.array([-np.sin(angle), np.cos(angle)])
     q_f, v_f = np.concatenate([tip, [tip[0] + base, tip[1]]]), np.tile(velocity, 2)
     return vm.Problem(system, jnp.array([-1.0]), jnp.asarray(q_f), jnp.array([0.0]), jnp.asarray(v_f))
 
@@ -104,8 +107,7 @@ def link_chain(num_links: int = 20, bend: float = 0.0) -> vm.Problem:
         bend: angle of the links up and down from the horizontal, in turns; 0 is straight.
     """
     length, mass = 0.1, 0.1
-    params = {"length": length, "mass": mass, "gravity": 9.81}
-    params = {name: jnp.asarray(v) for name, v in params.items()}
+    params = arrays(length=length, mass=mass, gravity=9.81)
     signs = np.where(np.arange(num_links) % 2, -1.0, 1.0)
     steps = length * np.stack([np.full(num_links, np.cos(bend)), signs * np.sin(bend)], axis=1)
     masses = vm.ConstantMass([10.0], np.full(2 * num_links, mass))
@@ -127,12 +129,10 @@ def stiff_links(q_f, params):
     return params["stiffness"] / 2 * jnp.sum(stretch**2)
 
 
-def stiff_chain(num_masses: int = 50, stiffness: float = 1e6) -> vm.Problem:
-    """Near-inextensible chain of unit masses in the plane (fast) with a load on a soft spring (slow), let go sideways."""
+def stiff_chain(num_masses: int = 50) -> vm.Problem:
+    """Near-inextensible chain of unit masses (fast) with a load on a soft spring (slow), let go sideways."""
     length, angle = 0.2, 0.3
-    params = {"length": length, "mass": 1.0, "stiffness": stiffness, "gravity": 9.81}
-    params |= {"load": 100.0, "kappa": 500.0, "soft_length": 1.0}
-    params = {name: jnp.asarray(v) for name, v in params.items()}
+    params = arrays(length=length, mass=1.0, stiffness=1e6, gravity=9.81, load=100.0, kappa=500.0, soft_length=1.0)
     down = np.array([np.sin(angle), -np.cos(angle)])
     points = length * np.arange(1, num_masses + 1)[:, None] * down
     system = vm.System(vm.ConstantMass([100.0] * 2, np.ones(2 * num_masses)), hung_weight, stiff_links, params=params)
@@ -151,11 +151,11 @@ def floor_contact(q_f, params):
     return params["stiffness"] / 2 * jnp.minimum(q_f[0], 0.0) ** 2
 
 
-def bouncing_ball(stiffness: float = 1e8, height: float = 1.0) -> vm.Problem:
+def bouncing_ball() -> vm.Problem:
     """A ball of unit mass dropped on a stiff floor: x slow, height z fast."""
-    params = {"stiffness": jnp.asarray(stiffness), "gravity": jnp.asarray(9.81)}
-    system = vm.System(vm.ConstantMass([1.0], [1.0]), ball_weight, floor_contact, params=params)
-    return vm.Problem(system, jnp.zeros(1), jnp.array([height]), jnp.ones(1), jnp.zeros(1))
+    masses, params = vm.ConstantMass([1.0], [1.0]), arrays(stiffness=1e8, gravity=9.81)
+    system = vm.System(masses, ball_weight, floor_contact, params=params)
+    return vm.Problem(system, jnp.zeros(1), jnp.ones(1), jnp.ones(1), jnp.zeros(1))
 
 
 def trap(q_s, q_f, params):
@@ -169,12 +169,9 @@ def gravitation(q_f, params):
 
 
 def two_body(eccentricity: float = 0.9) -> vm.Problem:
-    """Two bodies that attract each other: centre of mass in a soft trap (slow), relative position (fast); period 2 pi.
-
-    Started at the apocentre; the pericentre is at 1 - e.
-    """
-    params = {"kappa": jnp.asarray(0.01), "mu": jnp.asarray(1.0)}
-    system = vm.System(vm.ConstantMass([4.0] * 2, [1.0] * 2), trap, gravitation, params=params)
+    """Centre of mass of two bodies in a soft trap (slow), relative position (fast) from the apocentre; period 2 pi."""
+    masses, params = vm.ConstantMass([4.0] * 2, [1.0] * 2), arrays(kappa=0.01, mu=1.0)
+    system = vm.System(masses, trap, gravitation, params=params)
     speed = np.sqrt((1 - eccentricity) / (1 + eccentricity))
     q_f, v_f = jnp.array([1.0 + eccentricity, 0.0]), jnp.array([0.0, speed])
     return vm.Problem(system, jnp.array([1.0, 0.0]), q_f, jnp.zeros(2), v_f)
@@ -189,9 +186,9 @@ def three_stiff_springs(q_f, params):
 def three_scales(omega=(50.0, 70.0, 5000.0)) -> vm.Problem:
     """FPU chain with a frequency of its own for every stiff spring; all but the first at rest."""
     problem = fermi_pasta_ulam(len(omega), omega[0])
-    system = problem.system.replace(fast_potential=three_stiff_springs, params={"omega": jnp.asarray(omega)})
+    system = problem.system.replace(fast_potential=three_stiff_springs, params=arrays(omega=omega))
     second = jnp.zeros(len(omega)).at[1].set(1.0)
-    return vm.Problem(system, problem.q_s, problem.q_f + second / omega[1], problem.v_s, problem.v_f + second)
+    return replace(problem, system=system, q_f=problem.q_f + second / omega[1], v_f=problem.v_f + second)
 
 
 def soft_and_cubic_springs(q_s, q_f, params):
@@ -199,12 +196,11 @@ def soft_and_cubic_springs(q_s, q_f, params):
     return soft_springs(q_s, q_f, params) + params["beta"] / 3 * jnp.sum((q_s - q_f) ** 3)
 
 
-def cubic_chain(beta: float = 1.0) -> vm.Problem:
+def cubic_chain() -> vm.Problem:
     """FPU chain with a cubic soft coupling, which excites the resonances of third order."""
     problem = fermi_pasta_ulam()
-    params = problem.system.params | {"beta": jnp.asarray(beta)}
-    system = problem.system.replace(slow_potential=soft_and_cubic_springs, params=params)
-    return vm.Problem(system, problem.q_s, problem.q_f, problem.v_s, problem.v_f)
+    params = problem.system.params | arrays(beta=1.0)
+    return replace(problem, system=problem.system.replace(slow_potential=soft_and_cubic_springs, params=params))
 
 
 def everything_slow(q_s, q_f, params):

@@ -1,11 +1,9 @@
-"""Equations of motion made by automatic differentiation from the Lagrangian and the constraints that ours is given.
-
-Index-reduced: accelerations and multipliers solve
+"""Equations of motion by automatic differentiation of the Lagrangian and the constraints that ours is given:
 
     [M  G^T] [  a   ]   [ -grad(V + W)     ]
     [G   0 ] [lambda] = [ -(d/dt G) v      ]
 
-with G the Jacobian of the constraints. Nothing is eliminated by hand. Masses are constant in these systems, so that M is made once.
+with G the Jacobian of the constraints.
 """
 
 import jax
@@ -15,9 +13,10 @@ from benchmarks.peers.cases import Case
 
 
 def acceleration(case: Case):
-    """``a(q, v)``, arrays (n,), slow coordinates first; without constraints ``-grad(V + W)`` over the masses per coordinate."""
+    """``a(q, v)``, arrays (n,), slow coordinates first."""
     system, n_s = case.problem.system, case.problem.q_s.size
-    mass, force = mass_matrix(case), jax.grad(lambda q: -potential(case, q))
+    mass = jax.hessian(lambda v: kinetic(case, v))(jnp.asarray(case.v))
+    force = jax.grad(lambda q: -potential(case, q))
 
     def constraints(q):
         return system.constraints(0.0, q[:n_s], q[n_s:])
@@ -44,19 +43,12 @@ def potential(case: Case, q):
     return slow + (0.0 if system.fast_potential is None else system.fast_potential(q_f, system.params))
 
 
-def kinetic(case: Case, q, v):
-    """T."""
+def kinetic(case: Case, v):
+    """T at the positions of the start; masses are constant."""
     system, splits = case.problem.system, [case.problem.q_s.size]
-    (q_s, q_f), (v_s, v_f) = jnp.split(q, splits), jnp.split(v, splits)
-    return system.kinetic(q_s, q_f, v_s, v_f, system.params)
-
-
-def mass_matrix(case: Case):
-    """Second derivatives of the kinetic energy by the velocities, (n, n)."""
-    return jax.hessian(lambda v: kinetic(case, jnp.asarray(case.q), v))(jnp.asarray(case.v))
+    return system.kinetic(*jnp.split(case.q, splits), *jnp.split(v, splits), system.params)
 
 
 def energy(case: Case) -> float:
     """Of the start, from the functions that are differentiated."""
-    q, v = jnp.asarray(case.q), jnp.asarray(case.v)
-    return float(kinetic(case, q, v) + potential(case, q))
+    return float(kinetic(case, case.v) + potential(case, case.q))

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,6 @@ LEVELS = (1e-2, 2e-4, 2e-6, 1e-8)
 """Largest errors ``max |q - q_ref|`` at the end that are asked for."""
 BATCH_LEVEL = 2e-4
 """The same for batches, of the worst lane."""
-TRUTH = Path(__file__).parents[2] / "tests" / "data" / "ground_truth"
-FILES = {"FPU l=3": "fpu3", "FPU l=200": "fpu200", "TSP": "tsp", "SAM": "sam"}
 NAMES = ("FPU l=3 t=1", "FPU l=3 t=100", "FPU l=200 t=1", "TSP t=1", "TSP t=10", "SAM t=1", "SAM t=10")
 
 
@@ -27,18 +24,13 @@ class NotRepresentable(ValueError):
 
 @dataclass(frozen=True)
 class Case:
-    """One problem over one time: integrate `problem` from its start to `t_end`.
-
-    q_end: (n,) positions at `t_end`, slow ones first, of a solution far more accurate than any level.
-    source: where that solution is from.
-    """
+    """Integrate `problem` to `t_end`; q_end (n,) are positions there of a far better solution, slow ones first."""
 
     name: str
     system: str
     problem: vm.Problem
     t_end: float
     q_end: np.ndarray
-    source: str
 
     @cached_property
     def state(self) -> vm.State:
@@ -48,8 +40,7 @@ class Case:
     @cached_property
     def masses(self) -> np.ndarray:
         """(n,) masses per coordinate, slow ones first."""
-        kinetic: Any = self.problem.system.kinetic
-        return np.concatenate([kinetic.slow, kinetic.fast])
+        return programs.masses(self.problem)
 
     @cached_property
     def q(self) -> np.ndarray:
@@ -89,18 +80,13 @@ class Case:
 
 
 def case(name: str) -> Case:
-    """One of `NAMES`, with the reference from the folder `TRUTH`.
-
-    Raises:
-        ValueError: another name.
-    """
+    """One of `NAMES`."""
     if name not in NAMES:
         raise ValueError(f"case: there is no {name!r}; there are {', '.join(NAMES)}.")
     system, _, t_end = name.rpartition(" t=")
-    path = TRUTH / f"{FILES[system]}_t{t_end}.npz"
-    with np.load(path) as file:
+    with np.load(programs.ground_truth(system, t_end)) as file:
         q_end = file["q"][-1]
-    return Case(name, system, programs.problem(system), float(t_end), q_end, path.name)
+    return Case(name, system, programs.problem(system), float(t_end), q_end)
 
 
 @dataclass(frozen=True)
@@ -108,8 +94,7 @@ class Ladder:
     """One method of one integrator, from coarse to fine settings.
 
     kind: what a setting is, "tol" or "steps".
-    build: makes everything that is made once; what it returns integrates the case from its start to its end and gives the
-        positions there, slow ones first.
+    build: makes what is made once; what it returns gives the positions at the end, slow ones first.
     """
 
     method: str
@@ -125,6 +110,11 @@ class Ladder:
         """The setting between two, the geometric mean."""
         middle = float(np.sqrt(a * b))
         return middle if self.kind == "tol" else round(middle)
+
+
+def steps_ladder(case: Case, method: str, build: Callable[[int], Callable[[], Any]], first: float = 4.0) -> Ladder:
+    """From `first` steps per unit of time up to 1e7."""
+    return Ladder(method, "steps", step_counts(first * case.t_end, 1e7 * case.t_end), build)
 
 
 def tolerances(first: float, last: float) -> list[float]:

@@ -1,9 +1,8 @@
-"""Our integrators against what people use instead: the time to reach an error, in one interleaved run per problem."""
+"""Our integrators against what people use instead: the time to reach an error."""
 
 import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -11,10 +10,11 @@ import vmri_jax as vm
 from benchmarks.c_loops import NoCompiler
 from benchmarks.measure import Ratio, Tell, interleaved, quartiles, ratio, silent
 from benchmarks.peers import cases, figures
-from benchmarks.peers.cases import BATCH_LEVEL, LEVELS, Case, Ladder, NotRepresentable
+from benchmarks.peers.cases import BATCH_LEVEL, LEVELS, Case, NotRepresentable
+from benchmarks.peers.ours import last_positions
 from benchmarks.peers.scan import Point, candidates, scan
 from benchmarks.peers.targets import target
-from benchmarks.report import Claim, Report
+from benchmarks.report import Claim, Report, spread
 from benchmarks.worker import starts
 
 OURS = "vmri_jax"
@@ -40,15 +40,8 @@ FINE_STEPS = 1000
 BATCH_CASES = ("FPU l=3 t=1", "TSP t=1")
 SLOW = 0.2
 """Runs longer than this many seconds are timed among themselves and with ours, with fewer samples."""
-COLUMNS = (
-    "case",
-    "peer",
-    *(f"{level:.0e}" for level in LEVELS),
-    "trajectories/s",
-    "best error",
-    "energy differs",
-    "build, s",
-)
+TIMES = tuple(f"{level:.0e}" for level in LEVELS)
+COLUMNS = ("case", "peer", *TIMES, "trajectories/s", "best error", "energy differs", "build, s")
 
 
 @dataclass(frozen=True)
@@ -71,11 +64,7 @@ class Size:
 
 
 def sizes(name: str, only: Sequence[str] = (), peers: Sequence[str] = ()) -> Size:
-    """ "quick" or "full"; `only` these cases, e.g. "TSP t=1" or "TSP", and `peers`.
-
-    Raises:
-        ValueError: there is no such case or peer.
-    """
+    """ "quick" or "full"; `only` these cases, e.g. "TSP t=1" or "TSP", and `peers`."""
     chosen = _chosen(cases.NAMES, only)
     batches = _chosen([f"{case}, batch" for case in BATCH_CASES], only)
     if not chosen and not batches:
@@ -94,37 +83,25 @@ def _chosen(names: Sequence[str], only: Sequence[str]) -> list[str]:
 
 
 def load(peer: str):
-    """The module of a peer.
-
-    Raises:
-        ModuleNotFoundError: its package is not installed.
-    """
+    """The module of a peer, if its package is installed."""
     return importlib.import_module(f"benchmarks.peers.{PEERS[peer]}")
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Scan and time all of it, a report after each case."""
-    rows: list[dict] = []
-    claims: list[Claim] = []
-    notes: list[str] = []
+    report = Report("peers", name, [], [], [])
     found: dict[str, list[Point]] = {}
 
-    def report() -> Report:
-        return Report("peers", name, rows, claims, list(dict.fromkeys(notes)), figures.by_family(found, tuple(PEERS)))
+    def add(case: Case, peers: Sequence[str], levels: Sequence[float], ladders_of) -> Report:
+        found[case.name] = _one(case, peers, levels, ladders_of, size, report, tell)
+        return replace(report, figures=figures.by_family(found, tuple(PEERS)))
 
     for title in size.cases:
-        case = cases.case(title)
-        ladders = _ladders(title, case, size.peers, notes, partial(_single, case=case))
-        found[title] = _one(title, case, ladders, LEVELS, size, tell, rows, claims, notes)
-        yield report()
+        yield add(cases.case(title), size.peers, LEVELS, lambda module, case: module.ladders(case))
     for title in size.batches:
         case, lanes = batch_case(title.removesuffix(", batch"), size.batch)
         peers = [peer for peer in size.peers if peer in BATCHED]
-        ladders = _ladders(
-            title, case, peers, notes, lambda m, case=case, lanes=lanes: (m.batch_ladders(case, *lanes), None)
-        )
-        found[title] = _one(title, case, ladders, (BATCH_LEVEL,), size, tell, rows, claims, notes)
-        yield report()
+        yield add(case, peers, (BATCH_LEVEL,), lambda module, case, lanes=lanes: module.batch_ladders(case, *lanes))
 
 
 def batch_case(name: str, lanes: int) -> tuple[Case, tuple]:
@@ -133,10 +110,9 @@ def batch_case(name: str, lanes: int) -> tuple[Case, tuple]:
     states = starts(case.problem, lanes)
     steps = {"macro_dt": case.t_end / FINE_STEPS, "num_steps": FINE_STEPS, "save_every": FINE_STEPS}
     end = vm.simulate_batch(case.problem.system, vm.galerkin(1, 2, "gauss"), states, **steps)
-    q_end = np.concatenate([end.q_s[:, -1], end.q_f[:, -1]], axis=1)
     q = np.concatenate([states.q_s, states.q_f], axis=1)
     v = np.concatenate([states.p_s, states.p_f], axis=1) / case.masses
-    return replace(case, name=f"{name}, batch", q_end=q_end), (states, q, v)
+    return replace(case, name=f"{name}, batch", q_end=last_positions(end)), (states, q, v)
 
 
 def energy_difference(module, case: Case) -> float:
@@ -144,53 +120,50 @@ def energy_difference(module, case: Case) -> float:
     return abs(module.energy(case) - case.energy) / abs(case.energy)
 
 
-def _single(module, case: Case) -> tuple[list[Ladder], float]:
-    return module.ladders(case), energy_difference(module, case)
-
-
-def _ladders(
-    title: str, case: Case, peers, notes: list[str], get
-) -> dict[str, tuple[list[Ladder], float | None] | None]:
-    """By peer: its ladders and the difference of its energy, None where it is left out."""
-    found = {}
-    for peer in peers:
-        found[peer] = None
-        try:
-            found[peer] = get(load(peer))
-        except ModuleNotFoundError as error:
-            notes.append(f"{peer} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
-        except (NotRepresentable, NoCompiler) as error:
-            notes.append(f"{title}: {peer} was left out: {error}.")
-    return found
-
-
-def _one(title, case: Case, ladders, levels, size: Size, tell: Tell, rows, claims, notes) -> list[Point]:
-    """One case: rows, claims and notes are appended; returns all points."""
+def _one(case: Case, peers, levels, ladders_of, size: Size, report: Report, tell: Tell) -> list[Point]:
+    """Adds rows, claims and notes of one case to the report; returns all points."""
+    title, is_batch = case.name, case.q_end.ndim == 2
     points: dict[str, list[Point]] = {}
-    for peer, given in ladders.items():
+    differs: dict[str, float | None] = {}
+    for peer in peers:
         tell(f"{title}, {peer}")
-        if given is not None:
-            points[peer] = scan(peer, given[0], case, size.seconds, levels)
+        try:
+            module = load(peer)
+            ladders = ladders_of(module, case)
+            differs[peer] = None if is_batch else energy_difference(module, case)
+        except ModuleNotFoundError as error:
+            _note(report, f"{peer} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
+        except (NotRepresentable, NoCompiler) as error:
+            _note(report, f"{title}: {peer} was left out: {error}.")
+        else:
+            points[peer] = scan(peer, ladders, case, size.seconds, levels)
     tell(f"{title}, timing")
     timed = _time(points, levels, size)
     for peer, mine in points.items():
-        differs = None if (given := ladders[peer]) is None else given[1]
-        rows.append(_row(title, peer, mine, levels, timed, differs))
-        if case.q_end.ndim == 2 and rows[-1]["levels"]:
-            rows[-1]["trajectories/s"] = len(case.q_end) / (1e-3 * rows[-1]["levels"][0]["ms"])
-        notes += _not_reached(title, peer, mine, levels)
+        row = _row(title, peer, mine, levels, timed)
+        row["energy differs"] = differs[peer]
+        if is_batch and row["levels"]:
+            row["trajectories/s"] = len(case.q_end) / (1e-3 * row["levels"][0]["ms"])
+        report.rows.append(row)
+        if missed := [level for level in levels if (peer, level) not in timed]:
+            _note(report, f"{title}: {peer} does not reach {_why(mine, missed)}.")
         for level in levels:
             least = target(title, peer, level)
             if least is not None and (peer, level) in timed:
-                claims.append(
-                    Claim(f"{title}, {level:.0e}: {peer} over ours", timed[peer, level].to_ours, at_least=least)
-                )
+                what = f"{title}, {level:.0e}: {peer} over ours"
+                report.claims.append(Claim(what, timed[peer, level].to_ours, at_least=least))
     return [p for mine in points.values() for p in mine]
+
+
+def _note(report: Report, text: str) -> None:
+    """Once."""
+    if text not in report.notes:
+        report.notes.append(text)
 
 
 @dataclass(frozen=True)
 class Timed:
-    """The fastest setting of one peer at one level: samples, and the ratio of its time to ours (0 where ours never gets there)."""
+    """The fastest setting of one peer at one level; `to_ours` is 0 where ours never gets there."""
 
     point: Point
     samples: list[float]
@@ -198,7 +171,7 @@ class Timed:
 
 
 def _time(points: Mapping[str, Sequence[Point]], levels, size: Size) -> dict[tuple[str, float], Timed]:
-    """Interleaved times of all candidates: the fast ones together, the slow ones together, each with ours."""
+    """Times of all candidates in turn: the fast ones together, the slow ones together, each with ours."""
     chosen = {(peer, level): candidates(mine, level) for peer, mine in points.items() for level in levels}
     fastest = {key: some[0].seconds for key, some in chosen.items() if some}
     found: dict[tuple[str, float], Timed] = {}
@@ -224,8 +197,8 @@ def _time(points: Mapping[str, Sequence[Point]], levels, size: Size) -> dict[tup
     return found
 
 
-def _row(title, peer, points: Sequence[Point], levels, timed, differs) -> dict:
-    row = {"case": title, "peer": peer}
+def _row(title, peer, points: Sequence[Point], levels, timed) -> dict:
+    row: dict = {"case": title, "peer": peer}
     details = []
     for level in levels:
         key = f"{level:.0e}"
@@ -235,32 +208,18 @@ def _row(title, peer, points: Sequence[Point], levels, timed, differs) -> dict:
         at = timed[peer, level]
         ms = quartiles(at.samples, 1e3)
         row[key] = f"{ms.value:.3g} ms" + ("" if peer == OURS else f" ({at.to_ours.value:.2g}x)")
-        details.append(
-            {
-                "level": level,
-                "setting": at.point.label,
-                "error": at.point.error,
-                "ms": ms.value,
-                "low": ms.low,
-                "high": ms.high,
-            }
-        )
-        details[-1] |= {"to ours": at.to_ours.value, "build, s": at.point.build + at.point.compile}
+        detail = {"level": level, "setting": at.point.label, "error": at.point.error, **spread("ms", ms)}
+        details.append(detail | {"to ours": at.to_ours.value, "build, s": at.point.build + at.point.compile})
     row["best error"] = min((p.settled for p in points), default=np.inf)
-    row["energy differs"] = differs
     row["build, s"] = max((d["build, s"] for d in details), default=None)
     scanned = [{"setting": p.label, "error": p.error, "seconds": p.seconds} for p in points]
     return row | {"levels": details, "scan": scanned}
 
 
-def _not_reached(title, peer, points: Sequence[Point], levels) -> list[str]:
-    missed = [level for level in levels if not candidates(points, level)]
-    if not missed:
-        return []
+def _why(points: Sequence[Point], missed: Sequence[float]) -> str:
+    """These levels were missed, and by how much."""
     words = " or ".join(f"{level:.0e}" for level in missed)
     best = min(points, key=lambda p: (p.settled, p.seconds), default=None)
     if best is None or not np.isfinite(best.settled):
-        return [f"{title}: {peer} does not reach {words}: no run of it succeeded."]
-    return [
-        f"{title}: {peer} does not reach {words}: its best is {best.settled:.1e} in {1e3 * best.seconds:.3g} ms ({best.label})."
-    ]
+        return f"{words}: no run of it succeeded"
+    return f"{words}: its best is {best.settled:.1e} in {1e3 * best.seconds:.3g} ms ({best.label})"

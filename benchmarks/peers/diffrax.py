@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""diffrax: adaptive Runge-Kutta methods (Dopri8, Tsit5) and the semi-implicit Euler method, each compiled once."""
+"""diffrax: adaptive Runge-Kutta methods (Dopri8, Tsit5) and the semi-implicit Euler method."""
 
 from functools import partial
 from typing import Any
@@ -9,36 +9,32 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks.peers import equations as by_hand
-from benchmarks.peers.cases import Case, Ladder, step_counts, tolerances
+from benchmarks.peers.cases import Case, Ladder, steps_ladder, tolerances
 
 CHUNK = 64
 """Lanes at once that fit into the cache."""
 MOST_STEPS = 20_000
-"""Of the adaptive methods per unit of time: a step too large may leave them with a step size that is no number, for ever."""
+"""Of the adaptive methods per unit of time: they may go on for ever with a step size that is no number."""
 SOLVERS: tuple[Any, ...] = (diffrax.Dopri8, diffrax.Tsit5)
 
 
 def ladders(case: Case, equations=by_hand) -> list[Ladder]:
-    """Tolerances for the adaptive methods; steps for the semi-implicit one, which wants forces without velocities.
-
-    Args:
-        equations: a module with `acceleration`.
-    """
+    """Tolerances for the adaptive methods, steps for the semi-implicit one."""
     start = (jnp.asarray(case.q), jnp.asarray(case.v))
 
     def adaptive(solver) -> Ladder:
         solve = jax.jit(solution(case, solver(), equations))
-        return Ladder(
-            solver.__name__, "tol", tolerances(1e-2, 1e-14), lambda tol: partial(solve, start, jnp.asarray(tol))
-        )
+        name, settings = solver.__name__, tolerances(1e-2, 1e-14)
+        return Ladder(name, "tol", settings, lambda tol: partial(solve, start, jnp.asarray(tol)))
 
     found = [adaptive(solver) for solver in SOLVERS]
     if case.is_chain:
         solve = jax.jit(semi_implicit(case, equations))
-        settings = step_counts(32 * case.t_end, 1e7 * case.t_end)
-        found.append(
-            Ladder("SemiImplicitEuler", "steps", settings, lambda n: partial(solve, start, jnp.asarray(case.t_end / n)))
-        )
+
+        def build(num_steps: int):
+            return partial(solve, start, jnp.asarray(case.t_end / num_steps))
+
+        found.append(steps_ladder(case, "SemiImplicitEuler", build, first=32.0))
     return found
 
 
@@ -48,10 +44,8 @@ def solution(case: Case, solver, equations):
     term: Any = diffrax.ODETerm(lambda t, y, args: (y[1], accelerate(*y)))
 
     def solve(y, tol):
-        controller = diffrax.PIDController(rtol=tol, atol=tol)
-        return _end(
-            term, solver, y, case.t_end, None, stepsize_controller=controller, max_steps=round(MOST_STEPS * case.t_end)
-        )
+        controller, most = diffrax.PIDController(rtol=tol, atol=tol), round(MOST_STEPS * case.t_end)
+        return _end(term, solver, y, case.t_end, None, stepsize_controller=controller, max_steps=most)
 
     return solve
 

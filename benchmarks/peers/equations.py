@@ -1,4 +1,4 @@
-"""Equations of motion for the peers that take any right-hand side, written by hand, in the form that runs fastest."""
+"""Equations of motion for the peers that take any right-hand side, by hand, in their fastest form."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,18 +15,26 @@ def acceleration(case: Case):
         return lambda q, v: jnp.stack(chain_accelerations(list(q), case.omega))
 
     def chain(q, v):
-        s, f = jnp.split(q, 2)
-        wall = jnp.zeros(1)
-        cubes = (jnp.concatenate([s - f, wall]) - jnp.concatenate([wall, s + f])) ** 3
+        cubes, f = gaps(q) ** 3, q[q.size // 2 :]
         return jnp.concatenate([cubes[1:] - cubes[:-1], cubes[:-1] + cubes[1:] - case.omega**2 * f])
 
     return chain
 
 
+def gaps(q):
+    """`chain_gaps` over arrays."""
+    s, f = jnp.split(q, 2)
+    wall = jnp.zeros(1)
+    return jnp.concatenate([s - f, wall]) - jnp.concatenate([wall, s + f])
+
+
+def chain_potential(q, omega):
+    """``V + W`` of a chain."""
+    return jnp.sum(gaps(q) ** 4) / 4 + omega**2 / 2 * jnp.sum(q[q.size // 2 :] ** 2)
+
+
 def energy(case: Case) -> float:
-    """Of the start, in numpy."""
+    """Of the start."""
     if not case.is_chain:
         return case.particles.energy(case.q, case.v)
-    s, f = np.split(case.q, 2)
-    gaps = np.append(s - f, 0.0) - np.insert(s + f, 0, 0.0)
-    return float(np.sum(case.v**2) / 2 + np.sum(gaps**4) / 4 + case.omega**2 / 2 * np.sum(f**2))
+    return float(np.sum(case.v**2) / 2 + chain_potential(case.q, case.omega))

@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""Exudyn: implicit trapezoidal rule with constraints at velocity level, and generalized-alpha; RK67 where nothing constrains."""
+"""Exudyn: trapezoidal rule with constraints at velocity level, generalized-alpha, and RK67 for the chain."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 from exudyn import itemInterface as items
 from exudyn.advancedUtilities import CreateSymbolicUserFunction
 
-from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers.cases import Case, Ladder, steps_ladder
 from benchmarks.peers.mechanics import from_masses, to_masses
 
 SOLVERS = {
@@ -41,13 +41,13 @@ def ladders(case: Case) -> list[Ladder]:
 
             return run
 
-        return Ladder(name, "steps", step_counts(8 * case.t_end, 1e7 * case.t_end), build)
+        return steps_ladder(case, name, build, first=8.0)
 
     return [ladder(name) for name in SOLVERS if case.is_chain or name != "RK67"]
 
 
 def prepare(case: Case):
-    """The assembled system, its nodes, and its springs with what is needed for their potentials."""
+    """The assembled system, its nodes, and the potentials of its springs."""
     exu.SetWriteToConsole(False)
     mbs: Any = exu.SystemContainer().AddSystem()
     nodes, springs = (_chain if case.is_chain else _particles)(case, mbs)
@@ -62,7 +62,7 @@ def positions(case: Case, mbs, nodes) -> np.ndarray:
 
 
 def energy(case: Case) -> float:
-    """Of the start: Exudyn's positions and velocities at the nodes, and its lengths or coordinates of the springs."""
+    """Of the start, from Exudyn's nodes and lengths of the springs."""
     mbs, nodes, springs = prepare(case)
     values = [mbs.GetNodeOutput(node, exu.OutputVariableType.Coordinates_t) for node in nodes]
     masses = np.ones(len(nodes)) if case.is_chain else np.array(case.particles.masses)
@@ -91,7 +91,7 @@ def _settings(case: Case, num_steps: int):
 
 
 def _chain(case: Case, mbs):
-    """Its masses on a line; the quartic springs are symbolic functions, which Exudyn evaluates without Python."""
+    """Its masses on a line; symbolic functions for the quartic springs are evaluated without Python."""
     markers, nodes = [], []
     for x, v in zip(to_masses(case.q), to_masses(case.v), strict=True):
         node = mbs.AddNode(items.Node1D(referenceCoordinates=[0.0], initialCoordinates=[x], initialVelocities=[v]))

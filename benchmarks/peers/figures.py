@@ -9,22 +9,13 @@ from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
 from benchmarks.peers.cases import LEVELS
 from benchmarks.peers.scan import Point, front
+from benchmarks.report import legend_below
 from vmri_jax import plots
 
 FAMILIES = {"FPU": "Fermi-Pasta-Ulam chain", "TSP": "Triple spherical pendulum", "SAM": "Simple atomic model"}
 COLORS = (
-    "#0072b2",
-    "#d55e00",
-    "#009e73",
-    "#66c9a9",
-    "#a3508a",
-    "#d3a5c5",
-    "#b98700",
-    "#56a0d3",
-    "#8a6d5a",
-    "#d680a8",
-    "#5f6b75",
-    "#9aa5ae",
+    *("#0072b2", "#d55e00", "#009e73", "#66c9a9", "#a3508a", "#d3a5c5"),
+    *("#b98700", "#56a0d3", "#8a6d5a", "#d680a8", "#5f6b75", "#9aa5ae"),
 )
 SHOWN = (2e-10, 5e-2)
 """Errors between which a figure goes, or less where none is so small."""
@@ -33,11 +24,10 @@ MARKERS = ("o", "s", "^", "2", "D", "1", "v", "P", "X", "<", ">", "*")
 
 def by_family(found: Mapping[str, Sequence[Point]], peers: Sequence[str]) -> dict[str, Callable[[], Figure]]:
     """By file name, functions that draw; batches have a figure of their own."""
-    single = {title: points for title, points in found.items() if not title.endswith("batch")}
     batches = {title: points for title, points in found.items() if title.endswith("batch")}
     drawn: dict[str, Callable[[], Figure]] = {}
     for family, words in FAMILIES.items():
-        own = {title: points for title, points in single.items() if title.startswith(family)}
+        own = {title: found[title] for title in found if title.startswith(family) and title not in batches}
         if own:
             drawn[f"peers_{family.lower()}"] = partial(draw, own, peers, f"{words}: time to an error")
     if batches:
@@ -47,20 +37,14 @@ def by_family(found: Mapping[str, Sequence[Point]], peers: Sequence[str]) -> dic
 
 def draw(found: Mapping[str, Sequence[Point]], peers: Sequence[str], title: str) -> Figure:
     """One panel per case."""
-    with plots.style():
-        figure = plots.NotebookFigure(figsize=(max(7.2, 0.7 + 3.4 * len(found)), 4.7))
+    with plots.new_figure(max(7.2, 0.7 + 3.4 * len(found)), 4.7, title, plots.LIGHT) as figure:
         panels = figure.subplots(1, len(found), squeeze=False, sharey=True)[0]
-        handles: dict = {}
         lowest = min((p.settled for points in found.values() for p in points), default=SHOWN[0])
         for axes, (name, points) in zip(panels, found.items(), strict=True):
             _panel(axes, points, peers)
             axes.set(title=name, xlabel="time, s", ylim=(max(SHOWN[0], lowest / 3), SHOWN[1]))
-            handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
         panels[0].set(ylabel=r"error $\max\,|q - q_{\mathrm{ref}}|$ at the end")
-        ordered = [peer for peer in peers if peer in handles]
-        columns = min(len(ordered), 5)
-        figure.legend([handles[peer] for peer in ordered], ordered, loc="outside lower center", ncols=columns)
-        figure.suptitle(title, x=0.01, ha="left")
+        legend_below(figure, peers)
     return figure
 
 

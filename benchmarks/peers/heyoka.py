@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""heyoka: Taylor's method of adaptive step and order, compiled for the equations; multipliers eliminated by hand."""
+"""heyoka: Taylor's method of adaptive step and order, compiled for equations without multipliers."""
 
 from typing import Any
 
@@ -7,10 +7,10 @@ import heyoka as hy
 import numpy as np
 
 from benchmarks.peers.cases import Case, Ladder, tolerances
-from benchmarks.peers.mechanics import chain_accelerations
+from benchmarks.peers.mechanics import chain_accelerations, chain_gaps
 
 COMPACT = 50
-"""From so many coordinates on loops are compiled instead of one long program, which would take minutes to compile."""
+"""From so many coordinates on loops are compiled; one long program would take minutes."""
 
 
 def equations(case: Case) -> tuple[list, list[tuple[Any, Any]]]:
@@ -21,19 +21,13 @@ def equations(case: Case) -> tuple[list, list[tuple[Any, Any]]]:
     return [*q, *v], list(zip([*q, *v], [*v, *a], strict=True))
 
 
-def integrator(case: Case, tol: float, **options):
-    """A Taylor integrator of the case."""
-    _, system = equations(case)
-    compact = case.q.size >= COMPACT
-    return hy.taylor_adaptive(system, np.concatenate([case.q, case.v]), tol=tol, compact_mode=compact, **options)
-
-
 def ladders(case: Case) -> list[Ladder]:
     """One: a tolerance per rung; the order follows from it."""
 
     def build(tol: float):
         start, n = np.concatenate([case.q, case.v]), case.q.size
-        taylor = integrator(case, tol)
+        _, system = equations(case)
+        taylor = hy.taylor_adaptive(system, start, tol=tol, compact_mode=n >= COMPACT)
 
         def run():
             taylor.time = 0.0
@@ -47,7 +41,7 @@ def ladders(case: Case) -> list[Ladder]:
 
 
 def energy(case: Case) -> float:
-    """Of the start: heyoka's own expression for the Hamiltonian of the chain, else springs and weights as it knows them."""
+    """Of the start, by an expression of heyoka."""
     variables, _ = equations(case)
     q, v = variables[: case.q.size], variables[case.q.size :]
     kinetic = hy.sum([m / 2 * x**2 for m, x in zip(case.masses, v, strict=True)])
@@ -57,10 +51,8 @@ def energy(case: Case) -> float:
 
 def _potential(case: Case, q: list):
     if case.is_chain:
-        n = len(q) // 2
-        s, f = q[:n], q[n:]
-        gaps = [s[0] - f[0], *(s[i + 1] - f[i + 1] - s[i] - f[i] for i in range(n - 1)), s[-1] + f[-1]]
-        return hy.sum([d**4 / 4.0 for d in gaps] + [case.omega**2 / 2 * x**2 for x in f])
+        f = q[len(q) // 2 :]
+        return hy.sum([d**4 / 4.0 for d in chain_gaps(q)] + [case.omega**2 / 2 * x**2 for x in f])
     p = case.particles
     weights = [p.gravity * m * q[3 * i + 2] for i, m in enumerate(p.masses)]
     lengths = [hy.sqrt(hy.sum([(q[3 * j + a] - q[3 * i + a]) ** 2 for a in range(3)])) for i, j, _, _ in p.springs]
@@ -69,7 +61,7 @@ def _potential(case: Case, q: list):
 
 
 def batch_ladders(case: Case, states, q, v) -> list[Ladder]:
-    """Its batch mode, as many lanes as the processor has in a vector, one batch after the other or as an ensemble."""
+    """Its batch mode, a vector of the processor at once, one batch after the other or as an ensemble."""
     size, n = hy.recommended_simd_size(), case.q.size
     starts = np.concatenate([q, v], axis=1).reshape(-1, size, 2 * n).transpose(0, 2, 1)  # (batches, 2 n, lanes)
 

@@ -5,8 +5,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from benchmarks.peers import equations, mechanics
-from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers import equations
+from benchmarks.peers.cases import Case, Ladder, steps_ladder
+from benchmarks.peers.mechanics import dot, solve
 
 NUM_MICRO = (1, 4, 16)
 """Micro steps per macro step of r-RESPA that are tried."""
@@ -17,13 +18,12 @@ TOLERANCE = 1e-13
 def ladders(case: Case) -> list[Ladder]:
     """r-RESPA with some numbers of micro steps, or RATTLE; numbers of macro steps."""
     start = (jnp.asarray(case.q), jnp.asarray(case.v))
-    settings = step_counts(4 * case.t_end, 1e7 * case.t_end)
 
     def ladder(name: str, steps) -> Ladder:
         def build(num_steps: int):
             return partial(steps, start, jnp.asarray(case.t_end / num_steps), jnp.asarray(num_steps))
 
-        return Ladder(name, "steps", settings, build)
+        return steps_ladder(case, name, build)
 
     if case.is_chain:
         return [ladder(f"r-RESPA {n}", jax.jit(_respa(case, n))) for n in NUM_MICRO]
@@ -70,12 +70,12 @@ def _rattle(case: Case):
         return [f / p.masses[i // 3] for i, f in enumerate(p.forces(q, jnp.sqrt))]
 
     def squares(q):
-        return [(_dot(d, d) - l2) / 2 for d, l2 in zip(p.rods_of(q), lengths, strict=True)]
+        return [(dot(d, d) - l2) / 2 for d, l2 in zip(p.rods_of(q), lengths, strict=True)]
 
     def project(q, v):
         rods = p.rods_of(q)
-        rates = [-_dot(d, w) for d, w in zip(rods, p.rods_of(v), strict=True)]
-        return p.pulled(v, rods, mechanics.solve(p.rod_matrix(rods, rods), rates))
+        rates = [-dot(d, w) for d, w in zip(rods, p.rods_of(v), strict=True)]
+        return p.pulled(v, rods, solve(p.rod_matrix(rods, rods), rates))
 
     def steps(start, dt, num_steps):
         def step(_, carry):
@@ -91,7 +91,7 @@ def _rattle(case: Case):
                 mu, _, count = carry
                 at, _ = place(mu)
                 off = squares(at)
-                correction = mechanics.solve(p.rod_matrix(p.rods_of(at), rods), [-x / dt for x in off])
+                correction = solve(p.rod_matrix(p.rods_of(at), rods), [-x / dt for x in off])
                 worst = jnp.max(jnp.stack([jnp.abs(x) / l2 for x, l2 in zip(off, lengths, strict=True)]))
                 return [x + y for x, y in zip(mu, correction, strict=True)], worst, count + 1
 
@@ -108,10 +108,6 @@ def _rattle(case: Case):
         return jnp.stack(jax.lax.fori_loop(0, num_steps, step, (q, v, a, zero))[0])
 
     return steps
-
-
-def _dot(a, b):
-    return sum(x * y for x, y in zip(a, b, strict=True))
 
 
 energy = equations.energy

@@ -1,6 +1,6 @@
 """The same problems in the words of the peers: particles, springs and rods; accelerations without multipliers.
 
-Expressions are written over single numbers, so that the same lines serve arrays of JAX and symbols of heyoka.
+Expressions are of single numbers, which may be arrays of JAX or symbols of heyoka.
 """
 
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ class Particles:
             force[3 * i + 2] = -m * self.gravity
         for i, j, k, length in self.springs:
             d = _between(q, i, j)
-            pull = k - k * length / sqrt(_dot(d, d))  # k (|d| - l) / |d|
+            pull = k - k * length / sqrt(dot(d, d))  # k (|d| - l) / |d|
             for axis in range(3):
                 force[3 * i + axis] += pull * d[axis]
                 force[3 * j + axis] -= pull * d[axis]
@@ -69,7 +69,7 @@ class Particles:
                     for x in {i, j} & {k, n} - {-1}
                 ]
                 if shared:
-                    entries[a][b] = sum(shared) * _dot(d[a], e[b])
+                    entries[a][b] = sum(shared) * dot(d[a], e[b])
         return entries
 
     def rods_of(self, q: Sequence) -> list[list]:
@@ -83,7 +83,7 @@ class Particles:
         """
         free = [f / self.masses[i // 3] for i, f in enumerate(self.forces(q, sqrt))]
         rods, rates, relative = self.rods_of(q), self.rods_of(v), self.rods_of(free)
-        right = [-_dot(w, w) - _dot(d, a) for d, w, a in zip(rods, rates, relative, strict=True)]
+        right = [-dot(w, w) - dot(d, a) for d, w, a in zip(rods, rates, relative, strict=True)]
         mu = solve(self.rod_matrix(rods, rods), right)
         return self.pulled(free, rods, mu)
 
@@ -118,12 +118,17 @@ def solve(matrix: Sequence[Sequence], right: Sequence) -> list:
     return x
 
 
-def chain_accelerations(q: Sequence, omega: float) -> list:
-    """Of a Fermi-Pasta-Ulam chain, ``-dV/ds`` and ``-dV/df - omega^2 f``, over single numbers."""
+def chain_gaps(q: Sequence) -> list:
+    """Lengths of the soft springs of a Fermi-Pasta-Ulam chain between walls at 0, up to sqrt(2)."""
     n = len(q) // 2
     s, f = q[:n], q[n:]
-    gaps = [s[0] - f[0], *(s[i + 1] - f[i + 1] - s[i] - f[i] for i in range(n - 1)), -(s[-1] + f[-1])]
-    cubes = [d * d * d for d in gaps]
+    return [s[0] - f[0], *(s[i + 1] - f[i + 1] - s[i] - f[i] for i in range(n - 1)), -(s[-1] + f[-1])]
+
+
+def chain_accelerations(q: Sequence, omega: float) -> list:
+    """Of a Fermi-Pasta-Ulam chain, ``-dV/ds`` and ``-dV/df - omega^2 f``, over single numbers."""
+    cubes = [d * d * d for d in chain_gaps(q)]
+    f = q[len(q) // 2 :]
     slow = [right - left for left, right in pairwise(cubes)]
     fast = [left + right - omega**2 * x for (left, right), x in zip(pairwise(cubes), f, strict=True)]
     return slow + fast
@@ -146,5 +151,6 @@ def _between(q: Sequence, i: int, j: int) -> list:
     return [q[3 * j + axis] if i < 0 else q[3 * j + axis] - q[3 * i + axis] for axis in range(3)]
 
 
-def _dot(a: Sequence, b: Sequence):
+def dot(a: Sequence, b: Sequence):
+    """Of two vectors in space."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

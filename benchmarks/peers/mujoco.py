@@ -1,12 +1,10 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""MuJoCo: rods are ball joints of a tree, exact by construction; springs are tendons; RK4 and its semi-implicit Euler."""
-
-from collections.abc import Sequence
+"""MuJoCo: rods are ball joints of a tree, springs are tendons; RK4 and its semi-implicit Euler."""
 
 import mujoco
 import numpy as np
 
-from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers.cases import Case, Ladder, steps_ladder
 from benchmarks.peers.mechanics import Particles, from_masses, to_masses
 
 INERTIA = 1e-10
@@ -36,23 +34,20 @@ def ladders(case: Case) -> list[Ladder]:
 
             return run
 
-        return Ladder(name, "steps", step_counts(8 * case.t_end, 1e7 * case.t_end), build)
+        return steps_ladder(case, name, build, first=8.0)
 
     return [ladder(name) for name in INTEGRATORS]
 
 
 def prepare(case: Case):
     """Model, data and joint velocities at the start, where all joint positions are zero."""
-    bodies, tendons = _chain(case) if case.is_chain else _particles(case.particles, case.q)
-    gravity = 0.0 if case.is_chain else case.particles.gravity
-    model = mujoco.MjModel.from_xml_string(f"""
-        <mujoco>
-          <option gravity="0 0 {-gravity!r}"><flag contact="disable" constraint="disable" autoreset="disable"/></option>
-          <worldbody>{bodies}</worldbody>
-          <tendon>{tendons}</tendon>
-        </mujoco>""")
+    spec = mujoco.MjSpec()
+    for flag in ("CONTACT", "CONSTRAINT", "AUTORESET"):
+        spec.option.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")
+    (_chain if case.is_chain else _particles)(case, spec)
+    model = spec.compile()
     data = mujoco.MjData(model)
-    data.qvel[:] = to_masses(case.v) if case.is_chain else _velocities(model, case)
+    data.qvel[:] = to_masses(case.v) if case.is_chain else _velocities(case)
     return model, data, data.qvel.copy()
 
 
@@ -72,51 +67,53 @@ def energy(case: Case) -> float:
     return float(data.energy.sum())
 
 
-def _chain(case: Case) -> tuple[str, str]:
+def _chain(case: Case, spec) -> None:
     """Its masses on sliders, joined by tendons of linear and cubic force, ``(omega^2 / 2) d`` and ``4 d^3``."""
+    spec.option.gravity = np.zeros(3)
     x = to_masses(case.q)
-    bodies = "".join(_body(f"{i}", AXES[0] * a, _slider(f"{i}", AXES[0], a)) for i, a in enumerate(x))
-    stiff = [_tendon({i + 1: 1, i: -1}, f"{case.omega**2 / 2!r}") for i in range(0, len(x), 2)]
-    soft = [_tendon({i + 1: 1, i: -1}, "0 0 4") for i in range(1, len(x) - 1, 2)]
-    walls = [_tendon({i: 1}, "0 0 4") for i in (0, len(x) - 1)]
-    return bodies, "".join(stiff + soft + walls)
+    for i, place in enumerate(x):
+        body = _body(spec.worldbody, AXES[0] * place)
+        body.add_joint(name=f"{i}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=AXES[0], ref=place)
+    linear, cubic = [case.omega**2 / 2, 0.0, 0.0], [0.0, 0.0, 4.0]
+    last = len(x) - 1
+    for i in range(last):
+        _tendon(spec, {i + 1: 1.0, i: -1.0}, cubic if i % 2 else linear)
+    for i in (0, last):
+        _tendon(spec, {i: 1.0}, cubic)
 
 
-def _body(name: str, place, inside: str, mass: float = 1.0, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> str:
-    inertia = f'<inertial pos="{_numbers(offset)}" mass="{mass!r}" diaginertia="{_numbers([INERTIA] * 3)}"/>'
-    return f'<body name="b{name}" pos="{_numbers(place)}">{inertia}{inside}</body>'
+def _body(parent, place, mass: float = 1.0, centre=(0.0, 0.0, 0.0)):
+    return parent.add_body(pos=place, mass=mass, ipos=centre, inertia=[INERTIA] * 3, explicitinertial=True)
 
 
-def _slider(name: str, axis, place: float = 0.0) -> str:
-    return f'<joint name="j{name}" type="slide" axis="{_numbers(axis)}" ref="{float(place)!r}"/>'
+def _tendon(spec, joints: dict[int, float], stiffness) -> None:
+    tendon = spec.add_tendon(stiffness=stiffness, springlength=[0.0, 0.0])
+    for i, coefficient in joints.items():
+        tendon.wrap_joint(f"{i}", coefficient)
 
 
-def _tendon(joints: dict[int, int], stiffness: str) -> str:
-    inside = "".join(f'<joint joint="j{i}" coef="{c}"/>' for i, c in joints.items())
-    return f'<fixed stiffness="{stiffness}" springlength="0">{inside}</fixed>'
-
-
-def _particles(p: Particles, q) -> tuple[str, str]:
+def _particles(case: Case, spec) -> None:
     """A body per particle, hinged at the other end of its rod if it has one, else free to move."""
-    q = np.reshape(q, (-1, 3))
-
-    def tree(i: int, parent: int, origin) -> str:
-        """Particle i and those that hang on it; `origin` is where its parent's frame is."""
-        hinged = parent is not None
-        frame = (np.zeros(3) if parent == -1 else q[parent]) if hinged else q[i]
-        joints = '<joint type="ball"/>' if hinged else "".join(_slider(f"{i}{a}", AXES[a]) for a in range(3))
-        site = f'<site name="s{i}" pos="{_numbers(q[i] - frame)}"/>'
-        below = "".join(tree(j, i, frame) for k, j, _ in p.rods if k == i)
-        return _body(f"{i}", frame - origin, joints + site + below, p.masses[i], q[i] - frame)
-
+    p, q = case.particles, case.q.reshape(-1, 3)
+    spec.option.gravity = -p.gravity * AXES[2]
+    frames = {-1: np.zeros(3)}
+    bodies = {-1: spec.worldbody}
     parents = {j: i for i, j, _ in p.rods}
-    roots = [i for i in range(len(p.masses)) if parents.get(i, -1) == -1]
-    bodies = "".join(tree(i, parents.get(i), np.zeros(3)) for i in roots)  # pyright: ignore[reportArgumentType]
-    tendons = "".join(
-        f'<spatial stiffness="{k!r}" springlength="{length!r}"><site site="s{i}"/><site site="s{j}"/></spatial>'
-        for i, j, k, length in p.springs
-    )
-    return bodies, tendons
+    for i in _order(p):
+        parent = parents.get(i, -1)
+        hinged = i in parents
+        frames[i] = (q[parent] if parent >= 0 else np.zeros(3)) if hinged else q[i]
+        bodies[i] = _body(bodies[parent], frames[i] - frames[parent], p.masses[i], q[i] - frames[i])
+        if hinged:
+            bodies[i].add_joint(type=mujoco.mjtJoint.mjJNT_BALL)
+        else:
+            for axis in AXES:
+                bodies[i].add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        bodies[i].add_site(name=f"{i}", pos=q[i] - frames[i])
+    for i, j, k, length in p.springs:
+        tendon = spec.add_tendon(stiffness=[k, 0.0, 0.0], springlength=[length, length])
+        tendon.wrap_site(f"{i}")
+        tendon.wrap_site(f"{j}")
 
 
 def _order(p: Particles) -> list[int]:
@@ -129,7 +126,7 @@ def _order(p: Particles) -> list[int]:
     return [x for i in range(len(p.masses)) if parents.get(i, -1) == -1 for x in below(i)]
 
 
-def _velocities(model, case: Case) -> np.ndarray:
+def _velocities(case: Case) -> np.ndarray:
     """Joint velocities: ``r x (v - v_parent) / |r|^2`` for rods, relative to that of the rod they hang on."""
     p, q, v = case.particles, case.q.reshape(-1, 3), case.v.reshape(-1, 3)
     parents, spin, found = {j: i for i, j, _ in p.rods}, {}, []
@@ -143,7 +140,3 @@ def _velocities(model, case: Case) -> np.ndarray:
         spin[i] = np.cross(r, w) / (r @ r)
         found.append(spin[i] - (0 if k < 0 else spin[k]))
     return np.concatenate(found)
-
-
-def _numbers(values) -> str:
-    return " ".join(repr(float(x)) for x in values)

@@ -1,17 +1,17 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""OpenMM: its r-RESPA integrator with constraints (MTSIntegrator), on the Reference platform, which computes in doubles."""
+"""OpenMM: its r-RESPA integrator with constraints (MTSIntegrator), in doubles on the Reference platform."""
 
 import numpy as np
 import openmm as mm
 
-from benchmarks.peers.cases import Case, Ladder, step_counts
+from benchmarks.peers.cases import Case, Ladder, steps_ladder
 from benchmarks.peers.mechanics import from_masses, to_masses
 
 NUM_MICRO = (1, 4)
-"""Micro steps per macro step that are tried; every one of them is interpreted on its own, more make a step slower."""
+"""Micro steps per macro step that are tried; each is interpreted, more make a step slower."""
 SLOW, FAST = 0, 1  # force groups
 FIXED = 1e20
-"""Mass of the particle at the origin: OpenMM constrains no particle of infinite mass; this one moves less than round-off."""
+"""Mass of the particle at the origin, which cannot be infinite: it moves less than round-off."""
 TOLERANCE = 1e-13
 """Relative error of a rod; the iteration ends below it."""
 
@@ -36,13 +36,13 @@ def ladders(case: Case) -> list[Ladder]:
 
             return run
 
-        return Ladder(f"MTS {num_micro}", "steps", step_counts(4 * case.t_end, 1e7 * case.t_end), build)
+        return steps_ladder(case, f"MTS {num_micro}", build)
 
     return [ladder(n) for n in NUM_MICRO]
 
 
 def prepare(case: Case, num_micro: int):
-    """Context, positions and velocities at the start; lengths in nm, times in ps, energies in kJ/mol fit together."""
+    """Context, positions and velocities at the start, in nm, ps and kJ/mol."""
     system, x, v = _chain(case) if case.is_chain else _particles(case)
     integrator = mm.MTSIntegrator(1e-3, [(SLOW, 1), (FAST, num_micro)])
     integrator.setConstraintTolerance(TOLERANCE)

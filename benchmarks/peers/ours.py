@@ -1,4 +1,4 @@
-"""vmri_jax itself: every scheme as a prepared run, which is checked and compiled once for all numbers of steps."""
+"""vmri_jax itself: every scheme as a prepared run, compiled once for all numbers of steps."""
 
 import dataclasses
 from functools import cache
@@ -67,15 +67,16 @@ def ladders(case: Case) -> list[Ladder]:
         def build(num_steps: int):
             simulate, macro_dt = prepared(), case.t_end / num_steps
 
-            def run():
-                end = simulate(num_steps, macro_dt=macro_dt)
-                return np.concatenate([np.asarray(end.q_s)[-1], np.asarray(end.q_f)[-1]])
-
-            return run
+            return lambda: last_positions(simulate(num_steps, macro_dt=macro_dt))
 
         return Ladder(name, "steps", step_counts(max(2, 2 * case.t_end), 1e6 * case.t_end), build)
 
     return [ladder(*found) for found in _with_tolerances(case, schemes(case))]
+
+
+def last_positions(run: vm.Trajectory) -> np.ndarray:
+    """At the end, slow ones first; of all lanes of a batch."""
+    return np.concatenate([np.asarray(run.q_s)[..., -1, :], np.asarray(run.q_f)[..., -1, :]], axis=-1)
 
 
 def _with_tolerances(case: Case, schemes) -> list[tuple[str, vm.Scheme | vm.Composition, float]]:
@@ -103,8 +104,7 @@ def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladd
             steps = {"macro_dt": case.t_end / num_steps, "num_steps": num_steps, "save_every": num_steps}
 
             def run():
-                end = vm.simulate_batch(case.problem.system, scheme, states, **steps, newton=newton)
-                return np.concatenate([np.asarray(end.q_s)[:, -1], np.asarray(end.q_f)[:, -1]], axis=1)
+                return last_positions(vm.simulate_batch(case.problem.system, scheme, states, **steps, newton=newton))
 
             return run
 

@@ -26,10 +26,8 @@ ENOUGH = 0.01
 class Point:
     """One setting of one peer that was run.
 
-    settled: the largest error of it and of all finer settings of its ladder: no level is reached by luck.
-    seconds: the fastest of a few calls.
-    build: seconds for everything made beforehand.
-    compile: seconds by which the first call of its ladder was longer than a run.
+    settled: the largest error of it and of all finer settings of its ladder.
+    seconds, build, compile: of the fastest of a few calls, of what is made once, of what the first call took longer.
     """
 
     peer: str
@@ -45,9 +43,10 @@ class Point:
 def scan(
     peer: str, ladders: Sequence[Ladder], case: Case, seconds: float, levels: Sequence[float] = LEVELS
 ) -> list[Point]:
-    """Climb every ladder until the error is a tenth of the finest level, a run takes longer than `seconds`, or a setting can no longer
-    be the cheapest one: another ladder has reached the finest level in less time. Where a ladder is among the cheapest at a level,
-    settings between the last one that misses it and the first one that reaches it are tried too."""
+    """Climb every ladder until it is fine enough, a run takes longer than `seconds`, or another ladder was faster.
+
+    Those that are among the cheapest at a level are refined there.
+    """
     climbed: list[Climb] = []
     for ladder in ladders:
         climb = Climb(peer, ladder, case)

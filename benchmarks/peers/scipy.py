@@ -1,5 +1,5 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
-"""scipy: the adaptive Runge-Kutta method DOP853; its right-hand side is compiled by JAX, faster than numpy for few numbers."""
+"""scipy: the adaptive Runge-Kutta method DOP853, its right-hand side compiled by JAX."""
 
 import jax
 import jax.numpy as jnp
