@@ -299,7 +299,7 @@ def test_bad_schemes(changes, error, message):
         ({"macro_dt": 0.1, "save_every": 0}, ValueError, "save_every is 0; it must be an integer of at least 1"),
         ({"macro_dt": 0.1, "save_every": 3}, ValueError, "num_steps = 10 is not a multiple of save_every = 3"),
         ({"macro_dt": 0.1, "scheme": "fully_implicit"}, TypeError, "scheme is str; give a Scheme"),
-        ({"macro_dt": 0.1, "state": None}, TypeError, r"state is NoneType; give a State, e.g. from initial_state"),
+        ({"macro_dt": 0.1, "state": None}, TypeError, r"a System has no start; give a State, e.g. from initial_state"),
     ],
 )
 def test_bad_arguments_of_simulate(fpu, changes, error, message):
@@ -346,7 +346,7 @@ def test_parameters_that_are_not_finite(fpu):
 
 
 def test_results_that_do_not_fit_into_memory(fpu):
-    message = r"100000000000 saved nodes would take 1.5\de\+04 GB, and .* GB of memory are free. Save fewer .*stream"
+    message = r"100000000000 saved nodes would take 1.52e\+04 GB, and .* GB of memory are free. Save fewer .*stream"
     with pytest.raises(ValueError, match=message):
         simulate(fpu.system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=10**11)
     states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())

@@ -145,6 +145,7 @@ def start_of(what: str, system, state=None) -> tuple[System, State]:
     Raises:
         TypeError: something else; a system without a state.
     """
+    require_x64()
     if callable(getattr(system, "problem", None)):
         system = system.problem()
     if isinstance(system, Problem):

@@ -79,7 +79,7 @@ def simulate(
     if not run.is_concrete:
         return run.traced()
     run.check()
-    check_memory("simulate", run.state, scheme.num_micro, run.room, save_micro)
+    check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     trajectory = run.in_parts() if progress else run()
     if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
         check_constraints(run.system, run.state, "simulate: the state")
