@@ -1,5 +1,6 @@
 """Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories."""
 
+from importlib import import_module
 from importlib.metadata import version
 
 from vmri_jax import diagnostics
@@ -34,6 +35,14 @@ from vmri_jax.steppers.stepper import StepInfo
 from vmri_jax import systems  # isort: skip  (written with the names above)
 
 __version__ = version("vmri_jax")
+
+
+def __getattr__(name: str):
+    """``vm.plots``, imported when it is asked for: matplotlib takes half a second."""
+    if name == "plots":
+        return import_module("vmri_jax.plots")
+    raise AttributeError(f"module 'vmri_jax' has no attribute {name!r}")
+
 
 __all__ = [
     "CompiledAgainWarning",

@@ -18,8 +18,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator, LogLocator, NullFormatter, NullLocator
 
-from vmri_jax import diagnostics
-from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.mechanics.invariants import oscillatory_energies
 
 
 @dataclass(frozen=True)
@@ -42,6 +41,8 @@ DARK = Theme(
 MARKERS = ("o", "s", "^", "D", "v", "P")
 MAX_NAMED = 6
 """More curves than this in one panel are drawn alike and not named one by one."""
+ROUNDOFF = 1e-13
+"""Axes span this part of the values at least."""
 
 
 class NotebookFigure(Figure):
@@ -142,7 +143,18 @@ def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
         figure.savefig(path)
 
 
-def plot_trajectory(trajectory: Trajectory, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+class Run(Protocol):
+    """Saved nodes of a run, (k,) and (k, n), see `vmri_jax.Trajectory`."""
+
+    t: Any
+    q_s: Any
+    q_f: Any
+    p_f: Any
+    energy: Any
+    constraint_residual: Any
+
+
+def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Slow and fast positions, energy error and, where there are constraints, their residual, against time.
 
     Args:
@@ -162,6 +174,7 @@ def plot_trajectory(trajectory: Trajectory, title: str = "", theme: Theme = LIGH
         axes[1].set_ylabel(r"fast positions $q_f$")
         axes[2].plot(t, error, color=theme.curves[0], linewidth=_thin(t))
         axes[2].set_ylabel(label)
+        _not_below_roundoff(axes[2].yaxis, error)
         if constrained:
             shown = np.where(residual > 0, residual, np.nan)
             axes[3].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
@@ -173,7 +186,7 @@ def plot_trajectory(trajectory: Trajectory, title: str = "", theme: Theme = LIGH
     return figure
 
 
-def plot_oscillatory_energies(trajectory: Trajectory, omega, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of the stiff springs and their sum, the adiabatic invariant.
 
     Args:
@@ -183,7 +196,7 @@ def plot_oscillatory_energies(trajectory: Trajectory, omega, title: str = "", th
         theme: colours.
     """
     t = np.asarray(trajectory.t)
-    energies = np.asarray(diagnostics.oscillatory_energies(omega, trajectory.q_f, trajectory.p_f))
+    energies = np.asarray(oscillatory_energies(omega, trajectory.q_f, trajectory.p_f))
     with new_figure(7.2, 3.4, title, theme) as figure:
         axes = figure.subplots()
         axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
@@ -391,6 +404,15 @@ def _energy_error(energy) -> tuple[np.ndarray, str]:
     if abs(energy[0]) > 1e-12:
         return error / abs(energy[0]), r"energy error $\Delta E / |E_0|$"
     return error, r"energy error $\Delta E$"
+
+
+def _not_below_roundoff(axis: Axis, values) -> None:
+    """Limits that do not blow up round-off: they span `ROUNDOFF` of the values at least."""
+    middle, size = np.nanmean(values), np.nanmax(np.abs(values), initial=0.0)
+    low, high = axis.get_view_interval()
+    half = ROUNDOFF * max(size, 1.0) / 2
+    if high - low < 2 * half:
+        axis.set_view_interval(middle - half, middle + half, ignore=True)
 
 
 def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:

@@ -75,6 +75,16 @@ class Trajectory(eqx.Module):
         """`State` at the last saved node (of every run, in a batch)."""
         return State(self.t[..., -1], *(x[..., -1, :] for x in (self.q_s, self.q_f, self.p_s, self.p_f)))
 
+    def plot(self, title: str = ""):
+        """Positions, energy error and constraints against time, a matplotlib `Figure`; more in `vmri_jax.plots`.
+
+        Args:
+            title: over the figure.
+        """
+        from vmri_jax.plots import plot_trajectory  # matplotlib takes half a second
+
+        return plot_trajectory(self, title)
+
     def save(self, path, drawing: dict | None = None) -> None:
         """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
 
