@@ -134,7 +134,7 @@ def _by_hand(scheme: vm.Scheme, tell: Tell) -> dict[str, tuple]:
 def _program(system: vm.System, scheme: vm.Scheme, scene: Scene) -> tuple:
     """(operations in all, temporary bytes, operations by name) of a compiled run from the scene's start."""
     start = scene.problem()
-    state = vm.initial_state(system, start.q_s, start.q_f, start.v_s, start.v_f)
+    state = vm.initial_state(system, start.q_s, start.q_f, start.v_s, start.v_f, project=True)
     compiled = prepare_steps(system, scheme, state, MACRO_DT).compiled()
     counts = operations(compiled)
     return sum(counts.values()), temporary_bytes(compiled), counts

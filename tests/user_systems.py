@@ -106,7 +106,7 @@ def tilted(q_s, q_f, params):
 def tied_system() -> tuple[System, State]:
     """Coupling constraints, one of them moved, and slow ones; and a consistent start."""
     system = System(FULL_MASS, tilted, constraint=Rheonomic(lifted), slow_constraint=sphere, params=jnp.asarray(3.0))
-    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1])
+    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1], project=True)
 
 
 # --- a pendulum on a cart at a spring --------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ def norm_at_zero(full: bool) -> Outcome:
     for distance in (1e-2, 1e-4, 1e-8, 0.0):
         q_f = jnp.array([10.0, 2.0, 0.0, 10.0, 2.0, 0.0]).at[5].add(distance)
         v_f = jnp.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.5 if distance else 0.0])  # coincident points: also at rest
-        state = vm.Problem(problem.system, problem.q_s, q_f, problem.v_s, v_f).state()
+        state = vm.Problem(problem.system, problem.q_s, q_f, problem.v_s, v_f, project=True).state()
         gradient, trajectory = reached(problem.system.params["stiffness"], state)
         largest = float(jnp.max(jnp.abs(gradient)) * problem.system.params["stiffness"])
         values[f"gradient_{distance:g}"] = largest if trajectory.success else np.nan

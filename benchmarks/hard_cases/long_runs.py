@@ -29,7 +29,7 @@ def hanging_pendulum() -> vm.Problem:
     l_1, l_2, l_3 = params["lengths"] + [0.0, 0.0, params["gravity"] * params["masses"][2] / params["stiffness"]]
     q_f = jnp.array([0.0, 0.0, -l_1 - l_2, 0.0, 0.0, -l_1 - l_2 - l_3])
     v_s, v_f = jnp.array([0.5, 0.3, 0.0]), jnp.array([0.5, 0.3, 0.0, 0.7, 0.4, 0.1])
-    return vm.Problem(problem.system, jnp.array([0.0, 0.0, -l_1]), q_f, v_s, v_f)
+    return vm.Problem(problem.system, jnp.array([0.0, 0.0, -l_1]), q_f, v_s, v_f, project=True)
 
 
 @hard_case(16, "constraints for long", draw_energy)

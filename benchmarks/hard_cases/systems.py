@@ -45,7 +45,7 @@ def nearly_slow_constraint(eps: float) -> vm.Problem:
     q_s, q_f = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0])
     params = arrays(kappa=1.0, omega=50.0, anchor=q_f, eps=eps, square=1.0 + eps)
     system = vm.System(vm.ConstantMass([10.0] * 3, [1.0] * 3), tether, stiff_cage, nearly_slow, params=params)
-    return vm.Problem(system, q_s, q_f, jnp.array([0.0, 0.3, 0.0]), jnp.array([0.2, 0.0, 0.0]))
+    return vm.Problem(system, q_s, q_f, jnp.array([0.0, 0.3, 0.0]), jnp.array([0.2, 0.0, 0.0]), project=True)
 
 
 # --- linkages and chains ---------------------------------------------------------------------------------------------
@@ -85,7 +85,7 @@ def four_bar(angle: float, kappa: float = 0.0, redundant: bool = False) -> vm.Pr
     tip = np.array([np.cos(angle), np.sin(angle)])
     velocity = np.array([-np.sin(angle), np.cos(angle)])
     q_f, v_f = np.concatenate([tip, [tip[0] + base, tip[1]]]), np.tile(velocity, 2)
-    return vm.Problem(system, jnp.array([-1.0]), jnp.asarray(q_f), jnp.array([0.0]), jnp.asarray(v_f))
+    return vm.Problem(system, jnp.array([-1.0]), jnp.asarray(q_f), jnp.array([0.0]), jnp.asarray(v_f), project=True)
 
 
 def chain_weight(q_s, q_f, params):
@@ -113,7 +113,7 @@ def link_chain(num_links: int = 20, bend: float = 0.0) -> vm.Problem:
     masses = vm.ConstantMass([10.0], np.full(2 * num_links, mass))
     system = vm.System(masses, chain_weight, constraint=rigid_links, params=params)
     q_f = jnp.asarray(np.cumsum(steps, axis=0).reshape(-1))
-    return vm.Problem(system, jnp.zeros(1), q_f, jnp.array([0.1]), jnp.zeros(2 * num_links))
+    return vm.Problem(system, jnp.zeros(1), q_f, jnp.array([0.1]), jnp.zeros(2 * num_links), project=True)
 
 
 def hung_weight(q_s, q_f, params):
@@ -174,7 +174,7 @@ def two_body(eccentricity: float = 0.9) -> vm.Problem:
     system = vm.System(masses, trap, gravitation, params=params)
     speed = np.sqrt((1 - eccentricity) / (1 + eccentricity))
     q_f, v_f = jnp.array([1.0 + eccentricity, 0.0]), jnp.array([0.0, speed])
-    return vm.Problem(system, jnp.array([1.0, 0.0]), q_f, jnp.zeros(2), v_f)
+    return vm.Problem(system, jnp.array([1.0, 0.0]), q_f, jnp.zeros(2), v_f, project=True)
 
 
 # --- variants of the Fermi-Pasta-Ulam chain --------------------------------------------------------------------------
@@ -214,4 +214,4 @@ def swapped_chain() -> vm.Problem:
     kinetic = problem.system.kinetic
     assert isinstance(kinetic, vm.ConstantMass)
     system = vm.System(vm.ConstantMass(kinetic.fast, kinetic.slow), everything_slow, params=problem.system.params)
-    return vm.Problem(system, problem.q_f, problem.q_s, problem.v_f, problem.v_s)
+    return vm.Problem(system, problem.q_f, problem.q_s, problem.v_f, problem.v_s, project=True)

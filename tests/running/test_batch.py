@@ -123,7 +123,7 @@ def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, newton):
 
     def go(v_s, v_f, macro_dt, params):
         system = problem.system.replace(params=problem.system.params | params)
-        state = initial_state(system, problem.q_s, problem.q_f, v_s, v_f)
+        state = initial_state(system, problem.q_s, problem.q_f, v_s, v_f, project=True)
         return simulate(system, scheme, state, macro_dt=macro_dt, newton=newton, throw=False, **RUN)
 
     batch = jax.jit(jax.vmap(go))(v_s, v_f, steps, params)

@@ -29,7 +29,7 @@ def test_what_is_taken_out_was_never_there(effect):
     values = scene.system().num_constraints(jnp.zeros(3), jnp.zeros(9))
     assert rows[effect.name].multipliers == 5 * values[0] + values[1]
     q_s, q_f, v_s, v_f = (getattr(scene.problem(), name) for name in ("q_s", "q_f", "v_s", "v_f"))
-    state = initial_state(with_it, q_s, q_f, v_s, v_f)  # every function can be evaluated there
+    state = initial_state(with_it, q_s, q_f, v_s, v_f, project=True)  # every function can be evaluated there
     forces = jax.eval_shape(with_it.forces, state.t, q_s, q_f, v_s, v_f)
     assert [f.shape for f in forces] == [(3,), (9,)]
 

@@ -327,7 +327,9 @@ def test_kinetic_energy_is_a_function_only_with_a_magnetic_field():
     scene = Scene(charge, [MagneticField(3.0, 0.5)])
     assert not isinstance(scene.system().kinetic, ConstantMass)
     assert isinstance(scene.without("magnetic_field").system().kinetic, ConstantMass)
-    state = initial_state(scene.system(), *(getattr(scene.problem(), name) for name in ("q_s", "q_f", "v_s", "v_f")))
+    state = initial_state(
+        scene.system(), *(getattr(scene.problem(), name) for name in ("q_s", "q_f", "v_s", "v_f")), project=True
+    )
     assert np.allclose(state.p_s, [0.0, 2.0 + 0.5 * 3.0 / 2])  # m v + Q A
 
 

@@ -45,13 +45,13 @@ def general():
     system = System(
         FULL_MASS, soft, stiff, constraint=Rheonomic(lifted), slow_constraint=sphere, params=jnp.asarray(3.0)
     )
-    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1])
+    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1], project=True)
 
 
 def free():
     """No constraints."""
     system = System(FULL_MASS, soft, stiff, params=jnp.asarray(3.0))
-    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1])
+    return system, initial_state(system, [0.6, 0.8], [0.0, 1.0, 0.6], [0.4, -0.3], [0.2, 0.1, -0.1], project=True)
 
 
 def slow_only():

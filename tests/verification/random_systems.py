@@ -307,7 +307,7 @@ def problem(of: Structure, at: Draw) -> vm.Problem:
     else:
         kinetic = vm.ConstantMass(masses[:n_s], masses[n_s:])
     system = vm.System(**parts | {"kinetic": kinetic}, params=params)
-    return vm.Problem(system, q[:n_s], q[n_s:], v[:n_s], v[n_s:], at.time)
+    return vm.Problem(system, q[:n_s], q[n_s:], v[:n_s], v[n_s:], at.time, project=True)
 
 
 def scheme(of: Structure, at: Draw) -> vm.Scheme | vm.Composition:

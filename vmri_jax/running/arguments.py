@@ -34,7 +34,7 @@ def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_en
     check_counts(num_steps, save_every)
     if is_concrete(vars(state)):
         check_vectors(state)
-    return dt, num_steps
+    return dt, int(num_steps)
 
 
 def steps_until(t_end, t, macro_dt) -> int:
