@@ -225,13 +225,13 @@ class Readme(Timed):
 
     def __init__(self, case: Case):
         text = Path("README.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
-        lines = ast.parse(text)
+        lines = ast.parse(text).body
+        (last,) = (i for i, line in enumerate(lines) if "vm.simulate(" in ast.unparse(line))
         self.names: dict[str, Any] = {}
-        exec(compile(lines, "README.md", "exec"), self.names)
-        (line,) = (part for part in lines.body if "vm.simulate(" in ast.unparse(part))
-        self.line = compile(ast.Module([line], []), "README.md", "exec")
+        exec(compile(ast.Module(lines[: last + 1], []), "README.md", "exec"), self.names)
+        self.line = compile(ast.Module(lines[last : last + 1], []), "README.md", "exec")
         self.keep(self.names["run"], self.names["run"], node=COMPARED)
-        self.num_steps = 1000
+        self.num_steps = len(self.names["run"].t) - 1
 
     def sample(self) -> float:
         """Of one call."""
