@@ -38,7 +38,7 @@ def lifted_rope(t, q_s, q_f, params):
 def hoist() -> Problem:
     """The crane with a rope that is wound up and down."""
     system = crane().system.replace(constraint=Rheonomic(lifted_rope))
-    return Problem(system, jnp.zeros(1), jnp.array([0.6, -0.8]), jnp.zeros(1), jnp.array([0.008, 0.006]))
+    return Problem(system, jnp.zeros(1), jnp.array([0.6, -0.8]), jnp.zeros(1), jnp.array([0.008, 0.006]), project=True)
 
 
 def friction(t, q_s, q_f, v_s, v_f, params):
