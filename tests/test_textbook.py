@@ -14,6 +14,7 @@ SPRINGS: dict[str, Any] = {"slow_potential": "harmonic", "fast_potential": "spri
 STRUCTURES = {
     "explicit": rs.Structure(2, 1, 2, **SPRINGS, scheme="fully explicit", num_micro=5),
     "corrected kicks": rs.Structure(2, 1, 1, **SPRINGS, scheme="takahashi imada", num_micro=2),
+    "linear": rs.Structure(2, 1, 2, "matrix", "harmonic", "harmonic", scheme="explicit slow", num_micro=3),
     "drift": rs.Structure(2, 1, 2, **SPRINGS, constraint="chain", scheme="fully explicit"),
     "slow and fast apart": rs.Structure(
         2, 1, 2, **SPRINGS, constraint="anchored", slow_constraint="sphere", scheme="explicit slow", num_micro=3
@@ -41,6 +42,7 @@ STRUCTURES = {
 METHODS = {
     "explicit": "EXPLICIT",
     "corrected kicks": "EXPLICIT",
+    "linear": "LINEAR",
     "drift": "RATTLE",
     "slow and fast apart": "NESTED",
     "nested": "NESTED",

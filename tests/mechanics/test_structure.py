@@ -31,6 +31,7 @@ def nested(q):
         (lambda q: jnp.sum(q) ** 2, False, True),
         (lambda q: q[0] * q[1], False, True),
         (lambda q: jnp.sum((q[1:] - q[:-1]) ** 2), False, True),
+        (lambda q: jnp.sum(jnp.diff(q) ** 2 + jnp.roll(q, 1)[1:] * q[:-1]), False, True),
         (lambda q: jnp.linalg.norm(q), False, False),
         (lambda q: jnp.sum(q**2 * q[0]), False, False),
     ],

@@ -85,11 +85,8 @@ def depends_on(function: Callable, *args) -> tuple[bool, ...]:
     jaxpr = jax.make_jaxpr(function)(*args).jaxpr
     if jaxpr.effects:
         return (True,) * len(args)
-    _, needed = _needed(jaxpr, jaxpr.outvars)
-    leaves = [jax.tree.structure(a).num_leaves for a in args]
-    stops = np.cumsum(leaves)
-    used = [id(v) in needed for v in jaxpr.invars]
-    return tuple(any(used[stop - n : stop]) for n, stop in zip(leaves, stops, strict=True))
+    of_argument = np.repeat(np.arange(len(args)), [jax.tree.structure(a).num_leaves for a in args])
+    return tuple(any(_outputs_reached(jaxpr, (of_argument == i).tolist())) for i in range(len(args)))
 
 
 def has_constant_hessian(function: Callable, *args) -> bool:
