@@ -251,11 +251,11 @@ def test_a_problem_or_a_scene_is_enough(given, fpu):
         system, state = moved.system(), moved.state()
     else:
         moved, system, state = fpu, fpu.system, fpu.state()
-    start = (system, fully_implicit(2), state) if given == "system" else (moved, fully_implicit(2))
-    run = simulate(*start, macro_dt=0.05, t_end=0.2)
+    scheme, moved, start = fully_implicit(2), *((system, state) if given == "system" else (moved, None))
+    run = simulate(moved, scheme, start, macro_dt=0.05, t_end=0.2)
     expected = simulate(system, fully_implicit(2), state, macro_dt=0.05, num_steps=4)
     assert np.array_equal(run.q_f, expected.q_f)
-    assert str(plan(*start)) == str(plan(system, fully_implicit(2), state))
+    assert str(plan(moved, scheme, start)) == str(plan(system, scheme, state))
 
 
 def test_ends_of_runs(fpu):

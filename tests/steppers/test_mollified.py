@@ -1,5 +1,7 @@
 """The mollified impulse method: V at averaged fast positions."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,7 +115,7 @@ def dumbbell_start(x=(0.0,) * 6) -> State:
     return initial_state(DUMBBELL, q_s, q_s + along, v_s, v_s + (2.0 + x[5]) * np.array([along[1], -along[0]]))
 
 
-def dumbbell_run(scheme=None, method="auto", start=None):
+def dumbbell_run(scheme=None, method: Any = "auto", start=None):
     scheme, start = scheme or mollified_impulse(3), start or dumbbell_start()
     return simulate(DUMBBELL, scheme, start, macro_dt=0.02, num_steps=50, newton=Newton(method))
 
