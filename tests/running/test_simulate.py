@@ -251,7 +251,9 @@ def test_a_problem_or_a_scene_is_enough(given, fpu):
         system, state = moved.system(), moved.state()
     else:
         moved, system, state = fpu, fpu.system, fpu.state()
-    scheme, moved, start = fully_implicit(2), *((system, state) if given == "system" else (moved, None))
+    scheme, start = fully_implicit(2), None
+    if given == "system":
+        moved, start = system, state
     run = simulate(moved, scheme, start, macro_dt=0.05, t_end=0.2)
     expected = simulate(system, fully_implicit(2), state, macro_dt=0.05, num_steps=4)
     assert np.array_equal(run.q_f, expected.q_f)
