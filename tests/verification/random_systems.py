@@ -286,7 +286,7 @@ def functions(of: Structure) -> dict:
 
 
 def problem(of: Structure, at: Draw) -> vm.Problem:
-    """System and start. The constraints hold at the start up to ``off``."""
+    """System and start. The constraints hold at the start up to ``off``; where they hold, velocities are projected onto them."""
     n_s = of.dimension * of.slow
     q, v, masses = (np.array(x) for x in (at.positions, at.velocities, at.masses))
     params = {
@@ -307,7 +307,7 @@ def problem(of: Structure, at: Draw) -> vm.Problem:
     else:
         kinetic = vm.ConstantMass(masses[:n_s], masses[n_s:])
     system = vm.System(**parts | {"kinetic": kinetic}, params=params)
-    return vm.Problem(system, q[:n_s], q[n_s:], v[:n_s], v[n_s:], at.time, project=True)
+    return vm.Problem(system, q[:n_s], q[n_s:], v[:n_s], v[n_s:], at.time, project=not any(at.off))
 
 
 def scheme(of: Structure, at: Draw) -> vm.Scheme | vm.Composition:

@@ -320,7 +320,7 @@ def simulation(
     newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
     leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))
-    room = room_for(num_steps // save_every)
+    room = room_for(int(num_steps // save_every))
     return Simulation(
         system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, room, leaves, structure
     )
