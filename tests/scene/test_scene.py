@@ -312,9 +312,11 @@ def test_ledger_counts_unknowns_by_the_formula():
 
 def test_ledger_measures():
     scene = Scene([Body("a", 1.0, [1.0])], [SpringAnchor("a", 0.0, 4.0), LinearDamping(0.1)])
-    ledger = scene.explain(fully_implicit(1))
+    ledger = scene.explain(
+        fully_implicit(50)
+    )  # enough micro steps for effects to take most of the time, 3.6 times measured
     assert ledger.scene.operations > ledger.bare.operations
-    assert min(ledger.scene.microseconds, ledger.bare.microseconds) > 0  # which is more depends on what else runs
+    assert ledger.scene.microseconds > ledger.bare.microseconds
     shares = {row.name: row.operations for row in ledger.rows if row.kind != "body"}
     assert 0 < shares["damping"] < 1
     assert ledger.as_dict()["rows"][1]["name"] == "spring_anchors"

@@ -80,15 +80,14 @@ def initial_state(
 
 
 def _tell_of_velocities(taken: float) -> None:
-    """Say which part of the velocities pointed against the constraints, and refuse a large one."""
+    """Say which part of the velocities does not fit the constraints, at rest or moving, and refuse a large one."""
     message = (
-        f"initial_state: {taken:.2%} of the velocities (in the norm of the kinetic energy) point against the constraints, "
-        "which take them away"
+        f"initial_state: {taken:.2%} of the velocities (in the norm of the kinetic energy) do not fit the constraints"
     )
     if taken > REFUSED:
-        raise ValueError(f"{message}. Correct the velocities, or pass project=True for those that are left.")
+        raise ValueError(f"{message}. Correct the velocities, or pass project=True for the nearest that fit.")
     if taken > NOTICED:
-        warnings.warn(f"{message}; pass project=True if that is meant.", stacklevel=3)
+        warnings.warn(f"{message}; the nearest that fit are taken. Pass project=True if that is meant.", stacklevel=3)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,8 @@ def simulate_batch(
     """Simulate a batch of states, each lane as `simulate` would; the arrays returned have a leading batch axis.
 
     Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. A lane that fails is NaN from there on and has
-    its status in ``.result`` and ``.failed_at``; others do not notice, and nothing is raised. Lanes that the nested march does not solve are run again with the exact arrowhead.
+    its status in ``.result`` and ``.failed_at``; others do not notice, and nothing is raised. Lanes that the nested march does
+    not solve are run again with the exact arrowhead.
 
     Args:
         system, scheme: what moves, a `System`, `Problem` or scene, and how.
