@@ -14,7 +14,7 @@ WHOLE = 1e-9
 
 
 def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro=False):
-    """Refuse bad arguments of `simulate`; returns macro_dt and num_steps."""
+    """Refuse bad arguments of `simulate`; returns macro_dt, num_steps and save_every."""
     require_x64()
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(
@@ -31,10 +31,10 @@ def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_en
         raise ValueError(f"simulate: got {got} of num_steps and t_end; give exactly one of them.")
     if num_steps is None:
         num_steps = steps_until(t_end, state.t, dt)
-    check_counts(num_steps, save_every)
+    counts = check_counts(num_steps, save_every)
     if is_concrete(vars(state)):
         check_vectors(state)
-    return dt, int(num_steps)
+    return dt, *counts
 
 
 def steps_until(t_end, t, macro_dt) -> int:
@@ -67,15 +67,16 @@ def check_step_size(scheme: Scheme | Composition, macro_dt, micro_dt):
     return dt if micro_dt is None else scheme.num_micro * micro_dt
 
 
-def check_counts(num_steps, save_every) -> None:
-    """Whole numbers of steps, the last of which is saved."""
-    whole_number("simulate: num_steps", num_steps)
-    whole_number("simulate: save_every", save_every)
+def check_counts(num_steps, save_every) -> tuple[int, int]:
+    """Whole numbers of steps, the last of which is saved, as integers of Python."""
+    num_steps = whole_number("simulate: num_steps", num_steps)
+    save_every = whole_number("simulate: save_every", save_every)
     if num_steps % save_every:
         raise ValueError(
             f"simulate: num_steps = {num_steps} is not a multiple of save_every = {save_every}; the last saved node would "
             "not be the end."
         )
+    return num_steps, save_every
 
 
 def check_vectors(state: State) -> None:

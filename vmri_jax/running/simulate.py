@@ -314,13 +314,13 @@ def simulation(
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     warn_if_slow()
     system, state = start_of("simulate", system, state)
-    macro_dt, num_steps = check_run(
+    macro_dt, num_steps, save_every = check_run(
         system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro
     )
     newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
     leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))
-    room = room_for(int(num_steps // save_every))
+    room = room_for(num_steps // save_every)
     return Simulation(
         system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, room, leaves, structure
     )
