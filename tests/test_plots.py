@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 import vmri_jax as vm
 from vmri_jax import plots
+from vmri_jax.mechanics.names import Names
+from vmri_jax.running.origin import Origin
 from vmri_jax.running.trajectory import RunInfo
 from vmri_jax.study import ConvergenceRow, ConvergenceStudy, CostRow, CostStudy, ReferenceSolution
 
@@ -69,7 +72,7 @@ def y_data(line):
 def test_a_trajectory_has_a_panel_for_everything_it_carries():
     free, held = plots.plot_trajectory(run()), plots.plot_trajectory(run(constrained=True))
     assert [len(figure.axes) for figure in (free, held)] == [3, 4]
-    assert labels(free.axes[0]) == ["$s_{1}$", "$s_{2}$"]
+    assert labels(free.axes[0]) == ["q_s[0]", "q_s[1]"]
     assert "E_0" in free.axes[2].get_ylabel()
     np.testing.assert_allclose(y_data(free.axes[2].lines[0]), 0.5e-3 * np.sin(run().t), atol=1e-15)
 
@@ -81,11 +84,43 @@ def test_a_trajectory_cut_short_by_a_failure_is_drawn_up_to_there():
     assert np.isfinite(drawn).sum() == 5
 
 
-def test_many_coordinates_are_counted_instead_of_named():
+def test_of_many_coordinates_some_are_named():
     axes = plots.plot_trajectory(run(n_f=40)).axes[1]
-    assert axes.get_legend() is None
-    assert [text.get_text() for text in axes.texts] == ["40 coordinates"]
     assert len(axes.lines) == 40
+    legend = axes.get_legend()
+    assert legend is not None
+    assert legend.get_title().get_text() == "12 of 40"
+    assert labels(axes)[:2] == ["q_f[0]", "q_f[4]"]
+    assert labels(axes)[-1] == "q_f[39]"
+
+
+def test_bodies_give_their_names():
+    axes = plots.plot_trajectory(run().of(Origin(Names(slow={"cart": 1, "beam": 1}, fast={"bob": 3})))).axes
+    assert labels(axes[0]) == ["cart", "beam"]
+    assert labels(axes[1]) == ["bob x", "bob y", "bob z"]
+
+
+def test_the_energy_of_a_driven_system_has_a_balance():
+    def drag(t, q_s, q_f, v_s, v_f, params):
+        return -0.5 * v_s, jnp.zeros(0)
+
+    def spring(q_s, q_f, params):
+        return 2.0 * q_s @ q_s
+
+    problem = vm.Problem(vm.System(vm.ConstantMass([1.0], []), spring, force=drag), [1.0], [], [0.0], [])
+    damped = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.01, num_steps=200)
+    axes = plots.plot_trajectory(damped).axes
+    assert [a.get_ylabel() for a in axes] == ["slow positions $q_s$", "energy and work", "energy balance"]
+    assert labels(axes[1]) == ["energy", "work of forces"]
+    assert np.abs(y_data(axes[2].lines[0])).max() < 1e-3 * np.abs(y_data(axes[1].lines[0])).max()
+    kept = vm.simulate(
+        vm.Problem(vm.System(vm.ConstantMass([1.0], []), spring), [1.0], [], [0.0], []),
+        vm.fully_implicit(1),
+        macro_dt=0.01,
+        num_steps=20,
+    )
+    assert plots.plot_trajectory(kept).axes[1].get_ylabel().startswith("energy error")
+    assert plots.plot_trajectory(jax.tree.map(lambda a: a, kept)).axes[1].get_ylabel().startswith("energy change")
 
 
 def test_oscillatory_energies_and_their_sum():

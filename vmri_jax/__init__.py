@@ -6,6 +6,7 @@ from importlib.metadata import version
 from vmri_jax import diagnostics
 from vmri_jax.configure import NotConfiguredWarning, configure
 from vmri_jax.mechanics.functions import CompiledAgainWarning
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.running.batch import simulate_batch
@@ -50,6 +51,7 @@ __all__ = [
     "ConstantMass",
     "Interrupted",
     "Method",
+    "Names",
     "Newton",
     "NotConfiguredWarning",
     "Plan",

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FixedLocator, LogLocator, NullFormatter, NullLocator
 
 from vmri_jax.mechanics.invariants import oscillatory_energies
+from vmri_jax.mechanics.names import Names
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,10 @@ DARK = Theme(
     "#15191d", "#e3e6e8", "#384048", "#8b969f", ("#62b5e8", "#f08a4b", "#3cc79b", "#dd92c4", "#e3b341", "#9ad0f0")
 )
 MARKERS = ("o", "s", "^", "D", "v", "P")
-MAX_NAMED = 6
-"""More curves than this in one panel are drawn alike and not named one by one."""
+DPI = 150
+"""Of figures that are saved by their own method."""
+MOST_NAMED = 12
+"""Of more curves than this in one panel so many are named."""
 ROUNDOFF = 1e-13
 """Axes span this part of the values at least."""
 
@@ -108,7 +111,7 @@ def new_figure(width: float, height: float, title: str, theme: Theme) -> Iterato
         theme: colours.
     """
     with style(theme):
-        figure = NotebookFigure(figsize=(width, height))
+        figure = NotebookFigure(figsize=(width, height), dpi=DPI)
         yield figure
         figure.suptitle(title, x=0.01, ha="left")
 
@@ -144,7 +147,7 @@ def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
 
 
 class Run(Protocol):
-    """Saved nodes of a run, (k,) and (k, n), see `vmri_jax.Trajectory`."""
+    """Saved nodes of a run, (k,) and (k, n), and what is known of it, see `vmri_jax.Trajectory`."""
 
     t: Any
     q_s: Any
@@ -153,34 +156,49 @@ class Run(Protocol):
     energy: Any
     constraint_residual: Any
 
+    @property
+    def names(self) -> Names: ...
+    @property
+    def keeps_energy(self) -> bool | None: ...
+    def work(self) -> Any: ...
+
 
 def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
-    """Slow and fast positions, energy error and, where there are constraints, their residual, against time.
+    """Slow and fast positions, energy and, where there are constraints, their residual, against time.
+
+    The energy of a system that keeps it is shown as an error. Of one with forces or moving constraints the figure shows its
+    change, their work, and what is left of the balance.
 
     Args:
         trajectory: a run; nodes after a failure are left out by matplotlib since they are NaN.
         title: over the figure.
         theme: colours.
     """
-    t = np.asarray(trajectory.t)
+    t, names = np.asarray(trajectory.t), trajectory.names
     residual = np.asarray(trajectory.constraint_residual)
     constrained = bool(np.nanmax(residual) > 0)
-    error, label = _energy_error(np.asarray(trajectory.energy))
-    with new_figure(7.2, 7.6 if constrained else 6.0, title, theme) as figure:
-        axes = figure.subplots(3 + constrained, sharex=True)
-        _coordinates(axes[0], t, np.asarray(trajectory.q_s), "s", theme)
-        _coordinates(axes[1], t, np.asarray(trajectory.q_f), "f", theme)
-        axes[0].set_ylabel(r"slow positions $q_s$")
-        axes[1].set_ylabel(r"fast positions $q_f$")
-        axes[2].plot(t, error, color=theme.curves[0], linewidth=_thin(t))
-        axes[2].set_ylabel(label)
-        _not_below_roundoff(axes[2].yaxis, error)
+    positions = [
+        (np.asarray(trajectory.q_s), names.slow_coordinates, r"slow positions $q_s$"),
+        (np.asarray(trajectory.q_f), names.fast_coordinates, r"fast positions $q_f$"),
+    ]
+    positions = [panel for panel in positions if panel[0].shape[1]]
+    driven = trajectory.keeps_energy is False
+    count = len(positions) + (2 if driven else 1) + constrained
+    with new_figure(7.2, 0.4 + 1.85 * count, title, theme) as figure:
+        axes = figure.subplots(count, sharex=True)
+        for panel, (values, labels, what) in zip(axes, positions, strict=False):
+            _coordinates(panel, t, values, labels, theme)
+            panel.set_ylabel(what)
+        if driven:
+            _energy_balance(axes[len(positions)], axes[len(positions) + 1], trajectory, theme)
+        else:
+            _energy_error(axes[len(positions)], trajectory, theme)
         if constrained:
             shown = np.where(residual > 0, residual, np.nan)
-            axes[3].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
-            axes[3].semilogy(t, shown[:, 1], "--", linewidth=_thin(t), label="velocity $|G v|$")
-            axes[3].set_ylabel("constraint residual")
-            _legend_beside(axes[3])
+            axes[-1].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
+            axes[-1].semilogy(t, shown[:, 1], "--", linewidth=_thin(t), label="velocity $|G v|$")
+            axes[-1].set_ylabel("constraint residual")
+            _legend_beside(axes[-1])
         axes[-1].set(xlabel="time $t$", xlim=(t[0], t[-1]))
         figure.align_ylabels()
     return figure
@@ -200,7 +218,7 @@ def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Th
     with new_figure(7.2, 3.4, title, theme) as figure:
         axes = figure.subplots()
         axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
-        _coordinates(axes, t, energies, "I", theme)
+        _coordinates(axes, t, energies, [f"$I_{{{i + 1}}}$" for i in range(energies.shape[1])], theme)
         axes.set(xlabel="time $t$", ylabel="oscillatory energy", xlim=(t[0], t[-1]))
         axes.set_ylim(bottom=0)
     return figure
@@ -376,17 +394,19 @@ def _cost_panel(axes: Axes, study: CostCurves, paper_minimum: int | None, theme:
     log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
 
 
-def _coordinates(axes: Axes, t, values, letter: str, theme: Theme) -> None:
-    """One line per coordinate; named beside the panel if they are few."""
+def _coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> None:
+    """One line per coordinate with its name beside the panel; of very many every so manieth is named."""
     n = values.shape[1]
-    if n <= MAX_NAMED:
-        for i in range(n):
-            axes.plot(t, values[:, i], color=theme.curves[i], linewidth=_thin(t), label=f"${letter}_{{{i + 1}}}$")
-        if n:
-            _legend_beside(axes)
-        return
-    axes.plot(t, values, color=theme.curves[0], linewidth=0.7, alpha=max(0.15, 4 / n))
-    axes.text(1.01, 0.5, f"{n} coordinates", transform=axes.transAxes, rotation=90, va="center", fontsize=8.5)
+    colors: Any = theme.curves
+    if n > len(theme.curves):
+        low, high = (0.3, 1.0) if theme is DARK else (0.0, 0.88)
+        colors = matplotlib.colormaps["viridis"](np.linspace(low, high, n))
+    named = range(n) if n <= MOST_NAMED else np.linspace(0, n - 1, MOST_NAMED).round().astype(int)
+    for i in range(n):
+        label = names[i] if i in named else f"_{names[i]}"  # which legends leave out
+        axes.plot(t, values[:, i], color=colors[i], linewidth=_thin(t), label=label)
+    if n:
+        _legend_beside(axes, f"{len(named)} of {n}" if n > MOST_NAMED else None, 9.0 if n <= len(theme.curves) else 6.5)
 
 
 def _thin(t) -> float:
@@ -394,16 +414,39 @@ def _thin(t) -> float:
     return 1.2 if len(t) <= 300 else 0.7
 
 
-def _legend_beside(axes: Axes) -> None:
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
+def _legend_beside(axes: Axes, title: str | None = None, size: float = 9.0) -> None:
+    look = {"handlelength": 1.2, "fontsize": size, "title_fontsize": size, "labelspacing": 0.3}
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title=title, **look)
 
 
-def _energy_error(energy) -> tuple[np.ndarray, str]:
-    """Relative to the start, or absolute if the start is zero."""
-    error = energy - energy[0]
+def _energy_error(axes: Axes, trajectory: Run, theme: Theme) -> None:
+    """Relative to the start, or absolute if the start is zero; a mere change if the system is not known."""
+    t, energy = np.asarray(trajectory.t), np.asarray(trajectory.energy)
+    what = "error" if trajectory.keeps_energy else "change"
+    error, label = energy - energy[0], rf"energy {what} $\Delta E$"
     if abs(energy[0]) > 1e-12:
-        return error / abs(energy[0]), r"energy error $\Delta E / |E_0|$"
-    return error, r"energy error $\Delta E$"
+        error, label = error / abs(energy[0]), rf"{label[:-1]} / |E_0|$"
+    axes.plot(t, error, color=theme.curves[0], linewidth=_thin(t))
+    axes.set_ylabel(label)
+    _not_below_roundoff(axes.yaxis, error)
+
+
+def _energy_balance(above: Axes, below: Axes, trajectory: Run, theme: Theme) -> None:
+    """Energy and work since the start, and under them what is left of the balance."""
+    t, energy, work = np.asarray(trajectory.t), np.asarray(trajectory.energy), trajectory.work()
+    curves = {"energy": energy - energy[0], "forces": work.forces, "moving constraints": work.constraints}
+    for (name, values), color in zip(curves.items(), theme.curves, strict=False):
+        if name == "energy" or np.any(values != 0):
+            above.plot(
+                t, values, color=color, linewidth=_thin(t), label=name if name == "energy" else f"work of {name}"
+            )
+    above.set_ylabel("energy and work")
+    _legend_beside(above, size=7.5)
+    below.plot(t, work.balance, color=theme.curves[0], linewidth=_thin(t), label=r"$\Delta E$ - work")
+    below.axhspan(-work.uncertainty, work.uncertainty, color=theme.faint, label="not resolved\nby the nodes")
+    below.set_ylabel("energy balance")
+    _legend_beside(below, size=7.5)
+    _not_below_roundoff(below.yaxis, energy)
 
 
 def _not_below_roundoff(axis: Axis, values) -> None:

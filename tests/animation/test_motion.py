@@ -9,7 +9,6 @@ import pytest
 import vmri_jax as vm
 from tests.animation.support import PENDULUM, swinging, trajectory
 from vmri_jax.animation import Drawing, motion
-from vmri_jax.animation.motion import hermite
 
 LINE = Drawing.from_dict(
     {"bodies": [{"name": "a", "coordinates": [["s", 0]]}, {"name": "b", "coordinates": [["f", 0]]}]}
@@ -46,13 +45,6 @@ def error(count: int, system) -> float:
 def test_order_between_nodes(system, order):
     errors = [error(count, system) for count in (41, 81)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.15)  # measured 4.0 and 2.9
-
-
-def test_cubics_are_exact():
-    t = np.array([0.0, 0.3, 1.0, 1.2])
-    times = np.linspace(0.0, 1.2, 50)
-    values = hermite(t, t**3 - t, 3 * t**2 - 1, times)
-    np.testing.assert_allclose(values, times**3 - times, atol=1e-14)
 
 
 def test_nodes_are_met_and_times_beyond_the_ends_are_held():

@@ -106,10 +106,12 @@ def test_trajectory_with_a_field_missing(trajectory, tmp_path):
 
 def test_xarray_dataset(trajectory):
     data = trajectory.to_xarray()
-    assert dict(data.sizes) == {"t": 5, "slow": 3, "fast": 6, "level": 2, "t_end": 4, "micro": 3}
-    for name in ("q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual", "q_f_micro"):
+    assert dict(data.sizes) == {"t": 5, "slow": 3, "fast": 6, "level": 2, "micro": 3}
+    for name in ("q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual"):
         assert np.array_equal(data[name], getattr(trajectory, name))
-    assert np.array_equal(data.coords["t_end"], trajectory.t[1:])
+    assert np.array_equal(data["q_f_micro"][1:], trajectory.q_f_micro)
+    assert np.isnan(data["q_f_micro"][0]).all()
+    assert data["iterations"].values.tolist() == [-1, *trajectory.info.iterations.tolist()]
     assert float(data["q_s"].sel(t=0.12, method="nearest")[1]) == float(trajectory.q_s[2, 1])
     assert data.attrs == {"result": "CONVERGED", "failed_at": -1}
 

@@ -1,10 +1,11 @@
 """Checks of plain data that a user wrote: what came, what was expected, and where."""
 
-import difflib
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+from vmri_jax.mechanics.names import near
 
 
 def check_keys(data: Any, known: Sequence[str], needed: Sequence[str], where: str) -> None:
@@ -25,12 +26,6 @@ def entries(data: dict, key: str, where: str) -> list:
     if not isinstance(found, list | tuple):
         raise ValueError(f"{where}: {key} is {type(found).__name__}; it must be a list.")
     return list(found)
-
-
-def near(name: str, known: Collection[str]) -> str:
-    """A question with the known name that is most like it; empty if none is."""
-    close = difflib.get_close_matches(name, known, n=1)
-    return f" Did you mean {close[0]}?" if close else ""
 
 
 def numbers(value: Any, where: str) -> tuple[float, ...]:

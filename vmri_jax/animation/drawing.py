@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.animation.checks import check_keys, direction, entries, near, numbers, positive
+from vmri_jax.animation.checks import check_keys, direction, entries, numbers, positive
+from vmri_jax.mechanics.names import near
 
 KEYS = ("bodies", "blocks", "links", "springs", "anchors", "planes", "spheres", "up", "caption")
 BLOCK_KEYS = ("name", "coordinates")

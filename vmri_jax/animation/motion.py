@@ -7,11 +7,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from vmri_jax import diagnostics
 from vmri_jax.animation.bars import with_bars
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
 
@@ -45,7 +47,9 @@ class Motion:
         Args:
             times: where to look.
         """
-        return hermite(self.t, self.points, self.velocities, np.clip(times, self.t[0], self.t[-1]))
+        if len(self.t) == 1:
+            return np.repeat(self.points, len(times), axis=0)
+        return CubicHermiteSpline(self.t, self.points, self.velocities)(np.clip(times, self.t[0], self.t[-1]))
 
     def between(self, start: float | None = None, end: float | None = None) -> "Motion":
         """The part between the nodes around two times.
@@ -97,7 +101,7 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
     Args:
         trajectory: one run, of at least one node.
         drawing: its bodies name coordinates of the run.
-        system: what was simulated.
+        system: what was simulated; None for that which the run knows.
 
     Raises:
         ValueError: a batch of runs, no node that is finite, a drawing or system of other coordinates.
@@ -106,6 +110,7 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
         raise ValueError(
             f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
         )
+    system = system or trajectory.origin.system
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.q_s, trajectory.q_f, trajectory.t))
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
     count = len(t) if finite.all() else int(np.argmin(finite))
@@ -129,25 +134,6 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
         np.stack([np.interp(t, nodes, column) for column in residual.T], axis=1),
         _ending(trajectory, count),
     )
-
-
-def hermite(t, values, velocities, times) -> np.ndarray:
-    """Cubic Hermite interpolation, ``x_i + u h v_i + u^2 (3 d - h (2 v_i + v_j)) + u^3 (h (v_i + v_j) - 2 d)``.
-
-    ``u = (time - t_i) / h`` on ``[t_i, t_i + h]``, ``d = x_j - x_i``.
-
-    Args:
-        t: (k,) nodes.
-        values, velocities: (k, ...) at the nodes.
-        times: where the result (len(times), ...) is wanted.
-    """
-    if len(t) == 1:
-        return np.repeat(values, len(times), axis=0)
-    i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
-    h = (t[i + 1] - t[i]).reshape(-1, *[1] * (np.ndim(values) - 1))
-    u = (times - t[i]).reshape(h.shape) / h
-    left, right, d = h * velocities[i], h * velocities[i + 1], values[i + 1] - values[i]
-    return values[i] + u * (left + u * (3 * d - 2 * left - right + u * (left + right - 2 * d)))
 
 
 def _differences(t, values) -> np.ndarray:
@@ -185,19 +171,11 @@ def _ending(trajectory: Trajectory, count: int) -> str:
 
 
 def _with_micro_nodes(trajectory: Trajectory, t, q, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes with the micro nodes between them, if the run kept those of all its macro steps and they are in order.
-
-    There the slow positions are those of the cubic between macro nodes, and velocities central differences.
-    """
-    if trajectory.t_micro is None or len(t) < 2:
+    """Nodes with the micro nodes between them, if the run kept those of all its macro steps and they are in order."""
+    steps = len(t) - 1
+    if trajectory.t_micro is None or why_not(t, trajectory.t_micro[:steps]):
         return t, q, v
-    t_micro, q_f = (np.asarray(a, dtype=float)[: len(t) - 1] for a in (trajectory.t_micro, trajectory.q_f_micro))
-    step = np.diff(t) / t_micro.shape[1]
-    fine = np.concatenate([t[:1], t_micro.reshape(-1)])
-    steps_left_out = np.any(t_micro[:, 0] - t[:-1] > 1.5 * step)  # save_every > 1
-    if t_micro.shape[1] == 1 or steps_left_out or np.any(np.diff(fine) <= 0):
-        return t, q, v
-    n_s = q.shape[1] - q_f.shape[-1]
-    slow = hermite(t, q[:, :n_s], v[:, :n_s], fine)
-    fine_q = np.concatenate([slow, np.concatenate([q[:1, n_s:], q_f.reshape(-1, q_f.shape[-1])])], axis=1)
-    return fine, fine_q, _differences(fine, fine_q)
+    n_s = np.shape(trajectory.q_s)[1]
+    nodes = Nodes(t, q[:, :n_s], q[:, n_s:], v[:, :n_s], v[:, n_s:])
+    every = with_micro_nodes(nodes, trajectory.t_micro[:steps], trajectory.q_f_micro[:steps])
+    return every.t, np.concatenate([every.q_s, every.q_f], axis=1), np.concatenate([every.v_s, every.v_f], axis=1)

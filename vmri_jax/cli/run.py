@@ -164,15 +164,33 @@ def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> di
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
     times, energies, largest = (np.array(found) for found in zip(*map(_extremes, pieces), strict=True))
     position, velocity, method, iterations = largest.max(axis=0)
-    start = energies[0, 0]
-    change = np.abs(energies - start).max()
-    energy = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"
     return {
         "simulated time": f"{times[0, 0]:g} to {times[-1, 1]:g}",
         "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
-        "energy change": f"at most {energy}",
+        **(_energy_error(energies) if trajectory.keeps_energy else _energy_balance(trajectory)),
         "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if constrained else "",
     }
+
+
+def _energy_error(energies: np.ndarray) -> dict[str, str]:
+    """Of a system that keeps its energy: at the start, lowest, highest of every piece."""
+    start = energies[0, 0]
+    change = np.abs(energies - start).max()
+    energy = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"
+    return {"energy change": f"at most {energy}"}
+
+
+def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]:
+    """Of a system with forces or moving constraints: energy, their work, and what is left of the balance."""
+    pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
+    works = [piece.work() for piece in pieces]
+    forces, constraints, left = (sum(part[-1] for part in parts) for parts in zip(*(w[:3] for w in works), strict=True))
+    uncertainty = sum(work.uncertainty for work in works)
+    work = {"forces": forces, "moving constraints": constraints}
+    found = {f"work of {name}": f"{value:.6g}" for name, value in work.items() if value != 0}
+    energy = {"energy": f"{float(trajectory[0:1].energy[0]):.6g} to {float(trajectory[-1:].energy[0]):.6g}"}
+    resolved = f"; the saved nodes resolve the work to {uncertainty:.1e}"
+    return energy | found | {"energy balance": f"{left:.1e} left at the end{resolved}"}
 
 
 def _extremes(piece: Trajectory) -> tuple:

@@ -9,6 +9,7 @@ With the mass matrix ``M = d2T/dv2`` these are linear in the accelerations a and
 where gamma is the second derivative of g in time without acceleration.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -24,15 +25,14 @@ class Motion(NamedTuple):
 
     v_s, v_f: velocities.
     a_s, a_f: accelerations.
-    multiplier, slow_multiplier: (n_g,), (n_gs,) lambda of `constraint` and of `slow_constraint`.
+    multipliers: (n_g + n_gs,) lambda of `constraint` and of `slow_constraint`, joined.
     """
 
     v_s: Any
     v_f: Any
     a_s: Any
     a_f: Any
-    multiplier: Any
-    slow_multiplier: Any
+    multipliers: Any
 
 
 def motion(system: System, state: State) -> Motion:
@@ -72,33 +72,34 @@ def motion(system: System, state: State) -> Motion:
     gamma = jax.jvp(rates, (t, q), (jnp.ones_like(t), v))[1]
 
     free, responses = jnp.linalg.solve(mass, forces), jnp.linalg.solve(mass, jacobian.T)
-    multiplier = jnp.linalg.lstsq(jacobian @ responses, jacobian @ free + gamma)[0]
-    a = free - responses @ multiplier
-    n_g = system.num_constraints(state.q_s, state.q_f)[0]
-    return Motion(v_s, v_f, a[:n_s], a[n_s:], multiplier[:n_g], multiplier[n_g:])
+    multipliers = jnp.linalg.lstsq(jacobian @ responses, jacobian @ free + gamma)[0]
+    a = free - responses @ multipliers
+    return Motion(v_s, v_f, a[:n_s], a[n_s:], multipliers)
 
 
-def reaction_forces(system: System, state: State, multiplier, slow_multiplier):
-    """Forces ``-G^T lambda`` (n_s,), (n_f,) of the constraints for given multipliers.
+def reaction_force(system: System, state: State, rows: Sequence[int]):
+    """Force ``-G^T lambda`` (n_s + n_f,) of some rows of the constraints, and on which coordinates they act, (n_s + n_f,).
 
     Args:
         system: its constraints.
         state: where they are held.
-        multiplier, slow_multiplier: (n_g,), (n_gs,).
+        rows: among those of `constraint` and `slow_constraint`, joined.
     """
-    constraints = jax.vjp(lambda q_s, q_f: system.constraints(state.t, q_s, q_f), state.q_s, state.q_f)[1]
-    return jax.tree.map(jnp.negative, constraints(jnp.append(multiplier, slow_multiplier)))
+    chosen = jnp.asarray(rows)
+    jacobians = jax.jacrev(system.constraints, argnums=(1, 2))(state.t, state.q_s, state.q_f)
+    jacobian = jnp.concatenate(jacobians, axis=1)[chosen]
+    return -motion(system, state).multipliers[chosen] @ jacobian, jnp.any(jacobian != 0, axis=0)
 
 
 def powers(system: System, state: State):
     """Power (2,) of the forces, ``F . v``, and of constraints that depend on time, ``lambda . dg/dt``: what changes the energy."""
-    moving = motion(system, state)
     of_forces = of_constraints = jnp.zeros(())
     if system.force is not None:
-        f_s, f_f = system.forces(state.t, state.q_s, state.q_f, moving.v_s, moving.v_f)
-        of_forces = jnp.sum(f_s * moving.v_s) + jnp.sum(f_f * moving.v_f)
+        v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+        f_s, f_f = system.forces(state.t, state.q_s, state.q_f, v_s, v_f)
+        of_forces = jnp.sum(f_s * v_s) + jnp.sum(f_f * v_f)
     if system.is_rheonomic:
         at_rest = jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f)
         own = system.constraint_rates(state.t, state.q_s, state.q_f, *at_rest)
-        of_constraints = jnp.sum(jnp.append(moving.multiplier, moving.slow_multiplier) * own)
+        of_constraints = jnp.sum(motion(system, state).multipliers * own)
     return jnp.stack([of_forces, of_constraints])

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, require_x64
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
 from vmri_jax.mechanics.constraints import check_constraints, check_mass, project_positions
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.system import System
 
@@ -96,9 +97,10 @@ class Problem:
 
     drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
     project: whether `state` projects positions and velocities onto the constraints, see `initial_state`.
+    names: of bodies and constraints, `Names` or None; runs, figures and files are labelled by them.
 
     Raises:
-        TypeError, ValueError: arrays as `initial_state` refuses them.
+        TypeError, ValueError: arrays as `initial_state` refuses them; names that do not add up to coordinates and constraints.
     """
 
     system: System
@@ -109,6 +111,7 @@ class Problem:
     t: Number = 0.0
     drawing: Any = None
     project: bool = False
+    names: Names | None = None
 
     def __post_init__(self):
         require_x64()
@@ -116,6 +119,10 @@ class Problem:
         names = "q_s", "q_f", "v_s", "v_f"
         for name, array in zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True):
             object.__setattr__(self, name, array)
+        if self.names is not None:
+            check_type("Problem: names", self.names, Names, "vmri_jax.Names(slow={...}, fast={...})")
+            check_system(self.system, self.q_s, self.q_f)
+            self.names.of(self.system, self.q_s.size, self.q_f.size)
 
     def state(self, project: bool | None = None) -> State:
         """The consistent initial `State` (see `initial_state`); None for `project` of the problem."""

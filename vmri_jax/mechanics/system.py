@@ -105,6 +105,11 @@ class System(eqx.Module):
         """Whether constraints depend on time."""
         return any(isinstance(function, Rheonomic) for function in (self.constraint, self.slow_constraint))
 
+    @property
+    def keeps_energy(self) -> bool:
+        """Whether the energy is constant: no forces without a potential, no constraints that depend on time."""
+        return self.force is None and not self.is_rheonomic
+
     def forces(self, t, q_s, q_f, v_s, v_f):
         """Values of `force`, ``(F_s, F_f)``; zero where there is none."""
         if self.force is None:

@@ -14,6 +14,7 @@ from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import Engine
 from vmri_jax.running.memory import check_memory
+from vmri_jax.running.origin import problem_of
 from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory, from_arrays
 from vmri_jax.schemes.composition import Composition, stage_scheme
@@ -63,7 +64,8 @@ def simulate_batch(
     """
     lanes = _check_states(states)
     first = jax.tree.map(lambda a: np.asarray(a)[0], states)
-    system, _ = start_of("simulate_batch", system, first)
+    problem = problem_of(system)
+    system, _ = start_of("simulate_batch", problem, first)
     if params is not None:
         _check_params(system, params, lanes)
     if t_end is not None and any(np.ndim(step) for step in (macro_dt, micro_dt) if step is not None):
@@ -71,7 +73,7 @@ def simulate_batch(
             "simulate_batch: t_end with a step size for each lane; give num_steps, the same for all lanes."
         )
     run = simulation(
-        system, scheme, first, newton, _first(macro_dt), _first(micro_dt), num_steps, t_end, save_every, save_micro
+        problem, scheme, first, newton, _first(macro_dt), _first(micro_dt), num_steps, t_end, save_every, save_micro
     )
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
     dt = np.asarray(real_array(f"simulate_batch: {name}", dt))
@@ -98,7 +100,7 @@ def simulate_batch(
         )
         again = _in_chunks(run, exact, jax.tree.map(lambda a: a[failed], batch), width, devices)
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b), trajectory, again)
-    return trajectory
+    return trajectory.of(run.origin if params is None else run.origin._replace(params=params, lanes=True))
 
 
 def _first(dt):

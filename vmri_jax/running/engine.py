@@ -60,11 +60,15 @@ class Engine:
 
     @cached_property
     def onwards(self):
-        """``onwards(leaves, state, own, t_start, macro_dt, step, save_every)``: trajectory, state and own at its end."""
+        """``onwards(leaves, state, own, t_start, macro_dt, step, save_every, saves)``: the next part of a run.
 
-        def onwards(leaves, state, own, t_start, macro_dt, step, save_every):
+        The arrays of its trajectory, of which the first `saves` saved intervals are computed, and state and own at its end.
+        """
+
+        def onwards(leaves, state, own, t_start, macro_dt, step, save_every, saves):
             stepper = self._stepper(leaves, State(*state))
-            return self._run(stepper, State(*state), own, t_start, macro_dt, step, save_every)
+            piece, *end = self._run(stepper, State(*state), own, t_start, macro_dt, step, save_every, saves)
+            return jax.tree.leaves(piece), *end
 
         return jax.jit(onwards)
 

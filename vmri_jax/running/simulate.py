@@ -13,12 +13,14 @@ from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_flags, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import check_run
 from vmri_jax.running.engine import Engine, engine
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
+from vmri_jax.running.origin import Origin, names_of, problem_of
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join
 from vmri_jax.schemes.composition import Composition
@@ -26,6 +28,9 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
+
+SHOWN = 50
+"""A run with a progress bar is computed in about so many parts."""
 
 
 def simulate(
@@ -150,6 +155,7 @@ class Simulation:
     Attributes:
         system, scheme, newton, state, num_steps, save_every, save_micro: as of `simulate`.
         macro_dt: an array of shape ().
+        names: of bodies and constraints, None if there are none.
         room: saved intervals that the program has room for.
     """
 
@@ -162,6 +168,7 @@ class Simulation:
     save_every: int
     save_micro: bool
     room: int
+    names: Names | None
     leaves: list = field(repr=False)
     structure: Any = field(repr=False)
 
@@ -174,11 +181,12 @@ class Simulation:
             throw: raise `SimulationError` if a step fails; else the status is in the trajectory.
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
-        trajectory = from_arrays(self._program(False)(*arguments), self.num_saves)
+        origin = self.origin if params is None else self.origin._replace(params=params)
+        trajectory = from_arrays(self._program(False)(*arguments), self.num_saves).of(origin)
         if int(trajectory.failed_at) < 0:
             return trajectory
         if self._fallback_helps(trajectory):
-            trajectory = from_arrays(self._program(True)(*arguments), self.num_saves)
+            trajectory = from_arrays(self._program(True)(*arguments), self.num_saves).of(origin)
         if throw and int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, arguments[2], arguments[3])
         return trajectory
@@ -243,6 +251,11 @@ class Simulation:
         """How its steps are taken; ``print`` shows it in words."""
         return plan(self.system, self.scheme, self.state, self.newton)
 
+    @property
+    def origin(self) -> Origin:
+        """What its trajectory is of."""
+        return Origin(self.names, self.system, self.system.params)
+
     @cached_property
     def start_arrays(self) -> tuple:
         """The arrays of the start."""
@@ -280,16 +293,17 @@ class Simulation:
         return Checkpoint(step, State(*start), memory, fell_back)
 
     def advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
-        """The next `saves` saved intervals, compiled once per number of them; again with the fallback if the first method fails."""
+        """The next `saves` saved intervals, at most `room`; again with the fallback if the first method fails."""
         piece, end = self._advance(at, saves)
         if not at.fell_back and self._fallback_helps(piece):
             return self._advance(self.start(at.state, at.step, fell_back=True), saves)
         return piece, end
 
     def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
-        program = self.engine_for(at.fell_back, saves).onwards
-        numbers = self.start_arrays[0], self.macro_dt, at.step, self.save_every
-        piece, state, memory = program(self.leaves, tuple(vars(at.state).values()), at.memory, *numbers)
+        program = self.engine_for(at.fell_back, self.room).onwards
+        numbers = self.start_arrays[0], self.macro_dt, at.step, self.save_every, saves
+        arrays, state, memory = program(self.leaves, tuple(vars(at.state).values()), at.memory, *numbers)
+        piece = from_arrays(arrays, saves)
         return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
@@ -298,14 +312,15 @@ class Simulation:
 
     def in_parts(self) -> Trajectory:
         """The whole run with a progress bar; Ctrl-C raises `Interrupted` with what was computed."""
-        at, pieces = self.start(), []
+        parts = replace(self, room=-(-self.num_saves // SHOWN))
+        at, pieces = parts.start(), []
         with interrupts_noted() as interrupted:
-            for saves in _shown_sizes(self.num_saves):
-                piece, at = self.advance(at, saves)
+            for saves in _shown_sizes(self.num_saves, parts.room):
+                piece, at = parts.advance(at, saves)
                 pieces.append(piece)
                 if interrupted():
-                    raise Interrupted(join(pieces), at.step, self.num_steps)
-        return join(pieces)
+                    raise Interrupted(join(pieces).of(self.origin), at.step, self.num_steps)
+        return join(pieces).of(self.origin)
 
 
 def simulation(
@@ -313,7 +328,8 @@ def simulation(
 ) -> Simulation:
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     warn_if_slow()
-    system, state = start_of("simulate", system, state)
+    problem = problem_of(system)
+    system, state = start_of("simulate", problem, state)
     macro_dt, num_steps, save_every = check_run(
         system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro
     )
@@ -321,8 +337,9 @@ def simulation(
     leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))
     room = room_for(num_steps // save_every)
+    macro_dt, names = _float(macro_dt), names_of(problem)
     return Simulation(
-        system, scheme, newton, state, _float(macro_dt), num_steps, save_every, save_micro, room, leaves, structure
+        system, scheme, newton, state, macro_dt, num_steps, save_every, save_micro, room, names, leaves, structure
     )
 
 
@@ -360,11 +377,10 @@ def _check_once(known: _Known) -> None:
         check_constraints(known.system, known.state, known.what)
 
 
-def _shown_sizes(num_saves: int) -> Iterator[int]:
-    """About 50 equal numbers of saved nodes, with a progress bar around them."""
+def _shown_sizes(num_saves: int, size: int) -> Iterator[int]:
+    """Numbers of saved intervals of this size, and what is left, with a progress bar around them."""
     from rich.progress import track
 
-    size = -(-num_saves // 50)
     sizes = [size] * (num_saves // size) + ([num_saves % size] if num_saves % size else [])
     yield from track(sizes, description="simulating", transient=True)
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path as FilePath
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -11,9 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from vmri_jax.mechanics.arrays import Numbers, require_x64
-from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.arrays import Numbers, is_concrete
+from vmri_jax.mechanics.state import HasProblem, Problem, State
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.export import Exports
 from vmri_jax.running.files import replaced
+from vmri_jax.running.origin import Origin
+from vmri_jax.running.quantities import Quantities
 from vmri_jax.steppers.results import Result
 
 FORMAT = "vmri_jax trajectory 2"
@@ -38,8 +42,12 @@ class RunInfo(NamedTuple):
     residual: Float[Numbers, "k-1"]
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Quantities, Exports, eqx.Module):
     """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has an axis of lanes before.
+
+    ``len(run)`` is k; ``run[i]`` is the `State` at a node, ``run[-1]`` that at the end; ``run[a:b]`` and ``run[a:b:n]`` are the
+    `Trajectory` of these nodes. Velocities, multipliers, reaction forces and work are `Quantities` of it. Transformations of JAX
+    keep the arrays alone; then ``run.of(problem)`` says again what the run is of.
 
     Attributes:
         q_s, q_f, p_s, p_f: positions and momenta; NaN after a failure.
@@ -66,6 +74,67 @@ class Trajectory(eqx.Module):
     q_f_micro: Float[Numbers, "k-1 num_micro n_f"] = None
 
     @property
+    def origin(self) -> Origin:
+        return vars(self).get("_origin", Origin())
+
+    def of(self, what: System | Problem | HasProblem | Origin) -> "Trajectory":
+        """The same run, which knows what it is of: its system, and the names of its parts.
+
+        Args:
+            what: the Problem, Scene or System that was simulated.
+
+        Raises:
+            TypeError: something else.
+            ValueError: it has other numbers of coordinates.
+        """
+        origin = what if isinstance(what, Origin) else Origin.of(what)
+        if not isinstance(what, Origin):
+            origin.check(self.q_s.shape[-1], self.q_f.shape[-1])
+        own = object.__new__(type(self))
+        vars(own).update(vars(self), _origin=origin)
+        return own
+
+    def whole(self) -> "Trajectory":
+        return self
+
+    def __len__(self) -> int:
+        return np.shape(self.t)[-1]
+
+    @overload
+    def __getitem__(self, nodes: int) -> State: ...
+    @overload
+    def __getitem__(self, nodes: slice) -> "Trajectory": ...
+    def __getitem__(self, nodes):
+        if isinstance(nodes, int | np.integer):
+            at = range(len(self))[nodes]  # beyond the ends an IndexError
+            lanes = (slice(None),) * (np.ndim(self.t) - 1)
+            return State(*(a[*lanes, at] for a in (self.t, self.q_s, self.q_f, self.p_s, self.p_f)))
+        if not isinstance(nodes, slice):
+            raise TypeError(
+                f"Trajectory: the index is {nodes!r}; give the number of a node, or a slice as in run[:100]."
+            )
+        if not is_concrete(self.energy):
+            raise TypeError("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
+        first, last, stride = ends_of("Trajectory", nodes, len(self))
+        return from_named_arrays(part_of(named_arrays(self), first, last, stride)).of(self.origin)
+
+    def lane(self, i: int) -> "Trajectory":
+        """One run of a batch.
+
+        Args:
+            i: its number.
+
+        Raises:
+            ValueError: this is no batch.
+        """
+        if np.ndim(self.t) != 2:
+            raise ValueError("lane: this is one run, no batch of runs.")
+        return jax.tree.map(lambda a: a[i], self).of(self.origin.lane(i))
+
+    def __getstate__(self) -> dict:
+        return {name: value for name, value in vars(self).items() if name != "_origin"}  # functions may not be pickled
+
+    @property
     def success(self):
         """Whether no step failed (of every run, in a batch)."""
         return self.result <= Result.CONVERGED_AT_ROUNDOFF
@@ -75,38 +144,36 @@ class Trajectory(eqx.Module):
         """`State` at the last saved node (of every run, in a batch)."""
         return State(self.t[..., -1], *(x[..., -1, :] for x in (self.q_s, self.q_f, self.p_s, self.p_f)))
 
-    def plot(self, title: str = ""):
-        """Positions, energy error and constraints against time, a matplotlib `Figure`; more in `vmri_jax.plots`.
-
-        Args:
-            title: over the figure.
-        """
-        from vmri_jax.plots import plot_trajectory  # matplotlib takes half a second
-
-        return plot_trajectory(self, title)
-
     def save(self, path, drawing: dict | None = None) -> None:
         """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
+
+        Names of coordinates are the arrays ``slow_names`` and ``fast_names``.
 
         Args:
             path: of the file.
             drawing: plain data of a `vmri_jax.animation.Drawing`, kept next to the arrays.
+
+        Raises:
+            OSError: the file cannot be written.
         """
         arrays = {name: np.asarray(value) for name, value in named_arrays(self).items() if value is not None}
         if drawing is not None:
             arrays["drawing"] = np.array(json.dumps(drawing))
+        if self.origin.names is not None:
+            names = self.names
+            arrays |= {"slow_names": np.array(names.slow_coordinates), "fast_names": np.array(names.fast_coordinates)}
+            arrays["names"] = np.array(json.dumps(names.to_dict()))
         with replaced(path) as file:
             np.savez_compressed(file, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def load(cls, path) -> "Trajectory":
-        """Read a trajectory written by `save`.
+        """Read a trajectory written by `save`, as arrays of NumPy; with ``.of(problem)`` it knows its system again.
 
         Raises:
             FileNotFoundError: no such file.
             ValueError: a file that is damaged or not a trajectory.
         """
-        require_x64()
         path = FilePath(path)
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist; give the .npz file of a saved trajectory.")
@@ -119,39 +186,54 @@ class Trajectory(eqx.Module):
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
-        arrays.pop("drawing", None)
+        names = arrays.pop("names", None)
+        for name in ("drawing", "slow_names", "fast_names"):
+            arrays.pop(name, None)
         missing = _FIELDS - set(arrays) - set(MICRO)
         if missing or set(arrays) - _FIELDS:
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
-        return from_named_arrays({name: jnp.asarray(value) for name, value in arrays.items()})
+        return from_named_arrays(arrays).of(Origin.named(None if names is None else json.loads(str(names))))
 
-    def to_xarray(self):
-        """The trajectory as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``)."""
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError("to_xarray needs xarray; install it with pip install 'vmri_jax[xarray]'.") from error
-        t = np.asarray(self.t)
-        data = {
-            "q_s": (("t", "slow"), self.q_s),
-            "q_f": (("t", "fast"), self.q_f),
-            "p_s": (("t", "slow"), self.p_s),
-            "p_f": (("t", "fast"), self.p_f),
-            "energy": ("t", self.energy),
-            "constraint_residual": (("t", "level"), self.constraint_residual),
-            "method": ("t_end", self.info.method),
-            "iterations": ("t_end", self.info.iterations),
-            "residual": ("t_end", self.info.residual),
-        }
-        if self.q_f_micro is not None:
-            data["t_micro"] = (("t_end", "micro"), self.t_micro)
-            data["q_f_micro"] = (("t_end", "micro", "fast"), self.q_f_micro)
-        data = {k: (dims, np.asarray(v)) for k, (dims, v) in data.items()}
-        coords = {"t": t, "t_end": t[1:], "level": ["position", "velocity"]}
-        attributes = {"result": Result(int(self.result)).name, "failed_at": int(self.failed_at)}
-        return xarray.Dataset(data, coords=coords, attrs=attributes)
+
+def ends_of(what: str, nodes: slice, count: int) -> tuple[int, int, int]:
+    """First and last node of a slice, and the stride from one to the next.
+
+    Args:
+        what: the class of the run, for messages.
+        nodes: the slice.
+        count: number of nodes there are.
+
+    Raises:
+        ValueError: no node, or backwards.
+    """
+    first, stop, stride = nodes.indices(count)
+    if stride < 1 or first >= stop:
+        raise ValueError(f"{what}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
+    return first, first + (stop - 1 - first) // stride * stride, stride
+
+
+def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
+    """The arrays of some nodes of a trajectory: between two of them the most that the solver did, and no failure after them."""
+    lanes = (slice(None),) * (np.ndim(arrays["t"]) - 1)
+
+    def part(name: str, value):
+        value = np.asarray(value)
+        if name in NODES:
+            return value[*lanes, first : last + 1 : stride]
+        if name in MICRO:
+            return value[*lanes, first + stride - 1 : last : stride]
+        between = value[*lanes, first:last]
+        starts = range(0, last - first, stride)
+        return np.maximum.reduceat(between, starts, axis=len(lanes)) if starts else between
+
+    found: dict = {name: None if a is None else part(name, a) for name, a in arrays.items() if name not in STATUS}
+    failed = np.isnan(found["energy"]).any(axis=-1)
+    before = (np.asarray(arrays["failed_at"]) >= 0) & ~failed
+    found["failed_at"] = np.where(before, -1, arrays["failed_at"])
+    found["result"] = np.where(before, int(Result.CONVERGED), arrays["result"])
+    return found
 
 
 def join(pieces: list[Trajectory]) -> Trajectory:
@@ -174,7 +256,7 @@ def join(pieces: list[Trajectory]) -> Trajectory:
 
 def named_arrays(trajectory: Trajectory) -> dict:
     """All arrays of a trajectory by name, those of `info` among them; None for what was not asked for."""
-    fields = dict(vars(trajectory))
+    fields = {field.name: getattr(trajectory, field.name) for field in dataclasses.fields(trajectory)}
     return fields | fields.pop("info")._asdict()
 
 

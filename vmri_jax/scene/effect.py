@@ -1,8 +1,7 @@
 """Effects: what a scene calls for. Each contributes one function to the Lagrangian, the constraints or the forces."""
 
-import difflib
 from abc import ABC
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -12,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import double_array, is_concrete
+from vmri_jax.mechanics.names import Place, unknown
 from vmri_jax.scene.body import Bodies
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
-from vmri_jax.scene.layout import Place, Rows
+from vmri_jax.scene.layout import Rows
 from vmri_jax.scene.terms import EffectTerm, choose
 
 Kind = Literal["kinetic", "potential", "constraint", "force"]
@@ -178,6 +178,17 @@ class Effect(ABC):
             if parameter.measured and self.kind == "constraint":
                 self._check_start(name, bodies, params)
 
+    def by_size(self, select: Sequence[int], bodies: Bodies) -> list[list[int]]:
+        """Some of the elements, those between bodies of the same sizes together: each of these is a term.
+
+        Args:
+            select: indices of elements.
+        """
+        elements, found = self.elements(bodies), {}
+        for i in select:
+            found.setdefault(tuple(bodies[name].size for name in elements[i]), []).append(i)
+        return list(found.values())
+
     def terms(self, select: Sequence[int], bodies: Bodies, places: Mapping[str, Place], potentials: Mapping[str, Any]):
         """The terms of some of the elements; those of bodies of other sizes in another term.
 
@@ -186,11 +197,8 @@ class Effect(ABC):
             places: of all bodies in q_s and q_f.
             potentials: terms of all potentials of the scene by name of the effect.
         """
-        elements, by_size = self.elements(bodies), {}
-        for i in select:
-            by_size.setdefault(tuple(places[name].size for name in elements[i]), []).append(i)
-        terms = []
-        for some in by_size.values():
+        elements, terms = self.elements(bodies), []
+        for some in self.by_size(select, bodies):
             roles = zip(*(elements[i] for i in some), strict=True)
             rows = tuple(Rows.of([places[name] for name in role]) for role in roles)
             chosen = None if len(some) == len(elements) else tuple(some)
@@ -269,11 +277,3 @@ def real_tree(what: str, tree):
         return jnp.asarray(double_array(what + jax.tree_util.keystr(path), leaf))
 
     return jax.tree_util.tree_map_with_path(convert, tree)
-
-
-def unknown(kind: str, name: Any, known: Iterable[str]) -> str:
-    """The sentence that there is none of that name, with the near miss."""
-    known = list(known)
-    near = difflib.get_close_matches(str(name), known, n=1)
-    hint = f" Did you mean {near[0]}?" if near else ""
-    return f"there is no {kind} {name!r}.{hint} There are {', '.join(known) or 'none'}."

@@ -6,9 +6,8 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.names import Part, Place
 from vmri_jax.scene.body import Bodies
-
-Part = Literal["s", "f"]
 
 
 class Pace(NamedTuple):
@@ -16,14 +15,6 @@ class Pace(NamedTuple):
 
     value: Literal["slow", "fast"]
     reason: str
-
-
-class Place(NamedTuple):
-    """Coordinates ``q_part[start : start + size]`` of a body."""
-
-    part: Part
-    start: int
-    size: int
 
 
 def layout(bodies: Bodies, paces: Mapping[str, Pace]) -> dict[str, Place]:

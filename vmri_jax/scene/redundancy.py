@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraints import rank_of
+from vmri_jax.scene.labels import label
 from vmri_jax.scene.sorting import Placed, Sorting
 
 HOMES = ("slow_constraint", "constraint")
@@ -47,11 +48,11 @@ def _rows(sorting: Sorting, part: Placed, n_s: int) -> list[tuple[str, np.ndarra
     elements, params = effect.elements(bodies), effect.parameters(bodies)
     for i in part.elements:
         jacobian = np.asarray(_jacobian(effect.function, effect.timed, *effect.one(i, bodies, params)))
-        label = f"{effect.name} {'-'.join(elements[i])}"
+        name = label(effect, elements[i])
         for j, entries in enumerate(jacobian):
             row = np.zeros(sum(body.size for body in bodies.values()))
             row[np.concatenate([columns[name] for name in elements[i]])] = entries
-            rows.append((label if len(jacobian) == 1 else f"{label} [{j}]", row))
+            rows.append((name if len(jacobian) == 1 else f"{name} [{j}]", row))
     return rows
 
 

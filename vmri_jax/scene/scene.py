@@ -10,12 +10,13 @@ import jax
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
+from vmri_jax.mechanics.names import Names, Place, unknown
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import Body
-from vmri_jax.scene.effect import Effect, unknown
-from vmri_jax.scene.layout import Place
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.labels import names_of
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints
 from vmri_jax.scene.sorting import Sorting, sort
@@ -101,6 +102,11 @@ class Scene:
         """Where each body's coordinates are in q_s and q_f."""
         return self.sorting.places
 
+    @cached_property
+    def names(self) -> Names:
+        """Bodies and constraints by name, in the order of coordinates and rows."""
+        return names_of(self.sorting)
+
     @property
     def params(self) -> dict[str, Any]:
         """Parameters by the name of the effect."""
@@ -118,7 +124,8 @@ class Scene:
     def problem(self) -> Problem:
         """The system with positions and velocities at the start, and with the drawing unless its numbers are traced."""
         seen = is_concrete((self.params, [body.radius for body in self.bodies]))
-        return Problem(self.system(), *self.start, drawing=self.drawing() if seen else None, project=self.project)
+        drawing = self.drawing() if seen else None
+        return Problem(self.system(), *self.start, drawing=drawing, project=self.project, names=self.names)
 
     def state(self) -> State:
         """The consistent initial state, see `initial_state`."""

@@ -17,9 +17,10 @@ from typing import Literal, NamedTuple
 import jax
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.names import Place
 from vmri_jax.scene.body import Bodies
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.layout import Pace, Place, join, layout
+from vmri_jax.scene.layout import Pace, join, layout
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
 
 NAMED = 3

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+import xarray
 
 from tests.running.store.conftest import CHUNK, STEPS, assert_identical
 from vmri_jax import State, StoredTrajectory
@@ -48,10 +49,20 @@ def test_every_nth_node(uninterrupted, first, stop, stride):
     assert np.array_equal(np.asarray(part.q_f_micro)[:, -1], whole.q_f[ends])
 
 
+def test_single_nodes_are_states(uninterrupted):
+    whole = uninterrupted.load()
+    for run in (uninterrupted, whole):
+        assert isinstance(run[3], State)
+        assert np.array_equal(run[3].q_f, whole.q_f[3])
+        assert float(run[-1].t) == float(whole.t[-1])
+        with pytest.raises(IndexError):
+            run[13]
+
+
 def test_what_can_not_be_taken(uninterrupted):
-    with pytest.raises(TypeError, match=r"the index is 3; take nodes by a slice"):
-        uninterrupted[3]
-    with pytest.raises(ValueError, match=r"no nodes 13:13:1 .*13 nodes are on disk, of 13"):
+    with pytest.raises(TypeError, match=r"the index is 'q_s'; give the number of a node, or a slice"):
+        uninterrupted["q_s"]
+    with pytest.raises(ValueError, match=r"no nodes 13:13:1; it has 13"):
         uninterrupted[20:]
     with pytest.raises(ValueError, match=r"taken forwards"):
         uninterrupted[::-1]
@@ -68,7 +79,7 @@ def test_a_store_that_has_just_begun(run, tmp_path, monkeypatch):
     begun = StoredTrajectory(tmp_path / "run.zarr")
     assert (len(begun), begun.step, begun.complete) == (0, 0, False)
     assert "0 of 24 macro steps, not complete" in repr(begun)
-    with pytest.raises(ValueError, match=r"0 nodes are on disk"):
+    with pytest.raises(ValueError, match=r"no nodes 0:0:1; it has 0"):
         begun.load()
 
 
@@ -79,10 +90,24 @@ def test_any_zarr_library_reads_it(uninterrupted):
         warnings.simplefilter("error")
         group = zarr.open_group(uninterrupted.path, mode="r")
         members = dict(group.members(max_depth=None))
-    assert {"t", "q_s", "q_f_micro", "start/q_s", "checkpoint"} <= set(members)
-    assert np.array_equal(np.asarray(group["q_f"]), uninterrupted.load().q_f[1:])
+    assert {"t", "q_s", "q_f_micro", "resume/checkpoint"} <= set(members)
+    assert np.array_equal(np.asarray(group["q_f"]), uninterrupted.load().q_f)
     assert group.attrs["num_steps"] == STEPS
-    assert len(list((uninterrupted.path / "q_f").glob("c.*"))) == STEPS // 2 // CHUNK
+    assert len(list((uninterrupted.path / "q_f").glob("c.*"))) == -(-(STEPS // 2 + 1) // CHUNK)
+
+
+def test_xarray_opens_it(uninterrupted):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = xarray.open_zarr(uninterrupted.path)
+    assert dict(data.sizes) == {"t": 13, "slow": 3, "fast": 3, "level": 2, "micro": 3}
+    expected = uninterrupted.to_xarray()
+    assert set(expected.data_vars) == set(data.data_vars)
+    for name in expected.variables:
+        if name in data.variables:
+            assert data[name].dims == expected[name].dims
+            assert np.array_equal(data[name], expected[name], equal_nan=True)
+    assert np.array_equal(data["t"], uninterrupted.load().t)
 
 
 def test_no_file_is_left_over(uninterrupted):

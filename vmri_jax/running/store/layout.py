@@ -1,12 +1,13 @@
 """Layout of a store on disk, and what is written in which order.
 
-A store is a folder, a zarr group of format 3 that any zarr library reads:
+A store is a folder, a zarr group of format 3 that any zarr library reads, and `xarray.open_zarr` as a dataset:
 
-    t, q_s, q_f, ...   one array per field of `Trajectory`, a row per saved interval, one file per chunk
-    start              a group with the node before the first interval
-    checkpoint         one file of bytes, an .npz: how many intervals are saved, the status, and all that the next ones
+    t, q_s, q_f, ...   one array per field of `Trajectory`, a row per saved node, the start first, one file per chunk of rows
+    resume/checkpoint  one file of bytes, an .npz: how many intervals are saved, the status, and all that the next ones
                        depend on
-    attributes         format, identity of the run, chunk, what it was made with
+    attributes         format, identity of the run, chunk, names, what it was made with
+
+What the steps before a node did is in the row of that node, so that the first row of these arrays is empty.
 
 The checkpoint is what commits a chunk: it is replaced as a whole after the files of the chunk are on disk. What lies beyond
 it does not count and is written again. A new store is made beside its place and moved there when it is complete, so a kill at
@@ -19,6 +20,7 @@ import io
 import json
 import os
 import shutil
+import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,17 +31,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.running.export import DIMENSIONS, FILL, rows_of
 from vmri_jax.running.files import replaced, synchronize
 from vmri_jax.running.simulate import Checkpoint
-from vmri_jax.running.trajectory import NODES, STATUS, Trajectory, named_arrays
+from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
 
-FORMAT = "vmri_jax trajectory store 1"
+FORMAT = "vmri_jax trajectory store 2"
 METADATA = "zarr.json"
-CHECKPOINT = Path("checkpoint", "c", "0")
-"""File of the checkpoint within a store."""
-FILL = {"f": np.nan, "i": 0}
-"""Values of rows that are not there yet, by kind of number."""
+CHECKPOINT = Path("resume", "checkpoint", "c", "0")
+"""File of the checkpoint within a store; in a group of its own, which datasets leave out."""
 CONFIG: Any = {"write_empty_chunks": True}
 """Of arrays that are written to: every chunk has its file, so that one that is missing is noticed."""
 
@@ -87,7 +88,8 @@ def create(path: Path, attributes: dict[str, Any], record: Record) -> None:
     try:
         group = zarr.create_group(partial, attributes={"format": FORMAT, **attributes})
         size = len(_packed(record))
-        group.create_array("checkpoint", shape=(size,), dtype="uint8", chunks=(size,), compressors=None)
+        resume = group.create_group("resume")
+        resume.create_array("checkpoint", shape=(size,), dtype="uint8", chunks=(size,), compressors=None)
         commit(partial, record)
         _synchronize(_files(partial))
         if path.exists():
@@ -119,35 +121,34 @@ def clear(path: Path) -> None:
 
 
 class Writer:
-    """Appends the pieces of a run to a store that is to have `rows` intervals."""
+    """Appends the pieces of a run to a store that is to have `rows` rows, the start and one for each saved interval."""
 
     def __init__(self, path: Path, rows: int, chunk: int):
         self._path, self._rows, self._chunk = path, rows, chunk
         self._arrays: dict[str, Any] = {}
 
     def append(self, piece: Trajectory, saved: int) -> None:
-        """Write the next intervals, all within one chunk, behind `saved` ones; they count from `commit` on."""
-        values = {k: np.asarray(a) for k, a in named_arrays(piece).items() if k not in STATUS and a is not None}
+        """Write the next intervals, the last ones of a chunk of rows, behind `saved` ones; they count from `commit` on."""
+        values = rows_of(piece)
         files = []
         if saved == 0:
             files = self._make(values)
         elif not self._arrays:
             files = self._open(values)
+        first, last = (saved + 1 if saved else 0), saved + len(piece) - 1
         for name, value in values.items():
-            rows = value[1:] if name in NODES else value
-            self._arrays[name][saved : saved + len(rows)] = rows
-            files.append(_chunk_file(self._path / name, value.ndim, saved // self._chunk))
+            self._arrays[name][first : last + 1] = value[1 if saved else 0 :]
+            chunks = range(first // self._chunk, last // self._chunk + 1)
+            files += [_chunk_file(self._path / name, value.ndim, k) for k in chunks]
         _synchronize(files)  # after all have been written: the first wait is one for most of the others
 
     def _make(self, values: dict[str, np.ndarray]) -> list[Path]:
-        """Make all arrays and write the start; returns the files there are."""
+        """Make all arrays; returns the files there are."""
         import zarr
 
         group = zarr.open_group(self._path, mode="r+")
-        start = group.require_group("start")
-        for name in NODES:
-            _create_array(start, name, values[name], 1, 1)[:] = values[name][:1]
         self._arrays = {name: _create_array(group, name, v, self._rows, self._chunk) for name, v in values.items()}
+        _consolidate(self._path)
         return _files(self._path)
 
     def _open(self, values: dict[str, np.ndarray]) -> list[Path]:
@@ -159,7 +160,8 @@ class Writer:
             if array.shape[0] != self._rows:
                 array.resize((self._rows, *value.shape[1:]))
             self._arrays[name] = array
-        return [self._path / name / METADATA for name in values]
+        _consolidate(self._path)
+        return [self._path / METADATA, *(self._path / name / METADATA for name in values)]
 
 
 def commit(path: Path, record: Record) -> None:
@@ -182,7 +184,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     try:
         attributes = json.loads((path / METADATA).read_text())["attributes"]
         if attributes["format"] != FORMAT:
-            raise ValueError(f"its format is {attributes['format']!r}, not {FORMAT!r}")
+            raise ValueError(f"its format is {attributes['format']!r}, that of this version {FORMAT!r}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a stored trajectory ({type(error).__name__}: {error}).") from error
     return attributes
@@ -264,10 +266,20 @@ def _create_array(group, name: str, like: np.ndarray, rows: int, chunk: int):
         dtype=like.dtype,
         fill_value=FILL[like.dtype.kind],
         compressors=Crc32cCodec(),
+        dimension_names=DIMENSIONS[name],
         config=CONFIG,
         chunk_key_encoding={"name": "default", "separator": "."},
         overwrite=True,
     )
+
+
+def _consolidate(path: Path) -> None:
+    """Copy the metadata of all arrays into that of the group, where datasets look for it first."""
+    import zarr
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")  # of format 3, but widely read
+        zarr.consolidate_metadata(path)
 
 
 def _chunk_file(array: Path, dimensions: int, k: int) -> Path:

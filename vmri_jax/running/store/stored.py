@@ -1,25 +1,28 @@
 """Reading a store: how far its run is, and any part of its trajectory."""
 
-from functools import cached_property
+from copy import copy
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
-import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import require_x64
-from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.state import HasProblem, Problem, State
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.export import Exports
+from vmri_jax.running.origin import Origin
+from vmri_jax.running.quantities import Quantities
 from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
-from vmri_jax.running.trajectory import MICRO, NODES, RunInfo, Trajectory, from_named_arrays
+from vmri_jax.running.trajectory import MICRO, NODES, RunInfo, Trajectory, ends_of, from_named_arrays
 from vmri_jax.steppers.results import Result, SimulationError
 
 
-class StoredTrajectory:
+class StoredTrajectory(Quantities, Exports):
     """A trajectory on disk, written by `stream`; only what is asked for is read.
 
-    ``len(stored)`` is the number of saved nodes, the start among them (0 before the first chunk is complete);
-    ``stored[a:b]`` and ``stored[a:b:n]`` are a `Trajectory` of these nodes, ``stored.load()`` is all of them. What it says
-    is what was on disk when it was opened; open it again to follow a run at work.
+    ``len(stored)`` is the number of saved nodes, the start among them (0 before the first chunk is complete); ``stored[i]`` is
+    the `State` at a node, ``stored[a:b]`` and ``stored[a:b:n]`` are a `Trajectory` of these nodes, ``stored.load()`` is all of
+    them. Its `Quantities` are those of all nodes. What it says is what was on disk when it was opened; open it again to
+    follow a run at work. `xarray.open_zarr` reads its folder as well.
 
     Args:
         path: folder of the store.
@@ -45,6 +48,7 @@ class StoredTrajectory:
         self.chunk: int = self.attributes["chunk"]
         self.record: Record = read_record(self.path)
         self.step, self.result, self.failed_at = self.record.step, Result(self.record.result), self.record.failed_at
+        self._origin = Origin.named(self.attributes.get("names"))
 
     @classmethod
     def open(cls, path) -> "StoredTrajectory":
@@ -56,6 +60,16 @@ class StoredTrajectory:
         return f"StoredTrajectory({str(self.path)!r}: {self.step} of {self.num_steps} macro steps, {state})"
 
     @property
+    def origin(self) -> Origin:
+        return self._origin
+
+    def of(self, what: System | Problem | HasProblem | Origin) -> "StoredTrajectory":
+        """The same, which knows its system, see `Trajectory.of`."""
+        own = copy(self)
+        own._origin = self[:1].of(what).origin
+        return own
+
+    @property
     def success(self) -> bool:
         """Whether no step has failed."""
         return self.result.success
@@ -65,10 +79,13 @@ class StoredTrajectory:
         """Whether all steps were made."""
         return self.success and self.step == self.num_steps
 
-    @cached_property
+    @property
     def final_state(self) -> State:
         """`State` at the last saved node."""
-        return self[len(self) - 1 :].final_state
+        return self[-1]
+
+    def whole(self) -> Trajectory:
+        return self.load()
 
     def load(self) -> Trajectory:
         """All saved nodes.
@@ -81,27 +98,29 @@ class StoredTrajectory:
     def __len__(self) -> int:
         return self.record.saved + 1 if self.record.saved else 0
 
-    def __getitem__(self, nodes: slice) -> Trajectory:
+    @overload
+    def __getitem__(self, nodes: int) -> State: ...
+    @overload
+    def __getitem__(self, nodes: slice) -> Trajectory: ...
+    def __getitem__(self, nodes):
+        if isinstance(nodes, int | np.integer):
+            at = range(len(self))[nodes]  # beyond the ends an IndexError
+            return self[at : at + 1][0]
         if not isinstance(nodes, slice):
-            raise TypeError(f"StoredTrajectory: the index is {nodes!r}; take nodes by a slice, e.g. stored[:100].")
-        require_x64()
-        first, stop, stride = nodes.indices(len(self))
-        if stride < 1 or first >= stop:
-            raise ValueError(
-                f"StoredTrajectory: no nodes {first}:{stop}:{stride} in {self.path}; {len(self)} nodes are on disk, of "
-                f"{self.num_steps // self.save_every + 1}, and they are taken forwards."
+            raise TypeError(
+                f"StoredTrajectory: the index is {nodes!r}; give the number of a node, or a slice as in stored[:100]."
             )
-        last = first + (stop - 1 - first) // stride * stride
-        arrays = {name: self._nodes(name, first, last, stride) for name in NODES}
+        first, last, stride = ends_of(f"StoredTrajectory {self.path}", nodes, len(self))
+        arrays = {name: self._rows(name, slice(first, last + 1, stride)) for name in NODES}
         for name in RunInfo._fields:  # the most of all intervals between two nodes
-            rows = self._rows(name, slice(first, last))
+            rows = self._rows(name, slice(first + 1, last + 1))
             arrays[name] = np.maximum.reduceat(rows, range(0, len(rows), stride)) if len(rows) else rows
         if self.attributes["save_micro"]:
-            arrays |= {name: self._rows(name, slice(first + stride - 1, last, stride)) for name in MICRO}
+            arrays |= {name: self._rows(name, slice(first + stride, last + 1, stride)) for name in MICRO}
         arrays |= {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
         if self.failed_at < last * self.save_every:
             arrays |= {"result": np.asarray(int(self.result)), "failed_at": np.asarray(self.failed_at)}
-        return from_named_arrays({name: jnp.asarray(array) for name, array in arrays.items()})
+        return from_named_arrays(arrays).of(self.origin)
 
     def chunks(self):
         """The trajectory piece by piece, each of a chunk and starting where the one before ends."""
@@ -118,13 +137,6 @@ class StoredTrajectory:
         time = float(before.t[0] + (before.t[1] - before.t[0]) * within / self.save_every)
         iterations, residual = int(before.info.iterations[0]), float(before.info.residual[0])
         raise SimulationError(self.result, self.failed_at, time, iterations, residual, self)
-
-    def _nodes(self, name: str, first: int, last: int, stride: int) -> np.ndarray:
-        """Values at nodes; the start is stored apart, row k is node k + 1."""
-        if first > 0:
-            return self._rows(name, slice(first - 1, last, stride))
-        start = read_rows(self.path / "start", name, slice(0, 1), 1)
-        return np.concatenate([start, self._rows(name, slice(stride - 1, last, stride))])
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
         return read_rows(self.path, name, rows, self.chunk)

@@ -4,6 +4,7 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,7 @@ def stream(
         "made_with": environment(),
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
+    attributes |= {} if run.names is None else {"names": run.names.to_dict()}
     with interrupts_noted() as interrupted:
         if overwrite or not path.exists():
             with _explained(path, 0):
@@ -106,6 +108,7 @@ def stream(
                 if interrupted():
                     raise Interrupted(StoredTrajectory(path), step, num_steps)
     stored = StoredTrajectory(path)
+    stored = stored.of(run.origin) if len(stored) else stored
     if throw:
         stored.raise_failure()
     return stored
@@ -117,13 +120,14 @@ def _go_on(stored: StoredTrajectory, run: Simulation, progress: bool) -> Iterato
     rows = stored.num_steps // run.save_every
     if record.saved == rows or not stored.success:
         return
+    run = replace(run, room=chunk)  # one program for all parts
     try:
         at = record.checkpoint(like=run.start())
     except ValueError as error:
         raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
-    writer = layout.Writer(path, rows, chunk)
-    ends = [*range((record.saved // chunk + 1) * chunk, rows, chunk), rows]
-    sizes = [end - begin for begin, end in pairwise([record.saved, *ends])]
+    writer = layout.Writer(path, rows + 1, chunk)
+    nodes = [*range((record.saved + 1) // chunk * chunk + chunk, rows + 1, chunk), rows + 1]  # chunks of rows are full
+    sizes = [end - begin for begin, end in pairwise([record.saved + 1, *nodes])]
     for size in _shown(sizes, -(-rows // chunk)) if progress else sizes:
         piece, at = run.advance(at, size)
         with _explained(path, at.step - size * run.save_every):

@@ -1,0 +1,235 @@
+"""Velocities, multipliers, reaction forces and work of a run, by name, against formulas and independent integrals."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.scene import Anchor, Body, Gravity, LinearDamping, RigidLink, Scene, Spring
+
+GRAVITY, LENGTH, MASS = 9.81, 0.8, 2.0
+
+
+def weight(q_s, q_f, params):
+    return MASS * GRAVITY * q_f[1]
+
+
+def rod(q_s, q_f, params):
+    return jnp.array([q_f @ q_f - LENGTH**2]) / 2
+
+
+def shaken_rod(t, q_s, q_f, params):
+    pivot = jnp.stack([0.2 * jnp.sin(3 * t), jnp.zeros_like(t)])
+    return jnp.array([jnp.sum((q_f - pivot) ** 2) - LENGTH**2]) / 2
+
+
+def drag(t, q_s, q_f, v_s, v_f, params):
+    return jnp.zeros(0), -0.3 * v_f
+
+
+def pendulum(**changes) -> vm.Problem:
+    arguments = {"slow_potential": weight, "constraint": rod} | changes
+    system = vm.System(vm.ConstantMass([], [MASS, MASS]), **arguments)
+    names = vm.Names(fast={"bob": 2}, constraint={"rod": 1})
+    return vm.Problem(system, [], [LENGTH, 0.0], [], [0.0, 0.0], names=names, project=True)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    scheme = vm.fully_implicit(10)
+    return vm.simulate(pendulum(), scheme, macro_dt=0.05, num_steps=40, save_micro=True)
+
+
+@pytest.fixture(scope="module")
+def hanging():
+    bodies = [
+        Body("hook", 50.0, [0.0, -1.0]),
+        Body("load", 1.0, [0.4, -1.3]),
+        Body("bell", 1.0, [0.4, -2.3], [0.0, 3.0]),
+    ]
+    effects = [Gravity(), Anchor("hook", [0.0, 0.0]), RigidLink(("hook", "load")), Spring(("load", "bell"), 4e4, 1.0)]
+    return Scene(bodies, [*effects, LinearDamping(0.5, bodies=["bell"])])
+
+
+def test_velocities_are_those_of_the_momenta(swing):
+    assert np.allclose(swing.v_f, swing.p_f / MASS, rtol=1e-14)
+    assert swing.v_s.shape == (41, 0)
+    assert np.array_equal(swing.velocity("bob"), swing.v_f)
+    assert np.array_equal(swing.position("bob"), swing.q_f)
+
+
+@pytest.mark.parametrize("micro", [False, True])
+def test_the_tension_of_a_pendulum(swing, micro):
+    """``m (v^2 - g y) / L`` along the rod; from the height alone, since the energy is kept."""
+    y = (swing.q_f_micro if micro else swing.q_f)[..., 1]
+    speed_squared = -2 * GRAVITY * y  # released at y = 0
+    tension = MASS * (speed_squared - GRAVITY * y / LENGTH * LENGTH) / LENGTH
+    force = swing.reaction_forces("rod", micro=micro)["bob"]
+    assert force.shape == (*y.shape, 2)
+    assert np.allclose(np.linalg.norm(force, axis=-1), tension, atol=2e-3 * tension.max())  # measured 4e-4
+    (multiplier,) = swing.multipliers(micro=micro).values()
+    assert np.allclose(multiplier[..., 0] * LENGTH, tension, atol=2e-3 * tension.max())
+
+
+def test_micro_nodes_must_be_there(swing):
+    few = vm.simulate(pendulum(), vm.fully_implicit(10), macro_dt=0.05, num_steps=40, save_every=2, save_micro=True)
+    with pytest.raises(ValueError, match=r"some macro steps only; simulate with save_every=1"):
+        few.multipliers(micro=True)
+    none = vm.simulate(pendulum(), vm.fully_implicit(10), macro_dt=0.05, num_steps=2)
+    with pytest.raises(ValueError, match=r"kept none; simulate with save_micro=True"):
+        none.reaction_forces("rod", micro=True)
+
+
+def test_names_that_do_not_exist(swing):
+    with pytest.raises(ValueError, match=r"there is no body 'bop'. Did you mean bob\? There are bob"):
+        swing.position("bop")
+    with pytest.raises(ValueError, match=r"reaction_forces: there is no constraint 'rods'. Did you mean rod\?"):
+        swing.reaction_forces("rods")
+
+
+def test_work_accounts_for_the_energy():
+    problem = pendulum(constraint=vm.Rheonomic(shaken_rod), force=drag)
+    run = vm.simulate(problem, vm.fully_implicit(4), macro_dt=0.01, num_steps=300)
+    work = run.work()
+    assert np.abs(work.forces).max() > 0.5
+    assert np.abs(work.constraints).max() > 0.5
+    assert np.abs(work.balance).max() < 1e-3 * np.abs(run.energy - run.energy[0]).max()  # measured 2e-4
+    assert work.uncertainty < 1e-2
+
+
+def test_work_at_nodes_that_are_too_far_apart_is_uncertain(hanging):
+    """The bell vibrates at 283 rad/s: what its damper takes is not seen at every 50th of a second, but at micro nodes."""
+    arguments = {"macro_dt": 0.02, "num_steps": 50}
+    coarse = vm.simulate(hanging, vm.fully_implicit(40), **arguments).work()
+    fine = vm.simulate(hanging, vm.fully_implicit(40), save_micro=True, **arguments).work()
+    assert fine.uncertainty < coarse.uncertainty / 20
+    assert np.abs(fine.balance).max() < np.abs(coarse.balance).max() / 5
+
+
+def test_a_scene_gives_its_names(hanging):
+    run = vm.simulate(hanging, vm.fully_implicit(4), macro_dt=0.01, num_steps=10)
+    assert run.names.slow_coordinates == ["hook x", "hook y"]
+    assert run.names.fast_coordinates == ["load x", "load y", "bell x", "bell y"]
+    assert run.position("bell").shape == (11, 2)
+    forces = run.reaction_forces("links")
+    assert set(forces) == {"hook", "load"}
+    assert np.allclose(forces["hook"], -forces["load"], atol=1e-9)  # what a link does to one end it does to the other
+    assert set(run.reaction_forces("anchors")) == {"hook"}
+
+
+def test_a_system_without_names():
+    system = pendulum().system
+    run = vm.simulate(system, vm.fully_implicit(2), pendulum().state(), macro_dt=0.05, num_steps=4)
+    assert run.names.fast_coordinates == ["q_f[0]", "q_f[1]"]
+    assert np.array_equal(run.position("q_f"), run.q_f)
+    assert list(run.multipliers()) == ["constraint"]
+    assert list(run.reaction_forces("constraint")) == ["q_f"]
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ({"fast": {"bob": 3}}, r"fast is {'bob': 3}, which names 3; the system has 2"),
+        ({"constraint": {"rod": 1, "rope": 1}}, r"constraint is .*, which names 2; the system has 1"),
+    ],
+)
+def test_names_that_do_not_add_up(names, message):
+    with pytest.raises(ValueError, match=message):
+        vm.Problem(pendulum().system, [], [LENGTH, 0.0], [], [0.0, 0.0], names=vm.Names(**names))
+
+
+def test_names_that_are_none():
+    with pytest.raises(TypeError, match=r"Names: fast is \['bob'\]; give a dictionary of names and sizes"):
+        vm.Names(fast=["bob"])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"bob in slow and in fast"):
+        vm.Names(slow={"bob": 1}, fast={"bob": 1})
+
+
+def test_a_batch_with_its_own_parameters():
+    def spring(q_f, params):
+        return params["k"] / 2 * q_f @ q_f
+
+    def kinetic(q_s, q_f, v_s, v_f, params):
+        return params["m"] / 2 * v_f @ v_f
+
+    system = vm.System(kinetic, fast_potential=spring, params={"k": 100.0, "m": 2.0})
+    state = vm.initial_state(system, [], [0.1, 0.0], [], [0.0, 1.0])
+    states = jax.tree.map(lambda a: jnp.stack([a, a]), state)
+    params = {"k": np.array([100.0, 200.0]), "m": np.array([2.0, 5.0])}
+    runs = vm.simulate_batch(system, vm.fully_implicit(2), states, macro_dt=0.01, num_steps=10, params=params)
+    assert len(runs) == 11
+    assert runs[-1].q_f.shape == (2, 2)
+    assert runs[2:5].q_f.shape == (2, 3, 2)
+    assert np.allclose(runs.v_f, runs.p_f / params["m"][:, None, None], rtol=1e-12)
+    assert np.allclose(runs.lane(1).v_f, runs.v_f[1], rtol=1e-14)
+    assert runs.to_xarray().sizes["lane"] == 2
+    with pytest.raises(ValueError, match=r"this is a batch of runs; take one of them"):
+        runs.columns()
+
+
+def test_transformations_lose_the_origin_and_say_so(swing):
+    halved = jax.tree.map(lambda a: a, swing)
+    with pytest.raises(ValueError, match=r"does not know its system.*run.of\(problem\)"):
+        halved.v_f  # noqa: B018
+    assert np.array_equal(halved.of(pendulum()).v_f, swing.v_f)
+    with pytest.raises(ValueError, match=r"of: the run has 0 slow and 2 fast coordinates. ConstantMass: slow is for 3"):
+        halved.of(vm.systems.fermi_pasta_ulam())
+    assert np.array_equal(pickle.loads(pickle.dumps(swing)).q_f, swing.q_f)
+
+
+def test_prepared_runs_know_their_parameters():
+    def kinetic(q_s, q_f, v_s, v_f, params):
+        return params["m"] / 2 * v_f @ v_f
+
+    system = vm.System(kinetic, params={"m": 2.0})
+    problem = vm.Problem(system, [], [0.0], [], [1.0])
+    run = vm.prepare(problem, vm.fully_implicit(2), macro_dt=0.1, num_steps=4)
+    assert np.allclose(run(params={"m": 4.0}).v_f, 0.5)
+    assert np.allclose(run().v_f, 1.0)
+
+
+def test_files_carry_names(swing, tmp_path):
+    swing.save(tmp_path / "run.npz")
+    read = vm.Trajectory.load(tmp_path / "run.npz")
+    assert np.array_equal(read.position("bob"), swing.position("bob"))
+    assert np.load(tmp_path / "run.npz")["fast_names"].tolist() == ["bob x", "bob y"]
+    with pytest.raises(ValueError, match=r"read from a file"):
+        read.multipliers()
+    assert np.array_equal(read.of(pendulum()).multipliers()["rod"], swing.multipliers()["rod"])
+    swing.to_csv(tmp_path / "run.csv")
+    table = pandas.read_csv(tmp_path / "run.csv")
+    assert list(table) == list(swing.columns())
+    assert {"t", "bob x", "v bob y", "p bob x", "energy"} <= set(table)
+    assert np.array_equal(table["bob x"], swing.q_f[:, 0])
+    assert np.array_equal(swing.to_pandas()["v bob y"], np.asarray(swing.v_f)[:, 1])
+    data = swing.to_xarray()
+    assert np.array_equal(data["q_f"].sel(fast="bob y"), swing.q_f[:, 1])
+
+
+def test_a_streamed_run_is_the_same(swing, tmp_path):
+    stored = vm.stream(
+        pendulum(), vm.fully_implicit(10), out=tmp_path / "run.zarr", macro_dt=0.05, num_steps=40, save_micro=True
+    )
+    assert np.array_equal(stored.multipliers()["rod"], swing.multipliers()["rod"])
+    read = vm.StoredTrajectory(tmp_path / "run.zarr")
+    assert np.array_equal(read.position("bob"), swing.q_f)
+    assert np.array_equal(read.of(pendulum())[5:].v_f, np.asarray(swing.v_f)[5:])
+    assert list(read.columns()) == [name for name in swing.columns() if not name.startswith("v ")]
+
+
+def test_parts_of_a_run_that_failed():
+    """Before its failure nothing failed."""
+    scheme = vm.fully_explicit(1, 0.5)
+    system = vm.System(vm.ConstantMass([], [1.0]), fast_potential=lambda q_f, params: 50.0 * q_f[0] ** 4)
+    problem = vm.Problem(system, [], [1.0], [], [0.0])
+    run = vm.simulate(problem, scheme, macro_dt=1.0, num_steps=20, throw=False)
+    assert not run.success
+    last = int(np.flatnonzero(np.isfinite(run.energy))[-1])
+    assert run[: last + 1].success
+    assert not run[: last + 2].success
+    assert np.isfinite(run[: last + 1].v_f).all()
+    assert np.isnan(run.v_f[last + 1 :]).all()

@@ -1,0 +1,177 @@
+"""What coordinates, bodies and constraints are called: for labels, files, and quantities that are asked for by name."""
+
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from vmri_jax.mechanics.system import System
+
+Part = Literal["s", "f"]
+
+AXES = "xyz"
+"""Coordinates of a point of two or three dimensions."""
+
+
+class Place(NamedTuple):
+    """Coordinates ``q_part[start : start + size]`` of a body."""
+
+    part: Part
+    start: int
+    size: int
+
+
+@dataclass(frozen=True)
+class Names:
+    """Names of what follows one another in q_s and q_f, and in the values of the constraints, each with its size.
+
+        Names(slow={"trolley": 1}, fast={"hook": 2, "load": 2}, constraint={"rope": 1})
+
+    Args:
+        slow, fast: bodies, or single coordinates, in the order of q_s and q_f, with their numbers of coordinates.
+        constraint, slow_constraint: constraints in the order of the values of these functions, with their numbers of rows.
+
+    Raises:
+        TypeError: no mapping from names to whole numbers.
+        ValueError: a body that is slow and fast.
+    """
+
+    slow: Mapping[str, int] = field(default_factory=dict)
+    fast: Mapping[str, int] = field(default_factory=dict)
+    constraint: Mapping[str, int] = field(default_factory=dict)
+    slow_constraint: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self):
+        for what, sizes in vars(self).items():
+            named = isinstance(sizes, Mapping) and all(isinstance(name, str) for name in sizes)
+            if not (named and all(isinstance(size, int) and size > 0 for size in sizes.values())):
+                raise TypeError(
+                    f"Names: {what} is {sizes!r}; give a dictionary of names and sizes in the order of the coordinates or "
+                    "rows, e.g. {'hook': 2, 'load': 2}."
+                )
+        both = sorted(set(self.slow) & set(self.fast))
+        if both:
+            raise ValueError(f"Names: {', '.join(both)} in slow and in fast; give every body one place.")
+
+    @property
+    def bodies(self) -> dict[str, Place]:
+        """The place of every body."""
+        parts: list[tuple[Part, Mapping[str, int]]] = [("s", self.slow), ("f", self.fast)]
+        return {
+            name: Place(part, start, size) for part, sizes in parts for name, start, size in _one_after_another(sizes)
+        }
+
+    @property
+    def slow_coordinates(self) -> list[str]:
+        """A name for each entry of q_s."""
+        return _coordinates(self.slow)
+
+    @property
+    def fast_coordinates(self) -> list[str]:
+        """A name for each entry of q_f."""
+        return _coordinates(self.fast)
+
+    @property
+    def rows(self) -> dict[str, list[int]]:
+        """Where the values of every constraint are among all of them, those of `constraint` first."""
+        found: dict[str, list[int]] = {}
+        total = sum(self.constraint.values())
+        for first, sizes in ((0, self.constraint), (total, self.slow_constraint)):
+            for name, start, size in _one_after_another(sizes):
+                found.setdefault(name, []).extend(range(first + start, first + start + size))
+        return found
+
+    def place(self, body: str) -> Place:
+        """The place of a body.
+
+        Raises:
+            ValueError: no body of this name.
+        """
+        if body not in self.bodies:
+            raise ValueError(unknown("body", body, self.bodies))
+        return self.bodies[body]
+
+    def of(self, system: System, n_s: int, n_f: int) -> "Names":
+        """The same with plain names for coordinates and constraints of a system that have none.
+
+        Args:
+            system: what has the constraints.
+            n_s, n_f: numbers of slow and fast coordinates.
+
+        Raises:
+            ValueError: sizes that do not add up to the numbers of coordinates and of constraint rows.
+        """
+        n_g, n_gs = system.num_constraints(np.zeros(n_s), np.zeros(n_f))
+        constraint = self._completed("constraint", "constraint", n_g)
+        slow_constraint = self._completed("slow_constraint", "slow_constraint", n_gs)
+        return replace(self.of_coordinates(n_s, n_f), constraint=constraint, slow_constraint=slow_constraint)
+
+    def of_coordinates(self, n_s: int, n_f: int) -> "Names":
+        """The same with plain names for coordinates that have none.
+
+        Args:
+            n_s, n_f: their numbers.
+
+        Raises:
+            ValueError: sizes that do not add up to these.
+        """
+        return replace(self, slow=self._completed("slow", "q_s", n_s), fast=self._completed("fast", "q_f", n_f))
+
+    def _completed(self, what: str, plain: str, number: int) -> dict[str, int]:
+        sizes = dict(getattr(self, what)) or ({plain: number} if number else {})
+        if sum(sizes.values()) != number:
+            raise ValueError(
+                f"Names: {what} is {sizes}, which names {sum(sizes.values())}; the system has {number}. The sizes must add up "
+                "to that."
+            )
+        return sizes
+
+    def to_dict(self) -> dict[str, dict[str, int]]:
+        """As plain data, which keep their order in JSON."""
+        return asdict(self)
+
+
+def unknown(kind: str, name: Any, known: Iterable[str]) -> str:
+    """The sentence that there is none of that name, with the near miss.
+
+    Args:
+        kind: what has names.
+        name: the one that was given.
+        known: those there are.
+    """
+    known = list(known)
+    return f"there is no {kind} {name!r}.{near(name, known)} There are {', '.join(known) or 'none'}."
+
+
+def near(name: Any, known: Iterable[str]) -> str:
+    """A question with the known name that is most like it; empty if none is.
+
+    Args:
+        name: the one that was given.
+        known: those there are.
+    """
+    close = difflib.get_close_matches(str(name), list(known), n=1)
+    return f" Did you mean {close[0]}?" if close else ""
+
+
+def _one_after_another(sizes: Mapping[str, int]) -> list[tuple[str, int, int]]:
+    """(name, start, size) of each."""
+    starts, end = [], 0
+    for name, size in sizes.items():
+        starts.append((name, end, size))
+        end += size
+    return starts
+
+
+def _coordinates(sizes: Mapping[str, int]) -> list[str]:
+    names = []
+    for name, size in sizes.items():
+        if size == 1:
+            names.append(name)
+        elif size <= len(AXES) and name not in ("q_s", "q_f"):
+            names += [f"{name} {axis}" for axis in AXES[:size]]
+        else:
+            names += [f"{name}[{i}]" for i in range(size)]
+    return names

@@ -1,0 +1,164 @@
+"""A run for other programs: tables of named columns, CSV, pandas, xarray."""
+
+import csv
+import importlib
+import io
+import json
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vmri_jax.mechanics.names import Names
+from vmri_jax.running.files import replaced
+from vmri_jax.running.origin import Origin
+from vmri_jax.steppers.results import Result
+
+if TYPE_CHECKING:
+    from vmri_jax.running.trajectory import Trajectory
+
+DIMENSIONS = {
+    "t": ("t",),
+    "q_s": ("t", "slow"),
+    "q_f": ("t", "fast"),
+    "p_s": ("t", "slow"),
+    "p_f": ("t", "fast"),
+    "energy": ("t",),
+    "constraint_residual": ("t", "level"),
+    "method": ("t",),
+    "iterations": ("t",),
+    "residual": ("t",),
+    "t_micro": ("t", "micro"),
+    "q_f_micro": ("t", "micro", "fast"),
+}
+"""Names of the axes of all arrays with a row for each saved node."""
+FILL = {"f": np.nan, "i": -1}
+"""Values where there are none, by kind of number: of what a run did before its start, and of rows that are not there yet."""
+
+
+def rows_of(run: "Trajectory") -> dict[str, np.ndarray]:
+    """The arrays of a run with a row for each saved node; what its steps did before a node is in the row of that node.
+
+    Args:
+        run: one run, or a batch.
+    """
+    known = {name: getattr(run, name, None) for name in DIMENSIONS} | run.info._asdict()
+    arrays = {name: np.asarray(value) for name, value in known.items() if value is not None}
+    axis = arrays["t"].ndim - 1
+    for name, array in arrays.items():
+        missing = len(run) - array.shape[axis]
+        if missing:
+            widths = [(missing if i == axis else 0, 0) for i in range(array.ndim)]
+            arrays[name] = np.pad(array, widths, constant_values=FILL[array.dtype.kind])
+    return arrays
+
+
+class Exports(ABC):
+    """Ways out of a run. All of them carry the names of bodies and coordinates."""
+
+    @abstractmethod
+    def whole(self) -> "Trajectory":
+        """All saved nodes."""
+
+    @property
+    @abstractmethod
+    def origin(self) -> Origin:
+        """What the run is of."""
+
+    @property
+    @abstractmethod
+    def names(self) -> Names:
+        """Names of bodies and coordinates."""
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns (k,) by name: time, coordinates by their names, velocities "v ..." if the system is known, momenta "p ...",
+        energy, constraint residuals, and what the solver did before each node.
+
+        Raises:
+            ValueError: this is a batch.
+        """
+        run, names = self.whole(), self.names
+        if np.ndim(run.t) != 1:
+            raise ValueError("columns: this is a batch of runs; take one of them, run.lane(i).")
+        rows = rows_of(run)
+        parts = [("", rows["q_s"], rows["q_f"]), ("p ", rows["p_s"], rows["p_f"])]
+        if self.origin.system is not None:
+            parts.insert(1, ("v ", np.asarray(run.v_s), np.asarray(run.v_f)))
+        found = {"t": rows["t"]}
+        for letter, slow, fast in parts:
+            labels = [*names.slow_coordinates, *names.fast_coordinates]
+            found |= {letter + name: column for name, column in zip(labels, [*slow.T, *fast.T], strict=True)}
+        position, velocity = rows["constraint_residual"].T
+        found |= {"energy": rows["energy"], "constraint residual": position, "constraint rate": velocity}
+        return found | {name: rows[name] for name in ("method", "iterations", "residual")}
+
+    def to_csv(self, path) -> None:
+        """Write `columns` to a .csv file, with a line of names; a file that is there is replaced.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            ValueError: this is a batch.
+            OSError: the file cannot be written.
+        """
+        columns = self.columns()
+        head = io.StringIO()
+        csv.writer(head, lineterminator="\n").writerow(columns)
+        with replaced(Path(path)) as file:
+            file.write(head.getvalue().encode())
+            np.savetxt(file, np.stack(list(columns.values()), axis=1), fmt="%.17g", delimiter=",")
+
+    def to_pandas(self):
+        """`columns` as a `pandas.DataFrame` over time (pandas comes with the extra ``vmri_jax[xarray]``).
+
+        Raises:
+            ValueError: this is a batch.
+            ImportError: pandas is not installed.
+        """
+        pandas = _extra("pandas", "to_pandas")
+        columns = self.columns()
+        return pandas.DataFrame(columns).set_index("t")
+
+    def to_xarray(self):
+        """The run as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``), with a dimension of lanes in a batch.
+
+        Row k of "method", "iterations", "residual" and of the micro nodes is what led to node k, so that the first is empty
+        (-1 or NaN). The store of `vmri_jax.stream` has the same dimensions.
+
+        Raises:
+            ImportError: xarray is not installed.
+        """
+        xarray = _extra("xarray", "to_xarray")
+        run, names = self.whole(), self.names
+        rows = rows_of(run)
+        lanes = ("lane",) * (rows["t"].ndim - 1)
+        data = {name: ((*lanes, *DIMENSIONS[name]), array) for name, array in rows.items() if name != "t"}
+        coordinates = {
+            "t": ("t", rows["t"] if not lanes else rows["t"][0]),
+            "slow": names.slow_coordinates,
+            "fast": names.fast_coordinates,
+            "level": ["position", "velocity"],
+        }
+        if lanes and np.any(rows["t"] != rows["t"][0]):  # lanes with steps of their own
+            coordinates["t"] = ("t", np.arange(rows["t"].shape[1]))
+            data["time"] = (("lane", "t"), rows["t"])
+        return xarray.Dataset(data, coords=coordinates, attrs=attributes(run, self.origin, lanes != ()))
+
+
+def attributes(run: "Trajectory", origin: Origin, batch: bool) -> dict:
+    """The status of a run, and the names of its parts as JSON."""
+    if batch:
+        found = {"result": np.asarray(run.result), "failed_at": np.asarray(run.failed_at)}
+    else:
+        found = {"result": Result(int(run.result)).name, "failed_at": int(run.failed_at)}
+    return found | ({} if origin.names is None else {"names": json.dumps(origin.names.to_dict())})
+
+
+def _extra(package: str, what: str):
+    """A package that is not always installed."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ImportError(f"{what} needs {package}; install it with pip install 'vmri_jax[xarray]'.") from error

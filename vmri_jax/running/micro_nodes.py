@@ -1,0 +1,65 @@
+"""The micro nodes between the macro nodes of a run, with what is known of the motion there.
+
+A run keeps its fast positions at micro nodes. The slow ones are those of the cubic that has the positions and velocities of the
+macro nodes. Fast velocities are those of the cubic spline through the nodes of a macro step with the velocities at its ends,
+an approximation of order 4.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+
+
+class Nodes(NamedTuple):
+    """Positions and velocities at all nodes in order, macro and micro: t (k,), the others (k, n)."""
+
+    t: np.ndarray
+    q_s: np.ndarray
+    q_f: np.ndarray
+    v_s: np.ndarray
+    v_f: np.ndarray
+
+
+def why_not(t, t_micro) -> str:
+    """Why the micro nodes of a run are no refinement of its nodes; empty if they are.
+
+    Args:
+        t: (k,) times of the macro nodes.
+        t_micro: (k - 1, num_micro) times of the micro nodes before each of them, or None.
+    """
+    if np.ndim(t) != 1:
+        return "it is a batch; take one lane of it"
+    if t_micro is None:
+        return "it kept none; simulate with save_micro=True and save_every=1"
+    t, t_micro = np.asarray(t, dtype=float), np.asarray(t_micro, dtype=float)
+    if len(t) < 2:
+        return "it has a single node"
+    step = np.diff(t) / t_micro.shape[1]
+    if np.any(t_micro[:, 0] - t[:-1] > 1.5 * step):
+        return "it kept those of some macro steps only; simulate with save_every=1"
+    if np.any(np.diff(np.append(t[:1], t_micro)) <= 0):
+        return "the stages of its composition go back in time"
+    return ""
+
+
+def with_micro_nodes(nodes: Nodes, t_micro, q_f_micro) -> Nodes:
+    """All nodes of a run for which `why_not` is empty.
+
+    Args:
+        nodes: the macro nodes, all of them finite.
+        t_micro, q_f_micro: (k - 1, num_micro), (k - 1, num_micro, n_f).
+    """
+    t_micro, q_f_micro = np.asarray(t_micro, dtype=float), np.asarray(q_f_micro, dtype=float)
+    steps, num_micro = t_micro.shape
+    t = np.append(nodes.t[:1], t_micro)
+    slow = CubicHermiteSpline(nodes.t, nodes.q_s, nodes.v_s)
+    values = np.concatenate([nodes.q_f[:-1, None], q_f_micro], axis=1)  # (steps, num_micro + 1, n_f)
+    within = np.append(0.0, t_micro[0] - nodes.t[0])
+    ends: Any = (1, nodes.v_f[:-1]), (1, nodes.v_f[1:])  # first derivatives
+    v_f = CubicSpline(within, values, axis=1, bc_type=ends)(within[1:], 1)
+
+    def in_order(first, later):
+        return np.concatenate([first, later.reshape(steps * num_micro, -1)])
+
+    return Nodes(t, slow(t), in_order(nodes.q_f[:1], q_f_micro), slow(t, 1), in_order(nodes.v_f[:1], v_f))

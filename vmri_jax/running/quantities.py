@@ -1,0 +1,240 @@
+"""What follows from the positions and momenta of a run: velocities, multipliers, reaction forces, work, by name."""
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import numpy as np
+from scipy.integrate import cumulative_simpson, cumulative_trapezoid
+
+from vmri_jax.mechanics import invariants
+from vmri_jax.mechanics.motion import motion, powers, reaction_force
+from vmri_jax.mechanics.names import Names, unknown
+from vmri_jax.mechanics.projection import legendre
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
+from vmri_jax.running.origin import Origin, at_nodes
+
+if TYPE_CHECKING:
+    from vmri_jax.running.trajectory import Trajectory
+
+RANDOM = 0.5
+"""Values at nodes with a von Neumann ratio above this count as random: the nodes do not resolve what they are of."""
+
+
+class Work(NamedTuple):
+    """What changes the energy of a run from its start to each of its saved nodes, (k,).
+
+    forces: work of the forces that no potential gives.
+    constraints: work of constraints that move with time.
+    balance: ``E - E_0 - forces - constraints``: the error of the run, and of these integrals.
+    uncertainty: how well the nodes resolve the integrals: the largest difference between Simpson's and the trapezoidal rule; where
+        the power jumps from node to node, the spread of a sum of random numbers like it.
+    """
+
+    forces: np.ndarray
+    constraints: np.ndarray
+    balance: np.ndarray
+    uncertainty: float
+
+
+class Quantities(ABC):
+    """Quantities of a run by name, of a `Trajectory` or of one on disk.
+
+    Velocities, multipliers and work need the system. A run that was read from a file learns it by ``run.of(problem)``.
+    """
+
+    @abstractmethod
+    def whole(self) -> "Trajectory":
+        """All saved nodes."""
+
+    @property
+    @abstractmethod
+    def origin(self) -> Origin:
+        """What the run is of."""
+
+    @property
+    def names(self) -> Names:
+        """Names of bodies, coordinates and constraints, plain ones where none are known."""
+        run, origin = self.whole(), self.origin
+        n_s, n_f = run.q_s.shape[-1], run.q_f.shape[-1]
+        given = origin.names or Names()
+        if origin.system is None:
+            return given.of_coordinates(n_s, n_f)
+        return given.of(origin.system, n_s, n_f)
+
+    @property
+    def keeps_energy(self) -> bool | None:
+        """Whether the energy of the system is constant; None if the system is not known."""
+        system = self.origin.system
+        return None if system is None else system.keeps_energy
+
+    @property
+    def v_s(self):
+        """Slow velocities, shaped like q_s."""
+        return self._velocities()[0]
+
+    @property
+    def v_f(self):
+        """Fast velocities, shaped like q_f."""
+        return self._velocities()[1]
+
+    def position(self, body: str):
+        """Positions (..., k, size) of a body, or of a coordinate that has a name.
+
+        Args:
+            body: its name; "q_s" or "q_f" for all coordinates of a system without names.
+
+        Raises:
+            ValueError: no body of this name.
+        """
+        run = self.whole()
+        return self._of_body(body, run.q_s, run.q_f)
+
+    def velocity(self, body: str):
+        """Velocities (..., k, size) of a body, or of a coordinate that has a name.
+
+        Args:
+            body: its name.
+
+        Raises:
+            ValueError: no body of this name, or the run does not know its system.
+        """
+        return self._of_body(body, *self._velocities())
+
+    def multipliers(self, micro: bool = False) -> dict:
+        """Lagrange multipliers of the equations of motion at the saved nodes, (..., k, rows) for each constraint by name.
+
+        They are those of ``M a = -dU/dq + F - G^T lambda`` for the accelerations that keep the constraints. Of dependent
+        constraints they are those of least norm.
+
+        Args:
+            micro: at the micro nodes ``t_micro`` instead, (k - 1, num_micro, rows), with the velocities of a spline through
+                them; for runs with save_micro=True and save_every=1.
+
+        Raises:
+            ValueError: the run does not know its system, or did not keep the micro nodes.
+        """
+        values = np.asarray(at_nodes(_multipliers, self.origin, self._states(micro)))
+        return {name: self._shaped(values[..., rows], micro) for name, rows in self.names.rows.items()}
+
+    def reaction_forces(self, constraint: str, micro: bool = False) -> dict:
+        """Forces ``-G^T lambda`` of a constraint on the bodies that it touches, (..., k, size) for each of them by name.
+
+        Args:
+            constraint: its name; "constraint" or "slow_constraint" for all rows of a system without names.
+            micro: at the micro nodes instead, as of `multipliers`.
+
+        Raises:
+            ValueError: no constraint of this name, and as of `multipliers`.
+        """
+        names = self.names
+        if constraint not in names.rows:
+            raise ValueError(f"reaction_forces: {unknown('constraint', constraint, names.rows)}")
+        rows = tuple(names.rows[constraint])
+        forces, touched = at_nodes(reaction_force, self.origin, self._states(micro), rows)
+        n_s = self.whole().q_s.shape[-1]
+        parts = {"s": (forces[..., :n_s], touched[..., :n_s]), "f": (forces[..., n_s:], touched[..., n_s:])}
+        found = {}
+        for name, (part, start, size) in names.bodies.items():
+            force, touches = (np.asarray(a[..., start : start + size]) for a in parts[part])
+            if touches.any():
+                found[name] = self._shaped(force, micro)
+        return found
+
+    def work(self) -> Work:
+        """Work of forces and of moving constraints since the start, and the balance with the energy.
+
+        The powers ``F . v`` and ``lambda . dg/dt`` are integrated over the saved nodes by Simpson's rule, over micro nodes
+        where the run kept all of them.
+
+        Raises:
+            ValueError: the run does not know its system, or it is a batch.
+        """
+        run = self.whole()
+        if np.ndim(run.t) != 1:
+            raise ValueError("work: the run is a batch; take one lane of it, run.lane(i).")
+        micro = why_not(run.t, run.t_micro) == ""
+        states = self._states(micro, every=True)
+        power = np.asarray(at_nodes(powers, self.origin, states))
+        t, every = np.asarray(states.t), run.t_micro.shape[1] if micro else 1
+        done = cumulative_trapezoid(power, t, axis=0, initial=0.0)
+        simpson = cumulative_simpson(power, x=t, axis=0, initial=0.0) if len(t) > 2 else done
+        between = np.nanmax(np.abs(simpson - done), initial=0.0)
+        uncertainty = float(max(between, *(_spread(t, values) for values in power.T)))
+        forces, constraints = simpson[::every].T
+        energy = np.asarray(run.energy)
+        return Work(forces, constraints, energy - energy[0] - forces - constraints, uncertainty)
+
+    def plot(self, title: str = ""):
+        """Positions, energy and constraints against time, a matplotlib `Figure`; more in `vmri_jax.plots`.
+
+        Args:
+            title: over the figure.
+        """
+        from vmri_jax.plots import plot_trajectory  # matplotlib takes half a second
+
+        return plot_trajectory(self.whole(), title)
+
+    def _velocities(self):
+        return at_nodes(_velocity, self.origin, self._states(False))
+
+    def _of_body(self, body: str, slow, fast):
+        part, start, size = self.names.place(body)
+        return (slow if part == "s" else fast)[..., start : start + size]
+
+    def _states(self, micro: bool, every: bool = False) -> State:
+        """The states at the saved nodes, or at the micro nodes; at `every` node with the start."""
+        run = self.whole()
+        if not micro:
+            return State(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
+        reason = why_not(run.t, run.t_micro)
+        if reason:
+            raise ValueError(f"micro nodes: the run has none between all of its nodes: {reason}.")
+        nodes = self.all_nodes()
+        p_s, p_f = at_nodes(_momenta, self.origin, nodes)
+        states = State(nodes.t, nodes.q_s, nodes.q_f, p_s, p_f)
+        return states if every else jax.tree.map(lambda a: a[1:], states)
+
+    def all_nodes(self) -> Nodes:
+        """Times, positions and velocities at all nodes, macro and micro, in order; NaN after a failure."""
+        run = self.whole()
+        v_s, v_f = self._velocities()
+        nodes = Nodes(*(np.asarray(a) for a in (run.t, run.q_s, run.q_f, v_s, v_f)))
+        finite = np.isfinite(np.column_stack(nodes)).all(axis=1)
+        count = len(nodes.t) if np.all(finite) else int(np.argmin(finite))
+        if count < 2:
+            raise ValueError("micro nodes: the run failed in its first step; there are none.")
+        kept = Nodes(*(a[:count] for a in nodes))
+        found = with_micro_nodes(kept, run.t_micro[: count - 1], run.q_f_micro[: count - 1])
+        missing = (len(nodes.t) - count) * run.t_micro.shape[1]
+        return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in found))
+
+    def _shaped(self, values: np.ndarray, micro: bool) -> np.ndarray:
+        return values.reshape(*np.shape(self.whole().t_micro), -1) if micro else values
+
+
+def _spread(t: np.ndarray, power: np.ndarray) -> float:
+    """Standard deviation of the integral of a power whose values at the nodes are like random ones; zero if they are not.
+
+    Random values differ from their neighbours as much as from their mean: their von Neumann ratio is 2, that of a smooth function
+    is about zero.
+    """
+    power = power[np.isfinite(power)]
+    jumps, scatter = np.sum(np.diff(power) ** 2), np.sum((power - np.mean(power)) ** 2)
+    if jumps <= RANDOM * scatter:
+        return 0.0
+    return float(np.mean(np.diff(t)) * np.sqrt(scatter))
+
+
+def _velocity(system: System, state: State):
+    return invariants.velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+
+
+def _momenta(system: System, node: Nodes):
+    return legendre(system, node.q_s, node.q_f, node.v_s, node.v_f)
+
+
+def _multipliers(system: System, state: State):
+    return motion(system, state).multipliers
