@@ -312,10 +312,11 @@ class Simulation:
 
     def in_parts(self) -> Trajectory:
         """The whole run with a progress bar; Ctrl-C raises `Interrupted` with what was computed."""
-        parts = replace(self, room=-(-self.num_saves // SHOWN))
+        size = -(-self.num_saves // SHOWN)
+        parts = replace(self, room=room_for(size))
         at, pieces = parts.start(), []
         with interrupts_noted() as interrupted:
-            for saves in _shown_sizes(self.num_saves, parts.room):
+            for saves in _shown_sizes(self.num_saves, size):
                 piece, at = parts.advance(at, saves)
                 pieces.append(piece)
                 if interrupted():

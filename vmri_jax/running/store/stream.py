@@ -12,7 +12,7 @@ from typing import Any
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.simulate import Simulation, simulation
+from vmri_jax.running.simulate import Simulation, room_for, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import differences, environment, identity
 from vmri_jax.running.store.layout import Record
@@ -120,7 +120,7 @@ def _go_on(stored: StoredTrajectory, run: Simulation, progress: bool) -> Iterato
     rows = stored.num_steps // run.save_every
     if record.saved == rows or not stored.success:
         return
-    run = replace(run, room=chunk)  # one program for all parts
+    run = replace(run, room=room_for(chunk))  # one program for all parts
     try:
         at = record.checkpoint(like=run.start())
     except ValueError as error:
