@@ -104,3 +104,14 @@ def test_bad_changes_are_refused(fpu, changes, message):
 def test_tracers_are_refused(fpu):
     with pytest.raises(ValueError, match="prepare: arguments are tracers"):
         jax.jit(lambda state: prepare(fpu.system, fully_explicit(3), state, **STEPS)().q_f)(fpu.state())
+
+
+def test_short_floats_are_refused(fpu):
+    run = prepare(
+        fpu.system.replace(fast_potential=watched, params={"omega": 30.0}), fully_implicit(2), fpu.state(), **STEPS
+    )
+    with pytest.raises(ValueError, match=r"params\['omega'\] has dtype float32; give float64"):
+        run(params={"omega": np.float32(30.0)})
+    short = jax.tree.map(lambda a: np.asarray(a, dtype=np.float32), fpu.state())
+    with pytest.raises(ValueError, match=r"q_s has dtype float32; give float64"):
+        run(short)

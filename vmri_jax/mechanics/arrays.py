@@ -43,15 +43,16 @@ def is_short(value) -> bool:
 
 
 def check_precision(name: str, value) -> None:
-    """Refuse floats of less than 64 bits: the digits that they lack cannot come back.
+    """Refuse floats of less than 64 bits, in lists too: the digits that they lack cannot come back.
 
     Raises:
         ValueError: the 64-bit mode is off, where all arrays of JAX are short; or this array is.
     """
-    if is_short(value):
-        if isinstance(value, jax.Array):
-            require_x64()
-        raise ValueError(f"{name} has dtype {value.dtype}; {ADVICE}.")
+    for leaf in jax.tree.leaves(value):
+        if is_short(leaf):
+            if isinstance(leaf, jax.Array):
+                require_x64()
+            raise ValueError(f"{name} has dtype {leaf.dtype}; {ADVICE}.")
 
 
 def real_array(name: str, value, ndim: int | None = None):
@@ -86,18 +87,3 @@ def whole_number(what: str, value, least: int = 1, otherwise: str = "") -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{what} is {value!r}; it must be an integer of at least {least}{otherwise}.")
     return int(value)
-
-
-def double_array(name: str, value):
-    """`real_array` of numbers in double precision: the digits that an array of float32 lacks cannot be had back.
-
-    Raises:
-        ValueError: an array of float32 or float16, as JAX makes them before its 64-bit mode is switched on.
-    """
-    for leaf in jax.tree.leaves(value):
-        if getattr(leaf, "dtype", None) in (np.float32, np.float16):
-            raise ValueError(
-                f"{name} has dtype {leaf.dtype}; give float64. JAX makes arrays of float32 until 64-bit mode is switched on: "
-                'call jax.config.update("jax_enable_x64", True) before any array is made.'
-            )
-    return real_array(name, value)

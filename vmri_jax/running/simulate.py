@@ -11,18 +11,18 @@ import numpy as np
 
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_flags, check_system
+from vmri_jax.mechanics.checks import check_flags, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import check_run
+from vmri_jax.running.arguments import check_run, check_vectors
 from vmri_jax.running.engine import Engine, engine
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of, problem_of
 from vmri_jax.running.traced import traced_run
-from vmri_jax.running.trajectory import Trajectory, from_arrays, join
+from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
@@ -182,11 +182,11 @@ class Simulation:
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
         origin = self.origin if params is None else self.origin._replace(params=params)
-        trajectory = from_arrays(self._program(False)(*arguments), self.num_saves).of(origin)
+        trajectory = know(from_arrays(self._program(False)(*arguments), self.num_saves), origin)
         if int(trajectory.failed_at) < 0:
             return trajectory
         if self._fallback_helps(trajectory):
-            trajectory = from_arrays(self._program(True)(*arguments), self.num_saves).of(origin)
+            trajectory = know(from_arrays(self._program(True)(*arguments), self.num_saves), origin)
         if throw and int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, arguments[2], arguments[3])
         return trajectory
@@ -210,6 +210,7 @@ class Simulation:
         """What the programs of the engine are called with."""
         leaves, start, save_every = self.leaves, self.start_arrays, self.save_every
         if state is not None:
+            check_vectors(state)
             start = _arrays(state)
             if [a.shape for a in start] != [a.shape for a in self.start_arrays]:
                 raise ValueError(
@@ -228,6 +229,8 @@ class Simulation:
     def _leaves_with(self, params) -> list:
         own, structure = jax.tree.flatten(self.system.params)
         given, structure_given = jax.tree.flatten(params)
+        if not all(isinstance(leaf, float) or getattr(leaf, "dtype", None) == np.float64 for leaf in given):
+            check_params(params)
         if structure_given != structure or list(map(np.shape, given)) != list(map(np.shape, own)):
             raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
         return self.leaves[: len(self.leaves) - len(own)] + [np.asarray(leaf) for leaf in given]
@@ -251,7 +254,7 @@ class Simulation:
         """How its steps are taken; ``print`` shows it in words."""
         return plan(self.system, self.scheme, self.state, self.newton)
 
-    @property
+    @cached_property
     def origin(self) -> Origin:
         """What its trajectory is of."""
         return Origin(self.names, self.system, self.system.params)

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vmri_jax.mechanics.arrays import double_array, is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, real_array
 
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3
@@ -70,7 +70,7 @@ class Body:
 
     def _numbers(self, name: str, given):
         """Numbers as an array of float64, of NumPy where they are not traced: so the mode of JAX does not matter."""
-        value = double_array(f"Body {self.name}: {name}", given)
+        value = real_array(f"Body {self.name}: {name}", given)
         if not is_concrete(value):
             return value
         if not np.isfinite(value).all():

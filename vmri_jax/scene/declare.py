@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import double_array, is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.scene.body import Bodies, Body
 
 Elements = tuple[tuple[str, ...], ...]
@@ -94,7 +94,7 @@ class Parameter:
             TypeError: what is no real number.
             ValueError: arrays of float32, not one number or one for each element, vectors of another dimension than the bodies.
         """
-        value = jnp.asarray(double_array(what, given))
+        value = jnp.asarray(real_array(what, given))
         count, size = len(bodies), bodies[0].size
         if self.shape == "number" and value.shape not in ((), (count,)):
             raise ValueError(

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import double_array, is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.names import Place, unknown
 from vmri_jax.scene.body import Bodies
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
@@ -274,6 +274,6 @@ def real_tree(what: str, tree):
     """
 
     def convert(path, leaf):
-        return jnp.asarray(double_array(what + jax.tree_util.keystr(path), leaf))
+        return jnp.asarray(real_array(what + jax.tree_util.keystr(path), leaf))
 
     return jax.tree_util.tree_map_with_path(convert, tree)
