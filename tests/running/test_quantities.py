@@ -233,3 +233,16 @@ def test_parts_of_a_run_that_failed():
     assert not run[: last + 2].success
     assert np.isfinite(run[: last + 1].v_f).all()
     assert np.isnan(run.v_f[last + 1 :]).all()
+
+
+@pytest.mark.parametrize("name", ["fermi_pasta_ulam", "triple_spherical_pendulum", "simple_atomic_model"])
+def test_the_systems_of_the_study_have_names(name):
+    problem = getattr(vm.systems, name)()
+    names = problem.names.of(problem.system, problem.q_s.size, problem.q_f.size)
+    assert names.to_dict() == problem.names.to_dict() | {"numbered": names.numbered}  # nothing was left to be named
+    assert len(names.slow_coordinates) == problem.q_s.size
+
+
+def test_general_coordinates_are_numbered():
+    scene = Scene([Body("modes", 1.0, [0.1, 0.2, 0.3], block=True), Body("one", 1.0, [0.0])])
+    assert scene.names.slow_coordinates == ["modes[0]", "modes[1]", "modes[2]", "one"]

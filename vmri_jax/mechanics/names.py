@@ -1,7 +1,7 @@
 """What coordinates, bodies and constraints are called: for labels, files, and quantities that are asked for by name."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -32,6 +32,7 @@ class Names:
     Args:
         slow, fast: bodies, or single coordinates, in the order of q_s and q_f, with their numbers of coordinates.
         constraint, slow_constraint: constraints in the order of the values of these functions, with their numbers of rows.
+        numbered: bodies whose coordinates are general ones: they are called "name[0]", "name[1]", not "name x", "name y".
 
     Raises:
         TypeError: no mapping from names to whole numbers.
@@ -42,9 +43,11 @@ class Names:
     fast: Mapping[str, int] = field(default_factory=dict)
     constraint: Mapping[str, int] = field(default_factory=dict)
     slow_constraint: Mapping[str, int] = field(default_factory=dict)
+    numbered: Sequence[str] = ()
 
     def __post_init__(self):
-        for what, sizes in vars(self).items():
+        for what in ("slow", "fast", "constraint", "slow_constraint"):
+            sizes = getattr(self, what)
             named = isinstance(sizes, Mapping) and all(isinstance(name, str) for name in sizes)
             if not (named and all(isinstance(size, int) and size > 0 for size in sizes.values())):
                 raise TypeError(
@@ -66,12 +69,12 @@ class Names:
     @property
     def slow_coordinates(self) -> list[str]:
         """A name for each entry of q_s."""
-        return _coordinates(self.slow)
+        return self._coordinates(self.slow)
 
     @property
     def fast_coordinates(self) -> list[str]:
         """A name for each entry of q_f."""
-        return _coordinates(self.fast)
+        return self._coordinates(self.fast)
 
     @property
     def rows(self) -> dict[str, list[int]]:
@@ -117,7 +120,8 @@ class Names:
         Raises:
             ValueError: sizes that do not add up to these.
         """
-        return replace(self, slow=self._completed("slow", "q_s", n_s), fast=self._completed("fast", "q_f", n_f))
+        slow, fast = self._completed("slow", "q_s", n_s), self._completed("fast", "q_f", n_f)
+        return replace(self, slow=slow, fast=fast, numbered=(*self.numbered, "q_s", "q_f"))
 
     def _completed(self, what: str, plain: str, number: int) -> dict[str, int]:
         sizes = dict(getattr(self, what)) or ({plain: number} if number else {})
@@ -128,7 +132,18 @@ class Names:
             )
         return sizes
 
-    def to_dict(self) -> dict[str, dict[str, int]]:
+    def _coordinates(self, sizes: Mapping[str, int]) -> list[str]:
+        names = []
+        for name, size in sizes.items():
+            if size == 1 and name not in self.numbered:
+                names.append(name)
+            elif size <= len(AXES) and name not in self.numbered:
+                names += [f"{name} {axis}" for axis in AXES[:size]]
+            else:
+                names += [f"{name}[{i}]" for i in range(size)]
+        return names
+
+    def to_dict(self) -> dict[str, Any]:
         """As plain data, which keep their order in JSON."""
         return asdict(self)
 
@@ -163,15 +178,3 @@ def _one_after_another(sizes: Mapping[str, int]) -> list[tuple[str, int, int]]:
         starts.append((name, end, size))
         end += size
     return starts
-
-
-def _coordinates(sizes: Mapping[str, int]) -> list[str]:
-    names = []
-    for name, size in sizes.items():
-        if size == 1:
-            names.append(name)
-        elif size <= len(AXES) and name not in ("q_s", "q_f"):
-            names += [f"{name} {axis}" for axis in AXES[:size]]
-        else:
-            names += [f"{name}[{i}]" for i in range(size)]
-    return names

@@ -34,7 +34,8 @@ def names_of(sorting: Sorting) -> Names:
     for part in sorting.placed:
         if part.home in ("constraint", "slow_constraint"):
             sizes[part.home] |= _rows(sorting, part)
-    return Names(sizes["s"], sizes["f"], sizes["constraint"], sizes["slow_constraint"])
+    blocks = [name for name, body in sorting.bodies.items() if body.block]
+    return Names(sizes["s"], sizes["f"], sizes["constraint"], sizes["slow_constraint"], blocks)
 
 
 def _rows(sorting: Sorting, part: Placed) -> dict[str, int]:

@@ -6,6 +6,7 @@ Hairer, Lubich, Wanner, *Geometric Numerical Integration*, I.5.1.
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
 
@@ -40,4 +41,5 @@ def fermi_pasta_ulam(num_springs: int = 3, omega: float = 50.0) -> Problem:
         fast_potential=stiff_springs,
         params={"omega": jnp.asarray(omega)},
     )
-    return Problem(system, q_s=first, q_f=first / omega, v_s=first, v_f=first)
+    names = Names({"centres": num_springs}, {"elongations": num_springs}, numbered=("centres", "elongations"))
+    return Problem(system, q_s=first, q_f=first / omega, v_s=first, v_f=first, names=names)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
 
@@ -80,4 +81,10 @@ def simple_atomic_model(
     )
     v_s = np.array([[0.0, 0.5, 0.0], [0.3, 0.2, 0.1]])
     v_f = np.array([[0.0, 0.4, 0.2], [-0.5, 0.2, 0.3], [0.2, -0.6, 0.4], [0.7, 0.1, 0.2]])
-    return Problem(system, *(jnp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f)), project=True)
+    names = Names(
+        slow={"atom 1": 3, "atom 2": 3},
+        fast={f"atom {i}": 3 for i in (3, 4, 5, 6)},
+        constraint={"bond 2-4": 1, "bond 2-5": 1, "bond 3-6": 1},
+        slow_constraint={"bond 1": 1},
+    )
+    return Problem(system, *(jnp.asarray(a).reshape(-1) for a in (q_s, q_f, v_s, v_f)), project=True, names=names)

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
 
@@ -67,4 +68,5 @@ def triple_spherical_pendulum(
         q_f=jnp.array([l_1, l_2, 0.0, l_1, l_2, l_3]),
         v_s=jnp.array([0.0, 1.0, 0.0]),
         v_f=jnp.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.5]),
+        names=Names({"bob 1": 3}, {"bob 2": 3, "bob 3": 3}, {"rod 2": 1}, {"rod 1": 1}),
     )
