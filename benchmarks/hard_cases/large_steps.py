@@ -89,7 +89,7 @@ def mass_ratios(full: bool) -> Outcome:
         problem = vm.systems.triple_spherical_pendulum(masses=(ratio, 1.0, 1.0))
         trajectory = _pendulum_run(problem, 0.01, 1000 if full else 100)
         values[f"iterations_{ratio:.0e}"] = iterations(trajectory) if trajectory.success else np.inf
-        values[f"condition_{ratio:.0e}"] = step_condition(problem.system, PENDULUM, problem.state(), 0.01)
+        values[f"condition_{ratio:.0e}"] = step_condition(problem, PENDULUM, macro_dt=0.01)
     worst = max(v for name, v in values.items() if name.startswith("iterations"))
     condition = max(v for name, v in values.items() if name.startswith("condition"))
     return Outcome(
@@ -107,7 +107,7 @@ def tiny_steps(full: bool) -> Outcome:
     """
     problem = vm.systems.triple_spherical_pendulum()
     state, steps = problem.state(), 10.0 ** -np.arange(1.0, 7.0)
-    conditions = np.array([step_condition(problem.system, PENDULUM, state, h) for h in steps])
+    conditions = np.array([step_condition(problem.system, PENDULUM, state, macro_dt=h) for h in steps])
     floor = _pendulum_run(problem, 1e-6, 10_000 if full else 1_000)
     error = energy(floor, 1, float(floor.energy[0])).band
     flat = conditions[1:].max() / conditions[1:].min()  # H = 0.1 is no small step

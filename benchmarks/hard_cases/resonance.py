@@ -36,7 +36,7 @@ def impulse_resonance(full: bool) -> Outcome:
     first = {n: found.first_unstable(n) / np.pi for n in expected}
     first_window = found.windows(5)[0]
     macro_dt = (first_window.start + first_window.stop) / 2 / found.omega
-    advice = advise(model.system, vm.explicit_slow(5), model.state(), macro_dt)
+    advice = advise(model, vm.explicit_slow(5), macro_dt=macro_dt)
     words = ", ".join(f"{value:.3f} ({n})" for n, value in first.items())
     return Outcome(
         f"first unstable omega H / pi (num_micro): {words}; a step in the window is {advised(advice)}",
@@ -56,7 +56,7 @@ def chain_at_half_period(full: bool) -> Outcome:
     steps = round((200 if full else 50) / macro_dt)
     implicit = long_run(problem, vm.fully_implicit(num_micro), macro_dt, steps)
     kicked = long_run(problem, vm.explicit_slow(num_micro), macro_dt, round(200 / macro_dt))
-    advice = advise(problem.system, vm.explicit_slow(num_micro), problem.state(), macro_dt)
+    advice = advise(problem, vm.explicit_slow(num_micro), macro_dt=macro_dt)
     error = energy(implicit, steps).band
     return Outcome(
         f"explicit_slow {advised(advice)} (it ends in {status(kicked)}); fully_implicit: largest "
@@ -80,7 +80,7 @@ def combination_resonance(full: bool) -> Outcome:
     e = np.asarray(long_run(model, scheme, at / 50.0, steps).energy)
     k = np.linspace(0, steps, len(e))
     measured = np.polyfit(k[len(k) // 3 :], np.log(e[len(k) // 3 :]) / 2, 1)[0]  # energies grow as squares
-    advice = advise(model.system, scheme, model.state(), at / 50.0)
+    advice = advise(model, scheme, macro_dt=at / 50.0)
     return Outcome(
         f"growth {growth:.2e} per step from the eigenvalues, {measured:.2e} in a run of {steps} steps; {advised(advice)}",
         abs(growth / 8.4e-4 - 1) < 0.2 and abs(measured / growth - 1) < 0.2 and not advice.ok,
@@ -102,7 +102,7 @@ def nonlinear_resonance(full: bool) -> Outcome:
         runs = [long_run(start, scheme, phase / 50.0, steps) for start in starts]
         changes = [energy(run, steps, abs(float(run.energy[0]))) for run in runs]
         failed = not all(run.success for run in runs)
-        flagged = failed or not advise(problem.system, scheme, problem.state(), phase / 50.0).ok
+        flagged = failed or not advise(problem, scheme, macro_dt=phase / 50.0).ok
         drift, band = abs(np.median([c.drift for c in changes])) / 1e5, max(c.band for c in changes)
         values |= {f"drift {name}": drift, f"band {name}": band}
         said.append(f"omega H = {name}: {drift:.0e} per step in a band of {band:.1e}{', flagged' if flagged else ''}")
@@ -120,7 +120,7 @@ def swapped_labels(full: bool) -> Outcome:
     steps = 100_000 if full else 10_000
     trajectory = long_run(problem, scheme, macro_dt, steps)
     band = energy(trajectory, steps, abs(float(trajectory.energy[0]))).band
-    advice = advise(problem.system, scheme, problem.state(), macro_dt)
+    advice = advise(problem, scheme, macro_dt=macro_dt)
     suggested = any(word in str(advice).lower() for word in ("swap", "exchange"))
     return Outcome(
         f"fully_implicit, H = 0.03: {status(trajectory)}, relative energy error {band:.1e}; the swap is "

@@ -46,6 +46,8 @@ def vmri(tmp_path, monkeypatch):
     """Runs ``vmri`` in an empty folder: (exit code, everything printed with frames and line breaks taken out)."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "user.py").write_text(USER_FILE)
+    (tmp_path / "empty.py").write_text("x = 1")
+    (tmp_path / "two.py").write_text(f"{USER_FILE}first = second = my_problem\ndel my_problem")
     (tmp_path / "folder.npz").mkdir()
     (tmp_path / "folder.zarr").mkdir()
 
@@ -206,7 +208,8 @@ def test_a_full_disk_is_told(vmri, monkeypatch):
         (["fpuu", *RUN], "there is no system 'fpuu'. Did you mean fpu? There are fpu, tsp, sam."),
         (["fpu", *RUN[:4], "--scheme", "fully_explict"], "Did you mean fully-explicit? There are fully-implicit"),
         (["none.py:x", *RUN], "the file none.py does not exist"),
-        (["user.py", *RUN], "say which problem in that file, e.g. user.py:my_problem"),
+        (["empty.py", *RUN], "say which problem in that file; e.g. empty.py:my_problem"),
+        (["two.py", *RUN], "say which problem in that file; it has two.py:first, two.py:second"),
         (["user.py:my_problm", *RUN], "has no name 'my_problm'. Did you mean my_problem? Problems in it: my_problem."),
         (["user.py:not_a_problem", *RUN], "is int; it must be a vmri_jax.Problem, or a function"),
         (["user.py:needs_more", *RUN], "needs_more() in user.py failed: TypeError"),
@@ -231,6 +234,23 @@ def test_bad_input_is_refused_in_one_panel(vmri, arguments, message):
     assert code == 2
     assert message in text
     assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("first = make()", ""),
+        ("problem = make()", ""),
+        ("first = make()\nproblem = make()", "several.py: taking problem; there is also several.py:first."),
+    ],
+)
+def test_a_file_alone_stands_for_its_problem(vmri, tmp_path, source, said):
+    start = "from vmri_jax.systems import fermi_pasta_ulam as make\n"
+    (tmp_path / "several.py").write_text(start + source)
+    code, text = vmri("simulate", "several.py", *RUN)
+    assert code == 0
+    assert said in text
+    assert ("taking" in text) == bool(said)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_keeps_the_area(name):
     """With constraints it follows from the symplectic step, and from the stages one by one."""
     problem, scheme = PROBLEMS[name](), compose(fully_explicit(2), "kahan-li6")
     newton = without_fallback(problem.system, scheme)
-    assert vm.diagnostics.symplectic_defect(problem.system, scheme, problem.state(), 0.01, newton) < 1e-11
+    assert vm.diagnostics.symplectic_defect(problem, scheme, macro_dt=0.01, newton=newton) < 1e-11
 
 
 def test_derivative_by_the_step():

@@ -17,7 +17,7 @@ def kinds(advice, severity="error"):
 def test_impulse_resonance_of_the_chain(fpu):
     """FPU at omega H = pi."""
     scheme, state = explicit_slow(30), fpu.state()
-    advice = advise(fpu.system, scheme, state, 0.0628)
+    advice = advise(fpu.system, scheme, state, macro_dt=0.0628)
     assert kinds(advice) == ["impulse resonance"]
     assert not advice.ok
     assert advice.growth == pytest.approx(5.0e-3, rel=0.1)
@@ -25,11 +25,11 @@ def test_impulse_resonance_of_the_chain(fpu):
     assert "tenfold in 460" in str(advice)
     assert 0.06 < advice.safe_macro_dt < 0.066
     assert advice.safe_macro_dt != 0.0628
-    again = advise(fpu.system, scheme, state, advice.safe_macro_dt)
+    again = advise(fpu.system, scheme, state, macro_dt=advice.safe_macro_dt)
     assert again.ok
     assert again.findings == ()
     assert again.safe_macro_dt == again.macro_dt == advice.safe_macro_dt
-    near = advise(fpu.system, scheme, state, 0.0631)
+    near = advise(fpu.system, scheme, state, macro_dt=0.0631)
     assert near.growth == 0
     assert kinds(near, "warning") == ["impulse resonance"]
     assert not near.ok
@@ -38,7 +38,7 @@ def test_impulse_resonance_of_the_chain(fpu):
 def test_combination_resonance():
     """Linear model, kappa 25, omega h = 0.1, num_micro 57, fully implicit."""
     problem = linear_model()
-    advice = advise(problem.system, fully_implicit(57), problem.state(), 0.114)
+    advice = advise(problem, fully_implicit(57), macro_dt=0.114)
     assert kinds(advice) == ["combination resonance"]
     assert advice.growth == pytest.approx(8.4e-4, abs=2e-5)
     assert "frequencies 50.25 and 4.975" in str(advice)
@@ -48,7 +48,7 @@ def test_combination_resonance():
 
 @pytest.mark.parametrize(("x", "severity"), [(1.6, None), (1.98, "warning"), (2.1, "error")])
 def test_stability_limit_of_the_chain(fpu, x, severity):
-    advice = advise(fpu.system, fully_explicit(1), fpu.state(), x / 50)
+    advice = advise(fpu, fully_explicit(1), macro_dt=x / 50)
     assert advice.ok == (severity is None)
     assert (advice.growth > 0) == (severity == "error")
     if severity:
@@ -58,7 +58,7 @@ def test_stability_limit_of_the_chain(fpu, x, severity):
 
 
 def test_stages_of_a_composition(fpu):
-    advice = advise(fpu.system, compose(fully_explicit(1), "yoshida4"), fpu.state(), 1.6 / 50)
+    advice = advise(fpu, compose(fully_explicit(1), "yoshida4"), macro_dt=1.6 / 50)
     assert kinds(advice) == ["stability limit"]
     assert "longest stage" in str(advice)
     assert kinds(advice, "note") == ["stages"]
@@ -75,7 +75,7 @@ def test_swapped_labels(fpu):
     state = fpu.state()
     swapped = System(fpu.system.kinetic, all_in_the_slow_potential, params=fpu.system.params)
     start = State(0.0, state.q_f, state.q_s, state.p_f, state.p_s)
-    advice = advise(swapped, fully_explicit(1), start, 0.005)
+    advice = advise(swapped, fully_explicit(1), start, macro_dt=0.005)
     assert kinds(advice, "warning") == ["labels"]
     assert not advice.ok
     assert "q_s[0], q_s[1], q_s[2]" in str(advice)
@@ -87,7 +87,7 @@ def test_swapped_labels(fpu):
 def test_a_state_that_is_unstable_by_itself():
     """Coupling of the wrong sign: the growth is the motion's, not the scheme's."""
     problem = linear_model(kappa=-25.0)
-    advice = advise(problem.system, fully_explicit(1), problem.state(), 0.01)
+    advice = advise(problem, fully_explicit(1), macro_dt=0.01)
     assert advice.ok
     assert advice.growth == 0
     assert kinds(advice, "note") == ["motion"]
@@ -95,14 +95,14 @@ def test_a_state_that_is_unstable_by_itself():
 
 
 def test_table_and_bad_input(fpu):
-    advice = advise(fpu.system, fully_explicit(1), fpu.state(), 2.1 / 50)
+    advice = advise(fpu, fully_explicit(1), macro_dt=2.1 / 50)
     console = Console(width=300, record=True, file=None, quiet=False)
     with console.capture() as captured:
         console.print(advice)
     assert "stability limit" in captured.get()
     assert advice.verdict in captured.get()
     with pytest.raises(TypeError, match="scheme is int"):
-        advise(fpu.system, 3, fpu.state(), 0.1)  # pyright: ignore[reportArgumentType]
+        advise(fpu, 3, macro_dt=0.1)  # pyright: ignore[reportArgumentType]
     for macro_dt in (0.0, np.nan, [0.1]):
         with pytest.raises(ValueError, match="macro_dt is"):
-            advise(fpu.system, fully_explicit(1), fpu.state(), macro_dt)  # pyright: ignore[reportArgumentType]
+            advise(fpu, fully_explicit(1), macro_dt=macro_dt)  # pyright: ignore[reportArgumentType]

@@ -104,7 +104,7 @@ def test_a_step_that_fails_is_unstable():
 
 def test_bad_input():
     model, scheme = linear_model(), fully_explicit(3)
-    with pytest.raises(TypeError, match="model is System; give a Problem"):
+    with pytest.raises(TypeError, match="stability_map: a System has no start; give a State"):
         stability_map(model.system, scheme, GRID)  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="give a Scheme or Composition"):
         stability_map(model, {"a": 3}, GRID)  # pyright: ignore[reportArgumentType]
@@ -118,9 +118,9 @@ def test_bad_input():
     free = System(ConstantMass([1.0], [1.0]))
     zero = np.zeros(1)
     with pytest.raises(ValueError, match="params None"):
-        stability_map((free, State(0.0, zero, zero, zero, zero)), scheme, GRID, kappa=[1.0])
+        stability_map(free, scheme, GRID, state=State(0.0, zero, zero, zero, zero), kappa=[1.0])
     with pytest.raises(ValueError, match="nothing vibrates"):
-        stability_map((free, State(0.0, zero, zero, zero, zero)), scheme, GRID)
+        stability_map(free, scheme, GRID, state=State(0.0, zero, zero, zero, zero))
     found = stability_map(model, {"verlet": scheme}, [1.0, 2.0])
     with pytest.raises(ValueError, match="no row 'other'; there are 'verlet'"):
         found.windows("other")

@@ -15,10 +15,10 @@ def test_powers_of_a_linear_step():
     problem, scheme = linear_model(), fully_explicit(5)
     [(start, stop, _)] = stability_map(problem, scheme, np.linspace(2.9, 3.2, 7)).windows()
     macro_dt = (start + stop) / 2 / 50  # in the first impulse resonance
-    once = monodromy(problem.system, scheme, problem.state(), macro_dt, 1)
-    often = monodromy(problem.system, scheme, problem.state(), macro_dt, 40)
+    once = monodromy(problem, scheme, macro_dt=macro_dt, num_steps=1)
+    often = monodromy(problem, scheme, macro_dt=macro_dt, num_steps=40)
     assert often.matrix == pytest.approx(np.linalg.matrix_power(once.matrix, 40), rel=1e-10, abs=1e-9)
-    expected = multipliers(small_motions(problem.system, problem.state()), scheme, [macro_dt]).radius[0]
+    expected = multipliers(small_motions(problem), scheme, [macro_dt]).radius[0]
     assert expected > 1.01
     assert np.abs(often.multipliers[0]) == pytest.approx(expected**40, rel=1e-9)
     assert often.symplectic_defect < 1e-13
@@ -37,7 +37,7 @@ def swinging():
 def test_on_a_constraint_manifold(swinging):
     """The derivative maps tangent vectors to tangent vectors, keeps the symplectic form, and predicts a neighbour."""
     system, state = swinging
-    found = monodromy(system, fully_explicit(3), state, 0.03, 30, MARCH)
+    found = monodromy(system, fully_explicit(3), state, macro_dt=0.03, num_steps=30, newton=MARCH)
     assert found.matrix.shape == (4, 4)
     assert found.symplectic_defect < 1e-12  # 2e-14
     assert 0.1 < found.closure < 2
@@ -48,7 +48,7 @@ def test_on_a_constraint_manifold(swinging):
         start = [np.asarray(a) for a in (state.q_s, state.q_f, state.p_s, state.p_f)]
         q_s, q_f, p_s, p_f = (a + d for a, d in zip(start, np.split(shift, 4), strict=True))
         moved = initial_state(system, q_s, q_f, p_s / 5, p_f, project=True)
-        end = monodromy(system, fully_explicit(3), moved, 0.03, 30, MARCH).end
+        end = monodromy(system, fully_explicit(3), moved, macro_dt=0.03, num_steps=30, newton=MARCH).end
         ends.append(np.concatenate([end.q_s, end.q_f, end.p_s, end.p_f]))
     predicted = found.end_basis.T @ (found.matrix @ direction)
     assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(predicted, abs=1e-5 * np.abs(predicted).max())
@@ -57,8 +57,8 @@ def test_on_a_constraint_manifold(swinging):
 def test_failing_steps_and_bad_input(swinging):
     system, state = swinging
     with pytest.raises(RuntimeError, match=r"macro step \d+ failed: "):
-        monodromy(system, fully_explicit(3), state, 30.0, 30, MARCH)
+        monodromy(system, fully_explicit(3), state, macro_dt=30.0, num_steps=30, newton=MARCH)
     with pytest.raises(ValueError, match="num_steps is 0"):
-        monodromy(system, fully_explicit(3), state, 0.03, 0)
+        monodromy(system, fully_explicit(3), state, macro_dt=0.03, num_steps=0)
     with pytest.raises(ValueError, match="macro_dt is -1"):
-        monodromy(system, fully_explicit(3), state, jnp.asarray(-1.0), 3)
+        monodromy(system, fully_explicit(3), state, macro_dt=jnp.asarray(-1.0), num_steps=3)

@@ -140,7 +140,7 @@ def test_kinetic_energy_as_a_function_gives_the_same():
 def test_a_step_is_symplectic():
     system = SYSTEMS["pivot on a sprung cart"]
     state = run(system, fully_implicit(3), 3).final_state
-    assert float(symplectic_defect(system, fully_implicit(3), state, 0.05)) < 1e-12
+    assert float(symplectic_defect(system, fully_implicit(3), state, macro_dt=0.05)) < 1e-12
 
 
 def test_velocities_follow_the_pivot():

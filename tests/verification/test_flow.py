@@ -153,7 +153,7 @@ compiled_defect = jax.jit(symplectic_defect)
 
 def defect(problem, scheme, macro_dt):
     newton = without_fallback(problem.system, scheme)
-    return compiled_defect(problem.system, scheme, problem.state(), macro_dt, newton)
+    return compiled_defect(problem.system, scheme, problem.state(), macro_dt=macro_dt, newton=newton)
 
 
 def test_step_is_symplectic_for_rules_that_are_not_symmetric():

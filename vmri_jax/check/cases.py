@@ -23,7 +23,7 @@ from vmri_jax.check.measures import (
 )
 from vmri_jax.check.pictures import draw_energy
 from vmri_jax.diagnostics import step_condition
-from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
@@ -101,7 +101,7 @@ class Resolved:
 
     def tiny_steps(self, full: bool) -> Outcome:
         state, steps = self.problem.state(), self.macro_dt * 10.0 ** -np.arange(0, 6 if full else 5, 2)
-        conditions = [step_condition(self.problem.system, self.scheme, state, h) for h in steps]
+        conditions = [step_condition(self.problem.system, self.scheme, state, macro_dt=h) for h in steps]
         words = ", ".join(f"{c:.3g} at H = {h:.0e}" for c, h in zip(conditions, steps, strict=True))
         return Outcome(
             f"scaled condition {words}",
@@ -138,7 +138,7 @@ class Resolved:
         return Outcome(f"from the known method after {steps} steps: {words}", max(values.values()) < 1e-10, values)
 
     def advice(self, full: bool) -> Outcome:
-        advice = advise(self.problem.system, self.scheme, self.problem.state(), self.macro_dt)
+        advice = advise(self.problem, self.scheme, macro_dt=self.macro_dt)
         return Outcome(str(advice).replace("\n", "; "), advice.ok, {"safe_macro_dt": advice.safe_macro_dt})
 
 
@@ -161,15 +161,16 @@ def resolved(problem: Problem) -> Resolved:
     return Resolved(problem, fully_implicit(NUM_MICRO), NUM_MICRO * PHASE / omega, omega)
 
 
-def cases_for(problem: Problem) -> tuple[Case, ...]:
+def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
     """The hard cases for a system of your own, each with a criterion; those that do not apply to it say why.
 
     Args:
-        problem: system and start.
+        problem: system and start; a `Problem` or a scene.
 
     Raises:
         ValueError: the problem is refused by `initial_state`.
     """
+    problem = problem_of("cases_for", problem)
     own, system = resolved(problem), problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
     implicit = "its constraints are solved for in every step" if system.is_constrained else ""

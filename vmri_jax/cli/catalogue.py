@@ -8,8 +8,10 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+import typer
+
 from vmri_jax import systems
-from vmri_jax.animation.checks import near
+from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.scene import Scene
 from vmri_jax.schemes import composition
@@ -70,8 +72,8 @@ SYSTEMS = {
     ),
 }
 
-DEFAULT_NAME = "scene"
-"""What a file alone stands for, if it has one."""
+DEFAULT_NAMES = ("scene", "problem")
+"""What a file alone stands for, if it has several problems and one of these names."""
 
 KICKED = "2 at alpha = 1/2, else 1"
 SCHEMES = {
@@ -94,7 +96,7 @@ def find_problem(name: str) -> Problem:
     """A built-in problem by name, or one of your own, ``my_file.py:my_problem``.
 
     In the file it is a `Problem`, a `Scene`, or a function without arguments making one; ``my_file.py`` alone stands for
-    its ``scene``.
+    the one that it has, or for its ``scene`` or ``problem``, and then says so.
 
     Raises:
         ValueError: an unknown name; a file that does not exist, fails to run, or has no such name; no Problem there.
@@ -109,7 +111,7 @@ def find_problem(name: str) -> Problem:
 
 
 def find_scene(name: str) -> Scene:
-    """The scene in your own file, ``my_file.py:my_scene``, or ``my_file.py`` for its ``scene``.
+    """The scene in your own file, ``my_file.py:my_scene``, or ``my_file.py`` as in `find_problem`.
 
     Raises:
         ValueError: as of `find_problem`; a system that is no scene.
@@ -130,9 +132,29 @@ def _find_own(name: str) -> Problem | Scene:
     if not path.is_file():
         raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
     module = _run_file(path)
-    if not attribute and not hasattr(module, DEFAULT_NAME):
-        raise ValueError(f"{name}: say which problem in that file, e.g. {file_name}:my_problem.")
-    return _found_in(module, path, attribute or DEFAULT_NAME)
+    return _found_in(module, path, attribute or _only_name(module, file_name))
+
+
+def _only_name(module, file_name: str) -> str:
+    """The problem that a file alone stands for; where it has others, one line says which was taken."""
+    names = _problems_in(module)
+    named = [name for name in DEFAULT_NAMES if hasattr(module, name)]
+    if len(names) == 1 and not named:
+        return names[0]
+    if not named:
+        listed = (
+            f"it has {', '.join(f'{file_name}:{name}' for name in names)}" if names else f"e.g. {file_name}:my_problem"
+        )
+        raise ValueError(f"{file_name}: say which problem in that file; {listed}.")
+    others = [f"{file_name}:{name}" for name in names if name != named[0]]
+    if others:
+        typer.echo(f"{file_name}: taking {named[0]}; there is also {', '.join(others)}.", err=True)
+    return named[0]
+
+
+def _problems_in(module) -> list[str]:
+    """Names of the problems and scenes of a module, those that it imported from elsewhere too."""
+    return [name for name, value in vars(module).items() if isinstance(value, Problem | Scene) and name[0] != "_"]
 
 
 def find_scheme(name: str, num_micro: int, compose: str | None = None, **options) -> Scheme | Composition:
@@ -193,7 +215,7 @@ def _run_file(path: Path):
 def _found_in(module, path: Path, attribute: str) -> Problem | Scene:
     found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
     if attribute not in found:
-        problems = [name for name, value in found.items() if isinstance(value, Problem | Scene)]
+        problems = _problems_in(module)
         listed = f" Problems in it: {', '.join(problems)}." if problems else ""
         raise ValueError(f"{path} has no name {attribute!r}.{near(attribute, found)}{listed}")
     problem = found[attribute]

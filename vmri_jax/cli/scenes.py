@@ -13,7 +13,7 @@ app = typer.Typer()
 
 @app.command(epilog="Example:\n\nvmri explain my_file.py:my_scene --scheme explicit-slow --num-micro 20")
 def explain(
-    scene: Annotated[str, typer.Argument(help="my_file.py:my_scene, or my_file.py for its scene.")],
+    scene: Annotated[str, typer.Argument(help="my_file.py:my_scene, or my_file.py alone.")],
     scheme: options.Scheme = "fully-implicit",
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,

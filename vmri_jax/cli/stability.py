@@ -45,7 +45,7 @@ def advise(
             raise ValueError("give exactly one of --macro-dt and --micro-dt.")
         step = macro_dt if micro_dt is None else chosen.num_micro * micro_dt
         with console.status("looking at the steps around it"):
-            advice = advise_on(problem.system, chosen, problem.state(), step)  # pyright: ignore[reportArgumentType]
+            advice = advise_on(problem, chosen, macro_dt=step)  # pyright: ignore[reportArgumentType]
     console.print(advice.table() if advice.findings else escape(advice.verdict))
     if not advice.ok:
         raise typer.Exit(1)

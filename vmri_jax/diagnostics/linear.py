@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.invariants import all_constraints, potentials, velocity
-from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
@@ -53,7 +53,7 @@ def _null_space(normals):
     return jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :]
 
 
-def frequencies(system: System, state: State):
+def frequencies(system: Movable, state: State | None = None):
     """Angular frequencies of small vibrations about a state, the largest first: those of the frozen linear problem.
 
     Square roots of the generalised eigenvalues of ``Hessian(V + W)`` and the mass matrix on the tangent space of the
@@ -61,9 +61,10 @@ def frequencies(system: System, state: State):
     constraints are left out.
 
     Args:
-        system: masses, potentials, constraints.
-        state: where it is linearised.
+        system: masses, potentials, constraints; a problem, a scene, or a system.
+        state: where it is linearised; None for the start of the problem.
     """
+    system, state = start_of("frequencies", system, state)
     n_s = state.q_s.size
     q = jnp.concatenate([state.q_s, state.q_f])
     v = jnp.concatenate(velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
@@ -85,15 +86,22 @@ def frequencies_of(stiffness: np.ndarray) -> np.ndarray:
 
 
 def symplectic_defect(
-    system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton | None = None
+    system: Movable,
+    scheme: Scheme | Composition,
+    state: State | None = None,
+    *,
+    macro_dt,
+    newton: Newton | None = None,
 ):
     """Largest entry of ``M^T J M - J`` for the derivative M of one macro step, on the constraint manifold.
 
     With constraints, the form is compared on tangent vectors of the constraint manifold only, in an orthonormal basis.
 
     Args:
-        system, scheme, state, macro_dt, newton: as in `macro_step`; the state fulfils the constraints.
+        system, scheme, macro_dt, newton: as in `simulate`.
+        state: fulfils the constraints; None for the start of the problem.
     """
+    system, state = start_of("symplectic_defect", system, state)
     z, splits = phase_vector(state), phase_splits(state)
 
     def step(z):
@@ -106,16 +114,17 @@ def symplectic_defect(
     return jnp.max(jnp.abs(basis @ (M.T @ J @ M - J) @ basis.T))
 
 
-def step_condition(system: System, scheme: Scheme, state: State, macro_dt, sweeps: int = 10) -> float:
+def step_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt, sweeps: int = 10) -> float:
     """Condition number of the Newton matrix of a macro step, rows and columns scaled to length one.
 
     The matrix is that of the first iteration from straight motion; it is dense here, so take few micro steps. Scaling is
     by square roots of the lengths, again and again (Ruiz 2001).
 
     Args:
-        system, scheme, state, macro_dt: as in `macro_step`.
+        system, scheme, state, macro_dt: as in `simulate`.
         sweeps: times that rows and columns are scaled.
     """
+    system, state = start_of("step_condition", system, state)
     a = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
     for _ in range(sweeps):
         rows, columns = np.linalg.norm(a, axis=1), np.linalg.norm(a, axis=0)

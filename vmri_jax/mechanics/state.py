@@ -140,6 +140,31 @@ Movable = System | Problem | HasProblem
 """What can be simulated: a system needs a state as well."""
 
 
+def opened(given):
+    """The problem of a scene; anything else as it is."""
+    return given.problem() if callable(getattr(given, "problem", None)) else given
+
+
+def problem_of(what: str, given: Problem | HasProblem) -> Problem:
+    """The problem of a scene, or the problem itself.
+
+    Args:
+        what: the function that was called, for messages.
+        given: what it was called with.
+
+    Raises:
+        TypeError: something else.
+    """
+    require_x64()
+    problem = opened(given)
+    if not isinstance(problem, Problem):
+        raise TypeError(
+            f"{what}: problem is {type(problem).__name__}; give a vmri_jax.Problem or a Scene. A System needs a start: "
+            "Problem(system, q_s, q_f, v_s, v_f)."
+        )
+    return problem
+
+
 def start_of(what: str, system, state=None) -> tuple[System, State]:
     """The system and the state of what is to move.
 
@@ -152,8 +177,7 @@ def start_of(what: str, system, state=None) -> tuple[System, State]:
         TypeError: something else; a system without a state.
     """
     require_x64()
-    if callable(getattr(system, "problem", None)):
-        system = system.problem()
+    system = opened(system)
     if isinstance(system, Problem):
         system, state = system.system, system.state() if state is None else state
     if not isinstance(system, System):

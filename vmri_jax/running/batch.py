@@ -10,11 +10,10 @@ from jax.sharding import PartitionSpec
 
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.checks import check_params
-from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import Engine
 from vmri_jax.running.memory import check_memory
-from vmri_jax.running.origin import problem_of
 from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory, from_arrays
 from vmri_jax.schemes.composition import Composition, stage_scheme
@@ -64,7 +63,7 @@ def simulate_batch(
     """
     lanes = _check_states(states)
     first = jax.tree.map(lambda a: np.asarray(a)[0], states)
-    problem = problem_of(system)
+    problem = opened(system)
     system, _ = start_of("simulate_batch", problem, first)
     if params is not None:
         _check_params(system, params, lanes)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.state import HasProblem, Problem
+from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
 
 
@@ -30,7 +30,7 @@ class Origin(NamedTuple):
     def of(cls, what: System | Problem | HasProblem) -> "Origin":
         """That of a system, a problem or a scene."""
         names = names_of(what)
-        system = problem_of(what)
+        system = opened(what)
         system = system.system if isinstance(system, Problem) else system
         if not isinstance(system, System):
             raise TypeError(f"of: got {type(what).__name__}; give the vmri_jax.System, Problem or Scene of the run.")
@@ -71,11 +71,6 @@ class Origin(NamedTuple):
         if not self.lanes:
             return self
         return self._replace(params=jax.tree.map(lambda a: a[i], self.params), lanes=False)
-
-
-def problem_of(what: Any) -> Any:
-    """The problem of a scene; anything else as it is."""
-    return what.problem() if callable(getattr(what, "problem", None)) else what
 
 
 def names_of(what: Any) -> Names | None:

@@ -14,13 +14,13 @@ from vmri_jax.mechanics.arrays import is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_flags, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import check_run, check_vectors
 from vmri_jax.running.engine import Engine, engine
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
-from vmri_jax.running.origin import Origin, names_of, problem_of
+from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
 from vmri_jax.schemes.composition import Composition
@@ -332,7 +332,7 @@ def simulation(
 ) -> Simulation:
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     warn_if_slow()
-    problem = problem_of(system)
+    problem = opened(system)
     system, state = start_of("simulate", problem, state)
     macro_dt, num_steps, save_every = check_run(
         system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro

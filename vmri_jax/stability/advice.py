@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.mechanics.checks import require_x64
-from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import SmallMotions, small_motions
@@ -126,7 +124,12 @@ class Advice(ResultTable):
 
 
 def advise(
-    system: System, scheme: Scheme | Composition, state: State, macro_dt: float, *, tolerance: float = TOLERANCE
+    system: Movable,
+    scheme: Scheme | Composition,
+    state: State | None = None,
+    *,
+    macro_dt: float,
+    tolerance: float = TOLERANCE,
 ) -> Advice:
     """Judge a macro step before a long run, from the multipliers of the step of small motions about the state.
 
@@ -144,14 +147,14 @@ def advise(
     One compilation and some hundred eigenvalue problems. Far from the state frequencies differ: ask again there.
 
     Args:
-        system, scheme, state, macro_dt: of the run.
+        system, scheme, state, macro_dt: of the run; without a state it is judged at the start of the problem or scene.
         tolerance: growth per macro step above which a step is unstable.
 
     Raises:
         ValueError: a macro step that is not positive; second derivatives that are not finite at the state.
         TypeError: not a scheme.
     """
-    require_x64()
+    system, state = start_of("advise", system, state)
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
     if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):

@@ -14,7 +14,7 @@ import numpy as np
 
 from vmri_jax.diagnostics.linear import frequencies_of, phase_splits
 from vmri_jax.mechanics.invariants import potentials, velocity
-from vmri_jax.mechanics.state import Problem, State
+from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.mechanics.system import ConstantMass, System
 
 QUICK = {"xla_backend_optimization_level": 0}
@@ -118,7 +118,7 @@ class SmallMotions:
         return replace(self, system=system, stiffness=self.stiffness - removed, **{other: np.zeros_like(removed)})
 
 
-def small_motions(system: System, state: State) -> SmallMotions:
+def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
     """Second-order expansion of a system about the configuration of a state, held at rest there.
 
     Every term is expanded for itself, ``V(q + d) ~ d^T V'' d / 2`` and so on, and keeps its place in the scheme. Constraints
@@ -129,17 +129,13 @@ def small_motions(system: System, state: State) -> SmallMotions:
 
     Args:
         system: any; its potentials, constraints, kinetic energy and forces must have second derivatives there.
-        state: where; its velocity enters through lambda and through the derivatives of the force.
+        state: where, None for the start of the problem; its velocity enters through lambda and through the derivatives of the force.
 
     Raises:
-        TypeError: not a System and a State.
+        TypeError: what cannot be simulated, or a System without a state.
         ValueError: derivatives that are not finite there, constraints that leave no motion.
     """
-    if not isinstance(system, System) or not isinstance(state, State):
-        raise TypeError(
-            f"small_motions: got {type(system).__name__} and {type(state).__name__}; give a System and a State, e.g. "
-            "problem.system and problem.state()."
-        )
+    system, state = start_of("small_motions", system, state)
     terms = {name: np.asarray(value) for name, value in _expansion(system, state).items()}
     broken = [name for name, value in terms.items() if not np.isfinite(value).all()]
     if broken:

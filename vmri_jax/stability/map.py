@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vmri_jax.mechanics.checks import require_x64
-from vmri_jax.mechanics.state import Problem, State
+from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -113,35 +112,36 @@ class StabilityMap(ResultTable):
 
 
 def stability_map(
-    model: Problem | tuple[System, State],
+    system: Movable,
     scheme: Scheme | Composition | Mapping[Any, Scheme | Composition],
     omega_H: Sequence[float] | np.ndarray,
     *,
+    state: State | None = None,
     kappa: Sequence[float] | None = None,
     tolerance: float = TOLERANCE,
 ) -> StabilityMap:
-    """Where macro steps of length H are stable: multipliers of the step of small motions about the model's state.
+    """Where macro steps of length H are stable: multipliers of the step of small motions about a state.
 
     At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere those of the frozen problem
     (see `small_motions`). Windows between grid points are found where multipliers of opposite Krein signature have
     passed each other, and refined by bisection.
 
     Args:
-        model: `linear_model()`, any other `Problem`, or a system and a state. The unit of the grid is its omega: the
+        system: `linear_model()`, any other problem or scene, or a system with a state. The unit of the grid is its omega: the
             fastest frequency of the fast potential alone, or of everything where that has none.
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
             windows; multipliers that pass several others from one point to the next hide some.
         kappa: values of ``params["kappa"]`` of the system, one row each, for a single scheme.
+        state: where motions are small; None for the start of the problem.
         tolerance: growth per macro step above which a step is unstable.
 
     Raises:
-        TypeError: a model or scheme of the wrong kind.
+        TypeError: a system or scheme of the wrong kind.
         ValueError: a grid that is not increasing and positive; kappa for several schemes, or for a system without it.
     """
-    require_x64()
-    system, state = _system_and_state(model)
+    system, state = start_of("stability_map", system, state)
     grid = _grid(omega_H)
     schemes = scheme if isinstance(scheme, Mapping) else {"": scheme}
     if not schemes or not all(isinstance(s, Scheme | Composition) for s in schemes.values()):
@@ -156,7 +156,7 @@ def stability_map(
         rows = {float(k): (small_motions(_with_kappa(system, k), state), only) for k in kappa}
     omega = next(iter(rows.values()))[0].omega
     if omega == 0:
-        raise ValueError("stability_map: the model has no frequency that could scale omega_H; nothing vibrates there.")
+        raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
     measured = [measure(motions, s, grid / omega, tolerance) for motions, s in rows.values()]
     return StabilityMap(
         axis="scheme" if kappa is None else "kappa",
@@ -188,14 +188,6 @@ def measure(
     inside = np.array([a + (b - a) * INSIDE for a, b in edges])
     peaks = multipliers(motions, scheme, inside.reshape(-1)).radius.reshape(inside.shape).max(axis=1) - 1
     return found.radius, [Window(*ends, float(peak)) for ends, peak in zip(edges, peaks, strict=True)]
-
-
-def _system_and_state(model) -> tuple[System, State]:
-    if isinstance(model, Problem):
-        return model.system, model.state()
-    if isinstance(model, tuple) and len(model) == 2 and isinstance(model[0], System) and isinstance(model[1], State):
-        return model
-    raise TypeError(f"stability_map: model is {type(model).__name__}; give a Problem, or (system, state).")
 
 
 def _grid(omega_H) -> np.ndarray:

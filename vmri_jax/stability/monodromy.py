@@ -9,9 +9,7 @@ import numpy as np
 
 from vmri_jax.diagnostics.linear import phase_splits, phase_vector, symplectic_form, tangents
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.checks import require_x64
-from vmri_jax.mechanics.state import State
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -56,9 +54,10 @@ class Monodromy:
 
 
 def monodromy(
-    system: System,
+    system: Movable,
     scheme: Scheme | Composition,
-    state: State,
+    state: State | None = None,
+    *,
     macro_dt,
     num_steps: int,
     newton: Newton | None = None,
@@ -69,14 +68,14 @@ def monodromy(
 
     Args:
         system, scheme, macro_dt, newton: as in `macro_step`.
-        state: start, consistent.
+        state: start, consistent; None for that of the problem or scene.
         num_steps: macro steps; one period of a periodic orbit gives its Floquet multipliers.
 
     Raises:
         ValueError: num_steps below 1, a macro step that is not positive.
         RuntimeError: a step failed; says which and why.
     """
-    require_x64()
+    system, state = start_of("monodromy", system, state)
     if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer) or num_steps < 1:
         raise ValueError(f"monodromy: num_steps is {num_steps!r}; it must be an integer of at least 1.")
     if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):

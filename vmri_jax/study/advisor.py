@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vmri_jax import diagnostics
-from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
@@ -84,7 +84,7 @@ class Search:
     def __init__(self, problem, t_end: float, menu: Sequence[Family], reference: ReferenceSolution, newton=None):
         self.problem, self.t_end, self.menu, self.reference = problem, t_end, menu, reference
         self.newton = newton
-        self.frequency = float(diagnostics.frequencies(problem.system, problem.state())[0])
+        self.frequency = float(diagnostics.frequencies(problem)[0])
         self.programs: dict[tuple[str, int], Program] = {}
         self.settings: dict[tuple[str, int, int], Setting] = {}
 
@@ -261,7 +261,7 @@ def check_target(error: float, t_end: float, problem: Problem) -> None:
 
 
 def recommend(
-    problem: Problem,
+    problem: Problem | HasProblem,
     error: float,
     t_end: float,
     *,
@@ -276,7 +276,7 @@ def recommend(
     """Find the scheme, num_micro and macro step that reach an error in the least time on this machine.
 
     Args:
-        problem: system and start.
+        problem: system and start; a `Problem` or a scene.
         error: largest accepted ``|q - q_ref|`` over the compared nodes, in the unit of the positions.
         t_end: simulated time.
         menu: families to choose from, by default `families()`.
@@ -292,6 +292,7 @@ def recommend(
         NothingReached: no setting keeps the error; carries the runs.
         SimulationError: the reference could not be computed.
     """
+    problem = problem_of("recommend", problem)
     check_target(error, t_end, problem)
     if reference is None:
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)

@@ -15,7 +15,7 @@ import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
-from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
@@ -195,7 +195,7 @@ class ConvergenceStudy(ResultTable):
 
 
 def convergence_study(
-    problem: Problem,
+    problem: Problem | HasProblem,
     schemes: Mapping[str, Scheme | Composition],
     macro_dt: Sequence[float],
     t_end: float,
@@ -213,7 +213,7 @@ def convergence_study(
     A run that fails becomes a row of NaN with its status.
 
     Args:
-        problem: system and start.
+        problem: system and start; a `Problem` or a scene.
         schemes: schemes by label, of any num_micro and degree.
         macro_dt: macro steps H; each must divide `t_end` into a multiple of `num_saves` steps.
         t_end: time simulated.
@@ -228,6 +228,7 @@ def convergence_study(
     Raises:
         ValueError: no scheme, a step that does not divide `t_end` as above, a reference of another shape.
     """
+    problem = problem_of("convergence_study", problem)
     if not schemes:
         raise ValueError(
             "convergence_study: schemes is empty; give at least one, e.g. {'midpoint': fully_implicit(5)}."

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
@@ -71,7 +71,7 @@ class CostStudy(ResultTable):
 
 
 def cost_study(
-    problem: Problem,
+    problem: Problem | HasProblem,
     scheme: Callable[[int], Scheme],
     num_micro: Sequence[int],
     *,
@@ -93,7 +93,7 @@ def cost_study(
     Programs take turns in every repeat, so that a slow moment of the machine hits all of them; the median is kept.
 
     Args:
-        problem: system and start.
+        problem: system and start; a `Problem` or a scene.
         scheme: the scheme for a num_micro, e.g. `vmri_jax.fully_implicit`.
         num_micro: numbers of micro steps per macro step.
         micro_dt: the constant micro step h.
@@ -107,6 +107,7 @@ def cost_study(
     Raises:
         ValueError: an empty or bad argument.
     """
+    problem = problem_of("cost_study", problem)
     if not num_micro or not methods or repeats < 1 or not (micro_dt > 0 and t_end > 0):
         raise ValueError(
             f"cost_study: num_micro = {list(num_micro)}, methods = {list(methods)}, repeats = {repeats}, "

@@ -17,7 +17,7 @@ from matplotlib.ticker import EngFormatter
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.mechanics.invariants import potentials
-from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.study.advisor import MARGIN, Search, Setting
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.html import embedded, write_page
@@ -88,7 +88,7 @@ class CostReport(ResultTable):
 
 def default_t_end(problem: Problem) -> float:
     """PERIODS periods of the fastest vibration, rounded to one digit; 1 if nothing vibrates."""
-    frequency = float(diagnostics.frequencies(problem.system, problem.state())[0])
+    frequency = float(diagnostics.frequencies(problem)[0])
     if not frequency > 0:
         return 1.0
     t_end = PERIODS * 2 * math.pi / frequency
@@ -96,7 +96,7 @@ def default_t_end(problem: Problem) -> float:
 
 
 def cost_report(
-    problem: Problem,
+    problem: Problem | HasProblem,
     name: str,
     out: str | Path,
     *,
@@ -110,7 +110,7 @@ def cost_report(
     The page is rewritten after every error, so that what is found is kept whatever happens later.
 
     Args:
-        problem: system and start.
+        problem: system and start; a `Problem` or a scene.
         name: of the system, for the title and the commands: a built-in one or ``my_file.py:my_problem``.
         out: folder, made if it does not exist.
         t_end: simulated time, by default `default_t_end`.
@@ -122,6 +122,7 @@ def cost_report(
         ValueError: errors that are not positive.
         SimulationError: no reference solution could be computed.
     """
+    problem = problem_of("cost_report", problem)
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     t_end = default_t_end(problem) if t_end is None else t_end

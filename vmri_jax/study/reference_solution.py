@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.simulate import simulation_error
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import galerkin
@@ -62,7 +62,7 @@ class ReferenceSolution:
 
 
 def reference_solution(
-    problem: Problem,
+    problem: Problem | HasProblem,
     t_end: float,
     *,
     num_saves: int = 10,
@@ -73,7 +73,7 @@ def reference_solution(
     """Fine single-rate solution of order ``2 degree``, checked against itself at half the step.
 
     Args:
-        problem: system and start.
+        problem: system and start; a `Problem` or a scene.
         t_end: time simulated.
         num_saves: saved nodes, equally spaced over `t_end`.
         num_steps: steps of the coarser of the two runs, a multiple of `num_saves`; by default steps are halved until
@@ -87,6 +87,7 @@ def reference_solution(
     Raises:
         SimulationError: runs failed with every number of steps; the last one is in it.
     """
+    problem = problem_of("reference_solution", problem)
     program = Program(problem, galerkin(1, degree, "gauss"), t_end, num_saves)
     fixed = num_steps is not None
     n = num_steps if fixed else num_saves * max(1, 32 // num_saves)

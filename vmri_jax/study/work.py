@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vmri_jax import diagnostics, plots
-from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
@@ -158,7 +158,7 @@ def work_row(label: str, program: Program, num_steps: int, reference: ReferenceS
 
 
 def work_precision(
-    problem: Problem,
+    problem: Problem | HasProblem,
     schemes: Mapping[str, Scheme | Composition],
     t_end: float,
     *,
@@ -175,7 +175,7 @@ def work_precision(
     a slow moment of the machine hits all of them, and the median is kept. A run that fails is a row of NaN.
 
     Args:
-        problem: system and start.
+        problem: system and start; a `Problem` or a scene.
         schemes: schemes by label.
         t_end: simulated time.
         num_steps: numbers of macro steps, multiples of `num_saves`; by default doubled from the step at which the fastest
@@ -189,13 +189,14 @@ def work_precision(
     Raises:
         ValueError: no scheme, or numbers of steps that are no multiples of num_saves.
     """
+    problem = problem_of("work_precision", problem)
     if not schemes:
         raise ValueError("work_precision: schemes is empty; give at least one, e.g. {'impulse': fully_explicit(10)}.")
     if num_steps is not None and (not len(num_steps) or any(n < 1 or n % num_saves for n in num_steps)):
         raise ValueError(f"work_precision: num_steps is {list(num_steps)}; give multiples of num_saves = {num_saves}.")
     if reference is None:
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
-    frequency = float(diagnostics.frequencies(problem.system, problem.state())[0])
+    frequency = float(diagnostics.frequencies(problem)[0])
     runs: list[tuple[Program, WorkRow]] = []
     for i, (label, scheme) in enumerate(schemes.items()):
         program = Program(problem, scheme, t_end, num_saves, newton)
