@@ -23,12 +23,17 @@ def explain(
     macro_dt: Annotated[
         float | None, typer.Option(help="Macro step that is timed. [dim]from the fastest vibration[/dim]")
     ] = None,
-    measure: Annotated[bool, typer.Option(help="Compile the scene without each effect in turn and time it.")] = True,
+    measure: Annotated[bool, typer.Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
-    """Where every body and effect of a scene lives, and what it adds: unknowns, evaluations, operations, time."""
+    """Where every body and effect of a scene lives and why, and what it adds: unknowns, evaluations, time.
+
+    The time of an effect is that of its first derivatives at all of its nodes, once.
+    """
     with refusals():
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         found = find_scene(scene)
-        with console.status("compiling the scene without each effect in turn" if measure else "looking"):
+        with console.status("compiling and timing" if measure else "looking"):
             ledger = found.explain(chosen, macro_dt=macro_dt, measure=measure)
     console.print(ledger.table())
+    console.print()
+    console.print(ledger.reasons())

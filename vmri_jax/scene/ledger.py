@@ -3,12 +3,16 @@
 import re
 from collections import Counter
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
 from vmri_jax.diagnostics import frequencies
+from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.state import initial_state
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.simulate import Simulation, prepare
@@ -30,6 +34,10 @@ RULES = {"slow_potential": "slow", "fast_potential": "fast"}
 """What a scheme calls its rules of these parts."""
 STEPS = 20
 """Macro steps of a program that is timed."""
+TIMES = 500
+"""Evaluations of an effect that are timed together,"""
+TINY = 1e-30
+"""from positions that differ by so little, but in a way that no compiler foresees."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Row:
     grid, why: "macro" or "micro", where it lives, and how that was decided.
     unknowns, multipliers: it adds to the equations of a macro step.
     evaluations: nodes of a macro step at which its function is evaluated (by implicit schemes in every Newton iteration).
-    operations, time: shares of the compiled operations and of the measured time that go with it, None where not measured.
+    microseconds: of its first derivatives at all these nodes once, None where not measured.
     """
 
     name: str
@@ -50,26 +58,15 @@ class Row:
     unknowns: int
     multipliers: int
     evaluations: int
-    operations: float | None = None
-    time: float | None = None
-
-
-@dataclass(frozen=True)
-class Program:
-    """A compiled scene: instructions of the optimised program, temporary bytes, microseconds per macro step."""
-
-    operations: int
-    temporary_bytes: int
-    microseconds: float
+    microseconds: float | None = None
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """Rows of bodies and effects; the whole scene and its bodies alone as programs (None where not measured)."""
+    """Rows of bodies and effects, and the microseconds of a macro step of the whole scene (None where not measured)."""
 
     rows: tuple[Row, ...]
-    scene: Program | None = None
-    bare: Program | None = None
+    microseconds: float | None = None
 
     @property
     def unknowns(self) -> int:
@@ -77,26 +74,27 @@ class Ledger:
         return sum(row.unknowns + row.multipliers for row in self.rows)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data: "rows", "unknowns", "scene", "bare"."""
+        """Plain data: "rows", "unknowns", "microseconds"."""
         return asdict(self) | {"rows": [asdict(row) for row in self.rows], "unknowns": self.unknowns}
 
     def table(self) -> Table:
-        """A table for `rich.print`."""
-        costs = ("operations", "time") if self.scene is not None else ()
-        table = Table("name", "part of", "grid", "unknowns", "multipliers", "evaluations", box=None, pad_edge=False)
-        for column in costs:
+        """What each adds, a table for `rich.print`; `reasons` says why it is there."""
+        table = Table("name", "part of", "grid", box=None, pad_edge=False)
+        for column in ("unknowns", "evaluations", *(["time"] if self.microseconds is not None else [])):
             table.add_column(column, justify="right")
-        table.add_column("why", style="dim")
         for row in self.rows:
-            numbers = [str(n) if n else "" for n in (row.unknowns, row.multipliers, row.evaluations)]
-            shares = [getattr(row, cost) for cost in costs]
-            percents = [f"{100 * share:.0f} %" if share is not None else "" for share in shares]
-            table.add_row(f"[bold]{row.name}[/bold]", row.kind, row.grid, *numbers, *percents, row.why)
-        for name, program in {"the scene": self.scene, "its bodies alone": self.bare}.items():
-            if program is not None:
-                cost = (str(program.operations), f"{program.microseconds:.3g} µs", f"{program.temporary_bytes} bytes")
-                unknowns = str(self.unknowns) if program is self.scene else ""
-                table.add_row(name, "", "", unknowns, "", "", *cost, style="italic")
+            numbers = [str(n) if n else "" for n in (row.unknowns + row.multipliers, row.evaluations)]
+            time = [] if row.microseconds is None else [f"{row.microseconds:.2g} µs"]
+            table.add_row(f"[bold]{row.name}[/bold]", row.kind, row.grid, *numbers, *time)
+        step = [] if self.microseconds is None else [f"{self.microseconds:.3g} µs"]
+        table.add_row("a macro step", "", "", str(self.unknowns), "", *step, style="italic")
+        return table
+
+    def reasons(self) -> Table:
+        """Why each is slow or fast, and on its grid, a table for `rich.print`."""
+        table = Table("name", "why", box=None, pad_edge=False)
+        for row in self.rows:
+            table.add_row(f"[bold]{row.name}[/bold]", row.why)
         return table
 
 
@@ -117,15 +115,14 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
         grid = "micro" if pace.value == "fast" else "macro"
         unknowns = intervals[grid] * sorting.bodies[name].size
         rows.append(Row(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
-    whole, bare, shares = _measure(sorting, scheme, macro_dt) if measure else (None, None, {})
-    for part in sorting.placed:
-        name = part.effect.name
+    whole, times = _measure(sorting, scheme, macro_dt) if measure else (None, [None] * len(sorting.placed))
+    for part, nanoseconds in zip(sorting.placed, times, strict=True):
         rule = getattr(one, RULES.get(part.home, part.home))
         multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
         count = stages * evaluations(rule, one.num_micro)
-        share = shares.get(name, (None, None))
-        rows.append(Row(name, HOMES[part.home], rule.grid, part.reason, 0, multipliers, count, *share))
-    return Ledger(tuple(rows), whole, bare)
+        own = None if nanoseconds is None else nanoseconds * count / 1e3
+        rows.append(Row(part.effect.name, HOMES[part.home], rule.grid, part.reason, 0, multipliers, count, own))
+    return Ledger(tuple(rows), whole)
 
 
 def evaluations(rule, num_micro: int) -> int:
@@ -135,26 +132,39 @@ def evaluations(rule, num_micro: int) -> int:
     return len(nodes) - int(shared)
 
 
-def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[Program, Program, dict]:
-    """The scene's program, that of its bodies alone, and shares of operations and time by effect."""
-    names = dict.fromkeys(part.effect.name for part in sorting.placed)
-    kept = {f"without {name}": [part for part in sorting.placed if part.effect.name != name] for name in names}
-    systems = {key: build(sorting, some) for key, some in {"whole": sorting.placed, "bare": (), **kept}.items()}
-    states = {key: initial_state(system, *sorting.start) for key, system in systems.items()}
+def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
+    """Microseconds of a macro step, and nanoseconds of one evaluation of the first derivatives of every effect."""
+    system = build(sorting, sorting.placed)
+    state = initial_state(system, *sorting.start, project=True)
     if macro_dt is None:
-        fastest = float(frequencies(systems["whole"], states["whole"])[0])
+        fastest = float(frequencies(system, state)[0])
         macro_dt = scheme.num_micro * 0.1 / fastest if fastest > 0 else 0.01
-    runs = {key: prepare_steps(system, scheme, states[key], macro_dt) for key, system in systems.items()}
-    times = interleaved({key: run.timed() for key, run in runs.items()}, 5)
-    programs = {}
-    for key, run in runs.items():
-        compiled, us = run.compiled(), 1e6 * float(np.median(times[key])) / STEPS
-        programs[key] = Program(sum(operations(compiled).values()), temporary_bytes(compiled), us)
-    whole, shares = programs["whole"], {}
-    for name in names:
-        left = programs[f"without {name}"]
-        shares[name] = 1 - left.operations / whole.operations, 1 - left.microseconds / whole.microseconds
-    return whole, programs["bare"], shares
+    runs = {"step": prepare_steps(system, scheme, state, macro_dt).timed()}
+    for i, part in enumerate(sorting.placed):
+        runs[str(i)] = partial(_often, build(sorting, [part]), *sorting.start)
+    step, *effects = (float(np.median(samples)) for samples in interleaved(runs, 5).values())
+    return 1e6 * step / STEPS, [1e9 * seconds / TIMES for seconds in effects]
+
+
+@jax.jit
+def _often(system: System, q_s, q_f, v_s, v_f):
+    """First derivatives of all that a system has, `TIMES` times in a row, each time from where the last one led."""
+
+    def lagrangian(q_s, q_f):
+        potentials = sum(energy for energy in invariants.potentials(system, q_s, q_f))
+        kinetic = 0.0 if system.has_constant_mass else system.kinetic(q_s, q_f, v_s, v_f, system.params)
+        return kinetic - potentials
+
+    def again(_, q):
+        found = [*jax.grad(lagrangian, argnums=(0, 1))(*q)]
+        if system.is_constrained:
+            found += jax.jacrev(system.constraints, argnums=(1, 2))(jnp.zeros(()), *q)
+        if system.force is not None:
+            found += system.forces(jnp.zeros(()), *q, v_s, v_f)
+        moved = sum(jnp.sum(a) for a in found)
+        return tuple(a + TINY * moved for a in q)
+
+    return jax.lax.fori_loop(0, TIMES, again, (q_s, q_f))
 
 
 def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:

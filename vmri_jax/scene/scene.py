@@ -181,7 +181,7 @@ class Scene:
         Args:
             scheme: how the steps are taken.
             macro_dt: step that is measured; by default micro steps of a tenth of the fastest vibration's radian.
-            measure: compile the scene without each effect in turn and time it; without, the ledger costs nothing.
+            measure: compile and time a macro step, and the first derivatives of every effect; without, the ledger costs nothing.
         """
         return ledger(self.sorting, scheme, macro_dt, measure)
 
