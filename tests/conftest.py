@@ -37,6 +37,8 @@ def pytest_configure(config):
     from vmri_jax import configure
 
     configure()
+    # Tests make functions of one piece of code again for each case.
+    config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
 
 
 def pytest_collection_modifyitems(config, items):
