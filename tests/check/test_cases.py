@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import pytest
 
+from tests.check.broken_systems import no_potential, swapped_labels, wrong_gradient
 from tests.user_systems import two_oscillators
 from vmri_jax import ConstantMass, Problem, Rheonomic, System
 from vmri_jax.check import cases_for, run_cases
@@ -105,6 +106,40 @@ def test_steps_come_from_the_frequencies():
     assert own.omega == pytest.approx(50.0, rel=0.01)
     assert own.macro_dt == pytest.approx(1 / 50.0, rel=0.01)
     assert 0.5 < resolved(crane()).omega < 30  # nothing vibrates without the force of the rope
+
+
+@pytest.mark.parametrize(
+    ("make", "title", "words"),
+    [
+        (wrong_gradient, "derivatives", "the gradient of fast_potential from differences of its values differs by 0.3"),
+        (no_potential, "derivatives", "Forces that no potential has belong into force"),
+        (swapped_labels, "advice", "is one of the slow variables q_s[0]"),
+    ],
+)
+def test_what_is_broken_is_found(make, title, words):
+    [case] = [case for case in cases_for(make()) if case.title == title]
+    report = run_cases([case])
+    assert not report.passed
+    assert words in report.rows[0].outcome.measured
+
+
+def test_right_derivatives_are_right():
+    [case] = [case for case in cases_for(two_oscillators()) if case.title == "derivatives"]
+    outcome = case.run(False)
+    assert outcome.passed, outcome.measured
+    assert outcome.values["apart"] < 1e-10  # measured 1e-16, of the crane 1e-11
+
+
+def field(q_s, q_f, v_s, v_f, params):
+    """A charge in a magnetic field."""
+    return (v_s @ v_s + v_f @ v_f) / 2 + 40.0 * (q_f[0] * v_f[1] - q_f[1] * v_f[0]) / 2
+
+
+def test_a_magnetic_field_sets_the_step_and_has_no_way_back():
+    system = System(field, fast_potential=spring)
+    problem = Problem(system, jnp.ones(1), jnp.array([1.0, 0.0]), jnp.ones(1), jnp.array([0.0, 1.0]))
+    assert "sign of velocities" in reasons(problem)["reversibility"]
+    assert resolved(problem).omega == pytest.approx(20 + 500**0.5, rel=1e-6)  # of the spring alone 10
 
 
 def test_a_run_that_blows_up_is_missed_not_raised():

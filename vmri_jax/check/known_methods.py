@@ -13,6 +13,9 @@ from vmri_jax.mechanics.state import Problem
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.study.program import joined
 
+ROUND_OFF = 4 * np.finfo(float).eps
+"""Of a position, of its size, in a step."""
+
 
 class Flat:
     """A problem with slow and fast variables joined, as functions of q that return numpy arrays.
@@ -68,11 +71,17 @@ def rattle(flat: Flat, h: float, q, p):
 
 
 def apart_from(method, problem: Problem, scheme: Scheme, h: float, steps: int) -> float:
-    """Largest difference of a run from a known method, relative to the positions and momenta."""
+    """Largest difference of a run from a known method, relative to the largest positions and momenta, less round-off.
+
+    Momenta are ``M (q+ - q) / h`` in both: round-off of the positions is divided by h.
+    """
     flat, trajectory = Flat(problem), run(problem, scheme, h, steps)
     positions, momenta = joined(trajectory)
+    momentum = abs(momenta).max()
+    floor = ROUND_OFF * abs(flat.mass).max() * abs(positions).max() / h
     q, p, worst = flat.q, flat.p, 0.0
     for k in range(1, steps + 1):
         q, p = method(flat, h, q, p)
-        worst = max(worst, difference(positions[k], q) / abs(q).max(), difference(momenta[k], p) / abs(p).max())
+        of_momenta = max(difference(momenta[k], p) - k * floor, 0.0)
+        worst = max(worst, difference(positions[k], q) / abs(q).max(), of_momenta / momentum)
     return worst
