@@ -129,6 +129,7 @@ def test_a_failed_run_keeps_what_was_computed(vmri, tmp_path):
     assert "The run failed" in text
     assert "Try a smaller macro_dt" in text
     assert "The trajectory up to there is in run.npz." in text
+    assert "vmri advise fpu --macro-dt 1.0 --scheme fully-explicit --num-micro 1" in text
     trajectory = vm.Trajectory.load(tmp_path / "run.npz")
     assert np.isfinite(trajectory.q_s[0]).all()
     assert np.isnan(trajectory.q_s[-1]).all()

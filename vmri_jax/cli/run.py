@@ -90,7 +90,11 @@ def simulate(
             plots.save(plots.plot_trajectory(nodes, f"{system}, {scheme}, {num_micro} micro steps"), plot)
     saved = [str(path) for path in (out, plot) if path is not None]
     if stopped is not None:
-        raise typer.Exit(_print_stop(stopped, saved, streamed))
+        code = _print_stop(stopped, saved, streamed)
+        if code == 1:
+            step = {"macro-dt": macro_dt, "micro-dt": micro_dt, "scheme": scheme, "num-micro": num_micro}
+            _print_advice(system, step | {"alpha": alpha, "degree": degree, "rule": rule, "compose": compose})
+        raise typer.Exit(code)
     done = (steps - (0 if before is None else before.step)) * chosen.num_micro
     _print_named(
         {
@@ -134,6 +138,14 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
             f"Go on with it:\n[bold]{escape(shlex.join(['vmri', *again, '--resume']))}[/bold]", soft_wrap=True
         )
     return 130
+
+
+def _print_advice(system: str, given: dict) -> None:
+    """The command that judges the step of a run that failed: resonances, limits, slow and fast swapped."""
+    options = [word for name, value in given.items() if value is not None for word in (f"--{name}", str(value))]
+    command = shlex.join(["vmri", "advise", system, *options])
+    text = f"Whether this step is stable, which one near it is, and whether slow and fast are swapped:\n[bold]{escape(command)}[/bold]"
+    console.print(text, soft_wrap=True)
 
 
 def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
