@@ -9,7 +9,8 @@ from rich.markup import escape
 from benchmarks.gail2014.reference import reference_figures
 from benchmarks.gail2014.report import FigureResult, choose_figures, reproduce
 from benchmarks.measure import prepare
-from vmri_jax.cli.common import BadInput, console, print_failure, progress_bar
+from vmri_jax.cli.common import BadInput, console, print_failure
+from vmri_jax.running.progress import progress_shown
 
 
 def gail2014(
@@ -29,7 +30,7 @@ def gail2014(
         raise BadInput(str(error)) from error
     except OSError as error:
         raise BadInput(f"--out {out}: {error.strerror}; give a folder that can be written.") from error
-    with progress_bar() as show:
+    with progress_shown() as show:
         report = reproduce(out, size, only or [], show, _figure_done)
     console.print(f"\nReport: [bold]{escape(str(report.path))}[/bold]", soft_wrap=True)
     if report.failed:

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 import vmri_jax as vm
 from vmri_jax import plots
+from vmri_jax.running.progress import Progress, part
 from vmri_jax.study import ConvergenceStudy, CostStudy, convergence_study, cost_study, reference_solution
-from vmri_jax.study.progress import Progress, part
 
 ORDER_TOLERANCE = 0.2
 UPTURN = 1.5

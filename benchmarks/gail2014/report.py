@@ -10,8 +10,8 @@ from pathlib import Path
 from benchmarks.gail2014.figures import Check, ConvergenceFigure, CostFigure
 from benchmarks.gail2014.reference import reference_figures
 from vmri_jax import plots
+from vmri_jax.running.progress import Progress, part, silent
 from vmri_jax.study.html import embedded, svg, write_page
-from vmri_jax.study.progress import Progress, part, silent
 
 TEMPLATE = Path(__file__).parent / "report.html.j2"
 

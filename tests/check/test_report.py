@@ -104,4 +104,4 @@ def test_vmri_check_judges_a_system_of_ones_own(tmp_path):
     assert result.exit_code == 0, result.output
     assert "does not apply" in result.output
     assert "1 of 1 criteria met" in result.output
-    assert CliRunner().invoke(vmri, ["check", f"{file}:mine", "--case", "12"]).exit_code == 2
+    assert CliRunner().invoke(vmri, ["check", f"{file}:mine", "--case", "13"]).exit_code == 2

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from vmri_jax import plots
 from vmri_jax.check.case import Case, Outcome
-from vmri_jax.study.progress import Progress, silent
+from vmri_jax.running.progress import Progress, silent
 from vmri_jax.study.table import Column, ResultTable, rich_table
 
 VERDICTS = {True: ("pass", "green"), False: ("fail", "red"), None: ("does not apply", "dim")}

@@ -16,7 +16,8 @@ from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
 from vmri_jax.cli.catalogue import SYSTEMS, find_problem
-from vmri_jax.cli.common import PICTURES, check_target_file, console, progress_bar, refusals
+from vmri_jax.cli.common import PICTURES, check_target_file, console, refusals
+from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.store import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
 
@@ -96,7 +97,7 @@ def _write(shown: Motion, out: Path, title: str, frames: int, seconds: float, th
     if suffix == ".html":
         write_html(shown, out, title)
     elif suffix == ".gif":
-        with progress_bar() as tell:
+        with progress_shown() as tell:
             write_gif(shown, out, seconds, theme, lambda done, total: tell("drawing", done, total))
     else:
         plots.save(plot_strip(shown, frames, title, theme), out, theme)

@@ -9,7 +9,8 @@ import typer
 from vmri_jax.check import Case, cases_for, run_cases
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_problem
-from vmri_jax.cli.common import console, progress_bar, refusals
+from vmri_jax.cli.common import console, refusals
+from vmri_jax.running.progress import progress_shown
 
 Numbers = Annotated[list[int] | None, typer.Option("--case", help="Number of a case; again for more of them.")]
 Full = Annotated[bool, typer.Option("--full", help="Full forms: runs of up to a million steps, minutes.")]
@@ -28,7 +29,7 @@ def check(system: options.System, case: Numbers = None, full: Full = False, out:
 
 def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out: Path | None) -> None:
     """Run these cases, print the table, write the files; exit code 1 if a criterion is not met, 2 for an unknown number."""
-    with refusals(), progress_bar() as tell:
+    with refusals(), progress_shown() as tell:
         report = run_cases(cases, numbers, full, tell)
     console.print(report.table())
     judged = [row for row in report.rows if row.outcome.passed is not None]

@@ -9,11 +9,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
-
-from vmri_jax.study.progress import Progress as StudyProgress
 
 console = Console()
 
@@ -46,12 +43,14 @@ def refusals() -> Iterator[None]:
 
 
 @contextmanager
-def progress_bar() -> Iterator[StudyProgress]:
-    """A bar; yields the function that moves it."""
-    columns = (BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, transient=True) as bars:
-        task = bars.add_task("starting")
-        yield lambda what, done, total: bars.update(task, description=what, completed=done, total=total)
+def status(text: str) -> Iterator[None]:
+    """Say what is done meanwhile: beside a spinner, or in a line on the error stream where the output is no terminal."""
+    if console.is_terminal:
+        with console.status(text):
+            yield
+    else:
+        Console(stderr=True).print(f"{text} ...")
+        yield
 
 
 def print_failure(title: str, text: str) -> None:

@@ -6,7 +6,7 @@ import typer
 
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_scene, find_scheme
-from vmri_jax.cli.common import console, refusals
+from vmri_jax.cli.common import console, refusals, status
 
 app = typer.Typer()
 
@@ -32,7 +32,7 @@ def explain(
     with refusals():
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         found = find_scene(scene)
-        with console.status("compiling and timing" if measure else "looking"):
+        with status("compiling and timing" if measure else "looking"):
             ledger = found.explain(chosen, macro_dt=macro_dt, measure=measure)
     console.print(ledger.table())
     console.print()

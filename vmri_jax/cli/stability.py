@@ -10,7 +10,7 @@ from rich.markup import escape
 from vmri_jax import plots
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_problem, find_scheme
-from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_written, refusals
+from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_written, refusals, status
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
 from vmri_jax.stability.map import windows_text
@@ -44,7 +44,7 @@ def advise(
         if (macro_dt is None) == (micro_dt is None):
             raise ValueError("give exactly one of --macro-dt and --micro-dt.")
         step = macro_dt if micro_dt is None else chosen.num_micro * micro_dt
-        with console.status("looking at the steps around it"):
+        with status("looking at the steps around it"):
             advice = advise_on(problem, chosen, macro_dt=step)  # pyright: ignore[reportArgumentType]
     console.print(advice.table() if advice.findings else escape(advice.verdict))
     if not advice.ok:
@@ -81,7 +81,7 @@ def stability(
             name: {n: find_scheme(name, n, compose, alpha=alpha, degree=degree, rule=rule) for n in numbers}
             for name in scheme or ["explicit-slow"]
         }
-        with console.status("multipliers of the steps"):
+        with status("multipliers of the steps"):
             maps = {name: stability_map(problem, schemes, grid) for name, schemes in chosen.items()}
         if out is not None:
             plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)

@@ -17,15 +17,15 @@ from vmri_jax.cli.common import (
     console,
     print_failure,
     print_written,
-    progress_bar,
     refusals,
 )
+from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study import WorkPrecision, cost_report, recommend
 from vmri_jax.study.advisor import NothingReached, check_target
 from vmri_jax.study.cost_report import PERIODS
-from vmri_jax.study.progress import Progress
 from vmri_jax.study.table import rich_table
+from vmri_jax.study.work import duration
 
 app = typer.Typer()
 
@@ -59,13 +59,16 @@ def tune(
         _write_runs(found.runs, out)
     console.print("[bold]Errors against time[/bold], the best of all runs\n", found.runs.table())
     fastest = [setting.row for setting in (found.setting, *found.others)[:SHOWN]]
-    console.print(f"\n[bold]For an error of {error:g}[/bold], the fastest\n", rich_table(found.runs.columns, fastest))
+    console.print(
+        f"\n[bold]For an error of {error:g}[/bold], the choice first\n", rich_table(found.runs.columns, fastest)
+    )
     seen = found.verification
     if seen is not None:
         console.print(
-            f"\nFrom another start the first of them has {seen.error_ratio:.2g} times this error and takes "
-            f"{seen.time_ratio:.2g} times as long."
+            f"\nFrom another start the choice has an error of {seen.error_q:.1e} and takes {duration(seen.seconds)}."
         )
+    if any(setting.row.seconds < found.setting.row.seconds for setting in found.others):
+        console.print("Faster ones kept the error by luck: from another start theirs is more than twice as large.")
     console.print(f"\n[bold]{escape(found.setting.command(system))}[/bold]", soft_wrap=True)
 
 
@@ -99,7 +102,7 @@ def cost(
 def _search() -> Iterator[Progress]:
     """A progress bar, and a panel where the reference solution fails."""
     try:
-        with progress_bar() as tell:
+        with progress_shown() as tell:
             yield tell
     except SimulationError as failure:
         print_failure("No reference solution", str(failure))

@@ -107,14 +107,30 @@ def check_system(system: System, q_s, q_f) -> None:
 
 
 def _shape(name: str, function, *args):
+    """What a function returns; it must have two derivatives in forward mode, by everything but the params."""
+
+    def along(*args):
+        *moving, params = args
+
+        def tangent(*moving):
+            return jax.jvp(lambda *moving: function(*moving, params), moving, moving)
+
+        (value, _), _ = jax.jvp(tangent, moving, moving)
+        return value
+
     try:
-        return jax.eval_shape(function, *args)
+        return jax.eval_shape(along, *args)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
             f"System: {name} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
             "numpy and math, jnp.where(condition, a, b) instead of if, and no float(...) or int(...)."
         ) from None
     except Exception as error:
+        if "custom_vjp" in str(error) or "custom_lin" in str(error):
+            raise ValueError(
+                f"System: {name} has no derivative in forward mode{_line_of(error)}: implicit steps take second derivatives, "
+                "which a jax.custom_vjp does not give. Use jax.custom_jvp, which gives both modes."
+            ) from error
         raise ValueError(
             f"System: {name} could not be evaluated on arguments of shapes "
             f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and the params{_line_of(error)}: "

@@ -188,7 +188,7 @@ class Quantities(ABC):
         """The states at the saved nodes, or at the micro nodes; at `every` node with the start."""
         run = self.whole()
         if not micro:
-            return State(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
+            return run.states
         reason = why_not(run.t, run.t_micro)
         if reason:
             raise ValueError(f"micro nodes: the run has none between all of its nodes: {reason}.")

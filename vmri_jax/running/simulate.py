@@ -1,6 +1,6 @@
 """Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ from vmri_jax.running.engine import Engine, engine
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
+from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
 from vmri_jax.schemes.composition import Composition
@@ -318,9 +319,10 @@ class Simulation:
         size = -(-self.num_saves // SHOWN)
         parts = replace(self, room=room_for(size))
         at, pieces = parts.start(), []
-        with interrupts_noted() as interrupted:
-            for saves in _shown_sizes(self.num_saves, size):
-                piece, at = parts.advance(at, saves)
+        with interrupts_noted() as interrupted, progress_shown() as tell:
+            for done in range(0, self.num_saves, size):
+                tell("simulating", done, self.num_saves)
+                piece, at = parts.advance(at, min(size, self.num_saves - done))
                 pieces.append(piece)
                 if interrupted():
                     raise Interrupted(join(pieces).of(self.origin), at.step, self.num_steps)
@@ -379,14 +381,6 @@ def _check_once(known: _Known) -> None:
     check_mass(known.system, known.state.q_s, known.state.q_f)
     if known.constraints:
         check_constraints(known.system, known.state, known.what)
-
-
-def _shown_sizes(num_saves: int, size: int) -> Iterator[int]:
-    """Numbers of saved intervals of this size, and what is left, with a progress bar around them."""
-    from rich.progress import track
-
-    sizes = [size] * (num_saves // size) + ([num_saves % size] if num_saves % size else [])
-    yield from track(sizes, description="simulating", transient=True)
 
 
 def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> SimulationError:

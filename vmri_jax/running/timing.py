@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 
 import jax
+import numpy as np
 
 MIN_SECONDS = 0.02
 """A sample shorter than this is made of several calls; longer than clocks and schedulers disturb."""
@@ -54,3 +55,20 @@ def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], 
     for _ in range(calls):
         jax.block_until_ready(run())
     return (clock() - start) / calls
+
+
+def seconds_each(function: Callable, q, count: int = 2000) -> float:
+    """Seconds per evaluation in a compiled loop in which every evaluation waits for the one before.
+
+    Args:
+        function: ``function(q)``, shaped like q.
+        q: where it is evaluated.
+        count: evaluations in the loop.
+    """
+
+    @jax.jit
+    def loop(q, nothing):
+        return jax.lax.fori_loop(0, count, lambda _, q: q + nothing * function(q), q)
+
+    seconds = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005)[""]
+    return float(np.median(seconds)) / count

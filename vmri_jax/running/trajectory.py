@@ -138,6 +138,11 @@ class Trajectory(Quantities, Exports, eqx.Module):
         return self.result <= Result.CONVERGED_AT_ROUNDOFF
 
     @property
+    def states(self) -> State:
+        """All saved nodes as a `State` of arrays (k,), (k, n)."""
+        return State(self.t, self.q_s, self.q_f, self.p_s, self.p_f)
+
+    @property
     def final_state(self):
         """`State` at the last saved node (of every run, in a batch)."""
         return State(self.t[..., -1], *(x[..., -1, :] for x in (self.q_s, self.q_f, self.p_s, self.p_f)))

@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import jax
@@ -16,7 +15,7 @@ from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.state import initial_state
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.simulate import Simulation, prepare
-from vmri_jax.running.timing import interleaved
+from vmri_jax.running.timing import interleaved, seconds_each
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
@@ -34,10 +33,6 @@ RULES = {"slow_potential": "slow", "fast_potential": "fast"}
 """What a scheme calls its rules of these parts."""
 STEPS = 20
 """Macro steps of a program that is timed."""
-TIMES = 500
-"""Evaluations of an effect that are timed together,"""
-TINY = 1e-30
-"""from positions that differ by so little, but in a way that no compiler foresees."""
 
 
 @dataclass(frozen=True)
@@ -139,32 +134,31 @@ def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
     if macro_dt is None:
         fastest = float(frequencies(system, state)[0])
         macro_dt = scheme.num_micro * 0.1 / fastest if fastest > 0 else 0.01
-    runs = {"step": prepare_steps(system, scheme, state, macro_dt).timed()}
-    for i, part in enumerate(sorting.placed):
-        runs[str(i)] = partial(_often, build(sorting, [part]), *sorting.start)
-    step, *effects = (float(np.median(samples)) for samples in interleaved(runs, 5).values())
-    return 1e6 * step / STEPS, [1e9 * seconds / TIMES for seconds in effects]
+    step = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
+    q_s, q_f, v_s, v_f = sorting.start
+    own = [_first_derivatives(build(sorting, [part]), q_s.size, v_s, v_f) for part in sorting.placed]
+    q = jnp.concatenate([q_s, q_f])
+    return 1e6 * float(np.median(step)) / STEPS, [1e9 * seconds_each(derivatives, q) for derivatives in own]
 
 
-@jax.jit
-def _often(system: System, q_s, q_f, v_s, v_f):
-    """First derivatives of all that a system has, `TIMES` times in a row, each time from where the last one led."""
+def _first_derivatives(system: System, n_s: int, v_s, v_f):
+    """All first derivatives that a step takes of a system, as a function of its positions that is shaped like these."""
 
-    def lagrangian(q_s, q_f):
-        potentials = sum(energy for energy in invariants.potentials(system, q_s, q_f))
-        kinetic = 0.0 if system.has_constant_mass else system.kinetic(q_s, q_f, v_s, v_f, system.params)
-        return kinetic - potentials
+    def lagrangian(q):
+        potentials = sum(invariants.potentials(system, q[:n_s], q[n_s:]))
+        if system.has_constant_mass:
+            return -potentials
+        return system.kinetic(q[:n_s], q[n_s:], v_s, v_f, system.params) - potentials
 
-    def again(_, q):
-        found = [*jax.grad(lagrangian, argnums=(0, 1))(*q)]
+    def derivatives(q):
+        found = jax.grad(lagrangian)(q)
         if system.is_constrained:
-            found += jax.jacrev(system.constraints, argnums=(1, 2))(jnp.zeros(()), *q)
+            found += jax.jacrev(lambda q: system.constraints(0.0, q[:n_s], q[n_s:]))(q).sum(axis=0)
         if system.force is not None:
-            found += system.forces(jnp.zeros(()), *q, v_s, v_f)
-        moved = sum(jnp.sum(a) for a in found)
-        return tuple(a + TINY * moved for a in q)
+            found += jnp.concatenate(system.forces(0.0, q[:n_s], q[n_s:], v_s, v_f))
+        return found
 
-    return jax.lax.fori_loop(0, TIMES, again, (q_s, q_f))
+    return derivatives
 
 
 def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:

@@ -13,10 +13,10 @@ import numpy as np
 
 from vmri_jax import diagnostics
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.progress import Progress, silent
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
-from vmri_jax.study.progress import Progress, silent
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.work import WorkPrecision, WorkRow, timed_in_turn, work_row
 
@@ -186,7 +186,16 @@ class Search:
             climb(first, [n for n in NUM_MICRO if n > first.num_micro], done)
             climb(first, [n for n in reversed(NUM_MICRO) if n < first.num_micro], done)
         ranked = sorted(reached.values(), key=_seconds)
-        return sorted(self._timed(ranked[: 2 * KEPT]), key=_seconds) + ranked[2 * KEPT :]
+        timed = self._timed(ranked[: 2 * KEPT])
+        timed += self._timed(self._rivals(error, timed))
+        return sorted(timed, key=_seconds) + ranked[2 * KEPT :]
+
+    def _rivals(self, error: float, timed: Sequence[Setting]) -> list[Setting]:
+        """Settings that kept the error on the way, and whose first idea of a time is below the best of those timed."""
+        seen = {(s.family.name, s.num_micro, s.num_steps) for s in timed}
+        best = min((s.row.seconds for s in timed), default=0.0)
+        others = [setting for key, setting in self.settings.items() if key not in seen]
+        return [s for s in others if s.row.error_q <= error and s.row.seconds < best]
 
     def time_again(self, labels: Sequence[str]) -> None:
         """Time all runs of these schemes in turn."""
@@ -298,8 +307,9 @@ def recommend(
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
     if error < MARGIN * reference.error_q:
         raise ValueError(
-            f"recommend: error is {error:g}, but the reference solution is only good to {reference.error_q:.1e}; give an "
-            f"error of at least {MARGIN * reference.error_q:.1e}, or a better reference, or a smaller t_end."
+            f"recommend: error is {error:g}, but the reference solution is only good to {reference.error_q:.1e}: runs with half the "
+            f"step come no closer, as where a motion is chaotic. Give a smaller t_end, an error of at least "
+            f"{MARGIN * reference.error_q:.1e}, or a better reference."
         )
     search = Search(problem, t_end, families() if menu is None else menu, reference, newton)
     found = search.cheapest(error, progress, exhaustive)

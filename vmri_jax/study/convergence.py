@@ -17,13 +17,13 @@ from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.batch import simulate_batch
+from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
-from vmri_jax.study.progress import Progress, silent
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable
 

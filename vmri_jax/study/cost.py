@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
 from vmri_jax.study.program import Program
-from vmri_jax.study.progress import Progress, silent
 from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.timing import interleaved
 

@@ -18,13 +18,13 @@ from matplotlib.ticker import EngFormatter
 from vmri_jax import diagnostics, plots
 from vmri_jax.mechanics.invariants import potentials
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.progress import Progress, part, silent
+from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.advisor import MARGIN, Search, Setting
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.progress import Progress, part, silent
 from vmri_jax.study.reference_solution import reference_solution
 from vmri_jax.study.table import Column, ResultTable
-from vmri_jax.study.timing import interleaved
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
@@ -32,7 +32,7 @@ PERIODS = 30
 """Simulated by default: so many periods of the fastest vibration."""
 RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 """Errors asked for by default, relative to how far the system moves."""
-BUDGET = 150.0
+BUDGET = 75.0
 """Seconds of search after which no more schemes are compiled. The first error may take half of them, for all are new to it, the
 next one half of what is then left."""
 SHOWN = 8
@@ -232,21 +232,10 @@ def _shares(problem: Problem, setting: Setting | None) -> dict[str, float]:
         evaluations = row.fast_evaluations or row.slow_evaluations
         terms["constraints"] = lambda q: jax.jacrev(constraints)(q).sum(0) + constraints(q).sum(), evaluations
     q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
-    shares = {name: _seconds_each(f, q) * count / row.seconds for name, (f, count) in terms.items()}
+    shares = {name: seconds_each(f, q) * count / row.seconds for name, (f, count) in terms.items()}
     total = sum(shares.values())
     shares = {name: share / max(total, 1.0) for name, share in shares.items()}
     return shares | {"everything else": max(0.0, 1.0 - total)}
-
-
-def _seconds_each(function, q, count: int = 2000) -> float:
-    """Seconds per evaluation in a compiled loop in which every evaluation waits for the one before."""
-
-    @jax.jit
-    def loop(q, nothing):
-        return jax.lax.fori_loop(0, count, lambda _, q: q + nothing * function(q), q)
-
-    seconds = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005)[""]
-    return float(np.median(seconds)) / count
 
 
 def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:

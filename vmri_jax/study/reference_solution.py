@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.simulate import simulation_error
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import galerkin
 from vmri_jax.study.program import Program, joined
-from vmri_jax.study.progress import Progress, silent
 
 ROUNDOFF = 1e-13
 """Differences of two runs below this, relative to the solution, are round-off."""

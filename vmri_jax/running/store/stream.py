@@ -3,7 +3,7 @@
 import os
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
+from vmri_jax.running.progress import Progress, progress_shown, silent
 from vmri_jax.running.simulate import Simulation, room_for, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import differences, environment, identity
@@ -95,7 +96,7 @@ def stream(
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
-    with interrupts_noted() as interrupted:
+    with interrupts_noted() as interrupted, progress_shown() if progress else nullcontext(silent) as tell:
         if overwrite or not path.exists():
             with _explained(path, 0):
                 layout.create(path, attributes, Record.of(run.start()))
@@ -104,7 +105,7 @@ def stream(
             _check_same_run(stored, attributes, chunk)
             _lengthen(stored, num_steps)
             layout.clear(path)
-            for step in _go_on(StoredTrajectory(path), run, progress):
+            for step in _go_on(StoredTrajectory(path), run, tell):
                 if interrupted():
                     raise Interrupted(StoredTrajectory(path), step, num_steps)
     stored = StoredTrajectory(path)
@@ -114,7 +115,7 @@ def stream(
     return stored
 
 
-def _go_on(stored: StoredTrajectory, run: Simulation, progress: bool) -> Iterator[int]:
+def _go_on(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iterator[int]:
     """Compute and write what is not there yet; yields the number of macro steps done after every chunk."""
     path, chunk, record = stored.path, stored.chunk, stored.record
     rows = stored.num_steps // run.save_every
@@ -128,7 +129,8 @@ def _go_on(stored: StoredTrajectory, run: Simulation, progress: bool) -> Iterato
     writer = layout.Writer(path, rows + 1, chunk)
     nodes = [*range((record.saved + 1) // chunk * chunk + chunk, rows + 1, chunk), rows + 1]  # chunks of rows are full
     sizes = [end - begin for begin, end in pairwise([record.saved + 1, *nodes])]
-    for size in _shown(sizes, -(-rows // chunk)) if progress else sizes:
+    for size in sizes:
+        tell("simulating", record.saved, rows)
         piece, at = run.advance(at, size)
         with _explained(path, at.step - size * run.save_every):
             writer.append(piece, record.saved)
@@ -138,12 +140,6 @@ def _go_on(stored: StoredTrajectory, run: Simulation, progress: bool) -> Iterato
         yield at.step
         if record.failed_at >= 0:
             return
-
-
-def _shown(sizes: list[int], chunks: int):
-    from rich.progress import track
-
-    return track(sizes, "simulating", total=chunks, completed=chunks - len(sizes), transient=True)
 
 
 @contextmanager
