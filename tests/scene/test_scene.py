@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.scene.gallery_scenes import gallery_scene
-from vmri_jax import ConstantMass, compose, fully_explicit, fully_implicit, galerkin, initial_state
+from vmri_jax import ConstantMass, compose, fully_explicit, fully_implicit, galerkin, initial_state, simulate
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.scene import (
@@ -365,3 +365,10 @@ def test_arguments_may_be_iterators():
     assert homes(scene) == homes(expected)
     assert scene.drawing() == expected.drawing()
     assert jax.tree.all(jax.tree.map(np.array_equal, scene.replace("springs", rate="slow").params, expected.params))
+
+
+def test_a_scene_without_fast_bodies_says_so():
+    scene = Scene([Body("a", 1.0, [1.0, 0.0])], [Gravity()])
+    with pytest.warns(UserWarning, match=r"no body of the scene is fast.* Take num_micro=1"):
+        simulate(scene, fully_implicit(10), macro_dt=0.1, num_steps=1)
+    simulate(scene, fully_implicit(1), macro_dt=0.1, num_steps=1)

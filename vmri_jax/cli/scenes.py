@@ -3,10 +3,12 @@
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_scene, find_scheme
 from vmri_jax.cli.common import console, refusals, status
+from vmri_jax.running.simulate import NOTHING_FAST
 
 app = typer.Typer()
 
@@ -37,3 +39,5 @@ def explain(
     console.print(ledger.table())
     console.print()
     console.print(ledger.reasons())
+    if chosen.num_micro > 1 and all(row.grid == "macro" for row in ledger.rows if row.kind == "body"):
+        console.print(f"\n[yellow]{escape(NOTHING_FAST)}[/yellow]")

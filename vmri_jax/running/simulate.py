@@ -1,5 +1,6 @@
 """Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -30,6 +31,10 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
 
+NOTHING_FAST = (
+    "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1, or make what vibrates fast, "
+    'Body(..., pace="fast").'
+)
 SHOWN = 50
 """A run with a progress bar is computed in about so many parts."""
 
@@ -334,11 +339,13 @@ def simulation(
 ) -> Simulation:
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     warn_if_slow()
-    problem = opened(system)
+    problem, given = opened(system), system
     system, state = start_of("simulate", problem, state)
     macro_dt, num_steps, save_every = check_run(
         system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro
     )
+    if given is not problem and state.q_f.size == 0 and scheme.num_micro > 1:
+        warnings.warn(f"simulate: {NOTHING_FAST}", stacklevel=3)
     newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
     leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))
