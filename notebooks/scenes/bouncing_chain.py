@@ -2,8 +2,8 @@
 
 Teaches: contact as a smooth penalty belongs to the fast potential, where micro steps resolve it.
 
-    vmri simulate notebooks/scenes/bouncing_chain.py:scene --scheme fully-explicit --num-micro 5 --macro-dt 0.004 --steps 1500 --out bouncing_chain.npz
-    vmri animate bouncing_chain.npz
+    vmri simulate notebooks/scenes/bouncing_chain.py:scene --scheme fully-explicit --num-micro 5 --macro-dt 0.004 --steps 1500 --save-micro --out bouncing_chain.npz
+    vmri animate bouncing_chain.npz --out bouncing_chain.png --frames 3
 """
 
 from itertools import pairwise

@@ -3,8 +3,8 @@
 Teaches: blocks of general coordinates with custom potentials, here the (scaled) centres and elongations of the
 stiff springs: Hairer, Lubich, Wanner, *Geometric Numerical Integration*, I.5.1.
 
-    vmri simulate notebooks/scenes/fermi_pasta_ulam.py:scene --scheme fully-explicit --num-micro 5 --macro-dt 0.01 --steps 10000 --save-every 2 --out fermi_pasta_ulam.npz
-    vmri animate fermi_pasta_ulam.npz
+    vmri simulate notebooks/scenes/fermi_pasta_ulam.py:scene --scheme fully-explicit --num-micro 5 --macro-dt 0.01 --steps 10000 --save-micro --out fermi_pasta_ulam.npz
+    vmri animate fermi_pasta_ulam.npz --out fermi_pasta_ulam.png --frames 3
 """
 
 import jax.numpy as jnp

@@ -25,7 +25,6 @@ from vmri_jax.scene import Scene
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
-FRAMES = 3
 WIDTH = 1200
 """Of a picture, in points."""
 SYMMETRIC = 1e-9
@@ -34,7 +33,11 @@ SYMMETRIC = 1e-9
 HEAD = f"""# Scenes
 
 Each file is a scene as a user writes one. `vmri simulate` runs it, `vmri animate` shows it, `vmri explain` says where
-every effect lives and what it costs. Table and pictures: `python notebooks/scenes/{Path(__file__).name}`.
+every effect lives and what it costs. Without `--out`, `vmri animate` writes a page to play in a browser. Table and
+pictures: `python notebooks/scenes/{Path(__file__).name}`.
+
+Pictures: bodies at some times, with trails; below them a slow coordinate along the run, and a fast one during the time that is
+shaded.
 
 - *seconds*: of one core, from the start of Python to the end, compilation included.
 - *energy*: largest change, of the largest kinetic energy; with forces, of energy less their work at the saved nodes; not
@@ -136,12 +139,12 @@ def vmri(*words: str, cache: Path) -> None:
 
 def row(path: Path, folder: Path) -> str:
     """The row of a scene, which runs it and draws its picture."""
-    simulate, _ = docstring(path)[1]
+    simulate, animate = docstring(path)[1]
     out = str(folder / option(simulate, "--out"))
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     vmri(*simulate[:-1], out, cache=folder)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    vmri("animate", out, "--out", str(path.with_suffix(".png")), "--frames", str(FRAMES), cache=folder)
+    vmri("animate", out, *animate[2:], "--out", str(path.with_suffix(".png")), cache=folder)
     shrink(path.with_suffix(".png"))
     scene, run = find_scene(f"{path}:scene"), vm.Trajectory.load(out)
     found = kept(scene, run)

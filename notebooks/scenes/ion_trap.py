@@ -2,8 +2,8 @@
 
 Teaches: a velocity-dependent Lagrangian; the canonical angular momentum about the field is kept to round-off.
 
-    vmri simulate notebooks/scenes/ion_trap.py:scene --num-micro 10 --macro-dt 0.05 --steps 1000 --out ion_trap.npz
-    vmri animate ion_trap.npz
+    vmri simulate notebooks/scenes/ion_trap.py:scene --num-micro 10 --macro-dt 0.05 --steps 1000 --save-micro --out ion_trap.npz
+    vmri animate ion_trap.npz --out ion_trap.png --frames 3
 """
 
 import jax.numpy as jnp

@@ -2,8 +2,8 @@
 
 Teaches: the scene sorts effects by stiffness itself; ask `vmri explain notebooks/scenes/molecule.py:scene`.
 
-    vmri simulate notebooks/scenes/molecule.py:scene --scheme fully-explicit --num-micro 8 --macro-dt 0.005 --steps 4000 --out molecule.npz
-    vmri animate molecule.npz
+    vmri simulate notebooks/scenes/molecule.py:scene --scheme fully-explicit --num-micro 8 --macro-dt 0.005 --steps 4000 --save-micro --out molecule.npz
+    vmri animate molecule.npz --out molecule.png --frames 3 --to 6
 """
 
 import numpy as np

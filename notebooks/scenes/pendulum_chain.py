@@ -2,8 +2,8 @@
 
 Teaches: an explicit scheme solves nothing, however long the chain; gravity is evaluated once per macro step.
 
-    vmri simulate notebooks/scenes/pendulum_chain.py:scene --scheme fully-explicit --num-micro 10 --macro-dt 0.02 --steps 1000 --out pendulum_chain.npz
-    vmri animate pendulum_chain.npz
+    vmri simulate notebooks/scenes/pendulum_chain.py:scene --scheme fully-explicit --num-micro 10 --macro-dt 0.02 --steps 1000 --save-micro --out pendulum_chain.npz
+    vmri animate pendulum_chain.npz --out pendulum_chain.png --frames 3
 """
 
 from itertools import pairwise

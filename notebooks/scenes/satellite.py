@@ -2,8 +2,8 @@
 
 Teaches: one scene from the orbit to the vibration; momentum maps of the whole stay exact.
 
-    vmri simulate notebooks/scenes/satellite.py:scene --scheme explicit-slow --num-micro 10 --macro-dt 0.02 --steps 1000 --out satellite.npz
-    vmri animate satellite.npz
+    vmri simulate notebooks/scenes/satellite.py:scene --scheme explicit-slow --num-micro 10 --macro-dt 0.02 --steps 1000 --save-micro --out satellite.npz
+    vmri animate satellite.npz --out satellite.png --frames 3 --to 4.2 --view=-90,50
 """
 
 import numpy as np

@@ -2,8 +2,8 @@
 
 Teaches: the pace of a body may be given; soft springs and gravity are slow although they touch fast bodies.
 
-    vmri simulate notebooks/scenes/simple_atomic_model.py:scene --num-micro 10 --macro-dt 0.02 --steps 2500 --out simple_atomic_model.npz
-    vmri animate simple_atomic_model.npz
+    vmri simulate notebooks/scenes/simple_atomic_model.py:scene --num-micro 10 --macro-dt 0.02 --steps 2500 --save-micro --out simple_atomic_model.npz
+    vmri animate simple_atomic_model.npz --out simple_atomic_model.png --frames 3
 """
 
 import numpy as np

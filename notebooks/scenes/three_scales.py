@@ -3,8 +3,8 @@
 Teaches: the implicit scheme steps over what is too fast to resolve, here by a factor of 100, and keeps the actions
 (energy over frequency) of what it resolves.
 
-    vmri simulate notebooks/scenes/three_scales.py:scene --num-micro 5 --macro-dt 0.1 --steps 1000 --out three_scales.npz
-    vmri animate three_scales.npz
+    vmri simulate notebooks/scenes/three_scales.py:scene --num-micro 5 --macro-dt 0.1 --steps 1000 --save-micro --out three_scales.npz
+    vmri animate three_scales.npz --out three_scales.png --frames 2 --to 9
 """
 
 import numpy as np

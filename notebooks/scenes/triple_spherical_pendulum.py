@@ -2,8 +2,8 @@
 
 Teaches: the scene finds from masses and stiffness who is slow and who is fast; rods at both paces are kept to round-off.
 
-    vmri simulate notebooks/scenes/triple_spherical_pendulum.py:scene --num-micro 5 --macro-dt 0.02 --steps 1000 --out triple_spherical_pendulum.npz
-    vmri animate triple_spherical_pendulum.npz
+    vmri simulate notebooks/scenes/triple_spherical_pendulum.py:scene --num-micro 5 --macro-dt 0.02 --steps 1000 --save-micro --out triple_spherical_pendulum.npz
+    vmri animate triple_spherical_pendulum.npz --out triple_spherical_pendulum.png --frames 3
 """
 
 from vmri_jax.scene import Anchor, Body, Gravity, RigidLink, Scene, Spring

@@ -2,8 +2,8 @@
 
 Teaches: a custom constraint, force and potential; work of a drive against losses.
 
-    vmri simulate notebooks/scenes/valve_train.py:scene --num-micro 10 --macro-dt 0.01 --steps 1000 --out valve_train.npz
-    vmri animate valve_train.npz
+    vmri simulate notebooks/scenes/valve_train.py:scene --num-micro 10 --macro-dt 0.01 --steps 1000 --save-micro --out valve_train.npz
+    vmri animate valve_train.npz --out valve_train.png --frames 3
 """
 
 import jax.numpy as jnp

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from PIL import Image
 
 from tests.animation.support import PENDULUM, swinging
@@ -58,11 +59,13 @@ def pixels(figure) -> np.ndarray:
 
 @pytest.mark.parametrize("theme", [plots.LIGHT, plots.DARK])
 def test_bodies_are_drawn_where_the_camera_sees_them(pendulum, theme):
-    figure = plot_strip(pendulum, [1.3], theme=theme)
-    image = pixels(figure)
-    height, width, _ = image.shape
     stage = Stage.of(pendulum, theme)
     camera, aspect = stage.camera, stage.aspect
+    with plots.style(theme):
+        figure = Figure(figsize=(9.0, 9.0 / aspect))
+        stage.draw(figure, (0.0, 0.0, 1.0, 1.0), 1.3, 0.5)
+    image = pixels(figure)
+    height, width, _ = image.shape
     assert width / height == pytest.approx(aspect, rel=0.02)
     for place, color in zip(camera.project(pendulum.at([1.3])[0])[0], (theme.curves[0], "#aa3311"), strict=True):
         x, y = (place / [aspect, 1] + 1) / 2 * [width, height]
@@ -71,7 +74,7 @@ def test_bodies_are_drawn_where_the_camera_sees_them(pendulum, theme):
 
 
 def test_a_strip_has_its_moments(pendulum):
-    labels = [panel.texts[0].get_text() for panel in plot_strip(pendulum, 3, "Title").axes]
+    labels = [panel.texts[-1].get_text() for panel in plot_strip(pendulum, 3, "Title").axes if panel.texts]
     assert labels == ["$t = 0.00$", "$t = 2.00$", "$t = 4.00$"]
     with pytest.raises(ValueError, match=r"times is .*give at least one"):
         plot_strip(pendulum, [])
@@ -99,3 +102,25 @@ def test_a_strip_says_its_caption(pendulum):
     figure = plot_strip(dataclasses.replace(pendulum, drawing=drawing), 3, "Pendulum")
     assert [text.get_text() for text in figure.texts] == ["Pendulum", "Heights are modes times 2."]
     assert figure.get_figheight() > plot_strip(pendulum, 3, "Pendulum").get_figheight()
+
+
+def test_the_legend_says_which_colours_are_slow_and_fast(pendulum):
+    [legend] = plot_strip(pendulum, 3).legends
+    shown = {text.get_text(): line.get_color() for text, line in zip(legend.texts, legend.get_lines(), strict=True)}
+    assert shown == {"slow": plots.LIGHT.curves[0], "fast": plots.LIGHT.curves[1]}
+
+
+def test_bodies_are_named_in_the_first_picture_where_there_is_room(pendulum):
+    first, second, *_ = plot_strip(pendulum, 3).axes
+    assert {text.get_text() for text in first.texts} == {"bob", "tip", "$t = 0.00$"}
+    assert len(second.texts) == 1
+    bodies = [{"name": name, "coordinates": [["s", 0], ["s", 1]]} for name in ("one", "same place")]
+    crowded = motion(swinging(), Drawing.from_dict({"bodies": [*bodies, {**bodies[0], "name": "third"}]}))
+    assert len(plot_strip(crowded, 1).axes[0].texts) == 3  # one name to the right, one to the left, the time
+
+
+def test_trails_have_as_many_places_as_nodes():
+    many = motion(swinging(1001), Drawing.from_dict(PENDULUM))
+    stage = Stage.of(many, plots.LIGHT)
+    assert len(stage._trail_times(0.0, 2.0)) == 1002
+    assert len(stage._trail_times(0.0, 0.01)) == 160

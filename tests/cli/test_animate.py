@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from tests.animation.support import PENDULUM, reference_run, swinging
+from vmri_jax.cli import app
 from vmri_jax.cli.animate import animate
 from vmri_jax.running.store import stream
 from vmri_jax.running.store.layout import change_attributes
@@ -131,3 +132,22 @@ def test_bad_input_is_refused_in_words(vmri, arguments, pieces):
     assert code == 2
     for piece in pieces:
         assert piece in text
+
+
+def test_the_view_may_be_given(vmri):
+    assert vmri("drawn.npz", "--out", "run.html", "--view=-90,90")[0] == 0
+    assert page()["view"] == {"azimuth": pytest.approx(-np.pi / 2), "elevation": pytest.approx(np.pi / 2)}
+    for wrong in ("above", "10", "0,91"):
+        code, text = vmri("drawn.npz", "--view", wrong)
+        assert code == 2
+        assert "--view is" in text
+        assert "azimuth and elevation in degrees" in text
+
+
+@pytest.mark.parametrize("out", ["run.npz", "run.zarr"])
+def test_runs_keep_their_micro_nodes_and_names_for_pictures(vmri, out):
+    options = ["fpu", "--macro-dt", "0.1", "--num-micro", "5", "--steps", "2000", "--out", out, "--save-micro"]
+    result = CliRunner().invoke(app, ["simulate", *options])
+    assert result.exit_code == 0, result.output
+    assert vmri(out, "--out", "run.html", "--to", "1")[0] == 0
+    assert len(page()["t"]) > 8 * 50 * 4 / 3  # 8 bytes of 50 nodes in base 64

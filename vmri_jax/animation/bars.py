@@ -21,13 +21,18 @@ def bars(trajectory: Trajectory) -> dict:
     Returns:
         Plain data for `Drawing.from_dict`.
     """
-    sizes = {part: np.shape(q)[1] for part, q in (("s", trajectory.q_s), ("f", trajectory.q_f))}
-    blocks = [{"name": f"q_{part}", "coordinates": [[part, i] for i in range(n)]} for part, n in sizes.items() if n > 0]
+    names = trajectory.names
+    parts = (("s", names.slow_coordinates), ("f", names.fast_coordinates))
+    blocks = [
+        {"name": f"q_{part}", "coordinates": [[part, i] for i in range(len(labels))], "labels": labels}
+        for part, labels in parts
+        if labels
+    ]
     return {"blocks": blocks}
 
 
 def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
-    """The drawing with bodies ``name[i]`` for the coordinates of its blocks, to the right of all others.
+    """The drawing with a body for each coordinate of its blocks, to the right of all others.
 
     Every block has its own scale, 1, 2 or 5 times a power of ten, by which its largest coordinate in the run is as high as
     there is room; the caption says it.
@@ -52,10 +57,10 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
         largest = max(float(np.abs(values[part][:, i]).max()) for part, i in block.coordinates)
         scale = _round(height / largest) if largest > 0 else 1.0
         scales.append(f"{block.name} times {scale:g}")
-        for i, coordinate in enumerate(block.coordinates):
+        for label, coordinate in zip(block.labels, block.coordinates, strict=True):
             foot = tuple(((corner + np.array([x, 0.0, 0.0])) @ axes).tolist())
             forms = tuple(((scale * float(weight), *coordinate),) if weight else () for weight in axes[2])
-            bodies.append(Body(f"{block.name}[{i}]", forms, foot, RADIUS * unit))
+            bodies.append(Body(label, forms, foot, RADIUS * unit))
             posts.append(Joint("link", (bodies[-1].name,), foot))
             x += unit
         x += unit

@@ -47,6 +47,16 @@ def direction(value: Any, where: str) -> tuple[float, ...]:
     return found
 
 
+def angles(value: Any, where: str) -> tuple[float, ...]:
+    """Azimuth and elevation in degrees."""
+    found = numbers(value, where)
+    if len(found) != 2 or abs(found[1]) > 90:
+        raise ValueError(
+            f"{where} is {list(found)}; it must be azimuth and elevation in degrees, the latter from -90 to 90."
+        )
+    return found
+
+
 def positive(value: Any, where: str) -> float:
     """A positive number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.animation.checks import check_keys, direction, entries, numbers, positive
+from vmri_jax.animation.checks import angles, check_keys, direction, entries, numbers, positive
 from vmri_jax.mechanics.names import near
 
-KEYS = ("bodies", "blocks", "links", "springs", "anchors", "planes", "spheres", "up", "caption")
-BLOCK_KEYS = ("name", "coordinates")
+KEYS = ("bodies", "blocks", "links", "springs", "anchors", "planes", "spheres", "up", "view", "caption")
+BLOCK_KEYS = ("name", "coordinates", "labels")
 BODY_KEYS = ("name", "coordinates", "offset", "radius", "color")
 KINDS = ("link", "spring")
 PACES = ("slow", "fast")
@@ -47,10 +47,14 @@ class Body:
 
 @dataclass(frozen=True)
 class Block:
-    """General coordinates, ("s" or "f", index) each, that are not those of a point: each is shown as a bar."""
+    """General coordinates, ("s" or "f", index) each, that are not those of a point: each is shown as a bar.
+
+    labels: names of the coordinates, ``name[i]`` if they have none.
+    """
 
     name: str
     coordinates: tuple[tuple[str, int], ...]
+    labels: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,8 @@ class Drawing:
     Attributes:
         up: the direction that is shown upwards, in coordinates of the bodies; None for the last coordinate (bodies of one
             coordinate move sideways).
+        view: azimuth and elevation from which one looks, in degrees; None for one that suits. (-90, 0) is from the front, with
+            x to the right; (-90, 90) from above.
         caption: a line that is shown with the picture.
     """
 
@@ -102,6 +108,7 @@ class Drawing:
     planes: tuple[Plane, ...] = ()
     spheres: tuple[Sphere, ...] = ()
     up: tuple[float, ...] | None = None
+    view: tuple[float, ...] | None = None
     caption: str = ""
 
     @classmethod
@@ -113,11 +120,12 @@ class Drawing:
 
                 - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
                   ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``.
-                - ``blocks``: dicts of ``name``; ``coordinates``, any number of entries ``["s" or "f", index]``.
+                - ``blocks``: dicts of ``name``; ``coordinates``, any number of entries ``["s" or "f", index]``; and if wanted
+                  ``labels``, a name for each of them.
                 - ``links``, ``springs``: pairs of names, and a third entry "slow" or "fast" if wanted.
                 - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), and if wanted ``pace``.
                 - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
-                - ``up``, ``caption``: see above.
+                - ``up``, ``view``, ``caption``: see above.
 
         Raises:
             ValueError: anything else, with the entry that is wrong.
@@ -147,6 +155,7 @@ class Drawing:
             planes=all_of("planes", partial(_record, Plane, {"point": numbers, "normal": direction})),
             spheres=all_of("spheres", partial(_record, Sphere, {"center": numbers, "radius": positive})),
             up=None if data.get("up") is None else direction(data["up"], "drawing: up"),
+            view=None if data.get("view") is None else angles(data["view"], "drawing: view"),
             caption=str(data.get("caption") or ""),
         )
 
@@ -158,6 +167,13 @@ class Drawing:
         """
         fast = all(body.pace == "fast" for body in self.bodies if body.name in joint.bodies)
         return joint.pace or ("fast" if fast else "slow")
+
+    @property
+    def paces(self) -> list[str]:
+        """Those of its bodies and springs."""
+        found = {body.pace for body in self.bodies}
+        found |= {self.pace(joint) for joint in self.joints if joint.kind == "spring"}
+        return [pace for pace in PACES if pace in found]
 
     @property
     def dimension(self) -> int:
@@ -245,11 +261,16 @@ def _body(data: Any, where: str) -> Body:
 
 
 def _block(data: Any, where: str) -> Block:
-    check_keys(data, BLOCK_KEYS, BLOCK_KEYS, where)
+    check_keys(data, BLOCK_KEYS, BLOCK_KEYS[:2], where)
     forms = [_form(entry, where) for entry in entries(data, "coordinates", where)]
     if not forms or any(len(form) != 1 or form[0][0] != 1.0 for form in forms):
         raise ValueError(f"{where}: coordinates is {data['coordinates']!r}; it must be a list of ['s' or 'f', index].")
-    return Block(str(data["name"]), tuple((part, index) for ((_, part, index),) in forms))
+    labels = [str(label) for label in entries(data, "labels", where)] or [
+        f"{data['name']}[{i}]" for i in range(len(forms))
+    ]
+    if len(labels) != len(forms):
+        raise ValueError(f"{where}: there are {len(labels)} labels for {len(forms)} coordinates; give one for each.")
+    return Block(str(data["name"]), tuple((part, index) for ((_, part, index),) in forms), tuple(labels))
 
 
 def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:

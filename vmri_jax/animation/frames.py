@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from vmri_jax import plots
+from vmri_jax.animation.curves import Curves
 from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.shapes import Stage
 
@@ -23,6 +25,8 @@ def plot_strip(
     motion: Motion, times: int | Sequence[float] = 5, title: str = "", theme: plots.Theme = plots.LIGHT
 ) -> plots.NotebookFigure:
     """Several moments side by side, from one point of view; wide scenes one below the other.
+
+    Below them are curves: the slow motion along the whole run, with the moments as dots, and a close-up of the fast one.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
@@ -42,21 +46,36 @@ def plot_strip(
     columns = min(columns, len(moments), 6)
     rows = -(-len(moments) // columns)
     trail = 0.5 * (motion.t[-1] - motion.t[0]) / max(len(moments), 4)
-    caption = motion.drawing.caption
+    curves = Curves(motion, theme)
     with plots.style(theme):
         width = WIDTH / columns
-        height = rows * width / aspect + TITLE * (bool(title) + bool(caption))
+        head = TITLE * (1 + bool(motion.drawing.caption))
+        height = rows * width / aspect + head + curves.height
         figure = plots.NotebookFigure(figsize=(WIDTH, height))
+        figure.set_layout_engine("none")
         for k, time in enumerate(moments):
             row, column = divmod(k, columns)
-            bottom = (rows - 1 - row) * width / aspect / height
-            stage.draw(figure, (column / columns, bottom, 1 / columns, width / aspect / height), time, trail)
-        if title:
-            figure.text(0.1 / WIDTH, 1 - 0.1 / height, title, va="top", fontsize=11, color=theme.ink)
-        if caption:
-            top = 0.1 + TITLE * bool(title)
-            figure.text(0.1 / WIDTH, 1 - top / height, caption, va="top", fontsize=9, color=theme.ink)
+            bottom = (curves.height + (rows - 1 - row) * width / aspect) / height
+            place = (column / columns, bottom, 1 / columns, width / aspect / height)
+            stage.draw(figure, place, time, trail, names=k == 0)
+        curves.draw(figure, moments)
+        _write_head(figure, title, stage)
     return figure
+
+
+def _write_head(figure: Figure, title: str, stage: Stage) -> None:
+    """Title, legend of the colours and caption."""
+    width, height = figure.get_size_inches()
+    for text, top, size in ((title, 0.1, 11), (stage.motion.drawing.caption, 0.1 + TITLE, 9)):
+        if text:
+            figure.text(0.1 / width, 1 - top / height, text, va="top", color=stage.theme.ink, fontsize=size)
+    handles = [
+        Line2D([], [], color=color, marker="o", linestyle="none", markersize=8, label=pace)
+        for pace, color in stage.paces.items()
+        if pace in stage.motion.drawing.paces
+    ]
+    corner = (1 - 0.05 / width, 1 - 0.02 / height)
+    figure.legend(handles=handles, loc="upper right", bbox_to_anchor=corner, ncols=2, handletextpad=0.1)
 
 
 def write_gif(

@@ -15,6 +15,12 @@ MOST_NUMBERS = 600_000
 """Coordinates in a page; of longer runs every k-th node is taken."""
 WATCHED = 20.0
 """Seconds that a run takes at the first speed, about."""
+ENERGY = {
+    True: "energy error",
+    False: "energy change, by the work of forces and moving constraints,",
+    None: "energy change",
+}
+"""What the change of the energy is, by whether it should be constant."""
 
 
 def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
@@ -65,7 +71,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "points": _packed(motion.points),
         "velocities": _packed(motion.velocities),
         "energy": _packed(motion.energy),
-        "energy_title": "energy change" + (" ΔE / |E₀|" if motion.relative else " ΔE"),
+        "energy_title": f"{ENERGY[motion.keeps_energy]} {'ΔE / |E₀|' if motion.relative else 'ΔE'}",
         "residual": [_packed(column) for column in motion.residual.T] if constrained else None,
         "bodies": [
             {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius)}

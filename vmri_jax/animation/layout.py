@@ -109,7 +109,7 @@ def layout(motion: Motion) -> Layout:
     turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS).astype(int).tolist()
     grounds = _grounds(drawing, box, float(radii.max()), size)
     corners = [g.center + (1.0 if g.solid else FADED) * (g.corners - g.center) for g in grounds]
-    flat = drawing.dimension < 3
+    azimuth, elevation = drawing.view or ((-88, 7) if drawing.dimension < 3 else (-62, 14))
     return Layout(
         size,
         radii,
@@ -121,8 +121,8 @@ def layout(motion: Motion) -> Layout:
         sphere_radii=sphere_radii,
         grounds=grounds,
         hull=_hull(np.concatenate([box, *corners])),
-        azimuth=math.radians(-88 if flat else -62),
-        elevation=math.radians(7 if flat else 14),
+        azimuth=math.radians(azimuth),
+        elevation=math.radians(elevation),
     )
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from vmri_jax import diagnostics
 from vmri_jax.animation.bars import with_bars
@@ -26,10 +26,11 @@ class Motion:
         drawing: its blocks are bodies, see `vmri_jax.animation.bars`.
         t: (k,) times of the nodes.
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
-        energy: (k,) change of the energy since the start, relative to the start where that is not zero.
+        energy: (k,) change of the energy since the start, relative to the start where that is not zero and should be kept.
         relative: whether it is.
         residual: (k, 2) largest constraint value and largest rate of one.
         ending: why the run stopped early; empty if it did not.
+        keeps_energy: whether the energy should be constant; None if that is not known.
     """
 
     drawing: Drawing
@@ -40,6 +41,7 @@ class Motion:
     relative: bool
     residual: np.ndarray
     ending: str = ""
+    keeps_energy: bool | None = None
 
     def at(self, times: Sequence[float] | np.ndarray) -> np.ndarray:
         """(len(times), n_bodies, 3) positions, beyond the ends those of the ends.
@@ -96,7 +98,8 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
     """The motion of a drawing along a run, up to where it failed.
 
     Velocities at the nodes are those of the momenta if the system is given, else central differences. Where the run kept
-    the micro nodes of all its macro steps, these are nodes too.
+    the micro nodes of all its macro steps, these are nodes too; without the system, fast velocities are then those of a
+    cubic spline through all of them.
 
     Args:
         trajectory: one run, of at least one node.
@@ -121,8 +124,11 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
     nodes, q = t[:count], np.concatenate([q_s, q_f], axis=1)[:count]
     v = _differences(nodes, q) if system is None else _velocities(system, trajectory, count)
     t, q, v = _with_micro_nodes(trajectory, nodes, q, v)
+    if system is None and len(t) > len(nodes):  # differences between macro nodes miss the fast motion
+        v[:, q_s.shape[1] :] = CubicSpline(t, q[:, q_s.shape[1] :])(t, 1)
     energy = np.asarray(trajectory.energy, dtype=float)[:count]
-    relative = bool(abs(energy[0]) > 1e-12)
+    keeps_energy = None if system is None else system.keeps_energy
+    relative = bool(abs(energy[0]) > 1e-12) and keeps_energy is not False
     residual = np.asarray(trajectory.constraint_residual, dtype=float)[:count].reshape(count, -1)
     return Motion(
         drawing,
@@ -133,6 +139,7 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
         relative,
         np.stack([np.interp(t, nodes, column) for column in residual.T], axis=1),
         _ending(trajectory, count),
+        keeps_energy,
     )
 
 

@@ -19,6 +19,10 @@ from vmri_jax.animation.motion import Motion
 
 ON_TOP = 1e9
 """In front of all things, of whatever depth."""
+TRAIL = (160, 2000)
+"""Fewest and most places of a trail."""
+NAME_SIZE = 7.5
+"""Of the names of bodies, in points of print."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,15 @@ class Stage:
         aspect = float(np.clip((high[0] - low[0]) / (high[1] - low[1]), 0.5, 8.0))
         return cls(motion, sizes, start.fitted(sizes.hull, radius, aspect), aspect, theme)
 
-    def draw(self, figure: Figure, place: tuple[float, float, float, float], time: float, trail: float) -> None:
+    def draw(
+        self,
+        figure: Figure,
+        place: tuple[float, float, float, float],
+        time: float,
+        trail: float,
+        *,
+        names: bool = False,
+    ) -> None:
         """Draw one moment.
 
         Args:
@@ -54,6 +66,7 @@ class Stage:
             place: left, bottom, width and height of the panel, in parts of the figure.
             time: the moment.
             trail: so long ago is the oldest place that is shown of a body.
+            names: whether bodies are named, as far as there is room.
         """
         figure.set_layout_engine("none")
         axes = figure.add_axes(place)
@@ -62,24 +75,32 @@ class Stage:
         pen = _Pen(axes, self.camera, self.theme, 72 * place[2] * figure.get_figwidth() / (2 * self.aspect))
         points = self.motion.at([time])[0]
         self._draw_around(pen, points)
-        past = self.motion.at(np.linspace(max(self.motion.t[0], time - trail), time, 160))
+        past = self.motion.at(self._trail_times(max(float(self.motion.t[0]), time - trail), time))
         for i, color in enumerate(self._colors):
             pen.trail(past[:, i], color, self.sizes.radii[i])
         self._draw_joints(pen, points)
         for point, radius, color in zip(points, self.sizes.radii, self._colors, strict=True):
             pen.ball(point, radius, color)
+        if names:
+            pen.names(points, self.sizes.radii, [body.name for body in self.motion.drawing.bodies])
         span = float(self.motion.t[-1] - self.motion.t[0])
         digits = max(0, 2 - math.floor(math.log10(span))) if span > 0 else 2
         label = f"$t = {time:.{digits}f}$"
         axes.text(-0.97 * self.aspect, -0.97, label, va="bottom", fontsize=9, color=self.theme.ink, zorder=ON_TOP)
 
     @property
-    def _paces(self) -> dict[str, str]:
+    def paces(self) -> dict[str, str]:
+        """Colours of what is slow and what is fast."""
         return {"slow": self.theme.curves[0], "fast": self.theme.curves[1]}
 
     @property
     def _colors(self) -> list[str]:
-        return [body.color or self._paces[body.pace] for body in self.motion.drawing.bodies]
+        return [body.color or self.paces[body.pace] for body in self.motion.drawing.bodies]
+
+    def _trail_times(self, start: float, end: float) -> np.ndarray:
+        """Times of the places of a trail, as many as there are nodes: else fast motion would be drawn as a zigzag."""
+        nodes = int(np.sum((self.motion.t >= start) & (self.motion.t <= end)))
+        return np.linspace(start, end, int(np.clip(2 * nodes, *TRAIL)))
 
     def _ends(self, points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Centres that a connection joins."""
@@ -104,7 +125,7 @@ class Stage:
             if ends is not None and c.kind == "link":
                 pen.rod(*ends, sizes.rod, sizes.size)
             elif ends is not None:
-                pen.spring(*ends, sizes.coil, sizes.wire, self._paces[c.pace], c.turns)
+                pen.spring(*ends, sizes.coil, sizes.wire, self.paces[c.pace], c.turns)
             if c.point is not None and np.linalg.norm(a - b) > reach[0]:  # else within the body
                 pen.ball(c.point, 1.5 * sizes.rod, self.theme.rod)
 
@@ -178,6 +199,25 @@ class _Pen:
         behind = 0.998 * float(scale.mean())
         self.lines(segments, color, 0.5 + 0.9 * young, behind, alpha=0.7 * young**1.5, capstyle="butt")
 
+    def names(self, points, radii, names: list[str]) -> None:
+        """Beside the balls, to the right or to the left, the largest first; one that would cover something is left out."""
+        places, scale = self.camera.project(points)
+        letter, sizes = NAME_SIZE / self.points, scale * radii
+        edge = np.array(self.axes.get_xlim())
+        taken = [np.array([place - 0.7 * size, place + 0.7 * size]) for place, size in zip(places, sizes, strict=True)]
+        for i in np.argsort(-sizes, kind="stable"):
+            shift, width = 0.75 * sizes[i] + 0.15 * letter, 0.6 * letter * len(names[i])
+            for left in (shift, -shift - width):
+                corner = places[i] + [left, shift]
+                box = corner + np.array([[0.0, 0.0], [width, 1.2 * letter]])
+                inside = edge[0] < box[0, 0] and box[1, 0] < edge[1]
+                if inside and not any(_overlap(box, other) for other in taken):
+                    taken.append(box)
+                    x, y = corner.tolist()
+                    ink = self.theme.ink
+                    self.axes.text(x, y, names[i], va="bottom", fontsize=NAME_SIZE, color=ink, zorder=ON_TOP)
+                    break
+
     def ground(self, ground: Ground) -> None:
         """Its grid; a solid plane is tinted too."""
         places, scale = self.camera.project(ground.grid[:, :6].reshape(-1, 2, 3))
@@ -209,3 +249,8 @@ class _Pen:
         if len(corners):
             path = Path.make_compound_path_from_polys(self.camera.project(np.array(corners))[0])
             self.axes.add_patch(PathPatch(path, facecolor=color, linewidth=0, alpha=alpha, zorder=zorder))
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two boxes, lower left and upper right corner, have a part in common."""
+    return bool(np.all(a[0] < b[1]) and np.all(b[0] < a[1]))

@@ -1,6 +1,7 @@
 """The command ``vmri animate``: a run as a page, a strip of pictures or a GIF."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,7 @@ from rich.markup import escape
 
 from vmri_jax import plots
 from vmri_jax.animation.bars import bars
+from vmri_jax.animation.checks import angles
 from vmri_jax.animation.defaults import built_in
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.frames import plot_strip, write_gif
@@ -37,6 +39,9 @@ def animate(
     title: Annotated[str | None, typer.Option(help="Over the picture. [dim]name of the system or file[/dim]")] = None,
     start: Annotated[float | None, typer.Option("--from", help="Start at this time.")] = None,
     end: Annotated[float | None, typer.Option("--to", help="Stop at this time.")] = None,
+    view: Annotated[
+        str | None, typer.Option(help="Look from this azimuth and elevation in degrees, e.g. -90,90 from above.")
+    ] = None,
     frames: Annotated[int, typer.Option(min=1, max=60, help="Pictures in a strip.")] = 5,
     seconds: Annotated[float, typer.Option(min=0.1, max=60, help="How long a GIF takes.")] = 6.0,
     dark: Annotated[bool, typer.Option("--dark", help="Dark colours; a page has both.")] = False,
@@ -48,7 +53,7 @@ def animate(
     with refusals():
         out = run.with_suffix(".html") if out is None else out
         check_target_file("--out", out, (".html", *PICTURES, ".gif"))
-        shown = _motion(run, system, drawing).between(start, end)
+        shown = _seen_from(_motion(run, system, drawing).between(start, end), view)
         name = title or (SYSTEMS[system].title if system in SYSTEMS else run.stem)
         _write(shown, out, name, frames, seconds, plots.DARK if dark else plots.LIGHT)
     if shown.ending:
@@ -71,6 +76,18 @@ def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
         description = problem.drawing or built_in(system or "", np.size(problem.q_s))
     found = Drawing.from_dict(description or bars(trajectory))
     return motion(trajectory, found, None if problem is None else problem.system)
+
+
+def _seen_from(shown: Motion, view: str | None) -> Motion:
+    """The motion with the view of the option."""
+    if view is None:
+        return shown
+    parts: list = [part.strip() for part in view.split(",")]
+    try:
+        parts = [float(part) for part in parts]
+    except ValueError:
+        raise ValueError(f"--view is {view!r}; it must be azimuth and elevation in degrees, e.g. -90,90.") from None
+    return replace(shown, drawing=replace(shown.drawing, view=angles(parts, "--view")))
 
 
 def _load(run: Path) -> tuple[Trajectory, str | dict]:

@@ -53,6 +53,10 @@ def simulate(
     save_every: Annotated[
         int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
     ] = None,
+    save_micro: Annotated[
+        bool,
+        typer.Option("--save-micro", help="Keep the fast motion within macro steps too; of every one, if not told."),
+    ] = False,
     method: Annotated[str, typer.Option(help="auto, nested, arrowhead or dense.")] = "auto",
     out: Annotated[
         Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr all along the run.")
@@ -68,13 +72,16 @@ def simulate(
         problem = find_problem(system)
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
-        if save_every is None:
+        if save_every is None and save_micro:
+            save_every = 1
+        elif save_every is None:
             save_every = default_save_every(steps) if before is None else before.save_every
         arguments = {
             "macro_dt": macro_dt,
             "micro_dt": micro_dt,
             "num_steps": steps,
             "save_every": save_every,
+            "save_micro": save_micro,
             "newton": Newton(method=method),  # pyright: ignore[reportArgumentType]
             "progress": True,
         }

@@ -1,0 +1,76 @@
+"""Curves under the pictures of a strip: the slow motion along the whole run, and some periods of the fast one."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from vmri_jax import plots
+from vmri_jax.animation.motion import Motion
+from vmri_jax.animation.signals import Signal, fast_signal, slow_signal, window
+
+HEIGHT = 1.65
+"""Of the curves, in inches."""
+POINTS = 2000
+"""Of a curve."""
+LEFT, RIGHT, BELOW, ABOVE = 0.62, 0.12, 0.42, 0.3
+"""Room around a panel for its labels, in inches."""
+
+
+class Curves:
+    """The curves of a motion: two panels side by side, one or none where there is nothing to see.
+
+    Args:
+        motion: from `vmri_jax.animation.motion`.
+        theme: colours.
+    """
+
+    def __init__(self, motion: Motion, theme: plots.Theme):
+        self.motion, self.theme = motion, theme
+        self.slow, self.fast = slow_signal(motion), fast_signal(motion)
+
+    @property
+    def height(self) -> float:
+        """In inches."""
+        return HEIGHT if self.slow or self.fast else 0.0
+
+    def draw(self, figure: Figure, moments: Sequence[float] | np.ndarray) -> None:
+        """Draw them at the lower end of a figure.
+
+        Args:
+            figure: in the style of the theme.
+            moments: times of the pictures, which are marked.
+        """
+        span = float(self.motion.t[0]), float(self.motion.t[-1])
+        panels = [] if self.slow is None else [(self.slow, span, "t")]
+        if self.fast is not None:
+            panels.append((self.fast, window(self.motion, self.fast), "t, the shaded time"))
+        for k, (signal, part, time) in enumerate(panels):
+            axes = self._panel(figure, k, len(panels))
+            self._curve(axes, signal, part)
+            axes.set_title(signal.label, fontsize=9)
+            axes.set_xlabel(time, labelpad=1)
+            if signal is self.slow:
+                marks = np.asarray(moments)
+                axes.plot(
+                    marks, signal.of(self.motion.at(marks)), "o", color=self.theme.ink, markersize=4, clip_on=False
+                )
+                if self.fast is not None:
+                    axes.axvspan(*window(self.motion, self.fast), color=self.theme.curves[1], alpha=0.35, zorder=0)
+
+    def _panel(self, figure: Figure, k: int, count: int) -> Axes:
+        width, height = figure.get_size_inches()
+        left = k * width / count + LEFT
+        wide, high = width / count - LEFT - RIGHT, HEIGHT - BELOW - ABOVE
+        return figure.add_axes((left / width, BELOW / height, wide / width, high / height))
+
+    def _curve(self, axes: Axes, signal: Signal, part: tuple[float, float]) -> None:
+        nodes = self.motion.between(*part)
+        times = np.linspace(*part, POINTS) if len(nodes.t) < POINTS else nodes.t
+        color = self.theme.curves[0 if signal.pace == "slow" else 1]
+        axes.plot(times, signal.of(self.motion.at(times)), color=color, linewidth=1.1)
+        axes.margins(x=0)
+        axes.tick_params(labelsize=8)
+        axes.yaxis.set_major_locator(MaxNLocator(4))
