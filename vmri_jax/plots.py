@@ -173,7 +173,12 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
         trajectory: a run; nodes after a failure are left out by matplotlib since they are NaN.
         title: over the figure.
         theme: colours.
+
+    Raises:
+        ValueError: a batch of runs.
     """
+    if np.ndim(trajectory.t) != 1:
+        raise ValueError("plot: this is a batch of runs; take one of them, run.lane(i).")
     t, names = np.asarray(trajectory.t), trajectory.names
     residual = np.asarray(trajectory.constraint_residual)
     constrained = bool(np.nanmax(residual) > 0)

@@ -4,7 +4,7 @@ import errno
 
 import pytest
 
-from vmri_jax.running.files import replaced
+from vmri_jax.running.files import check_place, replaced
 
 
 def test_a_file_is_replaced_when_all_is_written(tmp_path):
@@ -38,3 +38,10 @@ def test_a_device_is_written_to():
     with pytest.raises(OSError, match="No space left") as caught, replaced("/dev/full") as file:
         file.write(b"new")
     assert caught.value.errno == errno.ENOSPC
+
+
+def test_places_where_no_file_can_be(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"the folder .*nowhere does not exist; make it first"):
+        check_place(tmp_path / "nowhere" / "run.npz")
+    with pytest.raises(IsADirectoryError, match="is a folder; give the name of a file"):
+        check_place(tmp_path)

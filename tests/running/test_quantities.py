@@ -246,3 +246,23 @@ def test_the_systems_of_the_study_have_names(name):
 def test_general_coordinates_are_numbered():
     scene = Scene([Body("modes", 1.0, [0.1, 0.2, 0.3], block=True), Body("one", 1.0, [0.0])])
     assert scene.names.slow_coordinates == ["modes[0]", "modes[1]", "modes[2]", "one"]
+
+
+def test_kinds_of_runs_on_disk_that_are_mixed_up(swing, tmp_path):
+    swing.save(tmp_path / "run.npz")
+    with pytest.raises(
+        ValueError, match=r"run.npz is not a stored trajectory but a file; .* is read by Trajectory.load"
+    ):
+        vm.StoredTrajectory(tmp_path / "run.npz")
+    (tmp_path / "run.zarr").mkdir()
+    with pytest.raises(ValueError, match=r"run.zarr is a folder; .* opened by StoredTrajectory"):
+        vm.Trajectory.load(tmp_path / "run.zarr")
+
+
+def test_a_scene_where_a_system_is_needed(hanging):
+    with pytest.raises(
+        TypeError, match=r"Problem: system is Scene; give a vmri_jax.System; of a scene its .system\(\)"
+    ):
+        vm.Problem(hanging, [], [], [], [])
+    with pytest.raises(TypeError, match=r"macro_step: system is Scene"):
+        vm.macro_step(hanging, vm.fully_implicit(1), hanging.state(), 0.1)

@@ -290,3 +290,11 @@ def test_lengths_of_runs_share_a_program(fpu):
     assert [len(run.t) for run in runs] == [34, 35, 36]
     assert all(np.array_equal(run.q_f, longest.q_f[: len(run.t)]) for run in runs)
     assert all(len(run.info.iterations) == len(run.t) - 1 for run in runs)
+
+
+def test_a_failure_says_what_to_ask_next(fpu):
+    with pytest.raises(SimulationError) as caught:
+        simulate(fpu, fully_explicit(1), macro_dt=1.0, num_steps=400)
+    [note] = caught.value.__notes__
+    assert "advise(problem, scheme, macro_dt=1)" in note
+    assert "swapped" in note

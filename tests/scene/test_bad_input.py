@@ -262,6 +262,8 @@ def test_scenes_made_before_64_bit_mode():
 def test_numbers_that_are_none():
     with pytest.raises(TypeError, match="springs: stiffness is 'stiff'; give real numbers"):
         Scene([A, B], [Spring(("bob", "tip"), "stiff")])
+    with pytest.raises(TypeError, match="plane_contact: normal is 'up'; give real numbers"):
+        Scene([A, B], [PlaneContact(point=[0.0, 0.0], normal="up", stiffness=1.0, smoothing=0.1)])
     with pytest.raises(TypeError, match="Body a: mass is 'heavy'; give real numbers"):
         Body("a", "heavy", [1.0])
     with pytest.raises(ValueError, match="springs: between is None; give 2 names of bodies"):

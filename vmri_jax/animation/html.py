@@ -10,6 +10,7 @@ from vmri_jax import plots
 from vmri_jax.animation.geometry import LAMP, SPAN, helix
 from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
+from vmri_jax.running.files import check_place
 
 MOST_NUMBERS = 600_000
 """Coordinates in a page; of longer runs every k-th node is taken."""
@@ -55,6 +56,7 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
         light=plots.LIGHT,
         dark=plots.DARK,
     )
+    check_place(Path(path))
     Path(path).write_text(text, encoding="utf-8")
 
 

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from vmri_jax import diagnostics
 from vmri_jax.animation.bars import with_bars
 from vmri_jax.animation.drawing import Drawing
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.trajectory import Trajectory
@@ -113,6 +114,7 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
         raise ValueError(
             f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
         )
+    check_type("motion: drawing", drawing, Drawing, "a Drawing, e.g. Drawing.from_dict(problem.drawing)")
     system = system or trajectory.origin.system
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.q_s, trajectory.q_f, trajectory.t))
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)

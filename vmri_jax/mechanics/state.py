@@ -49,7 +49,9 @@ def initial_state(
             kinetic energy without mass along some coordinate.
     """
     require_x64()
-    check_type("initial_state: system", system, System, "a vmri_jax.System")
+    check_type(
+        "initial_state: system", system, System, "a vmri_jax.System; of a scene its .system(), of a problem its .system"
+    )
     check_params(system.params)
     system = of_one_type(system)
     check_flags(project=project)
@@ -115,7 +117,12 @@ class Problem:
 
     def __post_init__(self):
         require_x64()
-        check_type("Problem: system", self.system, System, "a vmri_jax.System")
+        check_type(
+            "Problem: system",
+            self.system,
+            System,
+            "a vmri_jax.System; of a scene its .system(), of a problem its .system",
+        )
         names = "q_s", "q_f", "v_s", "v_f"
         for name, array in zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True):
             object.__setattr__(self, name, array)

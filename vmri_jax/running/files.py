@@ -11,6 +11,7 @@ from typing import IO
 def replaced(path: str | Path) -> Iterator[IO[bytes]]:
     """A binary file to write to that takes the place of `path`, at once and on disk, when all went well."""
     path = Path(path).resolve()  # of a link its target
+    check_place(path)
     if path.exists() and not path.is_file():  # a folder is refused by open, a device cannot be replaced
         with path.open("wb") as file:
             yield file
@@ -26,6 +27,19 @@ def replaced(path: str | Path) -> Iterator[IO[bytes]]:
         partial.unlink(missing_ok=True)
         raise
     synchronize(path.parent)
+
+
+def check_place(path: Path) -> None:
+    """Refuse a place where no file can be.
+
+    Raises:
+        FileNotFoundError: its folder does not exist.
+        IsADirectoryError: it is a folder.
+    """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path} cannot be written: the folder {path.parent} does not exist; make it first.")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; give the name of a file.")
 
 
 def synchronize(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import jax
 
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
@@ -28,7 +29,14 @@ def macro_step(
 
     Returns:
         The state at the end of the step, and what the step did.
+
+    Raises:
+        TypeError: no System, or no State.
     """
+    check_type(
+        "macro_step: system", system, System, "a vmri_jax.System; of a scene its .system(), of a problem its .system"
+    )
+    check_type("macro_step: state", state, State, "a State, e.g. problem.state()")
     return _macro_step(system, scheme, state, macro_dt, newton or Newton())
 
 

@@ -401,4 +401,4 @@ def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> Simul
         int(trajectory.info.iterations[interval]),
         float(trajectory.info.residual[interval]),
         trajectory,
-    )
+    ).advised(float(macro_dt))

@@ -180,6 +180,10 @@ class Trajectory(Quantities, Exports, eqx.Module):
         path = FilePath(path)
         if not path.exists():
             raise FileNotFoundError(f"{path} does not exist; give the .npz file of a saved trajectory.")
+        if path.is_dir():
+            raise ValueError(
+                f"{path} is a folder; a run written by stream is opened by StoredTrajectory({str(path)!r})."
+            )
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
                 arrays = dict(data)

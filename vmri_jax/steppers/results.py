@@ -105,5 +105,17 @@ class SimulationError(RuntimeError):
             "throw=False returns it instead of raising."
         )
 
+    def advised(self, macro_dt: float) -> "SimulationError":
+        """The same with a note on what to ask next.
+
+        Args:
+            macro_dt: of the run.
+        """
+        self.add_note(
+            f"vmri_jax.stability.advise(problem, scheme, macro_dt={macro_dt:g}), or vmri advise on the command line, says whether this "
+            "step is stable, which one near it is, and whether slow and fast variables are swapped."
+        )
+        return self
+
     def __reduce__(self):
         return type(self), (self.result, self.step, self.time, self.iterations, self.residual, self.trajectory)

@@ -181,6 +181,10 @@ def read_attributes(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give the folder of a stored trajectory.")
+    if path.is_file():
+        raise ValueError(
+            f"{path} is not a stored trajectory but a file; a run written by Trajectory.save is read by Trajectory.load({str(path)!r})."
+        )
     try:
         attributes = json.loads((path / METADATA).read_text())["attributes"]
         if attributes["format"] != FORMAT:

@@ -136,7 +136,8 @@ class StoredTrajectory(Quantities, Exports):
         within = self.failed_at - interval * self.save_every
         time = float(before.t[0] + (before.t[1] - before.t[0]) * within / self.save_every)
         iterations, residual = int(before.info.iterations[0]), float(before.info.residual[0])
-        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self)
+        macro_dt = float(before.t[1] - before.t[0]) / self.save_every
+        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self).advised(macro_dt)
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
         return read_rows(self.path, name, rows, self.chunk)

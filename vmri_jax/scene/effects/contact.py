@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.scene.declare import array, common, effect_class, names, number, positive
 from vmri_jax.scene.effect import Effect
 
@@ -74,7 +75,8 @@ class PlaneContact(_Contact):
         return params | {"normal": normal / jnp.linalg.norm(normal)}
 
     def check_parameters(self, bodies):
-        self.require(jnp.any(jnp.asarray(self.normal) != 0), "normal", self.normal, "it must not be zero")
+        normal = jnp.asarray(real_array(f"{self.name}: normal", self.normal))
+        self.require(jnp.any(normal != 0), "normal", self.normal, "it must not be zero")
         super().check_parameters(bodies)
 
     def drawing(self, bodies):
