@@ -5,7 +5,7 @@ ENVIRONMENT ?= .venv
 OLDER ?= python3.11
 NEWER ?= python3.13
 
-.PHONY: reproduce test smoke bench lint lock clean
+.PHONY: reproduce test smoke notebooks bench lint lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
@@ -15,6 +15,9 @@ test: .venv/installed  ## the whole test suite
 
 smoke:  ## a few minutes: every kind of step, with another environment, make smoke ENVIRONMENT=/path/to/venv
 	$(ENVIRONMENT)/bin/python -m pytest -n 2 tests/smoke
+
+notebooks: .venv/installed  ## run the notebooks and store their outputs
+	$(BIN)/python -m tests.notebooks
 
 bench: .venv/installed  ## the quick measurements: time, memory, against C; out/benchmarks
 	$(BIN)/python -m benchmarks all
