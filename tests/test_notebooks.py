@@ -21,9 +21,7 @@ def test_a_notebook_shows_what_it_holds(path, tmp_path):
     assert shown(executed(path, tmp_path)) == shown(nbformat.read(path, 4))
 
 
-@pytest.mark.parametrize(
-    "path", [pytest.param(p, marks=pytest.mark.full if p.stem == LONG[0] else (), id=p.stem) for p in paths()]
-)
+@pytest.mark.parametrize("path", paths(), ids=lambda path: path.stem)
 def test_a_notebook_holds_its_outputs(path):
     notebook = nbformat.read(path, 4)
     assert all(cell.execution_count for cell in notebook.cells if cell.cell_type == "code")

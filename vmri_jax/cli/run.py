@@ -16,8 +16,8 @@ from vmri_jax import plots
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_problem, find_scheme
 from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_failure, refusals
+from vmri_jax.running.arguments import NOTHING_FAST
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.simulate import NOTHING_FAST
 from vmri_jax.running.simulate import simulate as run_at_once
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory

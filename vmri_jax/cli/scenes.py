@@ -8,7 +8,7 @@ from rich.markup import escape
 from vmri_jax.cli import options
 from vmri_jax.cli.catalogue import find_scene, find_scheme
 from vmri_jax.cli.common import console, refusals, status
-from vmri_jax.running.simulate import NOTHING_FAST
+from vmri_jax.running.arguments import NOTHING_FAST
 
 app = typer.Typer()
 

@@ -11,6 +11,10 @@ from vmri_jax.steppers.newton import Newton
 
 WHOLE = 1e-9
 """Part by which a number of steps may miss a whole number."""
+NOTHING_FAST = (
+    "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1, or make what vibrates fast, "
+    'Body(..., pace="fast").'
+)
 
 
 def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro=False):

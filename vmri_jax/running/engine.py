@@ -113,6 +113,12 @@ class Engine:
         return trajectory, at.state, at.own
 
 
+def room_for(saves: int) -> int:
+    """The next number with at most four leading binary digits, so that many lengths of runs share few programs."""
+    unit = 2 ** max(saves.bit_length() - 4, 0)
+    return -(-saves // unit) * unit
+
+
 engine = lru_cache(maxsize=32)(Engine)
 """The engine with these attributes. Thousands of programs would exhaust the memory maps that a process may have."""
 

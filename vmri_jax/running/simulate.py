@@ -17,8 +17,8 @@ from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import check_run, check_vectors
-from vmri_jax.running.engine import Engine, engine
+from vmri_jax.running.arguments import NOTHING_FAST, check_run, check_vectors
+from vmri_jax.running.engine import Engine, engine, room_for
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
@@ -31,10 +31,6 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
 
-NOTHING_FAST = (
-    "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1, or make what vibrates fast, "
-    'Body(..., pace="fast").'
-)
 SHOWN = 50
 """A run with a progress bar is computed in about so many parts."""
 
@@ -354,12 +350,6 @@ def simulation(
     return Simulation(
         system, scheme, newton, state, macro_dt, num_steps, save_every, save_micro, room, names, leaves, structure
     )
-
-
-def room_for(saves: int) -> int:
-    """The next number with at most four leading binary digits, so that many lengths of runs share few programs."""
-    unit = 2 ** max(saves.bit_length() - 4, 0)
-    return -(-saves // unit) * unit
 
 
 def _arrays(state: State) -> tuple:

@@ -11,9 +11,10 @@ from typing import Any
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
+from vmri_jax.running.engine import room_for
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, progress_shown, silent
-from vmri_jax.running.simulate import Simulation, room_for, simulation
+from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import differences, environment, identity
 from vmri_jax.running.store.layout import Record

@@ -1,0 +1,38 @@
+"""Figures in one style: trajectories, conserved quantities, convergence and computing time.
+
+Every function returns a matplotlib `Figure` made without pyplot: no window opens, no global setting is touched, and a
+notebook shows it when it is the value of a cell. Colours follow Okabe and Ito, told apart by the colour-blind.
+"""
+
+from vmri_jax.plots.runs import plot_oscillatory_energies, plot_trajectory
+from vmri_jax.plots.studies import plot_convergence, plot_cost, plot_work_precision
+from vmri_jax.plots.theme import (
+    DARK,
+    LIGHT,
+    MARKERS,
+    NotebookFigure,
+    Theme,
+    log_ticks,
+    new_figure,
+    panel_grid,
+    save,
+    style,
+)
+
+__all__ = [
+    "DARK",
+    "LIGHT",
+    "MARKERS",
+    "NotebookFigure",
+    "Theme",
+    "log_ticks",
+    "new_figure",
+    "panel_grid",
+    "plot_convergence",
+    "plot_cost",
+    "plot_oscillatory_energies",
+    "plot_trajectory",
+    "plot_work_precision",
+    "save",
+    "style",
+]

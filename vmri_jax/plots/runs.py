@@ -1,0 +1,160 @@
+"""Figures of runs: positions, energies, constraints against time."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+
+from vmri_jax.mechanics.invariants import oscillatory_energies
+from vmri_jax.mechanics.names import Names
+from vmri_jax.plots.theme import DARK, LIGHT, NotebookFigure, Theme, legend_beside, new_figure
+
+MOST_NAMED = 12
+"""Of more curves than this in one panel so many are named."""
+ROUNDOFF = 1e-13
+"""Axes span this part of the values at least."""
+
+
+class Run(Protocol):
+    """Saved nodes of a run, (k,) and (k, n), and what is known of it, see `vmri_jax.Trajectory`."""
+
+    t: Any
+    q_s: Any
+    q_f: Any
+    p_f: Any
+    energy: Any
+    constraint_residual: Any
+
+    @property
+    def names(self) -> Names: ...
+    @property
+    def keeps_energy(self) -> bool | None: ...
+    def work(self) -> Any: ...
+
+
+def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+    """Slow and fast positions, energy and, where there are constraints, their residual, against time.
+
+    The energy of a system that keeps it is shown as an error. Of one with forces or moving constraints the figure shows its
+    change, their work, and what is left of the balance.
+
+    Args:
+        trajectory: a run; nodes after a failure are left out by matplotlib since they are NaN.
+        title: over the figure.
+        theme: colours.
+
+    Raises:
+        ValueError: a batch of runs.
+    """
+    if np.ndim(trajectory.t) != 1:
+        raise ValueError("plot: this is a batch of runs; take one of them, run.lane(i).")
+    t, names = np.asarray(trajectory.t), trajectory.names
+    residual = np.asarray(trajectory.constraint_residual)
+    constrained = bool(np.nanmax(residual) > 0)
+    positions = [
+        (np.asarray(trajectory.q_s), names.slow_coordinates, r"slow positions $q_s$"),
+        (np.asarray(trajectory.q_f), names.fast_coordinates, r"fast positions $q_f$"),
+    ]
+    positions = [panel for panel in positions if panel[0].shape[1]]
+    driven = trajectory.keeps_energy is False
+    count = len(positions) + (2 if driven else 1) + constrained
+    with new_figure(7.2, 0.4 + 1.85 * count, title, theme) as figure:
+        axes = figure.subplots(count, sharex=True)
+        for panel, (values, labels, what) in zip(axes, positions, strict=False):
+            _coordinates(panel, t, values, labels, theme)
+            panel.set_ylabel(what)
+        if driven:
+            _energy_balance(axes[len(positions)], axes[len(positions) + 1], trajectory, theme)
+        else:
+            _energy_error(axes[len(positions)], trajectory, theme)
+        if constrained:
+            shown = np.where(residual > 0, residual, np.nan)
+            axes[-1].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
+            axes[-1].semilogy(t, shown[:, 1], "--", linewidth=_thin(t), label="velocity $|G v|$")
+            axes[-1].set_ylabel("constraint residual")
+            legend_beside(axes[-1])
+        axes[-1].set(xlabel="time $t$", xlim=(t[0], t[-1]))
+        figure.align_ylabels()
+    return figure
+
+
+def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+    """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of the stiff springs and their sum, the adiabatic invariant.
+
+    Args:
+        trajectory: a run of a system whose fast variables are oscillators of unit mass.
+        omega: their frequency.
+        title: over the figure.
+        theme: colours.
+    """
+    t = np.asarray(trajectory.t)
+    energies = np.asarray(oscillatory_energies(omega, trajectory.q_f, trajectory.p_f))
+    with new_figure(7.2, 3.4, title, theme) as figure:
+        axes = figure.subplots()
+        axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
+        _coordinates(axes, t, energies, [f"$I_{{{i + 1}}}$" for i in range(energies.shape[1])], theme)
+        axes.set(xlabel="time $t$", ylabel="oscillatory energy", xlim=(t[0], t[-1]))
+        axes.set_ylim(bottom=0)
+    return figure
+
+
+def _coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> None:
+    """One line per coordinate with its name beside the panel; of very many every so manieth is named."""
+    n = values.shape[1]
+    colors: Any = theme.curves
+    if n > len(theme.curves):
+        low, high = (0.3, 1.0) if theme is DARK else (0.0, 0.88)
+        colors = matplotlib.colormaps["viridis"](np.linspace(low, high, n))
+    named = range(n) if n <= MOST_NAMED else np.linspace(0, n - 1, MOST_NAMED).round().astype(int)
+    for i in range(n):
+        label = names[i] if i in named else f"_{names[i]}"  # which legends leave out
+        axes.plot(t, values[:, i], color=colors[i], linewidth=_thin(t), label=label)
+    if n:
+        legend_beside(axes, f"{len(named)} of {n}" if n > MOST_NAMED else None, 9.0 if n <= len(theme.curves) else 6.5)
+
+
+def _thin(t) -> float:
+    """Line width for so many nodes: oscillations must not run into a solid band."""
+    return 1.2 if len(t) <= 300 else 0.7
+
+
+def _energy_error(axes: Axes, trajectory: Run, theme: Theme) -> None:
+    """Relative to the start, or absolute if the start is zero; a mere change if the system is not known."""
+    t, energy = np.asarray(trajectory.t), np.asarray(trajectory.energy)
+    what = "error" if trajectory.keeps_energy else "change"
+    error, label = energy - energy[0], rf"energy {what} $\Delta E$"
+    if abs(energy[0]) > 1e-12:
+        error, label = error / abs(energy[0]), rf"{label[:-1]} / |E_0|$"
+    axes.plot(t, error, color=theme.curves[0], linewidth=_thin(t))
+    axes.set_ylabel(label)
+    _not_below_roundoff(axes.yaxis, error)
+
+
+def _energy_balance(above: Axes, below: Axes, trajectory: Run, theme: Theme) -> None:
+    """Energy and work since the start, and under them what is left of the balance."""
+    t, energy, work = np.asarray(trajectory.t), np.asarray(trajectory.energy), trajectory.work()
+    curves = {"energy": energy - energy[0], "forces": work.forces, "moving constraints": work.constraints}
+    for (name, values), color in zip(curves.items(), theme.curves, strict=False):
+        if name == "energy" or np.any(values != 0):
+            above.plot(
+                t, values, color=color, linewidth=_thin(t), label=name if name == "energy" else f"work of {name}"
+            )
+    above.set_ylabel("energy and work")
+    legend_beside(above, size=7.5)
+    below.plot(t, work.balance, color=theme.curves[0], linewidth=_thin(t), label=r"$\Delta E$ - work")
+    below.axhspan(-work.uncertainty, work.uncertainty, color=theme.faint, label="not resolved\nby the nodes")
+    below.set_ylabel("energy balance")
+    legend_beside(below, size=7.5)
+    _not_below_roundoff(below.yaxis, energy)
+
+
+def _not_below_roundoff(axis: Axis, values) -> None:
+    """Limits that do not blow up round-off: they span `ROUNDOFF` of the values at least."""
+    middle, size = np.nanmean(values), np.nanmax(np.abs(values), initial=0.0)
+    low, high = axis.get_view_interval()
+    half = ROUNDOFF * max(size, 1.0) / 2
+    if high - low < 2 * half:
+        axis.set_view_interval(middle - half, middle + half, ignore=True)

@@ -1,0 +1,211 @@
+"""Figures of studies: convergence, error against work, computing time."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import EngFormatter, FixedLocator, NullLocator
+
+from vmri_jax.plots.theme import (
+    LIGHT,
+    MARKERS,
+    NotebookFigure,
+    Theme,
+    legend_beside,
+    log_ticks,
+    new_figure,
+    panel_grid,
+)
+
+
+class ConvergenceErrors(Protocol):
+    """Errors by scheme and quantity, "q" or "p": macro steps and errors, those worth a fit, and the order they show."""
+
+    @property
+    def schemes(self) -> Sequence[str]: ...
+    def errors(self, scheme: str, quantity: str) -> tuple[np.ndarray, np.ndarray]: ...
+    def usable(self, scheme: str, quantity: str) -> tuple[np.ndarray, np.ndarray]: ...
+    def order(self, scheme: str, quantity: str) -> float: ...
+
+
+def plot_convergence(
+    study: ConvergenceErrors, orders: Sequence[int] = (), title: str = "", theme: Theme = LIGHT
+) -> NotebookFigure:
+    """Errors of positions and of momenta against the macro step, with guide triangles of the given slopes.
+
+    Args:
+        study: e.g. of `vmri_jax.study.convergence_study`.
+        orders: slopes to draw for comparison.
+        title: over the figure.
+        theme: colours.
+    """
+    with new_figure(7.6, 3.7, title, theme) as figure:
+        panels = figure.subplots(1, 2, sharex=True)
+        for axes, quantity, name in zip(panels, ("q", "p"), ("positions", "momenta"), strict=True):
+            steps = []
+            for i, scheme in enumerate(study.schemes):
+                macro_dt, errors = study.errors(scheme, quantity)
+                order = study.order(scheme, quantity)
+                label = f"{scheme}   order {order:.2f}" if np.isfinite(order) else f"{scheme}   failed"
+                axes.loglog(macro_dt, errors, label=label, **_look(i, theme))
+                steps += list(macro_dt)
+            for order in orders:
+                _guide_triangle(axes, study, quantity, order, theme)
+            axes.set(title=name, xlabel="macro step $H$")
+            axes.set(ylabel=rf"largest error $|{quantity} - {quantity}_{{\mathrm{{ref}}}}|$")
+            log_ticks(axes.xaxis, steps)
+            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=1, handlelength=2.4)
+    return figure
+
+
+WORK = {
+    "seconds": "computing time of the run",
+    "slow_evaluations": r"evaluations of $\nabla V$",
+    "fast_evaluations": r"evaluations of $\nabla W$",
+    "solves": "systems of equations solved",
+}
+"""What `plot_work_precision` has on its axis, by the name in the rows."""
+
+
+class RunsByWork(Protocol):
+    """Runs by scheme and the best of all: rows with `error_q`, `num_steps` and every kind of `WORK`."""
+
+    @property
+    def schemes(self) -> Sequence[str]: ...
+    @property
+    def reference(self) -> Any: ...
+    def curve(self, scheme: str) -> Sequence[Any]: ...
+    def pareto(self, work: str) -> Sequence[Any]: ...
+
+
+def plot_work_precision(
+    study: RunsByWork, title: str = "", work: str = "seconds", theme: Theme = LIGHT
+) -> NotebookFigure:
+    """Error of the positions against work, one curve per scheme; the Pareto front is underlaid.
+
+    Args:
+        study: e.g. of `vmri_jax.study.work_precision`, or the runs of a recommendation.
+        title: over the figure.
+        work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
+        theme: colours.
+
+    Raises:
+        ValueError: another kind of work.
+    """
+    if work not in WORK:
+        raise ValueError(f"plot_work_precision: work is {work!r}; it must be one of {', '.join(WORK)}.")
+    front = [row for row in study.pareto(work) if getattr(row, work) > 0]
+    with new_figure(7.2, 4.3, title, theme) as figure:
+        axes = figure.subplots()
+        best, errors = [getattr(row, work) for row in front], [row.error_q for row in front]
+        under = {"color": theme.faint, "linewidth": 7, "solid_capstyle": "round", "zorder": 1}
+        axes.loglog(best, errors, label="best of all", **under)
+        for i, scheme in enumerate(study.schemes):
+            curve = sorted(study.curve(scheme), key=lambda row: row.num_steps)
+            x, y = [getattr(row, work) or np.nan for row in curve], [row.error_q for row in curve]
+            look = _look(i, theme) | {"marker": MARKERS[i // len(theme.curves) % len(MARKERS)]}
+            axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **look)
+        axes.set(xlabel=WORK[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
+        axes.set_ylim(top=30 * max(errors, default=1.0))
+        if study.reference.error_q > axes.get_ylim()[0]:
+            axes.axhline(study.reference.error_q, color=theme.ink, linewidth=0.8, linestyle=":")
+            above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}
+            axes.text(0.995, study.reference.error_q, "error of the reference ", **above)
+        log_ticks(axes.xaxis, [getattr(row, work) for scheme in study.schemes for row in study.curve(scheme)])
+        if work == "seconds":
+            axes.xaxis.set_major_formatter(EngFormatter("s"))
+        legend_beside(axes)
+    return figure
+
+
+def _look(i: int, theme: Theme) -> dict[str, Any]:
+    """Colour and marker of curve i."""
+    return {
+        "color": theme.curves[i % len(theme.curves)],
+        "marker": MARKERS[i % len(MARKERS)],
+        "markerfacecolor": theme.paper,
+    }
+
+
+class CostCurves(Protocol):
+    """By label and method: num_micro and microseconds per micro step."""
+
+    @property
+    def curves(self) -> Sequence[tuple[str, str]]: ...
+    def curve(self, label: str, method: str) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+def plot_cost(
+    studies: Mapping[str, CostCurves],
+    paper_minima: Mapping[str, int] | None = None,
+    title: str = "",
+    theme: Theme = LIGHT,
+) -> NotebookFigure:
+    """Computing time per micro step against num_micro, one panel per study, the cheapest point of each curve circled.
+
+    Args:
+        studies: by the title of their panel, e.g. of `vmri_jax.study.cost_study`.
+        paper_minima: num_micro to mark, by the title of the panel.
+        title: over the figure.
+        theme: colours.
+    """
+    columns = 2 if len(studies) == 4 else min(3, len(studies))
+    height = 0.6 + 2.7 * math.ceil(len(studies) / columns)
+    with new_figure(max(5.2, 0.6 + 3.0 * columns), height, title, theme) as figure:
+        grid = panel_grid(figure, len(studies), columns)
+        handles: dict = {}
+        for axes, (name, study) in zip(grid, studies.items(), strict=True):
+            _cost_panel(axes, study, (paper_minima or {}).get(name), theme)
+            axes.set(title=name)
+            shown = zip(*axes.get_legend_handles_labels(), strict=True)
+            handles.update({label: handle for handle, label in shown})
+        for axes in grid[-columns:]:
+            axes.set(xlabel="micro steps per macro step")
+        for axes in grid[::columns]:
+            axes.set(ylabel="µs per micro step")
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, len(handles)))
+    return figure
+
+
+def _cost_panel(axes: Axes, study: CostCurves, paper_minimum: int | None, theme: Theme) -> None:
+    one_label = len({label for label, _ in study.curves}) == 1
+    curves = [study.curve(label, method) for label, method in study.curves]
+    for i, ((label, method), (num_micro, cost)) in enumerate(zip(study.curves, curves, strict=True)):
+        name = method if one_label else f"{label}, {method}"
+        color = theme.curves[i % len(theme.curves)]
+        axes.loglog(num_micro, cost, marker=MARKERS[i], markersize=4, color=color, label=name)
+        if np.isfinite(cost).any():
+            best = np.nanargmin(cost)
+            axes.plot(num_micro[best], cost[best], "o", markersize=11, markerfacecolor="none", color=color)
+    if paper_minimum is not None:
+        axes.axvline(paper_minimum, color=theme.ink, linestyle=":", linewidth=1.1, label="minimum in the paper")
+    ticks = np.unique(np.concatenate([num_micro for num_micro, _ in curves]))
+    if len(ticks) > 7:
+        ticks = np.array([1, 4, 12, 40, 100])
+    axes.xaxis.set_major_locator(FixedLocator(ticks.tolist()))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter("{x:.0f}")
+    log_ticks(axes.yaxis, np.concatenate([cost for _, cost in curves]))
+
+
+def _guide_triangle(axes: Axes, study: ConvergenceErrors, quantity: str, order: int, theme: Theme) -> None:
+    """Triangle of slope `order` right below the most accurate curve of about that order."""
+    lowest = None
+    for scheme in study.schemes:
+        macro_dt, errors = study.usable(scheme, quantity)
+        if len(errors) > 1 and abs(study.order(scheme, quantity) - order) < 0.5:
+            middle = (len(errors) - 1) // 2
+            value = errors[middle] / macro_dt[middle] ** order
+            if lowest is None or value < lowest[0]:
+                lowest = value, macro_dt[middle], errors[middle]
+    if lowest is None:
+        return
+    _, right, top = lowest
+    left, top = right / 2, top / 2.5
+    bottom = top / 2**order
+    axes.fill([left, right, right], [bottom, bottom, top], facecolor=theme.faint, edgecolor="none", zorder=1)
+    axes.annotate(
+        f"{order}", (right, (bottom * top) ** 0.5), (4, 0), textcoords="offset points", va="center", fontsize=8.5
+    )

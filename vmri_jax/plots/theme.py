@@ -1,0 +1,160 @@
+"""The one style of all figures: themes, figures, legends, ticks."""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours of a figure: paper, text, faint lines, rods of animations, and the cycle of the curves."""
+
+    paper: str
+    ink: str
+    faint: str
+    rod: str
+    curves: tuple[str, ...]
+
+
+LIGHT = Theme(
+    "#ffffff", "#1f2428", "#d9dde1", "#8d979f", ("#0072b2", "#d55e00", "#009e73", "#a3508a", "#b98700", "#3d8fc4")
+)
+DARK = Theme(
+    "#15191d", "#e3e6e8", "#384048", "#8b969f", ("#62b5e8", "#f08a4b", "#3cc79b", "#dd92c4", "#e3b341", "#9ad0f0")
+)
+MARKERS = ("o", "s", "^", "D", "v", "P")
+DPI = 150
+"""Of figures that are saved by their own method."""
+
+
+class NotebookFigure(Figure):
+    """A figure that notebooks show without pyplot and its global state."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = BytesIO()
+        self.savefig(buffer, format="png", dpi=110)
+        return buffer.getvalue()
+
+
+def style(theme: Theme = LIGHT):
+    """Context in which figures are made and saved: ``with style(theme): ...``.
+
+    Args:
+        theme: colours.
+    """
+    return matplotlib.rc_context(
+        {
+            "figure.facecolor": theme.paper,
+            "savefig.facecolor": theme.paper,
+            "savefig.dpi": 200,
+            "figure.constrained_layout.use": True,
+            "font.family": "sans-serif",
+            "font.size": 9.5,
+            "mathtext.fontset": "dejavusans",
+            "axes.facecolor": theme.paper,
+            "axes.edgecolor": theme.ink,
+            "axes.labelcolor": theme.ink,
+            "axes.linewidth": 0.7,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.titlesize": 10.5,
+            "axes.titlecolor": theme.ink,
+            "axes.titlelocation": "left",
+            "axes.prop_cycle": matplotlib.cycler(color=theme.curves),  # pyright: ignore[reportAttributeAccessIssue]
+            "axes.grid": True,
+            "axes.axisbelow": True,
+            "grid.color": theme.faint,
+            "grid.linewidth": 0.6,
+            "text.color": theme.ink,
+            "xtick.color": theme.ink,
+            "ytick.color": theme.ink,
+            "xtick.major.width": 0.7,
+            "ytick.major.width": 0.7,
+            "lines.linewidth": 1.3,
+            "lines.markersize": 5.0,
+            "legend.frameon": False,
+            "legend.fontsize": 9,
+            "svg.fonttype": "path",
+            "svg.hashsalt": "vmri_jax",
+        }
+    )
+
+
+@contextmanager
+def new_figure(width: float, height: float, title: str, theme: Theme) -> Iterator[NotebookFigure]:
+    """A figure to fill within the context, in its style; the title is set at the end.
+
+    Args:
+        width, height: in inches.
+        title: over the figure.
+        theme: colours.
+    """
+    with style(theme):
+        figure = NotebookFigure(figsize=(width, height), dpi=DPI)
+        yield figure
+        figure.suptitle(title, x=0.01, ha="left")
+
+
+def panel_grid(figure: Figure, count: int, columns: int) -> np.ndarray:
+    """So many axes in rows of `columns`; cells of the grid that are left over stay empty.
+
+    Args:
+        figure: to draw on.
+        count: number of panels.
+        columns: of the grid.
+    """
+    axes = figure.subplots(math.ceil(count / columns), columns, squeeze=False).reshape(-1)
+    for empty in axes[count:]:
+        empty.set_axis_off()
+    return axes[:count]
+
+
+def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
+    """Write a figure in the format of the file's ending.
+
+    Args:
+        figure: of any function here.
+        path: of the file.
+        theme: the colours that the figure was made in.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: an ending that matplotlib does not know.
+    """
+    with style(theme):
+        figure.savefig(path)
+
+
+def legend_beside(axes: Axes, title: str | None = None, size: float = 9.0) -> None:
+    """Names of the curves to the right of a panel.
+
+    Args:
+        axes: the panel.
+        title: over the names.
+        size: of the letters, in points.
+    """
+    look = {"handlelength": 1.2, "fontsize": size, "title_fontsize": size, "labelspacing": 0.3}
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title=title, **look)
+
+
+def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
+    """Labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them.
+
+    Args:
+        axis: logarithmic.
+        values: what is drawn along it.
+    """
+    finite = [value for value in values if np.isfinite(value)]
+    axis.set_minor_formatter(NullFormatter())
+    if finite and max(finite) < 30 * min(finite):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter("{x:g}")
