@@ -58,6 +58,9 @@ def test_systems_compare_by_the_functions_of_users():
     assert pickle.loads(pickle.dumps(system())).slow_potential.function is soft
 
 
+@pytest.mark.skipif(
+    jax.__version_info__ >= (0, 12), reason="this JAX takes them over when it compiles, not when it traces"
+)
 def test_operations_are_taken_over_in_place():
     jaxpr = jax.make_jaxpr(jax.grad(traced_once(soft)))(jnp.ones(2), jnp.ones(1), None)
-    assert not any("jit" in equation.primitive.name for equation in jaxpr.eqns)
+    assert not any(equation.params.get("name") == soft.__name__ for equation in jaxpr.eqns)

@@ -35,8 +35,13 @@ def reached(eqn, inputs: list[bool]) -> list[bool]:
     """Which outputs of an equation of a jaxpr some of its inputs can change: those marked."""
     rule, inner = _LOOPS.get(eqn.primitive.name), called(eqn)
     if rule is not None:
-        return rule(inputs, **eqn.params)
-    return _outputs_reached(inner[0], inputs) if inner else [any(inputs)] * len(eqn.outvars)
+        return rule(eqn, inputs)
+    return _outputs_reached(inner[0], inputs) if inner else _everything(eqn, inputs)
+
+
+def _everything(eqn, inputs: list[bool]) -> list[bool]:
+    """The answer where nothing is known."""
+    return [any(inputs)] * len(eqn.outvars)
 
 
 def _outputs_reached(jaxpr, inputs: list[bool]) -> list[bool]:
@@ -47,21 +52,31 @@ def _outputs_reached(jaxpr, inputs: list[bool]) -> list[bool]:
     return [known.get(id(v), False) for v in jaxpr.outvars]
 
 
-def _by_while(inputs, *, cond_jaxpr, body_jaxpr, cond_nconsts, body_nconsts, **_) -> list[bool]:
+def _by_while(eqn, inputs: list[bool]) -> list[bool]:
     """Everything where the end of the loop is."""
-    cond_consts, body_consts = inputs[:cond_nconsts], inputs[cond_nconsts : cond_nconsts + body_nconsts]
+    try:
+        of_cond, of_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
+        cond, body = eqn.params["cond_jaxpr"].jaxpr, eqn.params["body_jaxpr"].jaxpr
+    except KeyError:
+        return _everything(eqn, inputs)
+    cond_consts, body_consts = inputs[:of_cond], inputs[of_cond : of_cond + of_body]
 
     def once(carry):
-        end = _outputs_reached(cond_jaxpr.jaxpr, cond_consts + carry)[0]
-        return [end or on for on in _outputs_reached(body_jaxpr.jaxpr, body_consts + carry)]
+        end = _outputs_reached(cond, cond_consts + carry)[0]
+        return [end or on for on in _outputs_reached(body, body_consts + carry)]
 
-    return _over_and_over(once, inputs[cond_nconsts + body_nconsts :])
+    return _over_and_over(once, inputs[of_cond + of_body :])
 
 
-def _by_scan(inputs, *, jaxpr, num_consts, num_carry, **_) -> list[bool]:
-    consts, carry, xs = inputs[:num_consts], inputs[num_consts:][:num_carry], inputs[num_consts + num_carry :]
-    carry = _over_and_over(lambda carry: _outputs_reached(jaxpr.jaxpr, consts + carry + xs)[:num_carry], carry)
-    return carry + _outputs_reached(jaxpr.jaxpr, consts + carry + xs)[num_carry:]
+def _by_scan(eqn, inputs: list[bool]) -> list[bool]:
+    """What is scanned over, or stacked, has one axis more outside than inside: so the carry is told from it."""
+    inner = eqn.params["jaxpr"].jaxpr
+    num_carry = sum(a.aval.shape == b.aval.shape for a, b in zip(eqn.outvars, inner.outvars, strict=True))
+    num_xs = sum(a.aval.shape != b.aval.shape for a, b in zip(eqn.invars, inner.invars, strict=True))
+    first = len(inputs) - num_xs - num_carry
+    consts, carry, xs = inputs[:first], inputs[first : first + num_carry], inputs[first + num_carry :]
+    carry = _over_and_over(lambda carry: _outputs_reached(inner, consts + carry + xs)[:num_carry], carry)
+    return carry + _outputs_reached(inner, consts + carry + xs)[num_carry:]
 
 
 def _over_and_over(once: Callable, carry: list[bool]) -> list[bool]:
@@ -70,10 +85,10 @@ def _over_and_over(once: Callable, carry: list[bool]) -> list[bool]:
     return carry if found == carry else _over_and_over(once, found)
 
 
-def _by_cond(inputs, *, branches, **_) -> list[bool]:
+def _by_cond(eqn, inputs: list[bool]) -> list[bool]:
     """Everything where the choice is."""
     index, *operands = inputs
-    cases = [_outputs_reached(branch.jaxpr, operands) for branch in branches]
+    cases = [_outputs_reached(branch.jaxpr, operands) for branch in eqn.params["branches"]]
     return [index or any(case) for case in zip(*cases, strict=True)]
 
 
