@@ -123,3 +123,25 @@ def cart() -> Problem:
     system = System(ConstantMass([3.0], [1.0, 1.0]), cart_spring, constraint=rod, params=jnp.asarray(20.0))
     zero = jnp.zeros(1)
     return Problem(system, zero, jnp.array([0.0, -0.5]), zero, jnp.array([0.4, 0.0]))
+
+
+# --- a pendulum: a point on a rod, at rest or on a pivot that swings, in still air -----------------------------------------
+
+GRAVITY, MASS, LENGTH = 9.81, 2.0, 1.5
+
+
+def hanging_weight(q_f, params):
+    return MASS * GRAVITY * q_f[1]
+
+
+def own_rod(q_s, q_f, params):
+    return jnp.array([q_f @ q_f - LENGTH**2]) / 2
+
+
+def swinging_rod(t, q_s, q_f, params):
+    pivot = jnp.stack([0.2 * jnp.sin(3 * t), jnp.zeros_like(t)])
+    return jnp.array([jnp.sum((q_f - pivot) ** 2) - LENGTH**2]) / 2
+
+
+def drag(t, q_s, q_f, v_s, v_f, params):
+    return jnp.zeros(0), -0.3 * v_f

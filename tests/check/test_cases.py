@@ -1,12 +1,16 @@
 """The hard cases of a system that is not ours."""
 
+import dataclasses
+
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.check.broken_systems import no_potential, swapped_labels, wrong_gradient
 from tests.user_systems import two_oscillators
 from vmri_jax import ConstantMass, Problem, Rheonomic, System
-from vmri_jax.check import cases_for, run_cases
+from vmri_jax.check import cases, cases_for, run_cases
 from vmri_jax.check.cases import resolved
 
 
@@ -149,3 +153,23 @@ def test_a_run_that_blows_up_is_missed_not_raised():
     outcome = energy.run(False)
     assert not outcome.passed
     assert "NON_FINITE" in outcome.measured
+
+
+@pytest.mark.parametrize(
+    ("energy_at", "passes"),
+    [
+        (lambda steps: 1e-8 * steps, False),  # goes on
+        (lambda steps: 1e-4 * np.sin(steps / 3e4), True),  # turns back in a longer run
+        (lambda steps: 1e-4 * np.tanh(steps / 1.5e4), True),  # settles
+    ],
+)
+def test_a_drift_goes_on_and_what_is_slow_does_not(monkeypatch, energy_at, passes):
+    problem = two_oscillators()
+    start = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.01, num_steps=100)
+
+    def long_run(problem, scheme, macro_dt, num_steps):
+        return dataclasses.replace(start, energy=1.0 + energy_at(np.linspace(0.0, num_steps, len(start))))
+
+    monkeypatch.setattr(cases, "long_run", long_run)
+    [case] = [case for case in cases_for(problem) if case.title == "energy for long"]
+    assert run_cases([case]).passed == passes

@@ -1,37 +1,17 @@
 """Accelerations, multipliers and reaction forces of the continuous equations, against formulas and runs."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.user_systems import double_pendulum
+from tests.user_systems import GRAVITY, LENGTH, MASS, double_pendulum, drag, hanging_weight, own_rod, swinging_rod
 from vmri_jax import ConstantMass, Rheonomic, State, System, fully_implicit, galerkin, initial_state, simulate
 from vmri_jax.mechanics.invariants import energy
 from vmri_jax.mechanics.motion import motion, powers, reaction_force
 
-GRAVITY, MASS, LENGTH = 9.81, 2.0, 1.5
-
-
-def weight(q_f, params):
-    return MASS * GRAVITY * q_f[1]
-
-
-def rod(q_s, q_f, params):
-    return jnp.array([q_f @ q_f - LENGTH**2]) / 2
-
-
-def swinging(t, q_s, q_f, params):
-    pivot = jnp.stack([0.2 * jnp.sin(3 * t), jnp.zeros_like(t)])
-    return jnp.array([jnp.sum((q_f - pivot) ** 2) - LENGTH**2]) / 2
-
-
-def drag(t, q_s, q_f, v_s, v_f, params):
-    return jnp.zeros(0), -0.3 * v_f
-
 
 def test_a_pendulum_by_the_formula():
-    system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), fast_potential=weight, constraint=rod)
+    system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), fast_potential=hanging_weight, constraint=own_rod)
     state = initial_state(system, [], LENGTH * np.array([0.6, -0.8]), [], np.array([0.8, 0.6]))
     found = motion(system, state)
     tension = MASS * (1.0 + GRAVITY * 0.8 * LENGTH) / LENGTH**2  # m (v^2 - g y) / L^2
@@ -47,7 +27,9 @@ def test_a_pendulum_by_the_formula():
 )
 def test_accelerations_are_those_of_runs(make):
     if make is None:
-        system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), None, weight, Rheonomic(swinging), force=drag)
+        system = System(
+            ConstantMass(np.zeros(0), MASS * np.ones(2)), None, hanging_weight, Rheonomic(swinging_rod), force=drag
+        )
         state = initial_state(system, [], [LENGTH, 0.0], [], [0.0, 0.0], project=True)
     else:
         problem = make()
@@ -63,7 +45,9 @@ def test_accelerations_are_those_of_runs(make):
 
 
 def test_powers_are_the_rate_of_energy():
-    system = System(ConstantMass(np.zeros(0), MASS * np.ones(2)), None, weight, Rheonomic(swinging), force=drag)
+    system = System(
+        ConstantMass(np.zeros(0), MASS * np.ones(2)), None, hanging_weight, Rheonomic(swinging_rod), force=drag
+    )
     state = initial_state(system, [], [LENGTH, 0.0], [], [0.0, 1.0], project=True)
     run = simulate(system, fully_implicit(1), state, macro_dt=1e-3, num_steps=1000)
     states = State(run.t, run.q_s, run.q_f, run.p_s, run.p_f)

@@ -10,6 +10,7 @@ from typing import Annotated
 import jax
 import numpy as np
 import typer
+from rich.console import Console
 from rich.markup import escape
 
 from vmri_jax import plots
@@ -154,7 +155,7 @@ def _print_advice(system: str, given: dict) -> None:
     options = [word for name, value in given.items() if value is not None for word in (f"--{name}", str(value))]
     command = shlex.join(["vmri", "advise", system, *options])
     text = f"Whether this step is stable, which one near it is, and whether slow and fast are swapped:\n[bold]{escape(command)}[/bold]"
-    console.print(text, soft_wrap=True)
+    Console(stderr=True).print(text, soft_wrap=True)
 
 
 def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:

@@ -135,12 +135,12 @@ class Names:
     def _coordinates(self, sizes: Mapping[str, int]) -> list[str]:
         names = []
         for name, size in sizes.items():
-            if size == 1 and name not in self.numbered:
-                names.append(name)
-            elif size <= len(AXES) and name not in self.numbered:
-                names += [f"{name} {axis}" for axis in AXES[:size]]
-            else:
+            if name in self.numbered or size > len(AXES):
                 names += [f"{name}[{i}]" for i in range(size)]
+            elif size == 1:
+                names.append(name)
+            else:
+                names += [f"{name} {axis}" for axis in AXES[:size]]
         return names
 
     def to_dict(self) -> dict[str, Any]:

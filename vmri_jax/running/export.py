@@ -4,15 +4,13 @@ import csv
 import importlib
 import io
 import json
-from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vmri_jax.mechanics.names import Names
 from vmri_jax.running.files import replaced
-from vmri_jax.running.origin import Origin
+from vmri_jax.running.quantities import Quantities
 from vmri_jax.steppers.results import Result
 
 if TYPE_CHECKING:
@@ -54,22 +52,8 @@ def rows_of(run: "Trajectory") -> dict[str, np.ndarray]:
     return arrays
 
 
-class Exports(ABC):
+class Exports(Quantities):
     """Ways out of a run. All of them carry the names of bodies and coordinates."""
-
-    @abstractmethod
-    def whole(self) -> "Trajectory":
-        """All saved nodes."""
-
-    @property
-    @abstractmethod
-    def origin(self) -> Origin:
-        """What the run is of."""
-
-    @property
-    @abstractmethod
-    def names(self) -> Names:
-        """Names of bodies and coordinates."""
 
     def columns(self) -> dict[str, np.ndarray]:
         """Columns (k,) by name: time, coordinates by their names, velocities "v ..." if the system is known, momenta "p ...",
@@ -78,12 +62,13 @@ class Exports(ABC):
         Raises:
             ValueError: this is a batch.
         """
-        run, names = self.whole(), self.names
+        run = self.whole()
+        names = run.names
         if np.ndim(run.t) != 1:
             raise ValueError("columns: this is a batch of runs; take one of them, run.lane(i).")
         rows = rows_of(run)
         parts = [("", rows["q_s"], rows["q_f"]), ("p ", rows["p_s"], rows["p_f"])]
-        if self.origin.system is not None:
+        if run.origin.system is not None:
             parts.insert(1, ("v ", np.asarray(run.v_s), np.asarray(run.v_f)))
         found = {"t": rows["t"]}
         for letter, slow, fast in parts:
@@ -131,8 +116,8 @@ class Exports(ABC):
             ImportError: xarray is not installed.
         """
         xarray = _extra("xarray", "to_xarray")
-        run, names = self.whole(), self.names
-        rows = rows_of(run)
+        run = self.whole()
+        names, rows = run.names, rows_of(run)
         lanes = ("lane",) * (rows["t"].ndim - 1)
         data = {name: ((*lanes, *DIMENSIONS[name]), array) for name, array in rows.items() if name != "t"}
         coordinates = {
@@ -144,16 +129,17 @@ class Exports(ABC):
         if lanes and np.any(rows["t"] != rows["t"][0]):  # lanes with steps of their own
             coordinates["t"] = ("t", np.arange(rows["t"].shape[1]))
             data["time"] = (("lane", "t"), rows["t"])
-        return xarray.Dataset(data, coords=coordinates, attrs=attributes(run, self.origin, lanes != ()))
+        return xarray.Dataset(data, coords=coordinates, attrs=attributes(run))
 
 
-def attributes(run: "Trajectory", origin: Origin, batch: bool) -> dict:
+def attributes(run: "Trajectory") -> dict:
     """The status of a run, and the names of its parts as JSON."""
-    if batch:
+    if np.ndim(run.t) > 1:
         found = {"result": np.asarray(run.result), "failed_at": np.asarray(run.failed_at)}
     else:
         found = {"result": Result(int(run.result)).name, "failed_at": int(run.failed_at)}
-    return found | ({} if origin.names is None else {"names": json.dumps(origin.names.to_dict())})
+    names = run.origin.names
+    return found | ({} if names is None else {"names": json.dumps(names.to_dict())})
 
 
 def _extra(package: str, what: str):

@@ -73,12 +73,12 @@ class Quantities(ABC):
     @property
     def v_s(self):
         """Slow velocities, shaped like q_s."""
-        return self._velocities()[0]
+        return _velocities(self.whole())[0]
 
     @property
     def v_f(self):
         """Fast velocities, shaped like q_f."""
-        return self._velocities()[1]
+        return _velocities(self.whole())[1]
 
     def position(self, body: str):
         """Positions (..., k, size) of a body, or of a coordinate that has a name.
@@ -90,7 +90,7 @@ class Quantities(ABC):
             ValueError: no body of this name.
         """
         run = self.whole()
-        return self._of_body(body, run.q_s, run.q_f)
+        return _of_body(run.names, body, run.q_s, run.q_f)
 
     def velocity(self, body: str):
         """Velocities (..., k, size) of a body, or of a coordinate that has a name.
@@ -101,7 +101,8 @@ class Quantities(ABC):
         Raises:
             ValueError: no body of this name, or the run does not know its system.
         """
-        return self._of_body(body, *self._velocities())
+        run = self.whole()
+        return _of_body(run.names, body, *_velocities(run))
 
     def multipliers(self, micro: bool = False) -> dict:
         """Lagrange multipliers of the equations of motion at the saved nodes, (..., k, rows) for each constraint by name.
@@ -116,8 +117,9 @@ class Quantities(ABC):
         Raises:
             ValueError: the run does not know its system, or did not keep the micro nodes.
         """
-        values = np.asarray(at_nodes(_multipliers, self.origin, self._states(micro)))
-        return {name: self._shaped(values[..., rows], micro) for name, rows in self.names.rows.items()}
+        run = self.whole()
+        values = np.asarray(at_nodes(_multipliers, run.origin, _states(run, micro)))
+        return {name: _shaped(run, values[..., rows], micro) for name, rows in run.names.rows.items()}
 
     def reaction_forces(self, constraint: str, micro: bool = False) -> dict:
         """Forces ``-G^T lambda`` of a constraint on the bodies that it touches, (..., k, size) for each of them by name.
@@ -129,18 +131,19 @@ class Quantities(ABC):
         Raises:
             ValueError: no constraint of this name, and as of `multipliers`.
         """
-        names = self.names
+        run = self.whole()
+        names = run.names
         if constraint not in names.rows:
             raise ValueError(f"reaction_forces: {unknown('constraint', constraint, names.rows)}")
         rows = tuple(names.rows[constraint])
-        forces, touched = at_nodes(reaction_force, self.origin, self._states(micro), rows)
-        n_s = self.whole().q_s.shape[-1]
+        forces, touched = at_nodes(reaction_force, run.origin, _states(run, micro), rows)
+        n_s = run.q_s.shape[-1]
         parts = {"s": (forces[..., :n_s], touched[..., :n_s]), "f": (forces[..., n_s:], touched[..., n_s:])}
         found = {}
         for name, (part, start, size) in names.bodies.items():
             force, touches = (np.asarray(a[..., start : start + size]) for a in parts[part])
             if touches.any():
-                found[name] = self._shaped(force, micro)
+                found[name] = _shaped(run, force, micro)
         return found
 
     def work(self) -> Work:
@@ -155,9 +158,9 @@ class Quantities(ABC):
         run = self.whole()
         if np.ndim(run.t) != 1:
             raise ValueError("work: the run is a batch; take one lane of it, run.lane(i).")
-        micro = why_not(run.t, run.t_micro) == ""
-        states = self._states(micro, every=True)
-        power = np.asarray(at_nodes(powers, self.origin, states))
+        micro = why_not(run.t, run.t_micro) == "" and bool(np.isfinite(run.energy[1]))
+        states = _states(run, micro, every=True)
+        power = np.asarray(at_nodes(powers, run.origin, states))
         t, every = np.asarray(states.t), run.t_micro.shape[1] if micro else 1
         done = cumulative_trapezoid(power, t, axis=0, initial=0.0)
         simpson = cumulative_simpson(power, x=t, axis=0, initial=0.0) if len(t) > 2 else done
@@ -177,42 +180,44 @@ class Quantities(ABC):
 
         return plot_trajectory(self.whole(), title)
 
-    def _velocities(self):
-        return at_nodes(_velocity, self.origin, self._states(False))
 
-    def _of_body(self, body: str, slow, fast):
-        part, start, size = self.names.place(body)
-        return (slow if part == "s" else fast)[..., start : start + size]
+def _of_body(names: Names, body: str, slow, fast):
+    part, start, size = names.place(body)
+    return (slow if part == "s" else fast)[..., start : start + size]
 
-    def _states(self, micro: bool, every: bool = False) -> State:
-        """The states at the saved nodes, or at the micro nodes; at `every` node with the start."""
-        run = self.whole()
-        if not micro:
-            return run.states
-        reason = why_not(run.t, run.t_micro)
-        if reason:
-            raise ValueError(f"micro nodes: the run has none between all of its nodes: {reason}.")
-        nodes = self.all_nodes()
-        p_s, p_f = at_nodes(_momenta, self.origin, nodes)
-        states = State(nodes.t, nodes.q_s, nodes.q_f, p_s, p_f)
-        return states if every else jax.tree.map(lambda a: a[1:], states)
 
-    def all_nodes(self) -> Nodes:
-        """Times, positions and velocities at all nodes, macro and micro, in order; NaN after a failure."""
-        run = self.whole()
-        v_s, v_f = self._velocities()
-        nodes = Nodes(*(np.asarray(a) for a in (run.t, run.q_s, run.q_f, v_s, v_f)))
-        finite = np.isfinite(np.column_stack(nodes)).all(axis=1)
-        count = len(nodes.t) if np.all(finite) else int(np.argmin(finite))
-        if count < 2:
-            raise ValueError("micro nodes: the run failed in its first step; there are none.")
-        kept = Nodes(*(a[:count] for a in nodes))
-        found = with_micro_nodes(kept, run.t_micro[: count - 1], run.q_f_micro[: count - 1])
-        missing = (len(nodes.t) - count) * run.t_micro.shape[1]
-        return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in found))
+def _velocities(run: "Trajectory"):
+    return at_nodes(_velocity, run.origin, run.states)
 
-    def _shaped(self, values: np.ndarray, micro: bool) -> np.ndarray:
-        return values.reshape(*np.shape(self.whole().t_micro), -1) if micro else values
+
+def _states(run: "Trajectory", micro: bool, every: bool = False) -> State:
+    """The states at the saved nodes, or at the micro nodes; at `every` node with the start."""
+    if not micro:
+        return run.states
+    reason = why_not(run.t, run.t_micro)
+    if reason:
+        raise ValueError(f"micro nodes: the run has none between all of its nodes: {reason}.")
+    nodes = _all_nodes(run)
+    p_s, p_f = at_nodes(_momenta, run.origin, nodes)
+    states = State(nodes.t, nodes.q_s, nodes.q_f, p_s, p_f)
+    return states if every else jax.tree.map(lambda a: a[1:], states)
+
+
+def _all_nodes(run: "Trajectory") -> Nodes:
+    """Times, positions and velocities at all nodes, macro and micro, in order; NaN after a failure."""
+    nodes = Nodes(*(np.asarray(a) for a in (run.t, run.q_s, run.q_f, *_velocities(run))))
+    finite = np.isfinite(np.column_stack(nodes)).all(axis=1)
+    count = len(nodes.t) if np.all(finite) else int(np.argmin(finite))
+    if count < 2:
+        raise ValueError("micro nodes: the run failed in its first step; there are none.")
+    kept = Nodes(*(a[:count] for a in nodes))
+    found = with_micro_nodes(kept, run.t_micro[: count - 1], run.q_f_micro[: count - 1])
+    missing = (len(nodes.t) - count) * run.t_micro.shape[1]
+    return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in found))
+
+
+def _shaped(run: "Trajectory", values: np.ndarray, micro: bool) -> np.ndarray:
+    return values.reshape(*np.shape(run.t_micro), -1) if micro else values
 
 
 def _spread(t: np.ndarray, power: np.ndarray) -> float:

@@ -17,7 +17,6 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import Exports
 from vmri_jax.running.files import replaced
 from vmri_jax.running.origin import Origin
-from vmri_jax.running.quantities import Quantities
 from vmri_jax.steppers.results import Result
 
 FORMAT = "vmri_jax trajectory 2"
@@ -42,7 +41,7 @@ class RunInfo(NamedTuple):
     residual: Float[Numbers, "k-1"]
 
 
-class Trajectory(Quantities, Exports, eqx.Module):
+class Trajectory(Exports, eqx.Module):
     """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has an axis of lanes before.
 
     ``len(run)`` is k; ``run[i]`` is the `State` at a node, ``run[-1]`` that at the end; ``run[a:b]`` and ``run[a:b:n]`` are the
@@ -106,7 +105,7 @@ class Trajectory(Quantities, Exports, eqx.Module):
         if isinstance(nodes, int | np.integer):
             at = range(len(self))[nodes]  # beyond the ends an IndexError
             lanes = (slice(None),) * (np.ndim(self.t) - 1)
-            return State(*(a[*lanes, at] for a in (self.t, self.q_s, self.q_f, self.p_s, self.p_f)))
+            return State(*(a[*lanes, at] for a in vars(self.states).values()))
         if not isinstance(nodes, slice):
             raise TypeError(
                 f"Trajectory: the index is {nodes!r}; give the number of a node, or a slice as in run[:100]."
@@ -145,7 +144,7 @@ class Trajectory(Quantities, Exports, eqx.Module):
     @property
     def final_state(self):
         """`State` at the last saved node (of every run, in a batch)."""
-        return State(self.t[..., -1], *(x[..., -1, :] for x in (self.q_s, self.q_f, self.p_s, self.p_f)))
+        return self[-1]
 
     def save(self, path, drawing: dict | None = None) -> None:
         """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.

@@ -6,17 +6,17 @@ from typing import Any, overload
 
 import numpy as np
 
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import Exports
 from vmri_jax.running.origin import Origin
-from vmri_jax.running.quantities import Quantities
 from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
 from vmri_jax.running.trajectory import MICRO, NODES, RunInfo, Trajectory, ends_of, from_named_arrays
 from vmri_jax.steppers.results import Result, SimulationError
 
 
-class StoredTrajectory(Quantities, Exports):
+class StoredTrajectory(Exports):
     """A trajectory on disk, written by `stream`; only what is asked for is read.
 
     ``len(stored)`` is the number of saved nodes, the start among them (0 before the first chunk is complete); ``stored[i]`` is
@@ -83,6 +83,10 @@ class StoredTrajectory(Quantities, Exports):
     def final_state(self) -> State:
         """`State` at the last saved node."""
         return self[-1]
+
+    @property
+    def names(self) -> Names:
+        return self[:1].names
 
     def whole(self) -> Trajectory:
         return self.load()
