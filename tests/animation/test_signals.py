@@ -2,9 +2,11 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.animation.support import trajectory
 from vmri_jax import plots
 from vmri_jax.animation import Drawing, bars, motion, plot_strip
@@ -103,11 +105,27 @@ def test_micro_nodes_without_the_system_move_as_they_do():
 
 
 def test_the_page_calls_the_energy_an_error_only_if_it_should_be_constant():
-    shown = moved()
-    titles = {}
-    for keeps in (True, False, None):
-        of = dataclasses.replace(shown, keeps_energy=keeps)
-        titles[keeps] = _data(of, layout(of))["energy_title"]
-    assert "error" in titles[True]
-    assert "error" not in titles[False] + titles[None]
-    assert "work" in titles[False]
+    """Of a damped mass it shows energy and work, and what is left of their balance."""
+    damped = vm.System(vm.ConstantMass([1.0], [1.0]), None, lambda q, params: 50 * jnp.sum(q**2), force=damping)
+    run = vm.simulate(
+        vm.Problem(damped, [0.0], [0.1], [1.0], [0.0]), vm.fully_implicit(num_micro=4), macro_dt=0.1, num_steps=50
+    )
+    drawing = Drawing.from_dict({"bodies": [{"name": "mass", "coordinates": [["f", 0]]}]})
+    shown = motion(run, drawing)
+    assert shown.energy_names == ("energy", "work of forces", "balance")
+    assert not shown.relative
+    np.testing.assert_allclose(shown.energy[:, 0], run.energy - run.energy[0])
+    assert shown.energy[-1, 1] < -0.5
+    np.testing.assert_allclose(shown.energy[:, 2], shown.energy[:, 0] - shown.energy[:, 1], atol=1e-12)
+    data = _data(shown, layout(shown))
+    assert data["energy_title"] == "since the start:"
+    assert len(data["energy"]) == len(data["energy_names"]) == 3
+    assert shown.thinned(10).energy.shape == (len(shown.thinned(10).t), 3)
+
+    kept = motion(run, drawing, damped.replace(force=None))
+    assert kept.energy_names == ("energy error",)
+    assert "error" in _data(kept, layout(kept))["energy_title"]
+
+
+def damping(t, q_s, q_f, v_s, v_f, params):
+    return -0.5 * v_s, -0.5 * v_f

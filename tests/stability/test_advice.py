@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from vmri_jax import State, System, compose, explicit_slow, fully_explicit, fully_implicit
+import vmri_jax as vm
+from vmri_jax import Names, Problem, State, System, compose, explicit_slow, fully_explicit, fully_implicit
 from vmri_jax.stability import advise, linear_model
 from vmri_jax.systems.fermi_pasta_ulam import soft_springs
 
@@ -82,6 +83,21 @@ def test_swapped_labels(fpu):
     assert "Swap the labels" in str(advice)
     assert advice.findings[0].number > 10
     assert advice.safe_macro_dt == advice.macro_dt  # the step itself is stable
+
+
+def test_swapped_labels_are_named_where_a_run_diverges(fpu):
+    """In the words of the bodies, without a question to `advise`."""
+    swapped = System(fpu.system.kinetic, all_in_the_slow_potential, params=fpu.system.params)
+    names = Names(slow={"cart": 2, "bell": 1}, fast={"clapper": 3})
+    start = fpu.q_f, fpu.q_s, fpu.v_f, fpu.v_s
+    problem = Problem(swapped, *start, names=names)
+    with pytest.raises(vm.SimulationError) as stopped:
+        vm.simulate(problem, fully_explicit(2), macro_dt=0.5, num_steps=2000)
+    assert "is one of the slow variables cart x, cart y, bell; those" in stopped.value.labels
+    assert stopped.value.labels in stopped.value.__notes__
+    with pytest.raises(vm.SimulationError) as stopped:
+        vm.simulate(fpu, fully_explicit(2), macro_dt=0.5, num_steps=2000)
+    assert stopped.value.labels == ""
 
 
 def test_a_state_that_is_unstable_by_itself():

@@ -16,12 +16,6 @@ MOST_NUMBERS = 600_000
 """Coordinates in a page; of longer runs every k-th node is taken."""
 WATCHED = 20.0
 """Seconds that a run takes at the first speed, about."""
-ENERGY = {
-    True: "energy error",
-    False: "energy change, by the work of forces and moving constraints,",
-    None: "energy change",
-}
-"""What the change of the energy is, by whether it should be constant."""
 
 
 def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
@@ -72,8 +66,9 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "t": _packed(t, np.float64),
         "points": _packed(motion.points),
         "velocities": _packed(motion.velocities),
-        "energy": _packed(motion.energy),
-        "energy_title": f"{ENERGY[motion.keeps_energy]} {'ΔE / |E₀|' if motion.relative else 'ΔE'}",
+        "energy": [_packed(column) for column in motion.energy.T],
+        "energy_names": motion.energy_names if len(motion.energy_names) > 1 else [""],
+        "energy_title": _energy_title(motion),
         "residual": [_packed(column) for column in motion.residual.T] if constrained else None,
         "bodies": [
             {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius)}
@@ -100,6 +95,12 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "caption": drawing.caption,
         "ending": motion.ending,
     }
+
+
+def _energy_title(motion: Motion) -> str:
+    if len(motion.energy_names) > 1:
+        return "since the start:"
+    return f"{motion.energy_names[0]} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
 
 
 def _plain(record: Connection | Ground) -> dict:

@@ -27,11 +27,12 @@ class Motion:
         drawing: its blocks are bodies, see `vmri_jax.animation.bars`.
         t: (k,) times of the nodes.
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
-        energy: (k,) change of the energy since the start, relative to the start where that is not zero and should be kept.
-        relative: whether it is.
+        energy: (k, c) change of the energy since the start, relative to the start where that is not zero and should be kept.
+            Where it should not be kept: and the work of forces and of moving constraints since the start, and the balance.
+        energy_names: (c,) what the columns are.
+        relative: whether the first is relative.
         residual: (k, 2) largest constraint value and largest rate of one.
         ending: why the run stopped early; empty if it did not.
-        keeps_energy: whether the energy should be constant; None if that is not known.
     """
 
     drawing: Drawing
@@ -39,10 +40,10 @@ class Motion:
     points: np.ndarray
     velocities: np.ndarray
     energy: np.ndarray
+    energy_names: tuple[str, ...]
     relative: bool
     residual: np.ndarray
     ending: str = ""
-    keeps_energy: bool | None = None
 
     def at(self, times: Sequence[float] | np.ndarray) -> np.ndarray:
         """(len(times), n_bodies, 3) positions, beyond the ends those of the ends.
@@ -85,12 +86,13 @@ class Motion:
             return self
         kept = np.append(np.arange(0, len(self.t) - 1, every), len(self.t) - 1)
         parts = np.split(self.energy, kept[1:])
+        columns = np.arange(self.energy.shape[1])
         return replace(
             self,
             t=self.t[kept],
             points=self.points[kept],
             velocities=self.velocities[kept],
-            energy=np.array([part[np.argmax(np.abs(part))] for part in parts]),
+            energy=np.array([part[np.argmax(np.abs(part), axis=0), columns] for part in parts]),
             residual=np.maximum.reduceat(self.residual, kept),
         )
 
@@ -128,21 +130,34 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
     t, q, v = _with_micro_nodes(trajectory, nodes, q, v)
     if system is None and len(t) > len(nodes):  # differences between macro nodes miss the fast motion
         v[:, q_s.shape[1] :] = CubicSpline(t, q[:, q_s.shape[1] :])(t, 1)
-    energy = np.asarray(trajectory.energy, dtype=float)[:count]
-    keeps_energy = None if system is None else system.keeps_energy
-    relative = bool(abs(energy[0]) > 1e-12) and keeps_energy is not False
+    energies, relative = _energies(trajectory, count, system)
     residual = np.asarray(trajectory.constraint_residual, dtype=float)[:count].reshape(count, -1)
     return Motion(
         drawing,
         t,
         offset + np.einsum("iaq,kq->kia", matrix, q),
         np.einsum("iaq,kq->kia", matrix, v),
-        np.interp(t, nodes, (energy - energy[0]) / (abs(energy[0]) if relative else 1.0)),
+        np.stack([np.interp(t, nodes, column) for column in energies.values()], axis=1),
+        tuple(energies),
         relative,
         np.stack([np.interp(t, nodes, column) for column in residual.T], axis=1),
         _ending(trajectory, count),
-        keeps_energy,
     )
+
+
+def _energies(trajectory: Trajectory, count: int, system: System | None) -> tuple[dict[str, np.ndarray], bool]:
+    """Curves of the energy by name, as in `Motion`, and whether that of the energy is relative to the start."""
+    energy = np.asarray(trajectory.energy, dtype=float)[:count]
+    change = energy - energy[0]
+    if system is not None and not system.keeps_energy:
+        known = trajectory if trajectory.origin.system is not None else trajectory.of(system)
+        work = known[:count].work()
+        parts = {"work of forces": work.forces, "work of moving constraints": work.constraints}
+        done = {name: values for name, values in parts.items() if np.any(values != 0)}
+        return {"energy": change, **done, "balance": work.balance}, False
+    relative = bool(abs(energy[0]) > 1e-12)
+    name = "energy change" if system is None else "energy error"
+    return {name: change / (abs(energy[0]) if relative else 1.0)}, relative
 
 
 def _differences(t, values) -> np.ndarray:

@@ -138,7 +138,8 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
     """Say how far a run came, and where that is; returns the exit code."""
     kept = f"\n\nThe trajectory up to there is in {' and '.join(saved)}." if saved else ""
     if isinstance(stopped, SimulationError):
-        reason = f"Macro step {stopped.step} at t = {stopped.time:.6g}: {stopped.result.message}{kept}"
+        labels = f"\n\n{stopped.labels}" if stopped.labels else ""
+        reason = f"Macro step {stopped.step} at t = {stopped.time:.6g}: {stopped.result.message}{labels}{kept}"
         print_failure("The run failed", reason)
         return 1
     print_failure("Interrupted", f"After {stopped.step} of {stopped.num_steps} macro steps.{kept}")

@@ -382,13 +382,16 @@ def _check_once(known: _Known) -> None:
 
 def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> SimulationError:
     """The error that says how a failed run failed."""
+    from vmri_jax.stability.labels import swapped_at_start  # only where a run failed: it stands on this room
+
     step = int(trajectory.failed_at)
     interval = step // save_every
-    return SimulationError(
+    error = SimulationError(
         Result(int(trajectory.result)),
         step,
         float(trajectory.t[0] + step * macro_dt),
         int(trajectory.info.iterations[interval]),
         float(trajectory.info.residual[interval]),
         trajectory,
-    ).advised(float(macro_dt))
+    )
+    return error.advised(float(macro_dt), swapped_at_start(trajectory))

@@ -6,9 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.stability.labels import swapped
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
@@ -27,8 +30,6 @@ NEAR = 0.05
 """Windows at most this part of the step away are near: frequencies move along a trajectory,"""
 WIDTHS = 3.0
 """but no further than so many times their width, which grows with the coupling as their distance does."""
-FASTER = 2.0
-"""Slow variables that vibrate so many times faster than the fast ones are wrongly labelled."""
 BEYOND = 0.01
 """Causes are looked for in steps longer by so much: V and W together reach a limit before each alone."""
 SCANS = 5
@@ -154,6 +155,7 @@ def advise(
         ValueError: a macro step that is not positive; second derivatives that are not finite at the state.
         TypeError: not a scheme.
     """
+    names = names_of(system)
     system, state = start_of("advise", system, state)
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(f"advise: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10).")
@@ -174,7 +176,7 @@ def advise(
         upper, lower = lower, lower / 3
         windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
 
-    findings = [*of_step, *_labels(motions), *_stages(scheme), *_motion(motions)]
+    findings = [*of_step, *_labels(motions, names), *_stages(scheme), *_motion(motions)]
     return Advice(
         macro_dt=macro_dt,
         growth=growth,
@@ -283,25 +285,11 @@ def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, 
     return turn if np.isfinite(turn) else exact
 
 
-def _labels(motions: SmallMotions) -> Iterator[Finding]:
+def _labels(motions: SmallMotions, names: Names | None) -> Iterator[Finding]:
     """Whether slow variables carry faster vibrations than fast ones."""
-    frequencies, modes = motions.modes
-    n_s, n_f, d = motions.rest.q_s.size, motions.rest.q_f.size, len(frequencies)
-    shares = (motions.shapes @ modes) * (motions.embed[n_s + n_f :, d:] @ modes)  # of each coordinate in each mode
-    slow = shares[:n_s].sum(axis=0) > 0.5
-    fastest, others = frequencies[slow].max(initial=0.0), frequencies[~slow].max(initial=0.0)
-    if not n_f or fastest <= FASTER * others or fastest == 0:
-        return
-    carried = shares[:n_s, frequencies > fastest / FASTER].sum(axis=1)
-    names = ", ".join(f"q_s[{i}]" for i in np.flatnonzero(carried > 0.1))
-    yield Finding(
-        "warning",
-        "labels",
-        f"The fastest vibration, of frequency {fastest:.4g}, is one of the slow variables {names}; those of the fast "
-        f"variables reach {others:.4g}. Swap the labels: make these variables fast and put their energy into "
-        "fast_potential, and the soft ones slow.",
-        float(fastest / others) if others else np.inf,
-    )
+    found = swapped(motions, names)
+    if found is not None:
+        yield Finding("warning", "labels", *found)
 
 
 def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:

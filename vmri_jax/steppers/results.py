@@ -94,23 +94,28 @@ class SimulationError(RuntimeError):
         time: time at the start of that step.
         iterations, residual: the most Newton iterations and the largest residual of a step from the saved node before to it.
         trajectory: the `Trajectory` up to the failure (NaN after it).
+        labels: what is wrong with what is slow and what is fast; empty where nothing is.
     """
 
     def __init__(self, result: Result, step: int, time: float, iterations: int, residual: float, trajectory):
         self.result, self.step, self.time = result, step, time
-        self.iterations, self.residual, self.trajectory = iterations, residual, trajectory
+        self.iterations, self.residual, self.trajectory, self.labels = iterations, residual, trajectory, ""
         super().__init__(
             f"macro step {step} at t = {time:.6g} failed ({result.name}) after {iterations} Newton iterations with residual "
             f"{residual:.2e}: {result.message} The trajectory up to there is in this exception's .trajectory; "
             "throw=False returns it instead of raising."
         )
 
-    def advised(self, macro_dt: float) -> "SimulationError":
-        """The same with a note on what to ask next.
+    def advised(self, macro_dt: float, labels: str = "") -> "SimulationError":
+        """The same with notes on a cause and on what to ask next.
 
         Args:
             macro_dt: of the run.
+            labels: what is wrong with what is slow and what is fast.
         """
+        self.labels = labels
+        if labels:
+            self.add_note(labels)
         self.add_note(
             f"vmri_jax.stability.advise(problem, scheme, macro_dt={macro_dt:g}), or vmri advise on the command line, says whether this "
             "step is stable, which one near it is, and whether slow and fast variables are swapped."

@@ -9,7 +9,9 @@ const TRAIL = 1.6; // seconds of watching
 const INSET = 9; // half the thumb of the slider: time 0 of the strips is below it
 
 const state = { time: motion.first, playing: false, speed: data.speed, trails: data.trails, stale: true, before: 0 };
-const strips = [new Strip(find("energy"), find("energy-text"), data.energy_title, motion, [["", decoded(data.energy, Float32Array), "slow"]], false)];
+const colored = ["slow", "third", "rod", "fast"];
+const energies = data.energy.map((text, k) => [data.energy_names[k], decoded(text, Float32Array), k && k === data.energy.length - 1 ? "fast" : colored[k]]);
+const strips = [new Strip(find("energy"), find("energy-text"), data.energy_title, motion, energies, false)];
 if (data.residual) {
   const [position, velocity] = data.residual.map((text) => decoded(text, Float32Array));
   strips.push(new Strip(find("residual"), find("residual-text"), "constraint residual", motion, [["position", position, "slow"], ["velocity", velocity, "third"]], true));
