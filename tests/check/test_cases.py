@@ -8,6 +8,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.check.broken_systems import no_potential, swapped_labels, wrong_gradient
+from tests.scene.gallery_scenes import SCENES, gallery_scene
 from tests.user_systems import two_oscillators
 from vmri_jax import ConstantMass, Problem, Rheonomic, System
 from vmri_jax.check import cases, cases_for, run_cases
@@ -103,6 +104,13 @@ def test_every_criterion_that_applies_is_met(make):
     if make is crane:
         [third] = [row for row in report.rows if row.case.number == 3]
         assert third.outcome.values["constraint"] < 3e-12  # measured 8e-13 at H = 0.43
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_of_the_gallery_is_healthy(name):
+    report = run_cases(cases_for(gallery_scene(name)))
+    assert report.passed, report.markdown()
 
 
 def test_steps_come_from_the_frequencies():

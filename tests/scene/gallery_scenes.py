@@ -7,6 +7,7 @@ from vmri_jax.cli.catalogue import find_scene
 from vmri_jax.scene import Scene
 
 FOLDER = Path(__file__).parents[2] / "notebooks" / "scenes"
+SCENES = sorted(path.stem for path in FOLDER.glob("*.py") if path.stem != "gallery")
 
 
 @cache

@@ -51,7 +51,7 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
                 axes.set(ylabel="micro steps per macro step")
         for axes in panels[-columns:]:
             axes.set(xlabel=r"$\omega H / \pi$")
-        figure.colorbar(colors, ax=panels.tolist(), label="growth per macro step; white: stable", aspect=30, pad=0.01)
+        figure.colorbar(colors, ax=panels.tolist(), label="growth per macro step\n(blank: stable)", aspect=30, pad=0.01)
     return figure
 
 
