@@ -29,7 +29,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])
     params: dict[str, Any] = {part.effect.name: part.effect.parameters(bodies) for part in placed}
-    slow, fast = (join(bodies, places, part, "mass") for part in ("s", "f"))
+    slow, fast = (join(bodies, places, part, "masses") for part in ("s", "f"))
     if "kinetic" in functions:
         params[MASS] = {"slow": slow, "fast": fast}
     kinetic = functions.pop("kinetic", None) or ConstantMass(slow, fast)

@@ -1,9 +1,11 @@
-"""Bodies: points of a scene, or blocks of general coordinates."""
+"""Bodies: points of a scene, blocks of general coordinates, and what effects see of a body."""
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
@@ -11,10 +13,149 @@ from vmri_jax.mechanics.arrays import is_concrete, real_array
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3
 """Coordinates of a point at most."""
+GROUND = "ground"
+"""What effects call the body that does not move."""
+GROUND_COORDINATES = np.concatenate([np.zeros(3), np.eye(3).ravel()])
+"""Its coordinates as those of a rigid body."""
+
+
+class Attachment(str):
+    """The name of a rigid body, and a point that is fixed in it; users write ``("hub", [0.5, 0, 0])``."""
+
+    at: Any
+    """(3,) from the centre of mass, in the axes of the body; of the ground (d,), in space."""
+
+    def __new__(cls, body: str, at: Any):
+        attached = super().__new__(cls, body)
+        attached.at = real_array(f"the point in {body}", at, 1)
+        return attached
+
+    @property
+    def label(self) -> str:
+        """``hub (0.5, 0, 0)``."""
+        numbers = ", ".join(f"{x:g}" for x in self.at) if is_concrete(self.at) else "a point"
+        return f"{self} ({numbers})"
+
+
+def is_entry(item: Any) -> bool:
+    """Whether it names a body, or a body and a point in it."""
+    if isinstance(item, str):
+        return True
+    pair = isinstance(item, tuple | list) and len(item) == 2 and isinstance(item[0], str)
+    return pair and not is_entry(item[1]) and not any(isinstance(x, str) for x in np.ravel(np.asarray(item[1], object)))
+
+
+def entry(item: Any) -> str:
+    """The name of a body, or an `Attachment`."""
+    return item if isinstance(item, str) else Attachment(*item)
+
+
+def label_of(name: str) -> str:
+    """How messages and drawings call a body or a point in one."""
+    return name.label if isinstance(name, Attachment) else name
+
+
+def moving(names: Iterable[str]) -> tuple[str, ...]:
+    """Those of bodies that move, each once: all but the ground."""
+    return tuple(dict.fromkeys(str(name) for name in names if name != GROUND))
+
+
+class Point(NamedTuple):
+    """What an effect between points sees of a body.
+
+    mass: None of a point that is only a part of a body.
+    """
+
+    name: str
+    position: Any
+    velocity: Any
+    mass: Any = None
+    block: bool = False
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return self.position.shape[0]
+
+
+class AnyBody(ABC):
+    """What every body of a scene says.
+
+    Attributes:
+        name, pace: see `Body`.
+        coordinates, rates, masses: (n,) at the start, and the masses of ``sum_i m_i v_i^2 / 2``.
+        block: its coordinates are general ones, not those of points.
+        rigid: they are those of a rigid body.
+    """
+
+    name: str
+    pace: Pace
+    radius: float | None
+    block: bool
+    rigid: bool = False
+
+    @property
+    @abstractmethod
+    def coordinates(self): ...
+
+    @property
+    @abstractmethod
+    def rates(self): ...
+
+    @property
+    @abstractmethod
+    def masses(self): ...
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return self.coordinates.shape[0]
+
+    @property
+    def motions(self) -> np.ndarray:
+        """(n, f) basis of the velocities that its own constraints allow at the start."""
+        return np.eye(self.size)
+
+    def weights(self, at: Any) -> Any:
+        """(3,) of the directors in a point ``phi + sum_i X_i d_i`` that is fixed in the body.
+
+        Args:
+            at: as of `point`.
+        """
+        return joined([at, np.zeros(3 - at.shape[0])])
+
+    @abstractmethod
+    def point(self, at: Any = None) -> Point:
+        """The point itself, or a point fixed in the body.
+
+        Args:
+            at: (3,) from the centre of mass, in the axes of the body; None for the centre itself.
+        """
+
+    def _check_names(self) -> None:
+        kind = type(self).__name__
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"{kind}: name is {self.name!r}; it must be a string that is not empty.")
+        if self.name == GROUND:
+            raise ValueError(
+                f"{kind}: name is {GROUND!r}, which effects call the body that does not move; take another."
+            )
+        if self.pace not in ("slow", "fast", "auto"):
+            raise ValueError(f"{kind} {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
+
+    def _numbers(self, name: str, given):
+        """Numbers as an array of float64, of NumPy where they are not traced: so the mode of JAX does not matter."""
+        what = f"{type(self).__name__} {self.name}: {name}"
+        value = real_array(what, given)
+        if not is_concrete(value):
+            return value
+        if not np.isfinite(value).all():
+            raise ValueError(f"{what} is {np.asarray(value)}, which is not finite.")
+        return np.asarray(value)
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class Body(AnyBody):
     """A point mass in one, two or three dimensions, or a block of n general coordinates with n masses.
 
     Its kinetic energy is ``sum_i m_i v_i^2 / 2``.
@@ -45,10 +186,7 @@ class Body:
     block: bool = False
 
     def __post_init__(self):
-        if not isinstance(self.name, str) or not self.name:
-            raise ValueError(f"Body: name is {self.name!r}; it must be a string that is not empty.")
-        if self.pace not in ("slow", "fast", "auto"):
-            raise ValueError(f"Body {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
+        self._check_names()
         position = self._vector("position", self.position)
         velocity = np.zeros(position.shape) if self.velocity is None else self._vector("velocity", self.velocity)
         mass = self._numbers("mass", self.mass)
@@ -68,15 +206,6 @@ class Body:
         for name, value in (("position", position), ("velocity", velocity), ("mass", mass), ("block", block)):
             object.__setattr__(self, name, value)
 
-    def _numbers(self, name: str, given):
-        """Numbers as an array of float64, of NumPy where they are not traced: so the mode of JAX does not matter."""
-        value = real_array(f"Body {self.name}: {name}", given)
-        if not is_concrete(value):
-            return value
-        if not np.isfinite(value).all():
-            raise ValueError(f"Body {self.name}: {name} is {np.asarray(value)}, which is not finite.")
-        return np.asarray(value)
-
     def _vector(self, name: str, given):
         value = self._numbers(name, given)
         value = value[None] if value.ndim == 0 else value
@@ -85,10 +214,73 @@ class Body:
         return value
 
     @property
-    def size(self) -> int:
-        """Number of coordinates."""
-        return self.position.shape[0]
+    def coordinates(self):
+        """(n,) position."""
+        return self.position
+
+    @property
+    def rates(self):
+        """(n,) velocity."""
+        return self.velocity
+
+    @property
+    def masses(self):
+        """(n,) masses."""
+        return self.mass + np.zeros(self.size)
+
+    def point(self, at: Any = None) -> Point:
+        """The point itself.
+
+        Raises:
+            ValueError: a point in it.
+        """
+        if at is not None:
+            raise ValueError(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
+        return Point(self.name, self.position, self.velocity, self.mass, self.block)
 
 
-Bodies = Mapping[str, Body]
+class Ground(AnyBody):
+    """The body that does not move: its axes are those of space."""
+
+    name, pace, radius, block, rigid = GROUND, "slow", None, False, True
+    coordinates = GROUND_COORDINATES
+    rates, masses = np.zeros(12), np.full(12, np.inf)
+
+    def point(self, at: Any = None) -> Point:
+        """A point that stays where it is."""
+        if at is None:
+            raise ValueError('the ground has no centre; give a point of it, ("ground", [x, y, z]).')
+        return Point(GROUND, at, np.zeros(len(at)))
+
+
+Bodies = Mapping[str, AnyBody]
 """The bodies of a scene by name."""
+
+
+def body_of(bodies: Bodies, name: str) -> AnyBody:
+    """A body by name, also the ground.
+
+    Args:
+        bodies: of the scene.
+        name: of one of them.
+    """
+    return Ground() if name == GROUND else bodies[name]
+
+
+def end_of(bodies: Bodies, name: str, whole: bool = False) -> Point:
+    """What an effect sees of a body: the point that it is, the centre of a rigid one, or a point in that.
+
+    Args:
+        bodies: of the scene.
+        name: of one of them, perhaps an `Attachment`.
+        whole: all coordinates of a rigid body instead of its centre.
+    """
+    body, at = body_of(bodies, name), getattr(name, "at", None)
+    if whole and body.rigid and at is None:
+        return Point(name, body.coordinates, body.rates)
+    return body.point(at)
+
+
+def joined(vectors):
+    """One vector of several, of NumPy where they are not traced."""
+    return np.concatenate(vectors) if is_concrete(vectors) else jnp.concatenate(vectors)

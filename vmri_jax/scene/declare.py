@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
-from vmri_jax.scene.body import Bodies, Body
+from vmri_jax.scene.body import Bodies, Point, entry, is_entry
 
 Elements = tuple[tuple[str, ...], ...]
 Sign = Literal["", "positive", "at least zero"]
@@ -50,19 +50,22 @@ class Names:
         """
         if given is None and self.may_be_all:
             given = tuple(bodies)
-        items = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Iterable) else ()
-        flat = bool(items) and all(isinstance(item, str) for item in items)
+        items = (given,) if is_entry(given) else tuple(given) if isinstance(given, Iterable) else ()
+        flat = bool(items) and all(is_entry(item) for item in items)
         if self.pairs and flat:
             if len(items) < 2:
                 raise ValueError(f"{what} is {given!r}; give at least two bodies, or a list of pairs.")
-            return tuple(combinations(items, 2))
+            return tuple(combinations(map(entry, items), 2))
         if self.count > 1 and flat:
             items = (items,)
-        elements = tuple((item,) if isinstance(item, str) else tuple(item) for item in items)
-        if not elements or any(len(element) != self.count for element in elements):
+        elements = tuple((item,) if is_entry(item) else tuple(item) for item in items)
+        wrong = any(len(element) != self.count or not all(map(is_entry, element)) for element in elements)
+        if not elements or wrong:
             one = "the name of a body" if self.count == 1 else f"{self.count} names of bodies"
-            raise ValueError(f"{what} is {given!r}; give {one}, or a list of such.")
-        return elements
+            raise ValueError(
+                f"{what} is {given!r}; give {one}, or a list of such. A point in a rigid body is (name, [x, y, z])."
+            )
+        return tuple(tuple(map(entry, element)) for element in elements)
 
 
 @dataclass(frozen=True)
@@ -82,13 +85,13 @@ class Parameter:
     measured: bool = False
     may_be_number: bool = False
 
-    def array(self, what: str, given: Any, bodies: Sequence[Body]) -> jax.Array:
+    def array(self, what: str, given: Any, bodies: Sequence[Point]) -> jax.Array:
         """The numbers as the function gets them.
 
         Args:
             what: the names of effect and field, for messages.
             given: the numbers as the user gave them.
-            bodies: the first body of every element.
+            bodies: what the effect sees of the first body of every element.
 
         Raises:
             TypeError: what is no real number.

@@ -2,7 +2,7 @@
 
 from abc import ABC
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import field, fields
+from dataclasses import field, fields, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
 
@@ -12,14 +12,16 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.names import Place, unknown
-from vmri_jax.scene.body import Bodies
+from vmri_jax.scene.body import GROUND, Attachment, Bodies, body_of, end_of, label_of, moving
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
 from vmri_jax.scene.layout import Rows
-from vmri_jax.scene.terms import EffectTerm, choose
+from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, Role, choose
 
 Kind = Literal["kinetic", "potential", "constraint", "force"]
 DRAWN = {"link": "links", "spring": "springs"}
 """What joins two bodies in a drawing, and its entry there."""
+POINTS = ("at_0", "at_1", "at_2", "at_3")
+"""Parameters with the points fixed in rigid bodies, role by role."""
 START = 1e-9
 """How far, relative to its size, what a constraint keeps may be from its value at the start."""
 
@@ -38,7 +40,8 @@ class Effect(ABC):
     | "kinetic" | ``function(q, v, params)`` | energy added to ``sum m v^2 / 2``, () |
     | "force" | ``function(t, q, v, params)`` | tuple of forces, shaped like q |
 
-    q and v are tuples with one entry per role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). params
+    q and v are tuples with one entry per role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). Of a rigid
+    body these are its centre's, or those of the point that is given with its name. The ground is a body, too. params
     are the fields that a class declares as numbers, vectors or arrays (see `vmri_jax.scene.declare`), by name.
 
     `bodies` of its methods are those of the scene, by name.
@@ -66,6 +69,8 @@ class Effect(ABC):
     """The masses of the bodies are parameters of these names, role by role."""
     derived: ClassVar[tuple[str, ...]] = ()
     """Parameters besides the declared ones that have a number for each element."""
+    whole: ClassVar[bool] = False
+    """Its function gets all coordinates of a rigid body, not those of its centre."""
     drawn_as: ClassVar[Literal["link", "spring"] | None] = None
     """What is drawn between neighbouring bodies of an element."""
 
@@ -89,7 +94,7 @@ class Effect(ABC):
     def split(self) -> tuple[str, ...]:
         """Names of parameters that have an entry for each element, or one for all."""
         declared = [name for name, parameter in self.declared.items() if parameter.shape in ("number", "vector")]
-        return (*declared, *self.masses, *self.derived)
+        return (*declared, *self.masses, *self.derived, *POINTS)
 
     @property
     def refers_to(self) -> tuple[str, ...]:
@@ -105,16 +110,29 @@ class Effect(ABC):
     def parameters(self, bodies: Bodies) -> dict[str, Any]:
         """What the function gets as params: arrays by name."""
         params, elements = {}, self.elements(bodies)
-        firsts = [bodies[element[0]] for element in elements]
+        firsts = [end_of(bodies, element[0], self.whole) for element in elements]
         for name, parameter in self.declared.items():
             if getattr(self, name) is not None:
                 params[name] = parameter.array(f"{self.name}: {name}", getattr(self, name), firsts)
         for role, name in enumerate(self.masses):
             params[name] = squeeze(jnp.stack([self._mass(element[role], bodies) for element in elements]))
+        params |= self.points(bodies)
         for name, parameter in self.declared.items():
             if parameter.measured and name not in params:
                 params[name] = self.at_start(bodies, params)
         return params
+
+    def points(self, bodies: Bodies) -> dict[str, Any]:
+        """Points fixed in rigid bodies, role by role, as weights of their directors; of bodies without one, zeros."""
+        found = {}
+        for at, role in zip(POINTS, zip(*self.elements(bodies), strict=True), strict=False):
+            if any(isinstance(name, Attachment) for name in role):
+                weights = [
+                    body_of(bodies, name).weights(name.at) if isinstance(name, Attachment) else np.zeros(3)
+                    for name in role
+                ]
+                found[at] = squeeze(jnp.stack(weights))
+        return found
 
     def at_start(self, bodies: Bodies, params: dict[str, Any]):
         """The measured value of every element at the start, (n,), or () of a single one."""
@@ -122,10 +140,21 @@ class Effect(ABC):
         return squeeze(jnp.stack([self.rest(*self.one(i, bodies, params)) for i in range(count)]))
 
     def one(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[tuple, dict[str, Any]]:
-        """Positions of the bodies of element i at the start, and its parameters among those of all."""
-        elements = self.elements(bodies)
-        q = tuple(bodies[name].position for name in elements[i])
-        return q, params if len(elements) == 1 else choose(params, (i,), self.split)
+        """What the function sees of the bodies of element i at the start, and its parameters among those of all."""
+        q = tuple(end_of(bodies, name, self.whole).position for name in self.elements(bodies)[i])
+        return q, self._own(i, bodies, params)
+
+    def alone(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[EffectTerm, dict[str, Any]]:
+        """Element i as a term on the coordinates of its bodies that move, one after the other as q_s, and its params."""
+        places, end = {}, 0
+        for name in moving(self.elements(bodies)[i]):
+            places[name] = Place("s", end, bodies[name].size)
+            end += bodies[name].size
+        return replace(self._term((i,), bodies, places), select=None), {self.name: self._own(i, bodies, params)}
+
+    def _own(self, i: int, bodies: Bodies, params: dict[str, Any]) -> dict[str, Any]:
+        """Parameters of element i among those of all."""
+        return params if len(self.elements(bodies)) == 1 else choose(params, (i,), self.split)
 
     def check(self, bodies: Bodies) -> None:
         """Refuse what is wrong with this effect between these bodies.
@@ -143,14 +172,20 @@ class Effect(ABC):
         """Refuse bodies that are not there, or that do not fit."""
         elements = self.elements(bodies)
         for element in elements:
+            if not moving(element):
+                raise ValueError(f"{self.name}: {element} is about the ground alone, which does not move; name a body.")
             for name in element:
-                if name not in bodies:
-                    raise ValueError(f"{self.name}: {unknown('body', name, bodies)}")
+                if name not in bodies and name != GROUND:
+                    raise ValueError(f"{self.name}: {unknown('body', str(name), bodies)}")
                 if element.count(name) > 1:
                     raise ValueError(
                         f"{self.name}: {name} occurs twice in {element}; an element is between different bodies."
                     )
-                block, size = bodies[name].block, bodies[name].size
+                try:
+                    end = end_of(bodies, name, self.whole)
+                except ValueError as error:
+                    raise ValueError(f"{self.name}: {error}") from None
+                block, size = end.block, end.size
                 if self.dimensions and (block or size not in self.dimensions):
                     has, allowed = "general " if block else "", " or ".join(map(str, self.dimensions))
                     raise ValueError(
@@ -179,15 +214,20 @@ class Effect(ABC):
                 self._check_start(name, bodies, params)
 
     def by_size(self, select: Sequence[int], bodies: Bodies) -> list[list[int]]:
-        """Some of the elements, those between bodies of the same sizes together: each of these is a term.
+        """Some of the elements, those between bodies of the same sizes and kinds together: each of these is a term.
 
         Args:
             select: indices of elements.
         """
         elements, found = self.elements(bodies), {}
         for i in select:
-            found.setdefault(tuple(bodies[name].size for name in elements[i]), []).append(i)
+            found.setdefault(tuple(self._kind(name, bodies) for name in elements[i]), []).append(i)
         return list(found.values())
+
+    def _kind(self, name: str, bodies: Bodies) -> tuple:
+        """What bodies of one role of a term have in common."""
+        body, end = body_of(bodies, name), end_of(bodies, name, self.whole)
+        return name == GROUND, isinstance(name, Attachment), body.size, end.size
 
     def terms(self, select: Sequence[int], bodies: Bodies, places: Mapping[str, Place], potentials: Mapping[str, Any]):
         """The terms of some of the elements; those of bodies of other sizes in another term.
@@ -197,13 +237,24 @@ class Effect(ABC):
             places: of all bodies in q_s and q_f.
             potentials: terms of all potentials of the scene by name of the effect.
         """
-        elements, terms = self.elements(bodies), []
-        for some in self.by_size(select, bodies):
-            roles = zip(*(elements[i] for i in some), strict=True)
-            rows = tuple(Rows.of([places[name] for name in role]) for role in roles)
-            chosen = None if len(some) == len(elements) else tuple(some)
-            terms.append(EffectTerm(self.name, self.function, rows, chosen, self.split, self.timed))
-        return tuple(terms)
+        return tuple(self._term(some, bodies, places) for some in self.by_size(select, bodies))
+
+    def _term(self, some: Sequence[int], bodies: Bodies, places: Mapping[str, Place]) -> EffectTerm:
+        """The term of elements of one kind."""
+        elements = self.elements(bodies)
+        roles = zip(POINTS, zip(*(elements[i] for i in some), strict=True), strict=False)
+        made = tuple(self._role(at, role, bodies, places) for at, role in roles)
+        chosen = None if len(some) == len(elements) else tuple(some)
+        return EffectTerm(self.name, self.function, made, chosen, self.split, self.timed)
+
+    def _role(self, at: str, names: Sequence[str], bodies: Bodies, places: Mapping[str, Place]) -> Role:
+        """Where the function gets the coordinates of bodies of one kind from."""
+        first, size = names[0], end_of(bodies, names[0], self.whole).size
+        attached = isinstance(first, Attachment)
+        if first == GROUND:
+            return OnGround(len(names), size, at if attached else None)
+        own = [places[name] for name in names]
+        return InRigidBodies(Rows.of(own), at) if attached else OnBodies(Rows.of(own, size))
 
     def curvature(self, bodies: Bodies):
         """Largest second derivative of the energy of each element, () or (n,), where its start does not show it, else None."""
@@ -213,7 +264,11 @@ class Effect(ABC):
         """What there is to see of it: entries of `Scene.drawing`, and "radii" of bodies, pairs of name and number."""
         if self.drawn_as is None:
             return {}
-        return {DRAWN[self.drawn_as]: [list(pair) for element in self.elements(bodies) for pair in pairwise(element)]}
+        pairs = [pair for element in self.elements(bodies) for pair in pairwise(element)]
+        between = [[label_of(a), label_of(b)] for a, b in pairs if GROUND not in (a, b)]
+        held = [(a, b) if b == GROUND else (b, a) for a, b in pairs if GROUND in (a, b)]
+        anchors = [{"body": label_of(a), "point": list(map(float, b.at)), "kind": self.drawn_as} for a, b in held]
+        return {DRAWN[self.drawn_as]: between, "anchors": anchors}
 
     def require(self, condition: Any, what: str, value: Any, expected: str) -> None:
         """Raise ValueError unless a condition on concrete numbers holds everywhere.
@@ -228,20 +283,25 @@ class Effect(ABC):
     def require_apart(self, bodies: Bodies) -> None:
         """Refuse elements whose neighbouring bodies are at one point at the start."""
         for a, b in (pair for element in self.elements(bodies) for pair in pairwise(element)):
-            apart = jnp.sqrt(jnp.sum((bodies[b].position - bodies[a].position) ** 2))
+            apart = jnp.sqrt(jnp.sum((end_of(bodies, b).position - end_of(bodies, a).position) ** 2))
             expected = "they must not start at the same point; move one of them"
             self.require(apart > 0, f"the distance of {a} and {b}", apart, expected)
 
     def _mass(self, name: str, bodies: Bodies):
         """The one mass of a body."""
-        if bodies[name].mass.ndim:
+        mass = end_of(bodies, name).mass
+        if mass is None:
+            raise ValueError(
+                f"{self.name}: {label_of(name)} has no mass of its own; it acts on the masses of whole bodies. Give the name alone."
+            )
+        if mass.ndim:
             raise ValueError(
                 f"{self.name}: {name} has a mass for each coordinate; it needs bodies with one mass. Give bodies=."
             )
-        return bodies[name].mass
+        return mass
 
     def _check_sizes(self, names: Sequence[str], bodies: Bodies) -> None:
-        sizes = {name: bodies[name].size for name in names}
+        sizes = {name: end_of(bodies, name, self.whole).size for name in names}
         if len(set(sizes.values())) > 1:
             described = ", ".join(f"{name} {size}" for name, size in sizes.items())
             raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must be of the same.")
@@ -255,7 +315,7 @@ class Effect(ABC):
         for element, given, found in zip(self.elements(bodies), *values, strict=True):
             right = abs(given - found) <= START * given
             expected = f"it starts as {found:.12g}; give that, or move a body"
-            self.require(right, f"{name} of {'-'.join(element)}", f"{given:g}", expected)
+            self.require(right, f"{name} of {'-'.join(map(label_of, element))}", f"{given:g}", expected)
 
 
 def lasting(value):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.names import Names
+from vmri_jax.scene.body import label_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.sorting import Placed, Sorting
 
@@ -17,7 +18,7 @@ def label(effect: Effect, element: Sequence[str]) -> str:
         effect: what has several elements.
         element: names of the bodies.
     """
-    return f"{effect.name} {'-'.join(element)}"
+    return f"{effect.name} {'-'.join(map(label_of, element))}"
 
 
 def names_of(sorting: Sorting) -> Names:

@@ -38,10 +38,9 @@ def join(bodies: Bodies, places: Mapping[str, Place], part: Part, what: str):
     Args:
         bodies, places: by name.
         part: "s" for slow ones, "f" for fast ones.
-        what: "position", "velocity" or "mass".
+        what: "coordinates", "rates" or "masses".
     """
-    members = [body for name, body in bodies.items() if places[name].part == part]
-    pieces = [jnp.broadcast_to(getattr(body, what), (body.size,)) for body in members]
+    pieces = [jnp.asarray(getattr(body, what)) for name, body in bodies.items() if places[name].part == part]
     return jnp.concatenate(pieces) if pieces else jnp.zeros(0)
 
 
@@ -56,37 +55,46 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True)
 class Rows:
-    """Coordinates of some bodies of one size, as static slices; compared by value, as `jax.jit` needs it."""
+    """Coordinates of some bodies of one size, as static slices; compared by value, as `jax.jit` needs it.
+
+    Of every body with `stride` coordinates the first `size` are taken.
+    """
 
     size: int
+    stride: int
     runs: tuple[Run, ...]
     single: bool
 
     @classmethod
-    def of(cls, places: Sequence[Place]) -> "Rows":
+    def of(cls, places: Sequence[Place], size: int | None = None) -> "Rows":
         """The rows at these places.
 
         Args:
             places: a single one gives a vector (size,), more give (n, size).
+            size: so many coordinates of each; None for all.
         """
-        size, runs = places[0].size, []
+        stride, runs = places[0].size, []
         for part, start, _ in places:
             last = runs[-1] if runs else Run(part, start, 0, False)
-            follows = not last.same and start == last.start + size * last.count
+            follows = not last.same and start == last.start + stride * last.count
             again = last.start == start and (last.same or last.count == 1)
             if last.part == part and last.count and (follows or again):
                 runs[-1] = last._replace(count=last.count + 1, same=again)
             else:
                 runs.append(Run(part, start, 1, False))
-        return cls(size, tuple(runs), len(places) == 1)
+        return cls(size or stride, stride, tuple(runs), len(places) == 1)
 
     def take(self, q_s, q_f):
         """The rows of these vectors, positions or velocities."""
         pieces = []
         for part, start, count, same in self.runs:
             q = q_s if part == "s" else q_f
-            piece = q[start : start + self.size * (1 if same else count)]
-            pieces.append(jnp.tile(piece, count) if same else piece)
+            if same or count == 1:
+                piece = q[start : start + self.size]
+                pieces.append(jnp.tile(piece, count) if same else piece)
+            else:
+                piece = q[start : start + self.stride * count]
+                pieces.append(self._first(piece, count))
         flat = jnp.concatenate(pieces)
         return flat if self.single else flat.reshape(-1, self.size)
 
@@ -104,8 +112,16 @@ class Rows:
         sums = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}
         for part, start, count, same in self.runs:
             piece = rows[at : at + count]
-            piece = jnp.sum(piece, axis=0) if same else piece.reshape(-1)
+            piece = jnp.sum(piece, axis=0) if same else self._whole(piece).reshape(-1)
             after = sums[part].shape[0] - start - piece.shape[0]
             sums[part] += jnp.pad(piece, (start, after))
             at += count
         return tuple(sums.values())
+
+    def _first(self, piece, count: int):
+        """The first coordinates of bodies that follow one another, flat."""
+        return piece if self.size == self.stride else piece.reshape(count, self.stride)[:, : self.size].reshape(-1)
+
+    def _whole(self, rows):
+        """(n, stride) with zeros for the coordinates that are not taken."""
+        return rows if self.size == self.stride else jnp.pad(rows, ((0, 0), (0, self.stride - self.size)))

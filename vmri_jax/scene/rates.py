@@ -16,10 +16,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
+from scipy.linalg import block_diag
 
-from vmri_jax.scene.body import LARGEST_POINT, Bodies
+from vmri_jax.scene.body import LARGEST_POINT, Bodies, moving
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.terms import EffectTerm
 
 SEPARATION = 3.0
 """Smallest ratio of two neighbouring rates that separates slow from fast; without, one rate is enough for all."""
@@ -35,7 +36,10 @@ class Rates(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """An element at the start: its coordinates, its force on bodies at rest, K, G, and d2L/dv2, its part of the mass matrix."""
+    """An element at the start: its columns, its force on bodies at rest, K, G, and d2L/dv2, its part of the mass matrix.
+
+    All are those of the motions that the bodies can make: of a rigid one the velocity of its centre and its spin.
+    """
 
     columns: np.ndarray
     force: np.ndarray
@@ -54,9 +58,9 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     Raises:
         ValueError: energies that are not smooth at the start, or a kinetic energy that is not positive there.
     """
-    sizes = [body.size for body in bodies.values()]
+    sizes = [body.motions.shape[1] for body in bodies.values()]
     columns = dict(zip(bodies, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
-    mass = np.diag(np.concatenate([np.broadcast_to(body.mass, (body.size,)) for body in bodies.values()]))
+    mass = block_diag(*(body.motions.T @ (body.masses[:, None] * body.motions) for body in bodies.values()))
     found = {effect.name: _linearise(effect, bodies, columns) for effect in effects}
     for element in chain(*found.values()):
         mass[np.ix_(element.columns, element.columns)] += element.mass
@@ -109,11 +113,13 @@ def _scaled(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
     params, found = effect.parameters(bodies), []
-    for i, element in enumerate(effect.elements(bodies)):
-        q, chosen = effect.one(i, bodies, params)
-        v = tuple(bodies[name].velocity for name in element)
-        parts = _derivatives(effect.function, effect.kind == "kinetic", q, v, chosen)
-        found.append(Linearised(np.concatenate([columns[name] for name in element]), *map(np.asarray, parts)))
+    for i, element in enumerate(map(moving, effect.elements(bodies))):
+        term, own = effect.alone(i, bodies, params)
+        q, v = (jnp.concatenate([getattr(bodies[name], what) for name in element]) for what in ("coordinates", "rates"))
+        force, *matrices = map(np.asarray, _derivatives(term, effect.kind == "kinetic", q, v, own))
+        motions = block_diag(*(bodies[name].motions for name in element))
+        parts = motions.T @ force, *(motions.T @ matrix @ motions for matrix in matrices)
+        found.append(Linearised(np.concatenate([columns[name] for name in element]), *parts))
         if not all(np.isfinite(part).all() for part in found[-1]):
             raise ValueError(
                 f"{effect.name}: its energy between {', '.join(element)} has no finite derivatives at the start; move them, or smooth it."
@@ -121,13 +127,12 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
     return found
 
 
-@partial(jax.jit, static_argnames=("function", "kinetic"))
-def _derivatives(function, kinetic: bool, q, v, params):
-    """What `Linearised` holds after the columns."""
-    (q, unravel), (v, _) = ravel_pytree(q), ravel_pytree(v)
+@partial(jax.jit, static_argnames=("term", "kinetic"))
+def _derivatives(term: EffectTerm, kinetic: bool, q, v, params):
+    """What `Linearised` holds after the columns, before the motions of bodies are chosen."""
 
     def lagrangian(q, v):
-        return function(unravel(q), unravel(v), params) if kinetic else -function(unravel(q), params)
+        return term.kinetic(q, None, v, None, params) if kinetic else -term.value(q, None, params)
 
     def force(q, v):
         momentum = jax.grad(lagrangian, 1)
@@ -139,6 +144,6 @@ def _derivatives(function, kinetic: bool, q, v, params):
 
 
 def _positions(bodies) -> np.ndarray:
-    """Coordinates of all points in one array, blocks left out where there are points; padded with zeros."""
-    points = [np.asarray(body.position) for body in bodies.values() if not body.block] or [np.zeros(1)]
+    """All points and centres in one array, blocks left out where there are points; padded with zeros."""
+    points = [np.asarray(body.point().position) for body in bodies.values() if not body.block] or [np.zeros(1)]
     return np.stack([np.pad(point, (0, LARGEST_POINT - point.size)) for point in points])

@@ -6,12 +6,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraints import rank_of
+from vmri_jax.scene.body import moving
 from vmri_jax.scene.labels import label
 from vmri_jax.scene.sorting import Placed, Sorting
+from vmri_jax.scene.terms import EffectTerm
 
 HOMES = ("slow_constraint", "constraint")
 
@@ -26,7 +27,7 @@ def check_constraints(sorting: Sorting) -> None:
         ValueError: with the names of the constraints that are too many.
     """
     held = [part for part in sorting.placed if part.home in HOMES]
-    positions = [body.position for body in sorting.bodies.values()]
+    positions = [body.coordinates for body in sorting.bodies.values()]
     if not held or not is_concrete((positions, [part.effect.parameters(sorting.bodies) for part in held])):
         return
     n_s = sum(place.size for place in sorting.places.values() if place.part == "s")
@@ -47,20 +48,20 @@ def _rows(sorting: Sorting, part: Placed, n_s: int) -> list[tuple[str, np.ndarra
     columns = {name: p.start + np.arange(p.size) + (n_s if p.part == "f" else 0) for name, p in sorting.places.items()}
     elements, params = effect.elements(bodies), effect.parameters(bodies)
     for i in part.elements:
-        jacobian = np.asarray(_jacobian(effect.function, effect.timed, *effect.one(i, bodies, params)))
-        name = label(effect, elements[i])
+        term, own = effect.alone(i, bodies, params)
+        names = moving(elements[i])
+        jacobian = np.asarray(_jacobian(term, jnp.concatenate([bodies[name].coordinates for name in names]), own))
+        what = label(effect, elements[i])
         for j, entries in enumerate(jacobian):
             row = np.zeros(sum(body.size for body in bodies.values()))
-            row[np.concatenate([columns[name] for name in elements[i]])] = entries
-            rows.append((name if len(jacobian) == 1 else f"{name} [{j}]", row))
+            row[np.concatenate([columns[name] for name in names])] = entries
+            rows.append((what if len(jacobian) == 1 else f"{what} [{j}]", row))
     return rows
 
 
-@partial(jax.jit, static_argnames=("function", "timed"))
-def _jacobian(function, timed: bool, q, params):
-    flat, unravel = ravel_pytree(q)
-    t = (jnp.zeros(()),) if timed else ()
-    return jax.jacfwd(lambda flat: jnp.reshape(function(*t, unravel(flat), params), (-1,)))(flat)
+@partial(jax.jit, static_argnames="term")
+def _jacobian(term: EffectTerm, q, params):
+    return jax.jacfwd(lambda q: jnp.reshape(term.value(q, None, params, jnp.zeros(())), (-1,)))(q)
 
 
 def _refuse(rows: Sequence[tuple[str, np.ndarray]], first: int, advice: str) -> None:

@@ -14,16 +14,18 @@ from vmri_jax.mechanics.names import Names, Place, unknown
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
 from vmri_jax.scene.assembly import build
-from vmri_jax.scene.body import Body
+from vmri_jax.scene.body import AnyBody
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.labels import names_of
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints
+from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
+EXPECTED = {"bodies": "Body or RigidBody", "effects": "Effect"}
 DRAWN_LISTS = ("links", "springs", "anchors", "planes", "spheres")
 """Entries of a drawing to which effects add."""
 
@@ -43,7 +45,7 @@ class Scene:
     numbers; these are in the system's params by the name of the effect, ``params["springs"]["stiffness"]``.
 
     Args:
-        bodies: `Body` instances; slow ones become q_s and fast ones q_f, in this order.
+        bodies: of `Body` and `RigidBody`; slow ones become q_s and fast ones q_f, in this order.
         effects: of `vmri_jax.scene`, also custom ones: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
             summed and constraints joined in this order.
         project: move positions onto the constraints at the start, and take away what of the velocities points against them,
@@ -60,17 +62,17 @@ class Scene:
 
     def __post_init__(self):
         require_x64()
-        for name, kind in (("bodies", Body), ("effects", Effect)):
+        for name, kind in (("bodies", AnyBody), ("effects", Effect)):
             items = getattr(self, name)
             if isinstance(items, kind) or not isinstance(items, Iterable):
                 raise TypeError(f"Scene: {name} is {items!r}; give a list.")
             object.__setattr__(self, name, tuple(items))
             for item in getattr(self, name):
                 if not isinstance(item, kind):
-                    raise TypeError(f"Scene: {item!r} is among {name}; it must be {kind.__name__}.")
+                    raise TypeError(f"Scene: {item!r} is among {name}; it must be {EXPECTED[name]}.")
         if not self.bodies:
             raise ValueError("Scene: there are no bodies; give at least one.")
-        for name, count in Counter(item.name for item in (*self.bodies, *self.effects)).items():
+        for name, count in Counter(item.name for item in (*self.bodies, *self.everything)).items():
             if count > 1:
                 raise ValueError(
                     f"Scene: the name {name!r} occurs twice; give each body and effect its own, e.g. name=..."
@@ -80,7 +82,7 @@ class Scene:
                 f"Scene: an effect is called {MASS!r}, where the params keep the masses; give it another name."
             )
         potentials = [effect.name for effect in self.effects if effect.kind == "potential"]
-        for effect in self.effects:
+        for effect in self.everything:
             effect.check(self.by_name)
             for name in effect.refers_to:
                 if name not in potentials:
@@ -88,14 +90,20 @@ class Scene:
         check_constraints(self.sorting)
 
     @cached_property
-    def by_name(self) -> dict[str, Body]:
+    def by_name(self) -> dict[str, AnyBody]:
         """Bodies by name."""
         return {body.name: body for body in self.bodies}
 
     @cached_property
+    def everything(self) -> tuple[Effect, ...]:
+        """The effects, after what keeps rigid bodies rigid."""
+        rigid = [body.name for body in self.bodies if body.rigid]
+        return (Rigidity(rigid), *self.effects) if rigid else self.effects
+
+    @cached_property
     def sorting(self) -> Sorting:
         """Who is slow and who is fast, where every effect lives, and why."""
-        return sort(self.by_name, self.effects)
+        return sort(self.by_name, self.everything)
 
     @property
     def places(self) -> dict[str, Place]:
@@ -110,7 +118,7 @@ class Scene:
     @property
     def params(self) -> dict[str, Any]:
         """Parameters by the name of the effect."""
-        return {effect.name: effect.parameters(self.by_name) for effect in self.effects}
+        return {effect.name: effect.parameters(self.by_name) for effect in self.everything}
 
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:

@@ -18,7 +18,7 @@ import jax
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.names import Place
-from vmri_jax.scene.body import Bodies
+from vmri_jax.scene.body import Bodies, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.layout import Pace, join, layout
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
@@ -61,7 +61,7 @@ class Sorting:
         def both(what: str):
             return join(self.bodies, self.places, "s", what), join(self.bodies, self.places, "f", what)
 
-        return (*both("position"), *both("velocity"))
+        return (*both("coordinates"), *both("rates"))
 
 
 def sort(bodies: Bodies, effects: Sequence[Effect]) -> Sorting:
@@ -81,7 +81,7 @@ def sort(bodies: Bodies, effects: Sequence[Effect]) -> Sorting:
     placed = []
     for effect in effects:
         homes: dict[Home, dict[int, Reason]] = {}
-        for i, element in enumerate(effect.elements(bodies)):
+        for i, element in enumerate(map(moving, effect.elements(bodies))):
             slow = tuple(name for name in element if paces[name].value == "slow")
             home, reason = _home(effect, i, slow, len(element), measured, limit)
             homes.setdefault(home, {})[i] = reason
@@ -93,13 +93,15 @@ def _measure(bodies, energies) -> dict[str, Rates]:
     """Rates of potentials and kinetic effects, if a decision depends on them."""
     undecided = []
     for effect in energies:
-        free = [all(bodies[name].pace != "slow" for name in element) for element in effect.elements(bodies)]
+        free = [
+            all(bodies[name].pace != "slow" for name in element) for element in map(moving, effect.elements(bodies))
+        ]
         if effect.kind == "potential" and effect.rate == "auto" and any(free):
             undecided.append(effect.name)
     if not undecided and all(body.pace != "auto" for body in bodies.values()):
         return {}
-    moving = any(effect.kind == "kinetic" for effect in energies)
-    numbers = [(body.mass, body.position, body.velocity if moving else None) for body in bodies.values()]
+    kinetic = any(effect.kind == "kinetic" for effect in energies)
+    numbers = [(body.masses, body.coordinates, body.rates if kinetic else None) for body in bodies.values()]
     if not is_concrete((numbers, [effect.parameters(bodies) for effect in energies])):
         raise ValueError(
             f"Scene: whether {', '.join(undecided or bodies)} is slow or fast depends on numbers that are traced. Give every body a "
@@ -118,7 +120,7 @@ def _paces(bodies, energies, measured, limit) -> dict[str, Pace]:
         else:
             paces[name] = Pace("slow", f"touched by nothing stiff, above {limit:.3g} rad/s")
     for effect in energies:
-        for i, element in enumerate(effect.elements(bodies)):
+        for i, element in enumerate(map(moving, effect.elements(bodies))):
             if effect.kind == "potential" and any(bodies[name].pace == "slow" for name in element):
                 continue  # it is part of V
             why = _stiff(effect, i, measured, limit)

@@ -12,10 +12,100 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from vmri_jax.scene.body import GROUND_COORDINATES
 from vmri_jax.scene.layout import Rows
 
 MASS = "mass"
 """Where the masses are in params if the kinetic energy is a function."""
+
+
+@dataclass(frozen=True)
+class OnBodies:
+    """A role whose bodies are points, blocks, rigid bodies as a whole or their centres: it gets their coordinates.
+
+    Args:
+        rows: where these are.
+    """
+
+    rows: Rows
+
+    def positions(self, q_s, q_f, params):
+        """(d,) or (n, d) coordinates."""
+        return self.rows.take(q_s, q_f)
+
+    def velocities(self, v_s, v_f, params):
+        """Their rates."""
+        return self.rows.take(v_s, v_f)
+
+    def put(self, force, params, n_s: int, n_f: int):
+        """Forces on all slow and on all fast coordinates."""
+        return self.rows.put(force, n_s, n_f)
+
+
+@dataclass(frozen=True)
+class InRigidBodies:
+    """A role whose points are fixed in rigid bodies: ``phi + sum_i X_i d_i`` with the components X in params.
+
+    Args:
+        rows: where the coordinates of the bodies are.
+        at: name of the parameter X.
+    """
+
+    rows: Rows
+    at: str
+
+    def positions(self, q_s, q_f, params):
+        """(3,) or (n, 3) points."""
+        q, at = self.rows.take(q_s, q_f), params[self.at]
+        triples = q.reshape(*q.shape[:-1], -1, 3)
+        arms = at[..., : triples.shape[-2] - 1, None] * triples[..., 1:, :]
+        return triples[..., 0, :] + jnp.sum(arms, axis=-2)
+
+    def velocities(self, v_s, v_f, params):
+        """Their velocities: the same map, which is linear."""
+        return self.positions(v_s, v_f, params)
+
+    def put(self, force, params, n_s: int, n_f: int):
+        """Forces on all slow and on all fast coordinates."""
+        at = params[self.at][..., : self.rows.stride // 3 - 1, None]
+        force = jnp.broadcast_to(force, (*jnp.broadcast_shapes(force.shape[:-1], at.shape[:-2]), 3))
+        triples = jnp.concatenate([force[..., None, :], at * force[..., None, :]], axis=-2)
+        return self.rows.put(triples.reshape(*triples.shape[:-2], -1), n_s, n_f)
+
+
+@dataclass(frozen=True)
+class OnGround:
+    """A role that stays where it is: points given in params, or the ground as a rigid body whose axes are those of space.
+
+    Args:
+        count: of elements.
+        size: of a point; 12 for the ground as a whole.
+        at: name of the parameter with the points; None for the ground as a whole.
+    """
+
+    count: int
+    size: int
+    at: str | None = None
+
+    def positions(self, q_s, q_f, params):
+        """(d,) or (n, d) points."""
+        if self.at is not None:
+            return params[self.at][..., : self.size]
+        return self._shaped(jnp.asarray(GROUND_COORDINATES))
+
+    def velocities(self, v_s, v_f, params):
+        """Zero."""
+        return self._shaped(jnp.zeros(self.size))
+
+    def put(self, force, params, n_s: int, n_f: int):
+        """Nothing: what holds the ground is not part of the scene."""
+        return jnp.zeros(n_s), jnp.zeros(n_f)
+
+    def _shaped(self, vector):
+        return vector if self.count == 1 else jnp.broadcast_to(vector, (self.count, self.size))
+
+
+Role = OnBodies | InRigidBodies | OnGround
 
 
 @dataclass(frozen=True)
@@ -28,7 +118,7 @@ class EffectTerm:
 
     name: str
     function: Callable
-    roles: tuple[Rows, ...]
+    roles: tuple[Role, ...]
     select: tuple[int, ...] | None = None
     split: tuple[str, ...] = ()
     timed: bool = False
@@ -37,23 +127,27 @@ class EffectTerm:
         """What the function gets as params."""
         return params[self.name] if self.select is None else choose(params[self.name], self.select, self.split)
 
-    def take(self, q_s, q_f):
-        """The coordinates of every role."""
-        return tuple(rows.take(q_s, q_f) for rows in self.roles)
-
     def value(self, q_s, q_f, params, t=None):
         """Energy or constraint values."""
-        return self.function(*((t,) if self.timed else ()), self.take(q_s, q_f), self.params_of(params))
+        own = self.params_of(params)
+        return self.function(*((t,) if self.timed else ()), self._positions(q_s, q_f, own), own)
 
     def kinetic(self, q_s, q_f, v_s, v_f, params):
         """Velocity-dependent energy."""
-        return self.function(self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
+        own = self.params_of(params)
+        return self.function(self._positions(q_s, q_f, own), self._velocities(v_s, v_f, own), own)
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates."""
-        forces = self.function(t, self.take(q_s, q_f), self.take(v_s, v_f), self.params_of(params))
-        sizes = q_s.shape[0], q_f.shape[0]
-        return totals([rows.put(force, *sizes) for rows, force in zip(self.roles, forces, strict=True)])
+        own, sizes = self.params_of(params), (q_s.shape[0], q_f.shape[0])
+        forces = self.function(t, self._positions(q_s, q_f, own), self._velocities(v_s, v_f, own), own)
+        return totals([role.put(force, own, *sizes) for role, force in zip(self.roles, forces, strict=True)])
+
+    def _positions(self, q_s, q_f, params):
+        return tuple(role.positions(q_s, q_f, params) for role in self.roles)
+
+    def _velocities(self, v_s, v_f, params):
+        return tuple(role.velocities(v_s, v_f, params) for role in self.roles)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import effect_class, names, number, positive
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.springs import elastic_energy
@@ -127,6 +128,6 @@ class Torsion(_AmongPoints):
         expected = "they must not start on a line, where there is no dihedral angle"
         for element in self.elements(bodies):
             for corner in (element[:3], element[1:]):
-                a, b, c = (bodies[name].position for name in corner)
+                a, b, c = (end_of(bodies, name).position for name in corner)
                 area, size = jnp.linalg.norm(jnp.cross(b - a, c - b)), jnp.linalg.norm(b - a) * jnp.linalg.norm(c - b)
                 self.require(area > 1e-9 * size, f"the area between {', '.join(corner)}", area, expected)

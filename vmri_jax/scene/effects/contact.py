@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, effect_class, names, number, positive
 from vmri_jax.scene.effect import Effect
 
@@ -115,7 +116,7 @@ class SphereContact(_Contact):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         for (name,) in self.elements(bodies):
-            position = bodies[name].position
+            position = end_of(bodies, name).position
             away = jnp.any(position != jnp.asarray(self.center))
             self.require(away, f"the start of {name}", position, "it must not be the center of the sphere")
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import field
 from typing import Any, Literal
 
+from vmri_jax.scene.body import end_of, entry, is_entry
 from vmri_jax.scene.declare import effect_class
 from vmri_jax.scene.effect import DRAWN, Effect, real_tree
 
@@ -21,7 +22,8 @@ class CustomEffect(Effect):
 
     Args:
         function: see `Effect`; define it at module level, it is compared by identity.
-        bodies: names of the bodies it touches, in the order in which the function takes them.
+        bodies: names of the bodies it touches, in the order in which the function takes them. Of a rigid body it gets all
+            coordinates, of a point in one, ``(name, [x, y, z])``, those of the point.
         params: numbers, arrays or trees of them that the function gets; traced.
         name: the name of the function by default.
         drawn_as: "link" or "spring", between each of its bodies and the next one; None for nothing to see.
@@ -37,6 +39,7 @@ class CustomEffect(Effect):
     drawn_as: Literal["link", "spring"] | None = field(default=None, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]
 
     same_size = False
+    whole = True
 
     def __post_init__(self):
         if not callable(self.function):
@@ -48,10 +51,15 @@ class CustomEffect(Effect):
             raise ValueError(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")
 
     def elements(self, bodies):
-        return ((self.bodies,) if isinstance(self.bodies, str) else tuple(self.bodies),)
+        return (tuple(map(entry, (self.bodies,) if is_entry(self.bodies) else self.bodies)),)
 
     def parameters(self, bodies):
-        return real_tree(f"{self.name}: params", self.params)
+        params, points = real_tree(f"{self.name}: params", self.params), self.points(bodies)
+        if points and not isinstance(params, dict):
+            raise TypeError(
+                f"{self.name}: params is {self.params!r}; with points in rigid bodies it must be a dictionary."
+            )
+        return params | points if points else params
 
     def check_bodies(self, bodies):
         super().check_bodies(bodies)
@@ -61,8 +69,9 @@ class CustomEffect(Effect):
         alone = f"it is drawn between bodies, and {element[0]} is alone; leave it out"
         self.require(len(element) > 1, "drawn_as", repr(self.drawn_as), alone)
         for name in element:
-            sized = f"it is drawn between points, and {name} has {bodies[name].size} coordinates; leave it out"
-            self.require(not bodies[name].block, "drawn_as", repr(self.drawn_as), sized)
+            end = end_of(bodies, name)
+            sized = f"it is drawn between points, and {name} has {end.size} coordinates; leave it out"
+            self.require(not end.block, "drawn_as", repr(self.drawn_as), sized)
 
 
 class Potential(CustomEffect):

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import array, common, effect_class, names, number
 from vmri_jax.scene.effect import Effect
 
@@ -76,9 +77,10 @@ class MagneticField(Effect):
         super().check_parameters(bodies)
         shape = self.parameters(bodies)["field"].shape
         for (name,) in self.elements(bodies):
-            needed = () if bodies[name].size == 2 else (3,)
+            size = end_of(bodies, name).size
+            needed = () if size == 2 else (3,)
             if shape != needed:
                 raise ValueError(
-                    f"{self.name}: field has shape {shape} and {name} has dimension {bodies[name].size}; give a number in the "
+                    f"{self.name}: field has shape {shape} and {name} has dimension {size}; give a number in the "
                     "plane, a vector (3,) in space."
                 )

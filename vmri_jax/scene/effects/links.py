@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import effect_class, positive
 from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
@@ -106,6 +107,6 @@ class Guide(ToPath):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         away = self.at_start(bodies, self.parameters(bodies))
-        size = jnp.max(jnp.abs(jnp.stack([bodies[name].position for (name,) in self.elements(bodies)])))
+        size = jnp.max(jnp.abs(jnp.stack([end_of(bodies, name).position for (name,) in self.elements(bodies)])))
         what = "the distance of the body from its point at t = 0"
         self.require(away <= START * jnp.maximum(size, 1.0), what, away, "it must start there")

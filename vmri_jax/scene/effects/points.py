@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.scene.body import end_of, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
 from vmri_jax.scene.effect import Effect, real_tree
 
@@ -86,8 +87,8 @@ class ToFixedPoint(ToPoint):
         points = np.atleast_2d(self.parameters(bodies)["point"])
         anchors = []
         for (name,), point in zip(self.elements(bodies), points.tolist(), strict=True):
-            if not bodies[name].block:
-                anchors.append({"body": name, "point": point, "kind": self.drawn_as})
+            if not end_of(bodies, name).block:
+                anchors.append({"body": label_of(name), "point": point, "kind": self.drawn_as})
         return {"anchors": anchors}
 
 
@@ -129,7 +130,7 @@ class ToPath(ToPoint):
         super().check_bodies(bodies)
         shape = jax.eval_shape(lambda: jnp.asarray(self.point_at_start({}))).shape
         for (name,) in self.elements(bodies):
-            size = bodies[name].size
+            size = end_of(bodies, name).size
             if shape != (size,):
                 raise ValueError(
                     f"{self.name}: path returns shape {shape}; {name} has dimension {size}, return ({size},)."
