@@ -32,6 +32,20 @@ STRUCTURES = {
     "kinetic function and all else": rs.Structure(
         2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=2
     ),
+    "null space": rs.Structure(
+        2,
+        1,
+        2,
+        "matrix",
+        **SPRINGS,
+        constraint="rod",
+        moving=True,
+        slow_constraint="norm",
+        scheme="gauss",
+        num_micro=2,
+        degree=2,
+        method="null_space",
+    ),
     "own rules": rs.Structure(
         1, 1, 2, "coupled", **SPRINGS, force="drive", scheme="mixed", num_micro=2, degree=2, method="dense"
     ),
@@ -50,6 +64,7 @@ METHODS = {
     "collocation": "COLLOCATION",
     "arrowhead": "ARROWHEAD",
     "kinetic function and all else": "ARROWHEAD",
+    "null space": "NULL_SPACE",
     "own rules": "DENSE",
     "composition": "NESTED",
 }

@@ -98,9 +98,10 @@ def _data(motion: Motion, sizes: Layout) -> dict:
 
 
 def _energy_title(motion: Motion) -> str:
-    if len(motion.energy_names) > 1:
+    name, *others = motion.energy_names
+    if others:
         return "since the start:"
-    return f"{motion.energy_names[0]} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
+    return f"{name} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
 
 
 def _plain(record: Connection | Ground) -> dict:

@@ -58,7 +58,7 @@ def simulate(
         bool,
         typer.Option("--save-micro", help="Keep the fast motion within macro steps too; of every one, if not told."),
     ] = False,
-    method: Annotated[str, typer.Option(help="auto, nested, arrowhead or dense.")] = "auto",
+    method: Annotated[str, typer.Option(help="auto, nested, arrowhead, null-space or dense.")] = "auto",
     out: Annotated[
         Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr all along the run.")
     ] = None,
@@ -83,7 +83,7 @@ def simulate(
             "num_steps": steps,
             "save_every": save_every,
             "save_micro": save_micro,
-            "newton": Newton(method=method),  # pyright: ignore[reportArgumentType]
+            "newton": Newton(method=method.replace("-", "_")),  # pyright: ignore[reportArgumentType]
             "progress": True,
         }
         if streamed:

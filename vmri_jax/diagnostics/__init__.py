@@ -1,6 +1,6 @@
 """What a discrete trajectory should keep, and how to see whether it does."""
 
-from vmri_jax.diagnostics.linear import frequencies, step_condition, symplectic_defect, tangents
+from vmri_jax.diagnostics.linear import frequencies, null_space_condition, step_condition, symplectic_defect, tangents
 from vmri_jax.diagnostics.orders import OrderFit, fit_order, observed_order
 from vmri_jax.mechanics.invariants import (
     all_constraints,
@@ -23,6 +23,7 @@ __all__ = [
     "fit_order",
     "frequencies",
     "momentum_map",
+    "null_space_condition",
     "observed_order",
     "oscillatory_energies",
     "rotation_about",

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import null_space
 
 from vmri_jax.mechanics.invariants import all_constraints, potentials, velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
@@ -132,6 +133,26 @@ def step_condition(system: Movable, scheme: Scheme, state: State | None = None, 
             return np.inf
         a = a / np.sqrt(rows[:, None] * columns)
     return float(np.linalg.cond(a))
+
+
+def null_space_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt) -> float:
+    """Condition number of the Newton matrix of a macro step on its free motions, without any scaling.
+
+    The equations of motion, their multipliers removed by a basis P of the null space of the constraints, ``P^T A P``: what the
+    method "null_space" of `Newton` solves. The matrix is that of the first iteration from straight motion; it is dense here.
+
+    Args:
+        system, scheme, state, macro_dt: as in `simulate`.
+    """
+    system, state = start_of("null_space_condition", system, state)
+    whole = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
+    n, r = scheme.num_micro, scheme.degree
+    n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    sizes = r * state.q_s.size, r * n_gs, n * r * state.q_f.size, n * r * n_g
+    held = np.repeat([False, True, False, True], sizes)  # the order of `Unknowns`
+    left, right = null_space(whole[np.ix_(~held, held)].T), null_space(whole[np.ix_(held, ~held)])
+    reduced = left.T @ whole[np.ix_(~held, ~held)] @ right
+    return float(np.linalg.cond(reduced)) if np.isfinite(reduced).all() else np.inf
 
 
 @jax.jit

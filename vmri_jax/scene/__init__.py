@@ -8,27 +8,41 @@ from vmri_jax.scene.effects.custom import Constraint, Force, Kinetic, Potential
 from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag, RayleighDamping
 from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, HarmonicDrive
 from vmri_jax.scene.effects.fields import Gravity, MagneticField
+from vmri_jax.scene.effects.joint_effects import JointDamper, JointDrive, JointLimit, JointMotion, JointSpring
+from vmri_jax.scene.effects.joints import Cylindrical, Fixed, Joint, Prismatic, Revolute, Spherical, Universal
 from vmri_jax.scene.effects.links import Anchor, Guide, MovingPivot, RigidLink
 from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity
 from vmri_jax.scene.effects.springs import MovingAnchor, NonlinearSpring, Spring, SpringAnchor
+from vmri_jax.scene.rigid import Ball, Box, Cylinder, RigidBody, Rod
 from vmri_jax.scene.scene import Scene
 
 __all__ = [
     "Anchor",
     "Angle",
+    "Ball",
     "Bending",
     "Body",
+    "Box",
     "ConstantForce",
     "Constraint",
     "Coulomb",
+    "Cylinder",
+    "Cylindrical",
     "Dashpot",
     "Drive",
     "Effect",
+    "Fixed",
     "FollowerForce",
     "Force",
     "Gravity",
     "Guide",
     "HarmonicDrive",
+    "Joint",
+    "JointDamper",
+    "JointDrive",
+    "JointLimit",
+    "JointMotion",
+    "JointSpring",
     "Kinetic",
     "LennardJones",
     "LinearDamping",
@@ -39,12 +53,18 @@ __all__ = [
     "NonlinearSpring",
     "PlaneContact",
     "Potential",
+    "Prismatic",
     "QuadraticDrag",
     "RayleighDamping",
+    "Revolute",
+    "RigidBody",
     "RigidLink",
+    "Rod",
     "Scene",
     "SphereContact",
+    "Spherical",
     "Spring",
     "SpringAnchor",
     "Torsion",
+    "Universal",
 ]

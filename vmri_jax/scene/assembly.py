@@ -6,7 +6,7 @@ from typing import Any
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.scene.layout import join
 from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import FUNCTIONS, MASS
+from vmri_jax.scene.terms import FUNCTIONS, MASS, SomeRows
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
@@ -23,7 +23,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         name, made = part.effect.name, part.effect.terms(part.elements, bodies, places, potentials)
         if part.effect.kind == "potential":
             potentials[name] = (*potentials.get(name, ()), *made)
-        terms.setdefault(part.home, []).extend(made)
+        terms.setdefault(part.home, []).extend([SomeRows(made, part.dropped)] if part.dropped else made)
     functions: dict[str, Any] = {home: FUNCTIONS[home](tuple(some)) for home, some in terms.items() if some}
     for home in ("constraint", "slow_constraint"):
         if any(term.timed for term in terms.get(home, ())):

@@ -86,25 +86,28 @@ class AnyBody(ABC):
         coordinates, rates, masses: (n,) at the start, and the masses of ``sum_i m_i v_i^2 / 2``.
         block: its coordinates are general ones, not those of points.
         rigid: they are those of a rigid body.
+        rotation: (3, 3) its axes in space at the start as columns; None of what has no axes.
     """
 
     name: str
     pace: Pace
+    position: Any
     radius: float | None
     block: bool
     rigid: bool = False
+    rotation: Any = None
 
     @property
     @abstractmethod
-    def coordinates(self): ...
+    def coordinates(self) -> Any: ...
 
     @property
     @abstractmethod
-    def rates(self): ...
+    def rates(self) -> Any: ...
 
     @property
     @abstractmethod
-    def masses(self): ...
+    def masses(self) -> Any: ...
 
     @property
     def size(self) -> int:
@@ -243,8 +246,10 @@ class Ground(AnyBody):
     """The body that does not move: its axes are those of space."""
 
     name, pace, radius, block, rigid = GROUND, "slow", None, False, True
-    coordinates = GROUND_COORDINATES
-    rates, masses = np.zeros(12), np.full(12, np.inf)
+    position, rotation = np.zeros(3), np.eye(3)
+    coordinates = property(lambda self: GROUND_COORDINATES)
+    rates = property(lambda self: np.zeros(12))
+    masses = property(lambda self: np.full(12, np.inf))
 
     def point(self, at: Any = None) -> Point:
         """A point that stays where it is."""

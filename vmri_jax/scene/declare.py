@@ -50,7 +50,7 @@ class Names:
         """
         if given is None and self.may_be_all:
             given = tuple(bodies)
-        items = (given,) if is_entry(given) else tuple(given) if isinstance(given, Iterable) else ()
+        items: tuple[Any, ...] = (given,) if is_entry(given) else tuple(given) if isinstance(given, Iterable) else ()
         flat = bool(items) and all(is_entry(item) for item in items)
         if self.pairs and flat:
             if len(items) < 2:

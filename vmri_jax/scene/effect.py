@@ -101,6 +101,17 @@ class Effect(ABC):
         """Names of the potentials that this effect builds on."""
         return ()
 
+    def bound(self, effects: Sequence["Effect"]) -> "Effect":
+        """The same with other effects that it builds on, instead of their names.
+
+        Args:
+            effects: of the scene.
+
+        Raises:
+            ValueError: one of them is not there.
+        """
+        return self
+
     def elements(self, bodies: Bodies) -> Elements:
         """Names of the bodies of every element."""
         given = next(f for f in fields(self) if "names" in f.metadata)
@@ -267,7 +278,9 @@ class Effect(ABC):
         pairs = [pair for element in self.elements(bodies) for pair in pairwise(element)]
         between = [[label_of(a), label_of(b)] for a, b in pairs if GROUND not in (a, b)]
         held = [(a, b) if b == GROUND else (b, a) for a, b in pairs if GROUND in (a, b)]
-        anchors = [{"body": label_of(a), "point": list(map(float, b.at)), "kind": self.drawn_as} for a, b in held]
+        anchors = [
+            {"body": label_of(a), "point": end_of(bodies, b).position.tolist(), "kind": self.drawn_as} for a, b in held
+        ]
         return {DRAWN[self.drawn_as]: between, "anchors": anchors}
 
     def require(self, condition: Any, what: str, value: Any, expected: str) -> None:

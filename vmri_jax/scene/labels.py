@@ -1,6 +1,7 @@
 """What the coordinates and constraints of a scene are called."""
 
 from collections.abc import Sequence
+from itertools import chain
 
 import jax
 import jax.numpy as jnp
@@ -44,9 +45,11 @@ def _rows(sorting: Sorting, part: Placed) -> dict[str, int]:
     bodies, effect = sorting.bodies, part.effect
     elements, params = effect.elements(bodies), effect.parameters(bodies)
     t = (jnp.zeros(()),) if effect.timed else ()
-    rows = {}
-    for some in effect.by_size(part.elements, bodies):
-        for i in some:
-            value = jax.eval_shape(effect.function, *t, *effect.one(i, bodies, params))
-            rows[effect.name if len(elements) == 1 else label(effect, elements[i])] = value.size
+    rows, at = {}, 0
+    for i in chain(*effect.by_size(part.elements, bodies)):
+        size = jax.eval_shape(effect.function, *t, *effect.one(i, bodies, params)).size
+        kept = sum(k not in part.dropped for k in range(at, at + size))
+        if kept:
+            rows[effect.name if len(elements) == 1 else label(effect, elements[i])] = kept
+        at += size
     return rows

@@ -60,7 +60,7 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     """
     sizes = [body.motions.shape[1] for body in bodies.values()]
     columns = dict(zip(bodies, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
-    mass = block_diag(*(body.motions.T @ (body.masses[:, None] * body.motions) for body in bodies.values()))
+    mass = np.asarray(block_diag(*(body.motions.T @ (body.masses[:, None] * body.motions) for body in bodies.values())))
     found = {effect.name: _linearise(effect, bodies, columns) for effect in effects}
     for element in chain(*found.values()):
         mass[np.ix_(element.columns, element.columns)] += element.mass

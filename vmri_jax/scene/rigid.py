@@ -9,7 +9,7 @@ Source: P. Betsch, S. Leyendecker, The discrete null space method for the energy
 mechanical systems, part II: multibody dynamics, Int. J. Numer. Meth. Engng 67 (2006).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax.numpy as jnp
@@ -99,6 +99,10 @@ class RigidBody(AnyBody):
         pace: "slow", "fast" or "auto", as of `Body`.
         shape: how it is drawn; that of `inertia` by default.
 
+    Attributes:
+        moments: (3,) principal moments of inertia.
+        axes: (3, 3) principal axes in those of the body, as columns.
+
     Raises:
         TypeError: what is no real number.
         ValueError: a mass or moment of inertia that is not positive, moments that no body has (one larger than the sum of
@@ -114,6 +118,8 @@ class RigidBody(AnyBody):
     spin: Any = None
     pace: Pace = "auto"
     shape: Shape | None = None
+    moments: Any = field(init=False, repr=False)
+    axes: np.ndarray = field(init=False, repr=False)
 
     rigid = True
     block = False
@@ -243,7 +249,8 @@ class RigidBody(AnyBody):
         out = [i for i in range(3) if i not in self.wide]
         if out and is_concrete(along) and np.any(np.abs(np.asarray(along)[out]) > ORTHONORMAL * np.abs(along).max()):
             raise ValueError(
-                f"{np.asarray(vector)} is no direction in {self.name}, which has no width there; give it an inertia with width."
+                f"{np.asarray(vector)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate or a "
+                "rod, without width there. Give it some."
             )
         return along
 
@@ -307,7 +314,7 @@ def matrix_of(rotation):
         w, u = rotation[0], _cross_matrix(rotation[1:])
         return jnp.eye(3) + 2 * w * u + 2 * u @ u
     if is_concrete(rotation):
-        return Rotation.from_rotvec(np.asarray(rotation)).as_matrix()
+        return Rotation.from_rotvec(np.array(rotation)).as_matrix()
     angle = jnp.sqrt(jnp.sum(rotation**2))
     u = _cross_matrix(rotation)
     return jnp.eye(3) + jnp.sinc(angle / np.pi) * u + jnp.sinc(angle / (2 * np.pi)) ** 2 / 2 * u @ u
@@ -344,7 +351,11 @@ def quaternion(q):
         q: (..., k, 12) coordinates along a run.
     """
     matrices = rotation(q)
-    found = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat(scalar_first=True).reshape(*matrices.shape[:-2], 4)
+    found = (
+        Rotation.from_matrix(np.array(matrices.reshape(-1, 3, 3)))
+        .as_quat(scalar_first=True)
+        .reshape(*matrices.shape[:-2], 4)
+    )
     if found.ndim > 1:
         turned = np.sign(np.sum(found[..., 1:, :] * found[..., :-1, :], axis=-1))
         signs = np.concatenate(

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import jax
 
@@ -18,7 +18,7 @@ from vmri_jax.scene.body import AnyBody
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.labels import names_of
 from vmri_jax.scene.ledger import Ledger, ledger
-from vmri_jax.scene.redundancy import check_constraints
+from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
@@ -50,6 +50,8 @@ class Scene:
             summed and constraints joined in this order.
         project: move positions onto the constraints at the start, and take away what of the velocities points against them,
             instead of refusing them.
+        redundant: what is done about constraints that depend on others, as in a planar loop of hinges: "refuse" names them,
+            "drop" leaves as many rows of them out as are too many, see `dropped`.
 
     Raises:
         TypeError: something else among them.
@@ -59,9 +61,12 @@ class Scene:
     bodies: Any
     effects: Any = ()
     project: bool = False
+    redundant: Literal["refuse", "drop"] = "refuse"
 
     def __post_init__(self):
         require_x64()
+        if self.redundant not in ("refuse", "drop"):
+            raise ValueError(f"Scene: redundant is {self.redundant!r}; it must be 'refuse' or 'drop'.")
         for name, kind in (("bodies", AnyBody), ("effects", Effect)):
             items = getattr(self, name)
             if isinstance(items, kind) or not isinstance(items, Iterable):
@@ -96,14 +101,21 @@ class Scene:
 
     @cached_property
     def everything(self) -> tuple[Effect, ...]:
-        """The effects, after what keeps rigid bodies rigid."""
+        """The effects, after what keeps rigid bodies rigid; with the joints that they name."""
         rigid = [body.name for body in self.bodies if body.rigid]
-        return (Rigidity(rigid), *self.effects) if rigid else self.effects
+        effects = tuple(effect.bound(self.effects) for effect in self.effects)
+        return (Rigidity(rigid), *effects) if rigid else effects
 
     @cached_property
     def sorting(self) -> Sorting:
         """Who is slow and who is fast, where every effect lives, and why."""
-        return sort(self.by_name, self.everything)
+        found = sort(self.by_name, self.everything)
+        return without_redundant(found) if self.redundant == "drop" else found
+
+    @property
+    def dropped(self) -> list[str]:
+        """Names of the rows of constraints that are left out, as they depend on others."""
+        return dropped_rows(self.sorting)
 
     @property
     def places(self) -> dict[str, Place]:
@@ -201,7 +213,7 @@ class Scene:
             part, start, size = self.places[body.name]
             axes = [[part, start + i] for i in range(size)]
             seen["blocks" if body.block else "bodies"].append({"name": body.name, "coordinates": axes})
-        for effect in self.effects:
+        for effect in self.everything:
             parts = effect.drawing(self.by_name)
             for kind in DRAWN_LISTS:
                 seen[kind] += parts.get(kind, [])

@@ -37,12 +37,16 @@ class Reason(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Some elements of an effect, the argument of `System` that they are part of, and why."""
+    """Some elements of an effect, the argument of `System` that they are part of, and why.
+
+    dropped: rows of a constraint that are left out, numbers in the order of its terms.
+    """
 
     effect: Effect
     elements: tuple[int, ...]
     home: Home
     reason: str
+    dropped: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ Everything here is compared by value: scenes of the same structure give equal fu
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import pairwise
 from operator import add
 from typing import Any
 
@@ -148,6 +149,25 @@ class EffectTerm:
 
     def _velocities(self, v_s, v_f, params):
         return tuple(role.velocities(v_s, v_f, params) for role in self.roles)
+
+
+@dataclass(frozen=True)
+class SomeRows:
+    """The values of some terms of a constraint one after the other, without those that are `dropped`."""
+
+    terms: tuple[EffectTerm, ...]
+    dropped: tuple[int, ...]
+
+    @property
+    def timed(self) -> bool:
+        """Whether one of them depends on time."""
+        return any(term.timed for term in self.terms)
+
+    def value(self, q_s, q_f, params, t=None):
+        """The values that stay, by static slices."""
+        values = joined([term.value(q_s, q_f, params, t) for term in self.terms])
+        ends = [-1, *self.dropped, values.shape[0]]
+        return joined([values[low + 1 : high] for low, high in pairwise(ends)])
 
 
 @dataclass(frozen=True)

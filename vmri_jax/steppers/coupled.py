@@ -7,6 +7,7 @@ chapters 3 and 5). The parts grow while that succeeds and shrink where it does n
 one loop, compiled once, and the second costs nothing where the first suffices.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -20,7 +21,7 @@ from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Number
 from vmri_jax.mechanics.constraints import is_rank_deficient
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.newton import Newton, arrowhead, dense
+from vmri_jax.steppers.newton import Newton, arrowhead, dense, null_space
 from vmri_jax.steppers.results import RUNNING, Method, Result
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
@@ -38,15 +39,25 @@ LEAST_DAMPING = 1 / 64
 """An iteration gives up where less than this part of its update makes the next one smaller."""
 
 
+LinearSolver = Literal["arrowhead", "null_space", "dense"]
+LINEAR_SOLVERS: dict[LinearSolver, tuple[Callable, Callable]] = {
+    "arrowhead": (arrowhead.factor, arrowhead.solve),
+    "null_space": (partial(arrowhead.factor, inverse=null_space.inverse), arrowhead.solve),
+    "dense": (dense.factor, dense.solve),
+}
+"""How Newton's direction is found: factors of the matrix at x, and the direction for a residual."""
+
+
 @dataclass(frozen=True)
 class Coupled(Solver):
     """Newton's iteration on all unknowns, with continuation where it fails.
 
-    linear_solver: "arrowhead", block elimination in O(num_micro), or "dense", one factorisation.
+    linear_solver: "arrowhead", block elimination in O(num_micro), "null_space", the same without multipliers, or "dense", one
+        factorisation.
     """
 
     newton: Newton
-    linear_solver: Literal["arrowhead", "dense"]
+    linear_solver: LinearSolver
 
     def solve(self, equations: StepEquations, guess: Unknowns, own) -> tuple[Solution, Any]:
         x, result, iterations = self._root(equations, guess)
@@ -89,12 +100,12 @@ class Coupled(Solver):
 
         Where `damped`, an update that leads to a larger next one is taken back and halved (natural monotonicity test).
         """
-        linear = {"arrowhead": arrowhead, "dense": dense}[self.linear_solver]
+        factor, solve = LINEAR_SOLVERS[self.linear_solver]
         newton = self.newton
 
         def iterate(at: Iterate) -> Iterate:
             residual = equations.residual(at.x)
-            d = linear.solve(linear.factor(equations, at.x), residual)
+            d = solve(factor(equations, at.x), residual)
             x = jax.tree.map(jnp.add, at.x, d)
             update = _size(equations, d, x, newton.tolerance)
             back = damped & ~(update < (1 - at.damping / 4) * at.update)
@@ -111,7 +122,7 @@ class Coupled(Solver):
         return done.x, done.result, done.iterations
 
     def lines(self) -> list[str]:
-        return [f"all unknowns of the step at once: Newton's iteration, {self.linear_solver}"]
+        return [f"all unknowns of the step at once: Newton's iteration, {self.linear_solver.replace('_', ' ')}"]
 
 
 class Part(NamedTuple):

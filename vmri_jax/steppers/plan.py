@@ -172,7 +172,7 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)
     if not can_be_nested or newton.method not in ("auto", "nested"):
-        linear_solver = "dense" if newton.method == "dense" else "arrowhead"
+        linear_solver = newton.method if newton.method in ("dense", "null_space") else "arrowhead"
         return Solved(system, scheme, Coupled(newton, linear_solver))
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):

@@ -83,6 +83,7 @@ class Method(IntEnum):
     COLLOCATION = 4
     ARROWHEAD = 5
     DENSE = 6
+    NULL_SPACE = 7
 
 
 class SimulationError(RuntimeError):

@@ -7,15 +7,16 @@ is block lower triangular. So a forward march gives the response of the chain to
 response to each slow increment; inserted into the slow equations they leave a small border system.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from vmri_jax.kernels import saddle
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.newton.linearization import Blocks, linearize
+from vmri_jax.steppers.newton.null_space import inverse_with_multipliers
 
 
 class Factors(NamedTuple):
@@ -23,37 +24,33 @@ class Factors(NamedTuple):
 
     chain: inverse of each chain block, k = r (n_f + n_g)
     response: of the chain unknowns to the slow increments
-    border: LU factors of the slow equations once the chain is eliminated, None if there are none
+    border: inverse of the slow equations once the chain is eliminated
     """
 
     blocks: Blocks
     chain: Float[Array, "num_micro k k"]
     response: Float[Array, "num_micro k r*n_s"]
-    border: tuple[Float[Array, "b b"], Int[Array, "b"]] | None
+    border: Float[Array, "b b"]
 
 
-def factor(equations: StepEquations, x: Unknowns) -> Factors:
-    """Eliminate the chain of the matrix at x."""
+def factor(equations: StepEquations, x: Unknowns, inverse: Callable = inverse_with_multipliers) -> Factors:
+    """Eliminate the chain of the matrix at x.
+
+    Args:
+        inverse: of the blocks ``[[A, -G_0^T], [G_1, 0]]`` of the micro intervals and of the border, see `null_space`.
+    """
     blocks = linearize(equations, x)
     n, r, n_f = x.fast.shape
-    n_s, n_gs, n_g = x.slow.shape[1], x.slow_multiplier.shape[1], x.multiplier.shape[2]
+    n_s, n_g = x.slow.shape[1], x.multiplier.shape[2]
     border = r * n_s
-    nodes = jnp.eye(r)
-
-    top_right = -jnp.einsum("mjga,ji->mjaig", blocks.g_f[:, :-1], nodes).reshape(n, r * n_f, r * n_g)
-    bottom_left = jnp.einsum("mjga,ji->mjgia", blocks.g_f[:, 1:], nodes).reshape(n, r * n_g, r * n_f)
-    top_left = blocks.ff[:, :-1, :, 1:].reshape(n, r * n_f, r * n_f)
-    chain = jnp.linalg.inv(saddle(top_left, top_right, bottom_left))
+    chain = inverse(blocks.ff[:, :-1, :, 1:].reshape(n, r * n_f, r * n_f), blocks.g_f[:, :-1], blocks.g_f[:, 1:])
 
     slots = blocks.fs.reshape(n, r + 1, n_f, border)
     g = jnp.einsum("mji,mjgb->mjgib", blocks.basis[:, 1:, 1:], blocks.g_s[:, 1:]).reshape(n, r, n_g, border)
     response, slow_rows = _march(blocks, chain, slots, g)
 
-    force = -jnp.einsum("iga,ij->iajg", blocks.g_slow[:-1], nodes).reshape(border, r * n_gs) / n
-    jacobian = jnp.einsum("iga,ij->igja", blocks.g_slow[1:], nodes).reshape(r * n_gs, border)
     slow = (slow_rows + blocks.ss[:-1].reshape(r, n_s, border)).reshape(border, border)
-    matrix = saddle(slow, force, jacobian)
-    return Factors(blocks, chain, response, jax.scipy.linalg.lu_factor(matrix) if matrix.size else None)
+    return Factors(blocks, chain, response, inverse(slow, blocks.g_slow[:-1] / n, blocks.g_slow[1:]))
 
 
 def solve(factors: Factors, residual: Unknowns) -> Unknowns:
@@ -63,8 +60,7 @@ def solve(factors: Factors, residual: Unknowns) -> Unknowns:
     own, slow_rows = _march(blocks, chain, slots, residual.multiplier[..., None])
     slow_rows = residual.slow + slow_rows[..., 0]
     rows = jnp.concatenate([slow_rows.reshape(-1), residual.slow_multiplier.reshape(-1)])
-    slow = -jax.scipy.linalg.lu_solve(border, rows) if border is not None else rows
-    d_slow, d_slow_multiplier = jnp.split(slow, [residual.slow.size])
+    d_slow, d_slow_multiplier = jnp.split(-border @ rows, [residual.slow.size])
     d_chain = own[..., 0] + response @ d_slow
     d_fast, d_multiplier = jnp.split(d_chain, [residual.fast[0].size], axis=1)
     return Unknowns(

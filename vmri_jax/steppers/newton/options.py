@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.steppers.results import RUNNING, Result
 
-Choice = Literal["auto", "nested", "arrowhead", "dense"]
+Choice = Literal["auto", "nested", "arrowhead", "null_space", "dense"]
 
 
 class Newton(eqx.Module):
@@ -19,6 +19,7 @@ class Newton(eqx.Module):
     |---|---|---|
     | "nested" | slow path outside, micro intervals in order, each with a small matrix of its own | lowest |
     | "arrowhead" | exact block elimination, O(num_micro) | |
+    | "null_space" | the same without multipliers: matrices of the free motions alone | |
     | "dense" | exact, one dense factorisation, O(num_micro^2): baseline and oracle | highest |
 
     "auto" takes "nested" where the terms can be cut into micro intervals (constant masses, potentials on the micro grid

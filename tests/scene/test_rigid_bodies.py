@@ -1,0 +1,247 @@
+"""Rigid bodies by directors, against what is known in closed form."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ellipj
+
+import vmri_jax as vm
+from vmri_jax.mechanics.invariants import potentials
+from vmri_jax.scene import (
+    Ball,
+    Body,
+    Box,
+    ConstantForce,
+    Constraint,
+    Cylinder,
+    Gravity,
+    LinearDamping,
+    NBodyGravity,
+    RigidBody,
+    RigidLink,
+    Rod,
+    Scene,
+    Spherical,
+    Spring,
+)
+from vmri_jax.scene.rigid import angular_momentum, angular_velocity, matrix_of, quaternion, rotation
+
+MOMENTS = np.array([1.0, 2.0, 2.5])
+SPIN = np.array([0.8, 0.0, 1.0])
+ONE = vm.fully_implicit(num_micro=1)
+
+
+def spins(run, name="hub"):
+    """Angular velocity in the axes of the body."""
+    q = run.position(name)
+    return np.einsum("kji,kj->ki", rotation(q), angular_velocity(q, run.velocity(name)))
+
+
+def free_motion(t):
+    """Of a free body that starts with the spin (w_1, 0, w_3), by Jacobi's functions (Landau, Lifshitz, Mechanics, 37)."""
+    (a, b, c), energy, momentum = MOMENTS, MOMENTS @ SPIN**2, MOMENTS**2 @ SPIN**2
+    high, low = energy * c - momentum, momentum - energy * a
+    rate = np.sqrt((c - b) * low / (a * b * c))
+    sn, cn, dn, _ = ellipj(rate * t, (b - a) * high / ((c - b) * low))
+    sizes = np.sqrt([high / (a * (c - a)), high / (b * (c - b)), low / (c * (c - a))])
+    return sizes * np.stack([cn, sn, dn], axis=-1)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_a_free_body_turns_as_jacobi_says_with_order_2_degree(degree):
+    scene = Scene([RigidBody("hub", 1.0, MOMENTS, np.zeros(3), spin=SPIN)])
+    errors = []
+    for steps in (20, 40):
+        scheme = vm.galerkin(num_micro=1, degree=degree)
+        run = vm.simulate(scene, scheme, macro_dt=4.0 / steps, num_steps=steps)
+        errors.append(np.abs(spins(run) - free_motion(np.asarray(run.t))).max())
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2 * degree, abs=0.1)
+    assert errors[1] < (6e-3, 2e-6, 3e-10)[degree - 1]
+
+
+def test_a_free_body_keeps_energy_and_angular_momentum():
+    body = RigidBody("hub", 2.0, MOMENTS, [1.0, 0.0, 0.5], [0.1, 0.2, 0.3], [0.1, 0.4, 0.0], SPIN, pace="fast")
+    run = vm.simulate(Scene([body]), ONE, macro_dt=0.05, num_steps=1000)
+    momenta = angular_momentum(run.position("hub"), np.asarray(run.velocity("hub")) * body.masses)
+    inertia = body.rotation @ np.diag(MOMENTS) @ body.rotation.T
+    np.testing.assert_allclose(momenta[0], inertia @ SPIN + 2.0 * np.cross(body.position, body.velocity), atol=1e-14)
+    assert np.abs(momenta - momenta[0]).max() < 1e-12
+    assert np.ptp(run.energy) < 1e-11
+    assert np.abs(run.constraint_residual).max() < 1e-13
+    turned = rotation(run.position("hub"))
+    np.testing.assert_allclose(np.swapaxes(turned, 1, 2) @ turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-12)
+
+
+def test_a_steady_top_precesses_without_nutation_to_second_order():
+    mass, length, across, along, tilt, precession = 1.0, 0.5, 0.1, 0.15, 0.4, 1.0
+    about = across + mass * length**2
+    spin = mass * 9.81 * length / (along * precession) + (about - along) / along * precession * np.cos(tilt)
+    axis = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
+    omega = spin * axis + np.array([0.0, 0.0, precession])
+    top = RigidBody(
+        "top", mass, [across, across, along], length * axis, [0.0, tilt, 0.0], np.cross(omega, length * axis), omega
+    )
+    scene = Scene([top], [Gravity(), Spherical(("ground", "top"), [0.0, 0.0, 0.0])])
+    nutation, late = [], []
+    for steps in (100, 200):
+        run = vm.simulate(scene, ONE, macro_dt=2.0 / steps, num_steps=steps)
+        axes = rotation(run.position("top"))[..., 2]
+        nutation.append(np.ptp(axes[:, 2]))
+        late.append(abs(np.arctan2(axes[-1, 1], axes[-1, 0]) - 2.0 * precession))
+    assert nutation[1] < 4e-4
+    assert nutation[0] / nutation[1] == pytest.approx(4, rel=0.15)
+    assert late[1] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("shape", "moments"),
+    [
+        (Box((1.0, 2.0, 3.0)), [13 / 6, 10 / 6, 5 / 6]),
+        (Cylinder(0.5, 2.0), [0.79166667, 0.79166667, 0.25]),
+        (Ball(0.5), [0.2, 0.2, 0.2]),
+        (Rod(2.0), [2 / 3, 2 / 3, 0.0]),
+    ],
+)
+def test_moments_of_shapes(shape, moments):
+    body = RigidBody("hub", 2.0, shape, np.zeros(3))
+    np.testing.assert_allclose(body.moments, moments, rtol=1e-7)
+    assert body.shape is shape
+
+
+def test_bodies_without_width_have_fewer_axes():
+    rod = RigidBody("rod", 3.0, Rod(2.0), np.zeros(3), [0.0, np.pi / 2, 0.0], spin=[0.0, 0.7, 0.0])
+    plate = RigidBody("plate", 3.0, Box((1.0, 2.0, 0.0)), np.zeros(3))
+    assert (rod.size, plate.size, RigidBody("box", 3.0, Box((1.0, 2.0, 0.5)), np.zeros(3)).size) == (6, 9, 12)
+    np.testing.assert_allclose(rod.masses, [3, 3, 3, 1, 1, 1])
+    np.testing.assert_allclose(rod.coordinates[3:], [1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(rod.rates[3:], [0, 0, -0.7], atol=1e-15)
+    run = vm.simulate(Scene([rod, plate]), ONE, macro_dt=0.05, num_steps=20)
+    assert run.names.slow_constraint == {"rigid rod": 1, "rigid plate": 3}
+    assert run.energy[0] == pytest.approx(3.0 * 2.0**2 / 12 * 0.7**2 / 2)
+
+
+def test_a_matrix_of_inertia_is_turned_into_principal_axes():
+    turned = matrix_of(np.array([0.3, -0.2, 0.5]))
+    at = [0.2, 0.3, -0.4]
+    given = RigidBody("hub", 2.0, turned @ np.diag(MOMENTS) @ turned.T, np.zeros(3), spin=SPIN)
+    principal = RigidBody("hub", 2.0, MOMENTS, np.zeros(3), turned, spin=SPIN)
+    np.testing.assert_allclose(given.moments, MOMENTS)
+    weight = Body("weight", 1.0, [2.0, 2.0, 2.0])
+    ends = []
+    for body, point in ((given, at), (principal, turned.T @ at)):
+        spring = Spring((("hub", point), "weight"), 3.0)
+        np.testing.assert_allclose(body.point(np.asarray(point)).position, at, atol=1e-15)
+        ends.append(vm.simulate(Scene([body, weight], [spring]), ONE, macro_dt=0.1, num_steps=10).position("weight"))
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-11)
+
+
+def test_rotations_are_given_as_people_have_them():
+    vector = np.array([0.3, -0.2, 0.5])
+    angle = np.linalg.norm(vector)
+    w_xyz = np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * vector / angle])
+    matrix = matrix_of(vector)
+    for given in (vector, w_xyz, matrix):
+        body = RigidBody("hub", 1.0, MOMENTS, np.zeros(3), given)
+        np.testing.assert_allclose(body.rotation, matrix, atol=1e-14)
+        np.testing.assert_allclose(quaternion(body.coordinates), w_xyz, atol=1e-14)
+    np.testing.assert_allclose(matrix_of(jnp.asarray(vector)), matrix, atol=1e-14)
+
+
+def test_quaternions_along_a_run_do_not_jump():
+    run = vm.simulate(
+        Scene([RigidBody("hub", 1.0, MOMENTS, np.zeros(3), spin=[0.0, 0.0, 3.0])]), ONE, macro_dt=0.1, t_end=6.0
+    )
+    assert np.abs(np.diff(quaternion(run.position("hub")), axis=0)).max() < 0.2
+
+
+def slow_energy(scene):
+    slow, _ = potentials(scene.system(), *scene.start[:2])
+    return float(slow)
+
+
+def pinned(q, params):
+    hub, weight = q
+    return (jnp.sum((hub[:3] + 0.5 * hub[3:6] - weight) ** 2) - 1.25) / 2
+
+
+def test_an_effect_on_a_point_of_a_body_is_that_on_its_coordinates():
+    """The point is linear in the coordinates, so both are the same to round-off; forces are its transpose."""
+    hub = RigidBody("hub", 2.0, MOMENTS, np.zeros(3), spin=SPIN)
+    weight = Body("weight", 1.0, [1.0, 1.0, 0.0], pace="fast")
+    by_point = Scene([hub, weight], [RigidLink((("hub", [0.5, 0.0, 0.0]), "weight")), Gravity(1.0)], project=True)
+    by_hand = Scene([hub, weight], [Constraint(pinned, ("hub", "weight")), Gravity(1.0)], project=True)
+    runs = [vm.simulate(scene, ONE, macro_dt=0.05, num_steps=20) for scene in (by_point, by_hand)]
+    np.testing.assert_allclose(runs[0].q_s, runs[1].q_s, atol=1e-12)
+    np.testing.assert_allclose(runs[0].q_f, runs[1].q_f, atol=1e-12)
+
+    pushed = Scene([hub], [ConstantForce(("hub", [0.5, 0.0, 0.0]), [0.0, 3.0, 0.0])])
+    system, (q_s, q_f, v_s, v_f) = pushed.system(), pushed.start
+    force, _ = system.forces(0.0, q_s, q_f, v_s, v_f)
+    np.testing.assert_allclose(force, [0, 3, 0, 0, 1.5, 0, 0, 0, 0, 0, 0, 0])
+
+
+def test_points_of_the_ground_stay_where_they_are():
+    hub = RigidBody("hub", 2.0, MOMENTS, np.zeros(3))
+    scene = Scene(
+        [hub], [Spring((("hub", [0.5, 0, 0]), ("ground", [2.0, 0, 0])), 7.0, 1.0), Gravity(), LinearDamping(0.1)]
+    )
+    assert slow_energy(scene) == pytest.approx(7.0 * 0.5**2 / 2)
+    assert vm.simulate(scene, ONE, macro_dt=0.05, num_steps=5).success
+    plane = Scene([Body("bob", 1.0, [1.0, 0.0])], [Spring(("bob", ("ground", [0.0, 0.0])), 2.0)])
+    assert plane.drawing()["anchors"] == [{"body": "bob", "point": [0.0, 0.0], "kind": "spring"}]
+
+
+def test_many_bodies_are_taken_by_slices():
+    """Centres of bodies that follow one another, also between other bodies, are where they should be."""
+    bodies: list = [RigidBody(f"b{i}", 1.0 + i, MOMENTS, [i, 2.0 * i, -i]) for i in range(4)]
+    bodies.insert(2, Body("point", 5.0, [7.0, 0.0, 1.0]))
+    scene = Scene(bodies, [Gravity(2.0)])
+    heights = [body.point().position[2] * body.mass for body in bodies]
+    assert slow_energy(scene) == pytest.approx(2.0 * sum(heights))
+
+
+BAD = [
+    ({"mass": -1.0}, "mass is -1.0; it must be one positive number"),
+    (
+        {"inertia": [1.0, 1.0, 2.5]},
+        r"which no body has: the largest, 2.5, must not be larger than the sum of the others, 2\.",
+    ),
+    ({"inertia": [0.0, 0.0, 0.0]}, "they must be positive"),
+    ({"inertia": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "it must be a symmetric matrix"),
+    ({"inertia": [1.0, 2.0]}, r"inertia has shape \(2,\); give \(3,\) principal moments, a matrix, or a shape"),
+    ({"rotation": np.diag([1.0, 1.0, -1.0])}, "which is no rotation: .* the determinant is -1"),
+    ({"rotation": 2 * np.eye(3)}, "which is no rotation: R.T R differs from 1 by 3"),
+    ({"rotation": [1.0, 1.0, 0.0, 0.0]}, "of length 1.4142135.*; divide it by its length"),
+    ({"rotation": [1.0, 0.0]}, r"rotation has shape \(2,\); give a matrix \(3, 3\)"),
+    ({"spin": [1.0]}, r"spin has shape \(1,\); give \(3,\)"),
+    ({"position": [np.nan, 0, 0]}, "position is .* not finite"),
+    ({"name": "ground"}, "'ground', which effects call the body that does not move"),
+    ({"pace": "quick"}, "pace is 'quick'"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_bodies_that_cannot_be(changes, message):
+    arguments = {"name": "hub", "mass": 1.0, "inertia": MOMENTS, "position": np.zeros(3)} | changes
+    with pytest.raises(ValueError, match=message):
+        RigidBody(**arguments)
+
+
+def test_points_that_cannot_be():
+    hub, rod, ball = (
+        RigidBody("hub", 1.0, MOMENTS, np.zeros(3)),
+        RigidBody("rod", 1.0, Rod(1.0), np.ones(3)),
+        Body("ball", 1.0, [2, 2, 2]),
+    )
+    for between, message in [
+        ((("ball", [1.0, 0, 0]), "hub"), "springs: ball is no rigid body, so that no point is fixed in it"),
+        ((("hub", [1.0, 0]), "ball"), r"springs: the point in hub has shape \(2,\); give \(3,\)"),
+        ((("rod", [1.0, 0, 0]), "ball"), "springs: .* sticks out of rod: .* a plate or a rod"),
+        (("ground", "ball"), "springs: the ground has no centre; give a point of it"),
+        ((("ground", [0, 0, 0]), ("ground", [1, 0, 0])), "about the ground alone"),
+        ((("hubb", [0, 0, 0]), "ball"), "no body 'hubb'.*hub"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            Scene([hub, rod, ball], [Spring(between, 1.0)])
+    with pytest.raises(ValueError, match=r"hub \(1, 0, 0\) has no mass of its own"):
+        Scene([hub, ball], [NBodyGravity(1.0, (("hub", [1.0, 0, 0]), "ball"))])

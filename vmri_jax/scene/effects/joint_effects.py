@@ -1,0 +1,269 @@
+"""What acts in a joint, along the freedom that it leaves: springs, dampers, drives, a motion that is given, limits."""
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.names import unknown
+from vmri_jax.scene.declare import effect_class, number, positive
+from vmri_jax.scene.effect import Effect, real_tree
+from vmri_jax.scene.effects.joints import FREEDOMS, M_PRIME, Freedom, Joint, M, dot, slide, triads
+from vmri_jax.scene.effects.springs import elastic_energy
+
+
+@dataclass(frozen=True)
+class EnergyOf:
+    """``law(x, params)`` of the freedom x of a joint; compared by value."""
+
+    law: Callable
+    freedom: Callable
+
+    def __call__(self, q, params):
+        return self.law(self.freedom(q, params), params)
+
+
+@dataclass(frozen=True)
+class ForceAlong:
+    """``F = f(t, x, x', params) dx/dq`` along the freedom x of a joint; compared by value.
+
+    For the angle of a hinge f is a torque about its axis: b gets it, and a its opposite.
+    """
+
+    law: Callable
+    freedom: Callable
+
+    def __call__(self, t, q, v, params):
+        def freedom(q):
+            return self.freedom(q, params)
+
+        x, rate = jax.jvp(freedom, (q,), (v,))
+        return jax.vjp(freedom, q)[1](jnp.broadcast_to(self.law(t, x, rate, params), x.shape))[0]
+
+
+@effect_class
+class InJoint(Effect):
+    """What acts along the freedom x of a joint: the angle by which b has turned, or how far it has moved, since the start.
+
+    Args:
+        joint: name of the joint in the scene: a `Revolute`, `Prismatic` or `Cylindrical`.
+        of: "turn" or "slide", of a joint that leaves both free; "auto" for the one that there is.
+
+    Raises:
+        ValueError: (of the scene) no joint of this name, or one that leaves no such freedom.
+    """
+
+    joint: Any
+    of: Literal["turn", "slide", "auto"] = field(default="auto", kw_only=True)
+
+    whole = True
+    same_size = False
+    derived = Joint.derived
+
+    def bound(self, effects):
+        """The same with the joint itself instead of its name."""
+        joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
+        if self.joint not in joints:
+            raise ValueError(f"{self.name}: {unknown('joint', self.joint, joints)}")
+        return replace(self, joint=joints[self.joint])
+
+    @property
+    def freedom(self) -> Freedom:
+        """Which freedom of the joint it acts on."""
+        joint = self.joint
+        has: dict[Freedom, bool] = {"turn": joint.turns, "slide": joint.slides}
+        free = [name for name in has if has[name]]
+        for name in free:
+            if self.of == name:
+                return name
+        if self.of == "auto" and len(free) == 1:
+            return free[0]
+        left = " and ".join(free) or "neither an angle nor a way along an axis"
+        raise ValueError(f"{self.name}: of is {self.of!r}; {joint.name} leaves {left} free.")
+
+    def elements(self, bodies):
+        return self.joint.elements(bodies)
+
+    def parameters(self, bodies):
+        return super().parameters(bodies) | self.joint.parameters(bodies)
+
+    def check_bodies(self, bodies):
+        """Nothing: those of the joint are checked there."""
+        _ = self.freedom
+
+
+@effect_class
+class JointSpring(InJoint):
+    """Springs in joints, ``V = sum k/2 (x - x_0)^2``.
+
+    An angle is between -pi and pi: the spring must not turn further.
+
+    Args:
+        joint, of: as of `InJoint`.
+        stiffness: k, N m/rad or N/m, positive; one number, or one for each pair of the joint.
+        neutral: x_0, rad or m, where it is relaxed; likewise. The start by default.
+    """
+
+    stiffness: Any = positive()
+    neutral: Any = number(default=0.0)
+
+    kind = "potential"
+    default_name = "joint_springs"
+
+    @staticmethod
+    def law(x, params):
+        return elastic_energy(params["stiffness"], x - params["neutral"])
+
+    @property
+    def function(self):
+        return EnergyOf(self.law, FREEDOMS[self.freedom])
+
+
+@effect_class
+class JointLimit(InJoint):
+    """Stops of a joint by a smooth penalty: ``V = sum k/2 (d_-^2 + d_+^2)``, ``d = s log(1 + exp(depth / s))``.
+
+    Args:
+        joint, of: as of `InJoint`.
+        lower, upper: rad or m, since the start; one number, or one for each pair of the joint.
+        stiffness: k, N m/rad or N/m, positive; likewise.
+        smoothing: s, rad or m, positive: the way within which the stop sets in.
+
+    Raises:
+        ValueError: (of the scene) lower above upper.
+    """
+
+    lower: Any = number()
+    upper: Any = number()
+    _: KW_ONLY
+    stiffness: Any = positive()
+    smoothing: Any = positive()
+
+    kind = "potential"
+    default_name = "joint_limits"
+
+    @staticmethod
+    def law(x, params):
+        s = params["smoothing"]
+        depths = (s * jax.nn.softplus(depth / s) for depth in (params["lower"] - x, x - params["upper"]))
+        return sum(elastic_energy(params["stiffness"], depth) for depth in depths)
+
+    @property
+    def function(self):
+        return EnergyOf(self.law, FREEDOMS[self.freedom])
+
+    def curvature(self, bodies):
+        return None if self.freedom == "turn" else self.stiffness
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        params = self.parameters(bodies)
+        self.require(params["lower"] < params["upper"], "lower", params["lower"], "it must be below upper")
+
+
+@effect_class
+class JointDamper(InJoint):
+    """Dampers in joints, against the rate of the freedom: ``f = -c x'``.
+
+    Args:
+        joint, of: as of `InJoint`.
+        coefficient: c, N m s/rad or N s/m, positive; one number, or one for each pair of the joint.
+    """
+
+    coefficient: Any = positive()
+
+    kind = "force"
+    default_name = "joint_dampers"
+
+    @staticmethod
+    def law(t, x, rate, params):
+        return -params["coefficient"] * rate
+
+    @property
+    def function(self):
+        return ForceAlong(self.law, FREEDOMS[self.freedom])
+
+
+@dataclass(frozen=True)
+class OfHistory:
+    """``f(t)``; compared by value."""
+
+    history: Callable
+
+    def __call__(self, t, x, rate, params):
+        return self.history(t, params["history"])
+
+
+@effect_class
+class JointDrive(InJoint):
+    """A torque about the axis of a joint, or a force along it, as a function of time; b gets it and a its opposite.
+
+    Args:
+        joint, of: as of `InJoint`.
+        history: ``history(t, params) -> ()``, N m or N; define it at module level, it is compared by identity.
+        params: what `history` gets as params; traced.
+    """
+
+    history: Callable
+    params: Any = field(default_factory=dict)
+
+    kind = "force"
+    default_name = "joint_drive"
+
+    @property
+    def function(self):
+        return ForceAlong(OfHistory(self.history), FREEDOMS[self.freedom])
+
+    def parameters(self, bodies):
+        return super().parameters(bodies) | {"history": real_tree(f"{self.name}: params", self.params)}
+
+
+@dataclass(frozen=True)
+class GivenMotion:
+    """``x - a(t)``, of an angle as ``e . (m' cos a - m sin a)``, which is homogeneous in the directors; compared by value."""
+
+    path: Callable
+    freedom: Freedom
+
+    def __call__(self, t, q, params):
+        given = self.path(t, params["path"])
+        if self.freedom == "slide":
+            return slide(q, params) - given
+        of_a, of_b = triads(q, params)
+        e = of_b[..., M, :]
+        return dot(of_a[..., M_PRIME, :], e) * jnp.cos(given) - dot(of_a[..., M, :], e) * jnp.sin(given)
+
+
+@effect_class
+class JointMotion(InJoint):
+    """The angle of a joint, or the way along it, is given; what holds it there does the work that is needed.
+
+    Args:
+        joint, of: as of `InJoint`.
+        path: ``path(t, params) -> ()``, rad or m since the start, zero at t = 0; define it at module level.
+        params: what `path` gets as params; traced.
+
+    Raises:
+        ValueError: (of the scene) a path that does not start at zero.
+    """
+
+    path: Callable
+    params: Any = field(default_factory=dict)
+
+    kind = "constraint"
+    default_name = "joint_motion"
+    timed = True
+
+    @property
+    def function(self):
+        return GivenMotion(self.path, self.freedom)
+
+    def parameters(self, bodies):
+        return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        start = self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
+        self.require(jnp.abs(jnp.asarray(start)) < 1e-9, "path(0)", start, "the joint starts at zero")

@@ -1,0 +1,334 @@
+"""Joints between rigid bodies: what they leave free is what the bodies can do.
+
+With the point of the joint at ``phi + rho`` in each body, the gap ``D = phi_b + rho_b - phi_a - rho_a``, and the triads
+``(m, m', n)`` fixed in a and ``(e, e', f)`` fixed in b, which coincide at the start, n along the axis:
+
+| joint | rows |
+|---|---|
+| spherical | ``D`` |
+| universal | ``D``, ``n . e``, e along a second axis |
+| revolute | ``D``, ``n . e``, ``n . e'`` |
+| fixed | ``D``, ``n . e``, ``n . e'``, ``m . e'`` |
+| cylindrical | ``m . D``, ``m' . D``, ``n . e``, ``n . e'`` |
+| prismatic | ``m . D``, ``m' . D``, ``n . e``, ``n . e'``, ``m . e'`` |
+
+Rows of axes are homogeneous in the directors of each body: between macro nodes, where the interpolated directors of a slow
+body are a little too short, they still mean the same direction.
+
+Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
+"""
+
+from typing import Any, ClassVar, Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.scene.body import GROUND, Attachment, body_of, label_of
+from vmri_jax.scene.declare import effect_class, names, squeeze
+from vmri_jax.scene.effect import START, Effect
+from vmri_jax.scene.rigid import split
+
+
+def place(q, weights):
+    """``phi + sum_i X_i d_i``, (..., 3)."""
+    phi, d = split(q)
+    return phi + jnp.sum(weights[..., : d.shape[-2], None] * d, axis=-2)
+
+
+def gap(q, params):
+    """``D``, (..., 3)."""
+    a, b = q
+    return place(b, params["point_b"]) - place(a, params["point_a"])
+
+
+def triads(q, params):
+    """``(m, m', n)`` of a and ``(e, e', f)`` of b in space, (..., 3, 3) with one vector per row."""
+    return tuple(params[f"frame_{role}"] @ split(x)[1] for role, x in zip("ab", q, strict=True))
+
+
+def dot(u, v):
+    """``u . v`` over the last axis."""
+    return jnp.sum(u * v, axis=-1)
+
+
+def aligned(q, params, *pairs: tuple[int, int]):
+    """Products of the i-th vector of a with the j-th of b, (..., number of pairs)."""
+    of_a, of_b = triads(q, params)
+    return jnp.stack([dot(of_a[..., i, :], of_b[..., j, :]) for i, j in pairs], axis=-1)
+
+
+M, M_PRIME, N = range(3)
+"""Rows of a triad."""
+PARALLEL = ((N, M), (N, M_PRIME))
+"""Products that vanish where the axes of both bodies are parallel."""
+UNTURNED = (M, M_PRIME)
+"""The product that vanishes where b has not turned about the axis."""
+
+
+@effect_class
+class Joint(Effect):
+    """What all joints share: two bodies, one of them perhaps the ground, and the point where they are joined.
+
+    Args:
+        between: names (a, b), or a list of such pairs; with points in them, ``(("hub", [1, 0, 0]), ("arm", [-1, 0, 0]))``,
+            these are the points of the joint, and must coincide at the start.
+        at: (3,) the point of the joint in space at the start; or one for each pair, (n, 3). Instead of points in the bodies.
+
+    Raises:
+        ValueError: (of the scene) no point, or points that do not coincide; directions that a body does not have.
+    """
+
+    between: Any = names(2)
+    at: Any = None
+
+    kind = "constraint"
+    whole = True
+    same_size = False
+    derived = ("point_a", "point_b", "frame_a", "frame_b")
+    turns: ClassVar[bool] = False
+    """Whether b can turn about the axis n."""
+    slides: ClassVar[bool] = False
+    """Whether b can slide along the axis n."""
+
+    def elements(self, bodies):
+        return tuple(tuple(map(str, element)) for element in super().elements(bodies))
+
+    def parameters(self, bodies):
+        return {name: squeeze(jnp.stack(values)) for name, values in self._frames(bodies).items()}
+
+    def points(self, bodies):
+        return {}
+
+    def frame(self, count: int) -> list | None:
+        """(n, 3, 3) the triads (m, m', n) in space at the start, None where the joint needs no direction."""
+        return None
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        for a, b, points in zip(*zip(*self._given(bodies), strict=True), self._points(bodies), strict=True):
+            away = jnp.linalg.norm(points[1] - points[0])
+            size = jnp.maximum(jnp.max(jnp.abs(points[0])), 1.0)
+            where = " and ".join(
+                f"{label_of(name)} is at {np.asarray(p)}" for name, p in zip((a, b), points, strict=True)
+            )
+            what = f"the distance of the points of {a}-{b}"
+            self.require(away <= START * size, what, f"{float(away):.6g}", f"{where}; they must coincide at the start")
+
+    def _given(self, bodies):
+        return super().elements(bodies)
+
+    def _points(self, bodies):
+        """The points of the joint in space, one in each body, pair by pair."""
+        given = self._given(bodies)
+        if self.at is not None:
+            for element in given:
+                if any(isinstance(name, Attachment) for name in element):
+                    raise ValueError(
+                        f"{self.name}: between has points in the bodies, and at is given too; give one of them."
+                    )
+            at = _rows(f"{self.name}: at", self.at, len(given))
+            return [(point, point) for point in at]
+        found = []
+        for element in given:
+            inside = [isinstance(name, Attachment) for name in element]
+            points = [
+                body_of(bodies, name).point(getattr(name, "at", None)).position
+                for name, attached in zip(element, inside, strict=True)
+                if attached or (name != GROUND and not bodies[name].rigid)
+            ]
+            if not points:
+                raise ValueError(
+                    f"{self.name}: nothing says where {element[0]} and {element[1]} are joined; give at=[x, y, z], or a point in one of "
+                    f"them, as in ({element[0]!r}, ({element[1]!r}, [x, y, z]))."
+                )
+            found.append((points[0], points[-1]))
+        return found
+
+    def _frames(self, bodies) -> dict[str, list]:
+        """Points and triads of every pair, as weights of the directors of each body."""
+        elements, points = self.elements(bodies), self._points(bodies)
+        frames = self.frame(len(elements))
+        found: dict[str, list] = {}
+        for i, element in enumerate(elements):
+            for role, name, point in zip("ab", element, points[i], strict=True):
+                body = body_of(bodies, name)
+                if not body.rigid:
+                    if frames is not None:
+                        raise ValueError(
+                            f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
+                        )
+                    found.setdefault(f"point_{role}", []).append(jnp.zeros(3))
+                    continue
+                found.setdefault(f"point_{role}", []).append(body.weights((point - body.position) @ body.rotation))
+                if frames is not None:
+                    try:
+                        own = jnp.stack([body.weights(vector @ body.rotation) for vector in frames[i]])
+                    except ValueError as error:
+                        raise ValueError(f"{self.name}: {error}") from None
+                    found.setdefault(f"frame_{role}", []).append(own)
+        return found
+
+
+@effect_class
+class Spherical(Joint):
+    """Ball joints: the bodies share a point; three rows, ``D = 0``.
+
+    Args:
+        between, at: as of `Joint`. A body that is a point is joined by itself.
+    """
+
+    default_name = "spherical"
+    function = staticmethod(gap)
+
+
+@effect_class
+class _AboutAxis(Joint):
+    """Joints with an axis.
+
+    Args:
+        between, at: as of `Joint`.
+        axis: (3,) direction n in space at the start, of any length; or one for each pair, (n, 3).
+    """
+
+    axis: Any = (0.0, 0.0, 1.0)
+
+    def frame(self, count: int):
+        return [triad(axis) for axis in self._directions("axis", count)]
+
+    def _directions(self, name: str, count: int):
+        """(n, 3) unit vectors of a field."""
+        rows = _rows(f"{self.name}: {name}", getattr(self, name), count)
+        lengths = jnp.linalg.norm(rows, axis=-1, keepdims=True)
+        self.require(lengths > 0, name, getattr(self, name), "it must not be zero")
+        return rows / lengths
+
+
+@effect_class
+class Revolute(_AboutAxis):
+    """Hinges: b turns about an axis that is fixed in both bodies; five rows, ``D = 0, n . e = n . e' = 0``.
+
+    Args:
+        between, at, axis: as of `Joint`, and the axis in space at the start.
+    """
+
+    default_name = "revolute"
+    turns = True
+
+    @staticmethod
+    def function(q, params):
+        return jnp.concatenate([gap(q, params), aligned(q, params, *PARALLEL)], axis=-1)
+
+
+@effect_class
+class Universal(_AboutAxis):
+    """Cardan joints: an axis n of a and an axis e of b stay perpendicular; four rows, ``D = 0, n . e = 0``.
+
+    Args:
+        between, at, axis: as of `Joint`; axis is that of a.
+        second: (3,) the axis of b, perpendicular to `axis` at the start; or one for each pair, (n, 3).
+
+    Raises:
+        ValueError: (of the scene) axes that are not perpendicular.
+    """
+
+    second: Any = (1.0, 0.0, 0.0)
+
+    default_name = "universal"
+
+    @staticmethod
+    def function(q, params):
+        return jnp.concatenate([gap(q, params), aligned(q, params, (N, M))], axis=-1)
+
+    def frame(self, count: int):
+        first, second = self._directions("axis", count), self._directions("second", count)
+        tilt = jnp.sum(first * second, axis=-1)
+        self.require(jnp.abs(tilt) < START, "axis . second", tilt, "the axes must be perpendicular")
+        return [jnp.stack([m, jnp.cross(n, m), n]) for n, m in zip(first, second, strict=True)]
+
+
+@effect_class
+class Fixed(_AboutAxis):
+    """Two bodies that move as one; six rows, ``D = 0, n . e = n . e' = m . e' = 0``.
+
+    Args:
+        between, at: as of `Joint`.
+    """
+
+    default_name = "fixed"
+
+    @staticmethod
+    def function(q, params):
+        return jnp.concatenate([gap(q, params), aligned(q, params, *PARALLEL, UNTURNED)], axis=-1)
+
+
+def across(q, params):
+    """``(m . D, m' . D)``, (..., 2)."""
+    apart, (of_a, _) = gap(q, params), triads(q, params)
+    return jnp.stack([dot(of_a[..., i, :], apart) for i in (M, M_PRIME)], axis=-1)
+
+
+@effect_class
+class Cylindrical(_AboutAxis):
+    """b slides along an axis and turns about it; four rows, ``m . D = m' . D = 0, n . e = n . e' = 0``.
+
+    Args:
+        between, at, axis: as of `Revolute`.
+    """
+
+    default_name = "cylindrical"
+    turns = slides = True
+
+    @staticmethod
+    def function(q, params):
+        return jnp.concatenate([across(q, params), aligned(q, params, *PARALLEL)], axis=-1)
+
+
+@effect_class
+class Prismatic(_AboutAxis):
+    """Slides: b moves along an axis and does not turn; five rows, those of `Cylindrical` and ``m . e' = 0``.
+
+    Args:
+        between, at, axis: as of `Revolute`.
+    """
+
+    default_name = "prismatic"
+    slides = True
+
+    @staticmethod
+    def function(q, params):
+        return jnp.concatenate([across(q, params), aligned(q, params, *PARALLEL, UNTURNED)], axis=-1)
+
+
+def turn(q, params):
+    """The angle by which b has turned about the axis since the start, rad, between -pi and pi, (...)."""
+    of_a, of_b = triads(q, params)
+    e = of_b[..., M, :]
+    return jnp.arctan2(dot(of_a[..., M_PRIME, :], e), dot(of_a[..., M, :], e))
+
+
+def slide(q, params):
+    """How far b has moved along the axis since the start, ``n . D``, m, (...)."""
+    return dot(triads(q, params)[0][..., N, :], gap(q, params))
+
+
+Freedom = Literal["turn", "slide"]
+FREEDOMS = {"turn": turn, "slide": slide}
+"""What a joint can leave free."""
+
+
+def triad(axis):
+    """(3, 3) orthonormal (m, m', n) with n along a unit vector."""
+    helper = jnp.eye(3)[jnp.argmin(jnp.abs(axis))]
+    m = jnp.cross(helper, axis)
+    m = m / jnp.linalg.norm(m)
+    return jnp.stack([m, jnp.cross(axis, m), axis])
+
+
+def _rows(what: str, given, count: int):
+    """(n, 3) vectors of one or of n."""
+    rows = jnp.asarray(real_array(what, given))
+    if rows.shape not in ((3,), (count, 3)):
+        more = f", or one for each pair, ({count}, 3)" if count > 1 else ""
+        raise ValueError(f"{what} has shape {rows.shape}; give (3,){more}.")
+    return jnp.broadcast_to(rows, (count, 3))

@@ -1,0 +1,82 @@
+"""Null space method: the equations of constrained variables without their multipliers.
+
+In Newton's equations of a micro interval, or of the slow variables,
+
+    A dq - G_0^T dmu = -r        G_1 dq = -g
+
+multipliers act along the rows of G_0, the constraints at the node where the interval starts, and increments are held by G_1,
+those where it ends. With bases P_0, P_1 of the null spaces, ``G_0 P_0 = 0`` and ``G_1 P_1 = 0``, and right inverses
+``G W = 1``, the increment is ``dq = P_1 z - W_1 g`` with as few unknowns z as there are free motions,
+
+    (P_0^T A P_1) z = -P_0^T (r - A W_1 g)        dmu = W_0^T (A dq + r)
+
+The multipliers follow, and are not part of what is solved. A is a mass matrix up to order h^2, and so is its projection: its
+condition number does not depend on the step. With multipliers it grows like 1 / h^2, unless they are scaled as they are in
+`vmri_jax.schemes.equations`. At the root ``P_0^T r = 0``: the discrete null space method.
+
+P and W come from a complete QR decomposition of G^T at each node.
+
+Source: P. Betsch, The discrete null space method for the energy consistent integration of constrained mechanical systems,
+part I, Comput. Methods Appl. Mech. Engng 194 (2005); S. Leyendecker, J. E. Marsden, M. Ortiz, Variational integrators for
+constrained dynamical systems, ZAMM 88 (2008).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vmri_jax.kernels import saddle
+
+
+class Motions(NamedTuple):
+    """What constraints with the Jacobian G (n_g, n) leave free, and what they hold.
+
+    basis: P, orthonormal columns with ``G P = 0``.
+    right_inverse: W, ``G W = 1``, its columns orthogonal to those of P.
+    """
+
+    basis: Float[Array, "*nodes n n-n_g"]
+    right_inverse: Float[Array, "*nodes n n_g"]
+
+
+def motions(jacobian) -> Motions:
+    """Null space and right inverse of independent rows (..., n_g, n)."""
+    n_g, n = jacobian.shape[-2:]
+    if n_g == 0:
+        eye = jnp.broadcast_to(jnp.eye(n), (*jacobian.shape[:-2], n, n))
+        return Motions(eye, eye[..., :0])
+    q, triangle = jnp.linalg.qr(jnp.swapaxes(jacobian, -1, -2), mode="complete")
+    square = jnp.swapaxes(triangle[..., :n_g, :], -1, -2)  # G = R^T Y^T
+    eye = jnp.broadcast_to(jnp.eye(n_g), square.shape)
+    return Motions(q[..., n_g:], q[..., :n_g] @ jax.scipy.linalg.solve_triangular(square, eye, lower=True))
+
+
+def inverse(a, g_0, g_1):
+    """Inverse of ``[[A, -G_0^T], [G_1, 0]]`` with r nodes each, (..., r n + r n_g, r n + r n_g).
+
+    Args:
+        a: (..., r n, r n).
+        g_0, g_1: (..., r, n_g, n) Jacobians at the nodes where multipliers act and where increments end.
+    """
+    (p_0, w_0), (p_1, w_1) = (Motions(*map(_block_diagonal, motions(g))) for g in (g_0, g_1))
+    p_0, w_0 = (jnp.swapaxes(m, -1, -2) for m in (p_0, w_0))
+    free = p_1 @ jnp.linalg.inv(p_0 @ a @ p_1) @ p_0
+    held = w_1 - free @ (a @ w_1)
+    top = jnp.concatenate([free, held], axis=-1)
+    bottom = jnp.concatenate([w_0 @ (a @ free) - w_0, w_0 @ (a @ held)], axis=-1)
+    return jnp.concatenate([top, bottom], axis=-2)
+
+
+def inverse_with_multipliers(a, g_0, g_1):
+    """The same by elimination with the multipliers among the unknowns, kept regular where constraints become dependent."""
+    down, across = (_block_diagonal(g) for g in (g_1, g_0))
+    return jnp.linalg.inv(saddle(a, -jnp.swapaxes(across, -1, -2), down))
+
+
+def _block_diagonal(blocks):
+    """(..., r n, r m) of (..., r, n, m)."""
+    *batch, r, n, m = blocks.shape
+    whole = jnp.einsum("...jnm,ji->...jnim", blocks, jnp.eye(r))
+    return whole.reshape(*batch, r * n, r * m)
