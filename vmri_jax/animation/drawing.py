@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,11 @@ import numpy as np
 from vmri_jax.animation.checks import angles, check_keys, direction, entries, numbers, positive
 from vmri_jax.mechanics.names import near
 
-KEYS = ("bodies", "blocks", "links", "springs", "anchors", "planes", "spheres", "up", "view", "caption")
+KEYS = ("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres", "up", "view", "caption")
 BLOCK_KEYS = ("name", "coordinates", "labels")
-BODY_KEYS = ("name", "coordinates", "offset", "radius", "color")
+BODY_KEYS = ("name", "coordinates", "offset", "radius", "color", "shown")
+SOLID_KEYS = ("name", "coordinates", "corners", "faces", "color")
+SHOWN = ("ball", "name", "")
 KINDS = ("link", "spring")
 PACES = ("slow", "fast")
 
@@ -31,6 +34,7 @@ class Body:
         offset: added to the coordinates: where the body is at q = 0.
         radius: in the unit of the coordinates; None for one that suits the picture.
         color: as in CSS, ``#rrggbb``; None for that of its pace.
+        shown: "ball", "name" (of a solid, whose centre it is), or "" for a point of which nothing is shown.
     """
 
     name: str
@@ -38,11 +42,29 @@ class Body:
     offset: tuple[float, ...]
     radius: float | None = None
     color: str | None = None
+    shown: str = "ball"
 
     @property
     def pace(self) -> str:
         """ "slow" if all its coordinates are, else "fast"."""
         return "slow" if all(part == "s" for form in self.forms for _, part, _ in form) else "fast"
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A convex solid that moves with four points: a corner with the weights c is at ``x_0 + sum_i c_i (x_i - x_0)``.
+
+    Attributes:
+        points: names of the four bodies, the centre first.
+        corners: the weights (c_1, c_2, c_3) of each corner.
+        faces: numbers of their corners, anticlockwise from outside.
+        color: None for that of the pace of its centre.
+    """
+
+    points: tuple[str, ...]
+    corners: tuple[tuple[float, ...], ...]
+    faces: tuple[tuple[int, ...], ...]
+    color: str | None = None
 
 
 @dataclass(frozen=True)
@@ -92,7 +114,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Bodies, blocks of general coordinates, what joins bodies, fixed things around them.
+    """Bodies, solids, blocks of general coordinates, what joins bodies, fixed things around them.
 
     Attributes:
         up: the direction that is shown upwards, in coordinates of the bodies; None for the last coordinate (bodies of one
@@ -104,6 +126,7 @@ class Drawing:
 
     bodies: tuple[Body, ...]
     blocks: tuple[Block, ...] = ()
+    solids: tuple[Solid, ...] = ()
     joints: tuple[Joint, ...] = ()
     planes: tuple[Plane, ...] = ()
     spheres: tuple[Sphere, ...] = ()
@@ -119,7 +142,9 @@ class Drawing:
             data: a dict (or its JSON text) of
 
                 - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
-                  ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``.
+                  ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``, ``shown``.
+                - ``solids``: dicts of ``name``; ``coordinates`` of a rigid body, its centre and its directors; ``corners``, along
+                  the directors; ``faces``; and if wanted ``color``.
                 - ``blocks``: dicts of ``name``; ``coordinates``, any number of entries ``["s" or "f", index]``; and if wanted
                   ``labels``, a name for each of them.
                 - ``links``, ``springs``: pairs of names, and a third entry "slow" or "fast" if wanted.
@@ -140,7 +165,8 @@ class Drawing:
         def all_of(key: str, read: Callable) -> tuple:
             return tuple(read(entry, f"drawing: {key}[{i}]") for i, entry in enumerate(entries(data, key, "drawing")))
 
-        bodies, blocks = all_of("bodies", _body), all_of("blocks", _block)
+        bodies, blocks, solids = all_of("bodies", _body), all_of("blocks", _block), all_of("solids", _solid)
+        bodies = (*chain(*(points for _, points in solids)), *bodies)
         names = [body.name for body in bodies]
         if not bodies and not blocks:
             raise ValueError("drawing: there are no bodies and no blocks; there must be at least one.")
@@ -151,6 +177,7 @@ class Drawing:
         return cls(
             bodies=bodies,
             blocks=blocks,
+            solids=tuple(solid for solid, _ in solids),
             joints=links + springs + all_of("anchors", partial(_anchor, names)),
             planes=all_of("planes", partial(_record, Plane, {"point": numbers, "normal": direction})),
             spheres=all_of("spheres", partial(_record, Sphere, {"center": numbers, "radius": positive})),
@@ -158,6 +185,20 @@ class Drawing:
             view=None if data.get("view") is None else angles(data["view"], "drawing: view"),
             caption=str(data.get("caption") or ""),
         )
+
+    def corners(self, points: np.ndarray) -> list[np.ndarray]:
+        """(..., n, 3) corners of every solid.
+
+        Args:
+            points: (..., n_bodies, 3) positions of the bodies.
+        """
+        index = {body.name: i for i, body in enumerate(self.bodies)}
+        found = []
+        for solid in self.solids:
+            centre, *others = (points[..., index[name], :] for name in solid.points)
+            axes = np.stack([other - centre for other in others], axis=-2)
+            found.append(centre[..., None, :] + np.array(solid.corners) @ axes)
+        return found
 
     def pace(self, joint: Joint) -> str:
         """ "slow" or "fast": as it says, else "fast" if all its bodies are.
@@ -257,7 +298,37 @@ def _body(data: Any, where: str) -> Body:
         raise ValueError(f"{where}: color is {color!r}; it must be like '#0072b2'.")
     forms = tuple(_form(entry, where) for entry in coordinates)
     offset = numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
-    return Body(str(data["name"]), forms, offset, radius, color)
+    shown = data.get("shown", "ball")
+    if shown not in SHOWN:
+        raise ValueError(f"{where}: shown is {shown!r}; it must be 'ball', 'name' or ''.")
+    return Body(str(data["name"]), forms, offset, radius, color, shown)
+
+
+def _solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
+    """The solid, and the four points that it moves with: its centre, and one along each director."""
+    check_keys(data, SOLID_KEYS, SOLID_KEYS[:4], where)
+    name = str(data["name"])
+    forms = [_form(coordinate, where) for coordinate in entries(data, "coordinates", where)]
+    corners = np.array([numbers(corner, f"{where}: corners") for corner in entries(data, "corners", where)])
+    faces = tuple(tuple(operator.index(i) for i in face) for face in entries(data, "faces", where))
+    count = len(forms) // 3 - 1
+    if len(forms) != 3 * (count + 1) or not 1 <= count <= 3 or corners.ndim != 2 or corners.shape[1] != count:
+        raise ValueError(
+            f"{where}: {len(forms)} coordinates and corners of shape {corners.shape}; give the 12 coordinates of a rigid body (or "
+            "fewer, of one with fewer directors) and a number along each director for every corner."
+        )
+    if any(not 0 <= i < len(corners) for face in faces for i in face):
+        raise ValueError(f"{where}: a face has corners that there are not; there are {len(corners)}.")
+    size = float(np.abs(corners).max()) or 1.0
+    centre = tuple(forms[:3])
+    bodies = [Body(name, centre, (0.0,) * 3, None, data.get("color"), "name")]
+    for k in range(3):
+        directors = forms[3 * (k + 1) : 3 * (k + 2)] or [()] * 3
+        along = [(*a, *((size * w, part, i) for w, part, i in b)) for a, b in zip(centre, directors, strict=True)]
+        bodies.append(Body(f"{name} axis {k + 1}", tuple(along), (0.0,) * 3, shown=""))
+    weights = np.pad(corners / size, [(0, 0), (0, 3 - count)])
+    named = tuple(body.name for body in bodies)
+    return Solid(named, tuple(map(tuple, weights.tolist())), faces, data.get("color")), bodies
 
 
 def _block(data: Any, where: str) -> Block:

@@ -7,6 +7,7 @@ import jinja2
 import numpy as np
 
 from vmri_jax import plots
+from vmri_jax.animation.drawing import Drawing, Solid
 from vmri_jax.animation.geometry import LAMP, SPAN, helix
 from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
@@ -34,7 +35,7 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     every = -(-motion.points.size // MOST_NUMBERS)
     drawing, sizes = motion.drawing, layout(motion)
     springs = [connection for connection in sizes.connections if connection.kind == "spring"]
-    uncoloured = [body for body in drawing.bodies if body.color is None]
+    uncoloured = [body for body in drawing.bodies if body.color is None and body.shown]
     data = _data(motion.thinned(-(-len(motion.t) // every)), sizes)
     if every > 1:
         ending = {2: "nd", 3: "rd"}.get(every, "th")
@@ -71,9 +72,10 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "energy_title": _energy_title(motion),
         "residual": [_packed(column) for column in motion.residual.T] if constrained else None,
         "bodies": [
-            {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius)}
+            {"name": body.name, "pace": body.pace, "color": body.color, "radius": float(radius), "shown": body.shown}
             for body, radius in zip(drawing.bodies, sizes.radii, strict=True)
         ],
+        "solids": [_solid(drawing, solid) for solid in drawing.solids],
         "connections": [_plain(connection) for connection in sizes.connections],
         "planes": [_plain(ground) | {"grid": _packed(ground.grid), "bears": ground.bears} for ground in sizes.grounds],
         "spheres": [
@@ -89,7 +91,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "view": {"azimuth": sizes.azimuth, "elevation": sizes.elevation},
         "fitted": sizes.hull.tolist(),
         "margin": float(sizes.radii.max()),
-        "trails": any(sum(bool(form) for form in body.forms) > 1 for body in drawing.bodies),  # not along one line
+        "trails": any(sum(map(bool, body.forms)) > 1 for body in drawing.bodies if body.shown),  # not along one line
         "speed": speed,
         "speeds": [float(f"{speed * factor:.1g}") for factor in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10)],
         "caption": drawing.caption,
@@ -104,6 +106,17 @@ def _energy_title(motion: Motion) -> str:
     return f"{name} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
 
 
+def _solid(drawing: Drawing, solid: Solid) -> dict:
+    """Numbers of its four points, and the rest."""
+    index = {body.name: i for i, body in enumerate(drawing.bodies)}
+    return {
+        "points": [index[name] for name in solid.points],
+        "corners": solid.corners,
+        "faces": solid.faces,
+        "color": solid.color,
+    }
+
+
 def _plain(record: Connection | Ground) -> dict:
     """Its fields, arrays as lists."""
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(record).items()}
@@ -116,7 +129,7 @@ def _packed(array: np.ndarray, dtype: type = np.float32) -> str:
 
 def _description(motion: Motion) -> str:
     drawing = motion.drawing
-    names = [body.name for body in drawing.bodies]
+    names = [body.name for body in drawing.bodies if body.shown]
     kinds = [joint.kind if joint.point is None else "fixed point" for joint in drawing.joints]
     counts = {kind: kinds.count(kind) for kind in ("link", "spring", "fixed point")}
     joints = [f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count]

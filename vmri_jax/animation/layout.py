@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.drawing import Body, Drawing
 from vmri_jax.animation.geometry import grid
 from vmri_jax.animation.motion import Motion
 
@@ -13,6 +13,8 @@ TURNS = (4, 14)
 """Fewest and most turns of a spring."""
 FADED = 0.45
 """A floor fades away outwards: so much of it must be seen."""
+POINT = 0.01
+"""Radius of a point that is not shown, in that of a ball."""
 LEVEL = 0.9
 """Least vertical part of the unit normal of a plane that counts as level."""
 
@@ -99,11 +101,13 @@ def layout(motion: Motion) -> Layout:
     spheres = drawing.place([sphere.center for sphere in drawing.spheres])
     sphere_radii = np.array([sphere.radius for sphere in drawing.spheres])
     reach = sphere_radii[:, None]
-    box = np.concatenate([points.reshape(-1, 3), fixed, spheres - reach, spheres + reach])
+    corners = [corner.reshape(-1, 3) for corner in drawing.corners(points)]
+    box = np.concatenate([points.reshape(-1, 3), *corners, fixed, spheres - reach, spheres + reach])
     size = float(np.linalg.norm(np.ptp(box, axis=0))) or 1.0
     lengths = [_median_length(connection, points) or size for connection in connections]
     small = min(0.02 * size, 0.3 * min(lengths, default=size))
-    radii = np.array([small if body.radius is None else body.radius for body in drawing.bodies])
+    radii = np.array([_radius(body, small) for body in drawing.bodies])
+    shown = [float(r) for r, body in zip(radii, drawing.bodies, strict=True) if body.shown == "ball"]
     sprung = [length for c, length in zip(connections, lengths, strict=True) if c.kind == "spring"]
     coil = min(0.015 * size, 0.16 * min(sprung, default=size))
     turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS).astype(int).tolist()
@@ -113,7 +117,7 @@ def layout(motion: Motion) -> Layout:
     return Layout(
         size,
         radii,
-        rod=min(0.0048 * size, 0.4 * float(radii.min())),
+        rod=min(0.0048 * size, 0.4 * min(shown, default=small)),
         coil=coil,
         wire=0.11 * coil,
         connections=[replace(c, turns=count) for c, count in zip(connections, turns, strict=True)],
@@ -124,6 +128,12 @@ def layout(motion: Motion) -> Layout:
         azimuth=math.radians(azimuth),
         elevation=math.radians(elevation),
     )
+
+
+def _radius(body: Body, small: float) -> float:
+    if body.shown != "ball":
+        return POINT * small
+    return small if body.radius is None else body.radius
 
 
 def _connections(drawing: Drawing) -> list[Connection]:

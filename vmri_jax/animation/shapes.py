@@ -19,6 +19,8 @@ from vmri_jax.animation.motion import Motion
 
 ON_TOP = 1e9
 """In front of all things, of whatever depth."""
+AMBIENT = -0.12
+"""Shade of a face that is neither turned to the lamp nor away from it."""
 TRAIL = (160, 2000)
 """Fewest and most places of a trail."""
 NAME_SIZE = 7.5
@@ -76,13 +78,17 @@ class Stage:
         points = self.motion.at([time])[0]
         self._draw_around(pen, points)
         past = self.motion.at(self._trail_times(max(float(self.motion.t[0]), time - trail), time))
-        for i, color in enumerate(self._colors):
-            pen.trail(past[:, i], color, self.sizes.radii[i])
+        bodies = self.motion.drawing.bodies
+        balls = [i for i, body in enumerate(bodies) if body.shown == "ball"]
+        for i in balls:
+            pen.trail(past[:, i], self._colors[i], self.sizes.radii[i])
         self._draw_joints(pen, points)
-        for point, radius, color in zip(points, self.sizes.radii, self._colors, strict=True):
-            pen.ball(point, radius, color)
+        for i in balls:
+            pen.ball(points[i], self.sizes.radii[i], self._colors[i])
+        self._draw_solids(pen, points)
         if names:
-            pen.names(points, self.sizes.radii, [body.name for body in self.motion.drawing.bodies])
+            named = [i for i, body in enumerate(bodies) if body.shown]
+            pen.names(points[named], self.sizes.radii[named], [bodies[i].name for i in named])
         span = float(self.motion.t[-1] - self.motion.t[0])
         digits = max(0, 2 - math.floor(math.log10(span))) if span > 0 else 2
         label = f"$t = {time:.{digits}f}$"
@@ -108,14 +114,25 @@ class Stage:
 
     def _draw_around(self, pen: "_Pen", points: np.ndarray) -> None:
         """Planes with the shadows on them, and fixed spheres."""
-        sizes = self.sizes
-        centers, radii = np.concatenate([points, sizes.spheres]), np.concatenate([sizes.radii, sizes.sphere_radii])
+        sizes, drawing = self.sizes, self.motion.drawing
+        balls = [i for i, body in enumerate(drawing.bodies) if body.shown == "ball"]
+        centers = np.concatenate([points[balls], sizes.spheres])
+        radii = np.concatenate([sizes.radii[balls], sizes.sphere_radii])
         for ground in sizes.grounds:
             pen.ground(ground)
             if ground.bears:
                 pen.shadows(ground, centers, radii, self._ends(points), sizes.rod)
+                for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
+                    pen.shadow(ground, [corners[list(face)] for face in solid.faces])
         for center, radius in zip(sizes.spheres, sizes.sphere_radii, strict=True):
             pen.ball(center, radius, self.theme.faint)
+
+    def _draw_solids(self, pen: "_Pen", points: np.ndarray) -> None:
+        drawing = self.motion.drawing
+        colors = {body.name: color for body, color in zip(drawing.bodies, self._colors, strict=True)}
+        for solid, corners in zip(drawing.solids, drawing.corners(points), strict=True):
+            for face in solid.faces:
+                pen.face(corners[list(face)], solid.color or colors[solid.points[0]])
 
     def _draw_joints(self, pen: "_Pen", points: np.ndarray) -> None:
         sizes = self.sizes
@@ -157,6 +174,20 @@ class _Pen:
         xy = np.stack([x - 0.34 * shift, y + 0.42 * shift], axis=1)
         area = (2 * self.points * r) ** 2
         self.axes.scatter(*xy.T, s=area, c=self.tone(color, shades), linewidths=0, zorder=float(scale))
+
+    def face(self, corners, color) -> None:
+        """A face of a convex solid, lit by the lamp, if it is seen from outside."""
+        normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
+        back = self.camera.axes[2]
+        eye = self.camera.target + self.camera.distance * back
+        places, scale = self.camera.project(corners)
+        if normal @ (eye - corners.mean(axis=0)) <= 0 or not (scale > 0).all():
+            return
+        bright = float((self.camera.axes @ normal) @ LAMP / np.linalg.norm(LAMP))
+        tone = self.tone(color, AMBIENT + (0.5 if bright > 0 else 0.35) * bright)[0]
+        style = {"facecolor": tone, "edgecolor": tone, "linewidth": 0.4, "joinstyle": "round"}
+        self.axes.add_patch(PathPatch(Path(places, closed=False), zorder=float(scale.mean()), **style))
 
     def rod(self, start, end, radius: float, size: float) -> None:
         """In pieces, each with its own depth."""
@@ -243,6 +274,16 @@ class _Pen:
             width = max(0.5, 2 * self.points * rod * float(scale.mean()))
             style = {"capstyle": "round", "linewidth": width, "alpha": 0.06 * strength}
             self.axes.add_patch(PathPatch(path, fill=False, edgecolor=color, zorder=-2, **style))
+
+    def shadow(self, ground: Ground, faces) -> None:
+        """Of a convex solid: its faces that are seen from above, straight down."""
+        strength = 1.0 if self.theme is plots.LIGHT else 2.0
+        for corners in faces:
+            if np.cross(corners[1] - corners[0], corners[2] - corners[1]) @ ground.normal > 0:
+                places = self.camera.project(dropped(ground.center, ground.normal, corners))[0]
+                self.axes.add_patch(
+                    PathPatch(Path(places), facecolor="#000000", linewidth=0, alpha=0.1 * strength, zorder=-2)
+                )
 
     def polygons(self, corners, color, alpha: float, zorder: float) -> None:
         """Of as many corners each, in one path."""

@@ -13,8 +13,9 @@ from vmri_jax.scene.effects.joints import Cylindrical, Fixed, Joint, Prismatic, 
 from vmri_jax.scene.effects.links import Anchor, Guide, MovingPivot, RigidLink
 from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity
 from vmri_jax.scene.effects.springs import MovingAnchor, NonlinearSpring, Spring, SpringAnchor
-from vmri_jax.scene.rigid import Ball, Box, Cylinder, RigidBody, Rod
+from vmri_jax.scene.rigid import RigidBody
 from vmri_jax.scene.scene import Scene
+from vmri_jax.scene.shapes import Ball, Box, Cylinder, Rod
 
 __all__ = [
     "Anchor",

@@ -271,6 +271,17 @@ class Effect(ABC):
         """Largest second derivative of the energy of each element, () or (n,), where its start does not show it, else None."""
         return None
 
+    def drawn_points(self, bodies: Bodies) -> dict[str, tuple[str, Any]]:
+        """Points in rigid bodies where something drawn ends: by their names there, body and weights of its directors."""
+        if self.drawn_as is None:
+            return {}
+        names = [name for element in self.elements(bodies) for name in element]
+        return {
+            name.label: (str(name), bodies[name].weights(name.at))
+            for name in names
+            if isinstance(name, Attachment) and name != GROUND
+        }
+
     def drawing(self, bodies: Bodies) -> dict[str, list]:
         """What there is to see of it: entries of `Scene.drawing`, and "radii" of bodies, pairs of name and number."""
         if self.drawn_as is None:

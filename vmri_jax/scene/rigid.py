@@ -20,62 +20,14 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import AnyBody, Pace, Point, joined
 from vmri_jax.scene.declare import effect_class, names
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.shapes import Ball, Rod, Shape, box_of
 
 THIN = 1e-12
 """Masses E below this part of the largest one are zero: the body has no width in that direction."""
+COVERED = 1.01
+"""Points as far out as this, in half the size of a body, are drawn within it."""
 ORTHONORMAL = 1e-9
 """How far a matrix may be from a rotation, and a quaternion from length one."""
-
-
-@dataclass(frozen=True)
-class Box:
-    """A solid box with edges (a, b, c), m, along the axes of the body; one of them may be zero: a plate."""
-
-    edges: tuple[float, float, float]
-
-    def inertia(self, mass):
-        """``J_1 = m (b^2 + c^2) / 12`` and so on, (3,) kg m^2."""
-        squares = jnp.asarray(self.edges) ** 2
-        return mass * (jnp.sum(squares) - squares) / 12
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """A solid cylinder, m, its axis along the third axis of the body."""
-
-    radius: float
-    length: float
-
-    def inertia(self, mass):
-        """``J_1 = J_2 = m (3 r^2 + l^2) / 12``, ``J_3 = m r^2 / 2``, (3,) kg m^2."""
-        across = mass * (3 * self.radius**2 + self.length**2) / 12
-        return jnp.stack([across, across, mass * self.radius**2 / 2])
-
-
-@dataclass(frozen=True)
-class Ball:
-    """A solid ball, m."""
-
-    radius: float
-
-    def inertia(self, mass):
-        """``J = 2 m r^2 / 5``, (3,) kg m^2."""
-        return jnp.full(3, 0.4 * mass * self.radius**2)
-
-
-@dataclass(frozen=True)
-class Rod:
-    """A thin rod, m, along the third axis of the body: it has no other axes."""
-
-    length: float
-
-    def inertia(self, mass):
-        """``J_1 = J_2 = m l^2 / 12``, ``J_3 = 0``, (3,) kg m^2."""
-        across = mass * self.length**2 / 12
-        return jnp.stack([across, across, jnp.zeros_like(across)])
-
-
-Shape = Box | Cylinder | Ball | Rod
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +205,42 @@ class RigidBody(AnyBody):
                 "rod, without width there. Give it some."
             )
         return along
+
+    @property
+    def _drawn_shape(self) -> Shape:
+        return self.shape or box_of(float(self.mass), self.moments)
+
+    def covers(self, weights) -> bool:
+        """Whether a point in the body, by weights of its directors, is in the box around what is drawn of it."""
+        shape = self._drawn_shape
+        if isinstance(shape, Ball):
+            return bool(np.linalg.norm(weights) <= shape.radius)
+        if isinstance(shape, Rod):
+            return bool(abs(weights[0]) <= COVERED * shape.length / 2)
+        corners = (shape.polyhedron()[0] @ self.axes)[:, list(self.wide)]
+        return bool(np.all(np.abs(weights[: len(self.wide)]) <= COVERED * np.abs(corners).max(axis=0)))
+
+    def drawing(self, part: str, start: int) -> dict[str, list]:
+        """What there is to see of it: entries of `Scene.drawing`.
+
+        Args:
+            part, start: where its coordinates are, "s" or "f" and the first.
+        """
+        shape = self._drawn_shape
+        centre = {"name": self.name, "coordinates": [[part, start + i] for i in range(3)]}
+        if isinstance(shape, Ball):
+            return {"bodies": [centre | {"radius": float(shape.radius)}]}
+        if isinstance(shape, Rod):
+            half, names = shape.length / 2, [f"{self.name} start", f"{self.name} end"]
+            ends = [
+                [[[1.0, part, start + i], [sign * half, part, start + 3 + i]] for i in range(3)] for sign in (-1.0, 1.0)
+            ]
+            hidden = [{"name": name, "coordinates": form, "shown": ""} for name, form in zip(names, ends, strict=True)]
+            return {"bodies": [centre | {"shown": "name"}, *hidden], "links": [names]}
+        corners, faces = shape.polyhedron()
+        along = (corners @ self.axes)[:, list(self.wide)]
+        coordinates = [[part, start + i] for i in range(self.size)]
+        return {"solids": [{"name": self.name, "coordinates": coordinates, "corners": along.tolist(), "faces": faces}]}
 
     def weights(self, at: Any) -> Any:
         """(3,) of the directors in a point ``phi + sum_i X_i d_i``."""

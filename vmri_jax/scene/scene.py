@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import jax
+import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
@@ -19,14 +20,14 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.labels import names_of
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
-from vmri_jax.scene.rigid import Rigidity
+from vmri_jax.scene.rigid import RigidBody, Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
 EXPECTED = {"bodies": "Body or RigidBody", "effects": "Effect"}
-DRAWN_LISTS = ("links", "springs", "anchors", "planes", "spheres")
+DRAWN_LISTS = ("solids", "links", "springs", "anchors", "planes", "spheres")
 """Entries of a drawing to which effects add."""
 
 
@@ -212,7 +213,12 @@ class Scene:
         for body in self.bodies:
             part, start, size = self.places[body.name]
             axes = [[part, start + i] for i in range(size)]
-            seen["blocks" if body.block else "bodies"].append({"name": body.name, "coordinates": axes})
+            if isinstance(body, RigidBody):
+                for kind, entries in body.drawing(part, start).items():
+                    seen[kind] += entries
+            else:
+                seen["blocks" if body.block else "bodies"].append({"name": body.name, "coordinates": axes})
+        seen["bodies"] += self._drawn_points()
         for effect in self.everything:
             parts = effect.drawing(self.by_name)
             for kind in DRAWN_LISTS:
@@ -224,6 +230,17 @@ class Scene:
             if entry["name"] in radii:
                 entry["radius"] = radii[entry["name"]]
         return seen
+
+    def _drawn_points(self) -> list[dict[str, Any]]:
+        """Points in rigid bodies where something drawn ends, as bodies that are not shown."""
+        found = {}
+        for effect in self.everything:
+            for label, (name, weights) in effect.drawn_points(self.by_name).items():
+                part, start, size = self.places[name]
+                along = [1.0, *np.asarray(weights).tolist()][: size // 3]
+                forms = [[[w, part, start + 3 * k + i] for k, w in enumerate(along) if w] for i in range(3)]
+                found[label] = {"name": label, "coordinates": forms, "shown": ""}
+        return list(found.values())
 
     def _named(self, what: str, names: Iterable[str]) -> list[Effect]:
         """The effects of these names, in the order of the scene."""

@@ -38,7 +38,15 @@ function shadows(painter, plane, positions) {
     trace(context, [from, to]);
   }
   context.stroke();
-  const balls = [...bodies.map(({ radius }, i) => ({ center: at(i), radius })), ...spheres];
+  context.beginPath();
+  for (const one of data.solids) {
+    const corners = cornersOf(one, at).map((p) => camera.project(dropped(plane, p)));
+    const area = (face) => face.reduce((sum, i, k) => sum + cross(corners[face.at(k - 1)], corners[i])[2], 0);
+    for (const face of one.faces) if (area(face) < 0) outline(context, face.map((i) => corners[i]), near); // the upper ones cover the shadow
+  }
+  context.globalAlpha = 0.1 * painter.shade;
+  context.fill("nonzero");
+  const balls = [...bodies.map(({ radius, shown }, i) => ({ center: at(i), radius, shown })).filter(({ shown }) => shown === "ball"), ...spheres];
   const above = balls.map(({ center, radius }) => ({ center, radius, below: dropped(plane, center) })).filter(({ center, below }) => center[2] >= below[2]);
   context.globalAlpha = 0.026 * painter.shade;
   for (let grown = 0.7; grown < 1.5; grown += 0.1) { // a soft edge

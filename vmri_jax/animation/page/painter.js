@@ -81,17 +81,18 @@ class Painter {
     context.lineCap = context.lineJoin = "round";
     for (const plane of data.planes) drawPlane(this, plane, positions);
     for (const sphere of data.spheres) obstacle(this, sphere);
-    bodies.forEach((body, i) => drawTrail(this, trail, i, at(i), body.radius));
+    bodies.forEach((body, i) => body.shown === "ball" && drawTrail(this, trail, i, at(i), body.radius));
     for (const { kind, body, other, point, pace, turns } of data.connections) {
       const ends = [at(body), point ?? at(other), bodies[body].radius, point ? 0 : bodies[other].radius];
       if (kind === "link") rod(this, ...ends);
       else spring(this, ...ends, this.colors[pace], turns);
       if (point && Math.hypot(...plus(point, ends[0], -1)) > ends[2]) ball(this, point, 1.5 * data.rod, this.colors.rod); // else within the body
     }
-    bodies.forEach((body, i) => ball(this, at(i), body.radius, this.bodies[i]));
+    bodies.forEach((body, i) => body.shown === "ball" && ball(this, at(i), body.radius, this.bodies[i]));
+    data.solids.forEach((one) => solid(this, one, at));
     this.items.sort((a, b) => b[0] - a[0]);
     for (const item of this.items) item[1](context);
-    if (this.names) bodies.forEach((body, i) => label(this, at(i), body));
+    if (this.names) bodies.forEach((body, i) => body.shown && label(this, at(i), body));
   }
 }
 

@@ -1,4 +1,4 @@
-// Bodies as balls, links as rods, springs as helices, and where bodies have been.
+// Bodies as balls and solids, links as rods, springs as helices, and where bodies have been.
 
 function ball(painter, center, radius, color) {
   const { camera } = painter, [x, y, depth] = camera.project(center), r = Math.max(1.2, (camera.scale * radius) / depth);
@@ -8,6 +8,33 @@ function ball(painter, center, radius, color) {
     context.fillStyle = shine;
     disc(context, x, y, r);
   });
+}
+
+// Corners of a solid: its first point, plus weights times the ways to the other three.
+function cornersOf({ points, corners }, at) {
+  const [center, ...others] = points.map(at), axes = others.map((p) => plus(p, center, -1));
+  return corners.map((weights) => weights.reduce((p, w, k) => plus(p, axes[k], w), center));
+}
+
+// The faces of a convex solid that are seen from outside, lit by the lamp.
+function solid(painter, one, at) {
+  const { camera } = painter, lamp = unit(painter.data.lamp), color = one.color ? rgb(one.color) : painter.bodies[one.points[0]];
+  const corners = cornersOf(one, at), places = corners.map((p) => camera.project(p));
+  for (const face of one.faces) {
+    const [a, b, c] = face.map((i) => corners[i]), normal = unit(cross(plus(b, a, -1), plus(c, b, -1)));
+    const middle = face.reduce((sum, i) => plus(sum, corners[i], 1 / face.length), [0, 0, 0]);
+    if (dot(normal, plus(camera.eye, middle, -1)) <= 0) continue;
+    const bright = [camera.right, camera.up, camera.back].reduce((sum, axis, k) => sum + dot(normal, axis) * lamp[k], 0);
+    const depth = face.reduce((sum, i) => sum + places[i][2], 0) / face.length;
+    painter.add(depth, (context) => {
+      context.fillStyle = context.strokeStyle = painter.tone(color, -0.12 + (bright > 0 ? 0.5 : 0.35) * bright, depth);
+      context.lineWidth = 0.7; // or seams would show
+      context.beginPath();
+      outline(context, face.map((i) => places[i]), 0.02 * camera.distance);
+      context.fill();
+      context.stroke();
+    });
+  }
 }
 
 // Where a joint of two balls starts and ends, and its direction; null if they touch or an end lies within the other ball.

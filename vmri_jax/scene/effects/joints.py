@@ -27,7 +27,7 @@ from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.scene.body import GROUND, Attachment, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, squeeze
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.rigid import split
+from vmri_jax.scene.rigid import RigidBody, split
 
 
 def place(q, weights):
@@ -114,6 +114,32 @@ class Joint(Effect):
             )
             what = f"the distance of the points of {a}-{b}"
             self.require(away <= START * size, what, f"{float(away):.6g}", f"{where}; they must coincide at the start")
+
+    def drawn_points(self, bodies):
+        points = {role: np.atleast_2d(values) for role, values in zip("ab", self._ends(bodies), strict=True)}
+        return {
+            self._end(element, name): (name, points[role][i])
+            for i, element in enumerate(self.elements(bodies))
+            for role, name in zip("ab", element, strict=True)
+            if self._sticks_out(name, points[role][i], bodies)
+        }
+
+    def drawing(self, bodies):
+        return {"links": [[name, end] for end, (name, _) in self.drawn_points(bodies).items()]}
+
+    def _ends(self, bodies):
+        params = self.parameters(bodies)
+        return params["point_a"], params["point_b"]
+
+    @staticmethod
+    def _sticks_out(name: str, point, bodies) -> bool:
+        """Whether an arm is drawn from the centre of a body to the point of the joint."""
+        body = body_of(bodies, name)
+        return isinstance(body, RigidBody) and not body.covers(point)
+
+    def _end(self, element, name: str) -> str:
+        """What the point of the joint in a body is called in drawings."""
+        return f"{self.name} {'-'.join(element)} in {name}"
 
     def _given(self, bodies):
         return super().elements(bodies)

@@ -1,0 +1,84 @@
+"""Solid shapes of rigid bodies: their moments of inertia, and the corners and faces that are drawn."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+SIDES = 20
+"""Of a cylinder as it is drawn."""
+
+Polyhedron = tuple[np.ndarray, list[list[int]]]
+"""Corners (n, 3) in the axes of a body, and faces as their numbers, anticlockwise from outside."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A solid box with edges (a, b, c), m, along the axes of the body; one of them may be zero: a plate."""
+
+    edges: tuple[float, float, float]
+
+    def inertia(self, mass):
+        """``J_1 = m (b^2 + c^2) / 12`` and so on, (3,) kg m^2."""
+        squares = jnp.asarray(self.edges) ** 2
+        return mass * (jnp.sum(squares) - squares) / 12
+
+    def polyhedron(self) -> Polyhedron:
+        """Eight corners and six faces."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+        return signs * np.asarray(self.edges, dtype=float) / 2, faces
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A solid cylinder, m, its axis along the third axis of the body."""
+
+    radius: float
+    length: float
+
+    def inertia(self, mass):
+        """``J_1 = J_2 = m (3 r^2 + l^2) / 12``, ``J_3 = m r^2 / 2``, (3,) kg m^2."""
+        across = mass * (3 * self.radius**2 + self.length**2) / 12
+        return jnp.stack([across, across, mass * self.radius**2 / 2])
+
+    def polyhedron(self) -> Polyhedron:
+        """Two polygons of so many `SIDES`, and what is between them."""
+        angle = 2 * np.pi * np.arange(SIDES) / SIDES
+        circle = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        ends = [np.column_stack([circle, np.full(SIDES, z)]) for z in (-self.length / 2, self.length / 2)]
+        around = [[i, (i + 1) % SIDES, SIDES + (i + 1) % SIDES, SIDES + i] for i in range(SIDES)]
+        return np.concatenate(ends), [*around, [*range(SIDES)][::-1], [*range(SIDES, 2 * SIDES)]]
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A solid ball, m."""
+
+    radius: float
+
+    def inertia(self, mass):
+        """``J = 2 m r^2 / 5``, (3,) kg m^2."""
+        return jnp.full(3, 0.4 * mass * self.radius**2)
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A thin rod, m, along the third axis of the body: it has no other axes."""
+
+    length: float
+
+    def inertia(self, mass):
+        """``J_1 = J_2 = m l^2 / 12``, ``J_3 = 0``, (3,) kg m^2."""
+        across = mass * self.length**2 / 12
+        return jnp.stack([across, across, jnp.zeros_like(across)])
+
+
+Shape = Box | Cylinder | Ball | Rod
+
+
+def box_of(mass: float, moments) -> Box:
+    """The solid box with these principal moments of inertia."""
+    squares = 6 * (np.sum(moments) - 2 * np.asarray(moments)) / mass
+    a, b, c = np.sqrt(np.maximum(squares, 0.0)).tolist()
+    return Box((a, b, c))
