@@ -2,11 +2,11 @@
 
 Teaches: closed loops of hinges in a plane have rows too many, which the scene leaves out and names.
 
-    vmri simulate notebooks/scenes/four_bar.py:scene --scheme fully-implicit --num-micro 1 --macro-dt 0.01 --steps 1000 --out four_bar.npz
-    vmri animate four_bar.npz --out four_bar.png --frames 3 --to 3 --view=-80,12
-
 Source: F. Gonzalez, A. Luaces, U. Lugris, M. Gonzalez, Non-intrusive parallelization of multibody system dynamic simulations,
 Comput. Mech. 44 (2009), case A02 of the IFToMM library of benchmarks.
+
+    vmri simulate notebooks/scenes/four_bar.py:scene --scheme fully-implicit --num-micro 1 --macro-dt 0.01 --steps 1000 --out four_bar.npz
+    vmri animate four_bar.npz --out four_bar.png --frames 3 --to 3 --view=-80,12
 """
 
 import numpy as np

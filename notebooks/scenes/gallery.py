@@ -67,10 +67,11 @@ def option(words: list[str], name: str, default: str = "") -> str:
     return words[words.index(name) + 1] if name in words else default
 
 
-def momentum_maps(system: vm.System, run: vm.Trajectory, size: int) -> list[np.ndarray]:
+def momentum_maps(system: vm.System, run: vm.Trajectory, size: int, shifted: tuple) -> list[np.ndarray]:
     """Linear and angular momenta (k,) of points in R^size along a run, of those motions that are symmetries, scaled.
 
-    A translation or rotation ``xi = A x + b`` is one if Lagrangian and constraints do not change along it, at some states
+    `shifted` says of every vector in q_s and of every one in q_f whether it is a point, or a director: a direction, which a
+    translation leaves as it is. A translation or rotation ``xi = A x + b`` is one if Lagrangian and constraints do not change along it, at some states
     of the run. The scale is the largest sum of the sizes of all terms of ``p . xi``.
     """
 
@@ -81,7 +82,10 @@ def momentum_maps(system: vm.System, run: vm.Trajectory, size: int) -> list[np.n
         return jnp.append(system.constraints(0.0, *q), lagrangian)
 
     def moved(matrix, shift, x):
-        return tuple((part.reshape(-1, size) @ matrix.T + shift).reshape(-1) for part in x)
+        parts = zip(x, shifted, strict=True)
+        return tuple(
+            (part.reshape(-1, size) @ matrix.T + points[:, None] * shift).reshape(-1) for part, points in parts
+        )
 
     @jax.jit
     def rate(matrix, shift, q, p):
@@ -96,9 +100,19 @@ def momentum_maps(system: vm.System, run: vm.Trajectory, size: int) -> list[np.n
         states = [((run.q_s[k], run.q_f[k]), (run.p_s[k], run.p_f[k])) for k in (0, len(run.t) // 2, -1)]
         if max(float(jnp.abs(rate(*motion, q, p)).max()) for q, p in states) < SYMMETRIC:
             q, p = (np.concatenate(pair, axis=1) for pair in ((run.q_s, run.q_f), (run.p_s, run.p_f)))
-            terms = p * (q.reshape(len(q), -1, size) @ motion[0].T + motion[1]).reshape(q.shape)
+            shift = np.concatenate(shifted)[:, None] * motion[1]
+            terms = p * (q.reshape(len(q), -1, size) @ motion[0].T + shift).reshape(q.shape)
             found.append(terms.sum(axis=1) / np.abs(terms).sum(axis=1).max())
     return found
+
+
+def points_and_directors(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Of every vector in q_s and in q_f, 1 for a point and 0 for a director of a rigid body."""
+    found: dict[str, list[float]] = {"s": [], "f": []}
+    for name, place in scene.places.items():
+        directors = place.size // 3 - 1 if scene.by_name[name].rigid else 0
+        found[place.part] += [1.0] + [0.0] * directors
+    return np.array(found["s"]), np.array(found["f"])
 
 
 class Kept(NamedTuple):
@@ -124,8 +138,9 @@ def kept(scene: Scene, run: vm.Trajectory) -> Kept:
     kinetic, power = kinetic_and_power(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
     work = np.append(0.0, np.cumsum(np.diff(run.t) * (power[1:] + power[:-1]) / 2))
     balance = np.asarray(run.energy) - run.energy[0] - work
-    sizes, points = {body.size for body in scene.bodies}, not any(body.block for body in scene.bodies)
-    maps = momentum_maps(system, run, sizes.pop()) if points and len(sizes) == 1 and system.force is None else []
+    sizes = {0 if body.block else body.point().size for body in scene.bodies}
+    counted = len(sizes) == 1 and 0 not in sizes and system.force is None
+    maps = momentum_maps(system, run, *sizes, shifted=points_and_directors(scene)) if counted else []
     momentum = max((float(np.abs(values - values[0]).max()) for values in maps), default=0.0)
     energy = np.nan if system.is_rheonomic else float(np.abs(balance).max() / kinetic.max())
     return Kept(energy, float(run.constraint_residual[:, 0].max()), len(maps), momentum)
@@ -164,9 +179,10 @@ def row(path: Path, folder: Path) -> str:
 
 def section(path: Path) -> str:
     """What a scene is about, how to run it, its picture."""
-    (title, teaches), commands = docstring(path)
+    paragraphs, commands = docstring(path)
     lines = "\n".join(shlex.join(["vmri", *words]) for words in commands)
-    return f"## {path.stem}\n\n{title}\n{teaches}\n\n```sh\n{lines}\n```\n\n![{path.stem}]({path.stem}.png)\n"
+    about = "\n".join(paragraphs)
+    return f"## {path.stem}\n\n{about}\n\n```sh\n{lines}\n```\n\n![{path.stem}]({path.stem}.png)\n"
 
 
 def shrink(path: Path) -> None:

@@ -2,11 +2,11 @@
 
 Teaches: a mechanism from its published data; a fast one, of which nothing is slow.
 
-    vmri simulate notebooks/scenes/squeezer.py:scene --scheme galerkin --degree 2 --num-micro 1 --macro-dt 0.0001 --steps 300 --out squeezer.npz
-    vmri animate squeezer.npz --out squeezer.png --frames 3 --view=-90,89
-
 Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, VII.7, after W. Schiehlen, Multibody Systems Handbook,
 1990. In the plane z = 0; units are those of the source, m, kg, s.
+
+    vmri simulate notebooks/scenes/squeezer.py:scene --scheme galerkin --degree 2 --num-micro 1 --macro-dt 0.0001 --steps 300 --out squeezer.npz
+    vmri animate squeezer.npz --out squeezer.png --frames 3 --view=-90,89
 """
 
 import jax.numpy as jnp

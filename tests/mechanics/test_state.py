@@ -19,6 +19,12 @@ def test_momenta_are_mass_times_velocity(fpu):
     assert float(state.t) == 0.0
 
 
+def test_a_problem_starts_at_rest_by_default():
+    problem = Problem(System(ConstantMass([1.0], [1.0, 2.0])), [0.5], [1.0, 2.0])
+    np.testing.assert_array_equal(problem.v_s, [0.0])
+    np.testing.assert_array_equal(problem.state().p_f, [0.0, 0.0])
+
+
 def test_a_problem_takes_plain_lists():
     """Functions of the system get arrays, also where studies call them with the start of a problem."""
     ring = System(ConstantMass([1.0, 1.0], [1.0]), slow_constraint=lambda q_s, params: jnp.array([q_s @ q_s - 1.0]))

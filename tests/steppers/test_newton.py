@@ -75,7 +75,7 @@ def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(f
     [
         (
             {"method": "sparse"},
-            "method is 'sparse'; it must be one of auto, nested, arrowhead, dense",
+            "method is 'sparse'; it must be one of auto, nested, arrowhead, null_space, dense",
         ),
         ({"tolerance": 0.0}, "tolerance is 0.0; it must be positive"),
         ({"max_iterations": 0}, "max_iterations is 0; it must be positive"),

@@ -95,7 +95,7 @@ def _tell_of_velocities(taken: float) -> None:
 
 @dataclass(frozen=True)
 class Problem:
-    """A system with initial positions and velocities, which are kept as arrays.
+    """A system with initial positions and velocities, which are kept as arrays; at rest by default.
 
     drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
     project: whether `state` projects positions and velocities onto the constraints, see `initial_state`.
@@ -108,8 +108,8 @@ class Problem:
     system: System
     q_s: Any
     q_f: Any
-    v_s: Any
-    v_f: Any
+    v_s: Any = None
+    v_f: Any = None
     t: Number = 0.0
     drawing: Any = None
     project: bool = False
@@ -123,6 +123,9 @@ class Problem:
             System,
             "a vmri_jax.System; of a scene its .system(), of a problem its .system",
         )
+        for velocity, position in (("v_s", self.q_s), ("v_f", self.q_f)):
+            if getattr(self, velocity) is None:
+                object.__setattr__(self, velocity, np.zeros(np.shape(position)))
         names = "q_s", "q_f", "v_s", "v_f"
         for name, array in zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True):
             object.__setattr__(self, name, array)

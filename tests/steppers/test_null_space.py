@@ -1,0 +1,76 @@
+"""The null space method: the same trajectory without multipliers among the unknowns, and a matrix that no step makes worse."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.scene.gallery_scenes import gallery_scene
+from vmri_jax import systems
+from vmri_jax.diagnostics import null_space_condition, symplectic_defect
+from vmri_jax.steppers.newton.null_space import inverse, inverse_with_multipliers, motions
+
+NULL_SPACE = vm.Newton(method="null_space")
+
+
+def test_bases_span_what_is_free_and_what_is_held():
+    jacobian = jnp.asarray(np.random.default_rng(1).normal(size=(4, 3, 7)))
+    basis, right_inverse = motions(jacobian)
+    np.testing.assert_allclose(jacobian @ basis, np.zeros((4, 3, 4)), atol=1e-14)
+    np.testing.assert_allclose(jacobian @ right_inverse, np.broadcast_to(np.eye(3), (4, 3, 3)), atol=1e-13)
+    np.testing.assert_allclose(jnp.swapaxes(basis, 1, 2) @ basis, np.broadcast_to(np.eye(4), (4, 4, 4)), atol=1e-14)
+    assert motions(jacobian[:, :0]).basis.shape == (4, 7, 7)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_the_inverse_is_that_with_multipliers(degree):
+    random = np.random.default_rng(degree)
+    a = jnp.asarray(random.normal(size=(5, 6 * degree, 6 * degree)) + 8 * np.eye(6 * degree))
+    g_0, g_1 = (jnp.asarray(random.normal(size=(5, degree, 2, 6))) for _ in range(2))
+    np.testing.assert_allclose(inverse(a, g_0, g_1), inverse_with_multipliers(a, g_0, g_1), atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["triple_spherical_pendulum", "simple_atomic_model"])
+@pytest.mark.parametrize("steps", [200, pytest.param(10_000, marks=pytest.mark.full)])
+def test_trajectories_are_those_of_the_method_with_multipliers(name, steps):
+    problem = getattr(systems, name)()
+    arguments = {"macro_dt": 0.01, "num_steps": steps, "save_every": 20}
+    runs = [
+        vm.simulate(problem, vm.fully_implicit(num_micro=5), newton=newton, **arguments)
+        for newton in (NULL_SPACE, vm.Newton(method="arrowhead"))
+    ]
+    assert runs[0].info.method[0] == vm.Method.NULL_SPACE
+    assert float(runs[0].constraint_residual.max()) < 1e-12
+    for found, other in ((runs[0].q_s, runs[1].q_s), (runs[0].q_f, runs[1].q_f)):
+        np.testing.assert_allclose(found, other, atol=1e-11)
+    first, second = (run.multipliers() for run in runs)
+    for constraint in first:
+        np.testing.assert_allclose(first[constraint], second[constraint], atol=1e-6)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", ["spinning_top", "four_bar", "rigid_satellite"])
+def test_trajectories_of_rigid_bodies(name):
+    scene = gallery_scene(name)
+    runs = [
+        vm.simulate(scene, vm.fully_implicit(num_micro=2), macro_dt=0.005, num_steps=100, newton=newton)
+        for newton in (NULL_SPACE, None)
+    ]
+    np.testing.assert_allclose(runs[0].q_s, runs[1].q_s, atol=1e-11)
+    np.testing.assert_allclose(runs[0].q_f, runs[1].q_f, atol=1e-11)
+
+
+def test_steps_are_symplectic():
+    problem = systems.triple_spherical_pendulum()
+    defect = symplectic_defect(problem, vm.fully_implicit(num_micro=3), macro_dt=0.02, newton=NULL_SPACE)
+    assert float(defect) < 1e-11
+
+
+@pytest.mark.parametrize("name", ["triple_spherical_pendulum", "simple_atomic_model"])
+def test_the_condition_does_not_depend_on_the_step(name):
+    problem = getattr(systems, name)()
+    found = [
+        null_space_condition(problem, vm.fully_implicit(num_micro=3), macro_dt=step)
+        for step in 10.0 ** -np.arange(1, 7)
+    ]
+    assert max(found) < 1.01 * min(found)  # measured 1.000
