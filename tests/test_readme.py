@@ -28,6 +28,17 @@ def test_example_runs(tmp_path):
     assert (tmp_path / "run.csv").read_text().startswith("t,trolley,hook x,hook y,load x,load y,v trolley,")
 
 
+def test_scenes_run():
+    """Points and springs, then rigid bodies and a hinge, one after the other as they stand there."""
+    scope = {}
+    for start in ("from vmri_jax.scene import Anchor", "from vmri_jax.scene import Box"):
+        exec(next(program for program in PROGRAMS if program.startswith(start)), scope)
+    for name, places in (("scene", {"hook": "s", "bell": "f"}), ("satellite", {"hub": "s", "panel": "f"})):
+        scene = scope[name]
+        assert {body: scene.places[body].part for body in places} == places
+        assert vm.simulate(scene, vm.fully_implicit(num_micro=10), macro_dt=0.01, num_steps=10).success
+
+
 @pytest.mark.full
 def test_a_gradient_over_many_steps_in_little_memory(fpu):
     recipe = next(program for program in PROGRAMS if "jax.checkpoint" in program)

@@ -23,6 +23,7 @@ NAMES = [path.stem for path in gallery.scenes()]
 ENERGY = {"bouncing_chain": 2e-3, "fermi_pasta_ulam": 2e-3, "molecule": 3e-3, "valve_train": 3e-3}
 """Measured 2e-3 at most; the work of forces is summed up at macro nodes."""
 MAPS = {
+    "spinning_top": 1,
     "satellite": 6,
     "molecule": 6,
     "bouncing_chain": 3,
@@ -54,7 +55,7 @@ def run(name: str):
 
 
 def test_all_scenes_are_there():
-    assert len(NAMES) == 11
+    assert len(NAMES) == 16
     readme = (FOLDER / "README.md").read_text(encoding="utf-8")
     for name in NAMES:
         assert f"]({name}.png)" in readme
@@ -72,6 +73,10 @@ def test_commands(name):
 
 
 LONG = (
+    "engine",
+    "four_bar",
+    "rigid_satellite",
+    "squeezer",
     "satellite",
     "valve_train",
     "ion_trap",

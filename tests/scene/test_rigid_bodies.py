@@ -128,7 +128,7 @@ def test_a_matrix_of_inertia_is_turned_into_principal_axes():
     np.testing.assert_allclose(given.moments, MOMENTS)
     weight = Body("weight", 1.0, [2.0, 2.0, 2.0])
     ends = []
-    for body, point in ((given, at), (principal, turned.T @ at)):
+    for body, point in ((given, at), (principal, np.asarray(turned).T @ at)):
         spring = Spring((("hub", point), "weight"), 3.0)
         np.testing.assert_allclose(body.point(np.asarray(point)).position, at, atol=1e-15)
         ends.append(vm.simulate(Scene([body, weight], [spring]), ONE, macro_dt=0.1, num_steps=10).position("weight"))

@@ -92,8 +92,12 @@ SCHEMES = {
 }
 
 
+MODELS = (".xml", ".mjcf", ".urdf")
+"""Files that MuJoCo reads."""
+
+
 def find_problem(name: str) -> Problem:
-    """A built-in problem by name, or one of your own, ``my_file.py:my_problem``.
+    """A built-in problem by name, or one of your own, ``my_file.py:my_problem``, or a model of MuJoCo, ``model.xml``.
 
     In the file it is a `Problem`, a `Scene`, or a function without arguments making one; ``my_file.py`` alone stands for
     the one that it has, or for its ``scene`` or ``problem``, and then says so.
@@ -126,6 +130,11 @@ def find_scene(name: str) -> Scene:
 
 def _find_own(name: str) -> Problem | Scene:
     file_name, colon, attribute = name.partition(":")
+    if Path(name).suffix.lower() in MODELS:
+        try:
+            return Scene.from_mujoco(name)
+        except ImportError as error:
+            raise ValueError(str(error)) from error
     if not colon and not file_name.endswith(".py"):
         raise ValueError(f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem.")
     path = Path(file_name)

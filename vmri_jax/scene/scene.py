@@ -1,7 +1,7 @@
 """Scenes: bodies and the effects between them, turned into an ordinary `System`."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -94,6 +94,25 @@ class Scene:
                 if name not in potentials:
                     raise ValueError(f"{effect.name}: {unknown('potential', name, potentials)}")
         check_constraints(self.sorting)
+
+    @classmethod
+    def from_mujoco(cls, model: Any, *, qpos: Any = None, qvel: Any = None, ignore: Collection[str] = ()) -> "Scene":
+        """The scene of a model of MuJoCo: bodies, inertias, joints, their springs and dampers, connect, weld, gravity.
+
+        All bodies decide their pace by themselves; ``scene.replace("arm", pace="fast")`` changes that.
+
+        Args:
+            model: path of an MJCF or URDF file, or a compiled `mujoco.MjModel`.
+            qpos, qvel: MuJoCo's coordinates and velocities at the start; None for those of the model, at rest.
+            ignore: what is left out although the model has it, by the names in the message that refuses it.
+
+        Raises:
+            ImportError: without the package mujoco.
+            ValueError: a file that MuJoCo cannot read; all that a scene does not express, in one list.
+        """
+        from vmri_jax.scene.mujoco import bodies_and_effects  # its package is an extra
+
+        return cls(*bodies_and_effects(model, qpos, qvel, ignore), redundant="drop", project=True)
 
     @cached_property
     def by_name(self) -> dict[str, AnyBody]:

@@ -73,8 +73,7 @@ class InJoint(Effect):
     def freedom(self) -> Freedom:
         """Which freedom of the joint it acts on."""
         joint = self.joint
-        has: dict[Freedom, bool] = {"turn": joint.turns, "slide": joint.slides}
-        free = [name for name in has if has[name]]
+        free: list[Freedom] = ["turn"] * joint.turns + ["slide"] * joint.slides
         for name in free:
             if self.of == name:
                 return name
