@@ -26,6 +26,7 @@ from vmri_jax.scene import (
     Spherical,
     Universal,
 )
+from vmri_jax.scene.body import Pace
 from vmri_jax.scene.effects.joints import slide, turn
 from vmri_jax.scene.rigid import angular_velocity, rotation
 
@@ -83,7 +84,7 @@ def test_a_joint_holds_what_it_says_and_leaves_the_rest(joint, left):
         assert np.ptp(slide((a, b), held)) > 0.02
 
 
-def pendulum(*effects, mass=2.0, length=0.7, tilt=0.5, pace="slow", spin=0.0):
+def pendulum(*effects, mass=2.0, length=0.7, tilt=0.5, pace: Pace = "slow", spin=0.0):
     """A bar that swings about the y axis through the origin."""
     bar = RigidBody(
         "bar",

@@ -31,10 +31,11 @@ def test_the_inverse_is_that_with_multipliers(degree):
 
 
 @pytest.mark.parametrize("name", ["triple_spherical_pendulum", "simple_atomic_model"])
-@pytest.mark.parametrize("steps", [200, pytest.param(10_000, marks=pytest.mark.full)])
-def test_trajectories_are_those_of_the_method_with_multipliers(name, steps):
+@pytest.mark.parametrize(("step", "steps"), [(0.01, 200), pytest.param(0.001, 10_000, marks=pytest.mark.full)])
+def test_trajectories_are_those_of_the_method_with_multipliers(name, step, steps):
+    """Over longer times both part, as does every other method: the motion is chaotic."""
     problem = getattr(systems, name)()
-    arguments = {"macro_dt": 0.01, "num_steps": steps, "save_every": 20}
+    arguments = {"macro_dt": step, "num_steps": steps, "save_every": 20}
     runs = [
         vm.simulate(problem, vm.fully_implicit(num_micro=5), newton=newton, **arguments)
         for newton in (NULL_SPACE, vm.Newton(method="arrowhead"))
@@ -49,11 +50,11 @@ def test_trajectories_are_those_of_the_method_with_multipliers(name, steps):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ["spinning_top", "four_bar", "rigid_satellite"])
-def test_trajectories_of_rigid_bodies(name):
+@pytest.mark.parametrize(("name", "num_micro"), [("spinning_top", 1), ("four_bar", 1), ("rigid_satellite", 5)])
+def test_trajectories_of_rigid_bodies(name, num_micro):
     scene = gallery_scene(name)
     runs = [
-        vm.simulate(scene, vm.fully_implicit(num_micro=2), macro_dt=0.005, num_steps=100, newton=newton)
+        vm.simulate(scene, vm.fully_implicit(num_micro), macro_dt=0.005, num_steps=100, newton=newton)
         for newton in (NULL_SPACE, None)
     ]
     np.testing.assert_allclose(runs[0].q_s, runs[1].q_s, atol=1e-11)
