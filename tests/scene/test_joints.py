@@ -103,17 +103,8 @@ INERTIA = 2.0 * (3 * 0.1**2 + 1.0) / 12 + 2.0 * 0.7**2
 """Of `pendulum` about its hinge."""
 
 
-def angles(scene, run, name="hinge"):
-    joint = next(effect for effect in scene.effects if effect.name == name)
-    q = tuple(
-        jnp.asarray(np.broadcast_to(ground(), (len(run), 12)) if n == "ground" else run.position(n))
-        for n in joint.between
-    )
-    return np.asarray(turn(q, joint.parameters(scene.by_name)))
-
-
-def ground():
-    return np.concatenate([np.zeros(3), np.eye(3).ravel()])
+def angles(scene, run):
+    return scene.joint_motion(run, "hinge")
 
 
 @pytest.mark.parametrize("pace", ["slow", "fast"])
@@ -153,6 +144,20 @@ def test_a_damper_in_a_hinge_stops_it():
     run = vm.simulate(scene, ONE, macro_dt=0.01, num_steps=100)
     rate = -np.asarray(angular_velocity(run.position("bar"), run.velocity("bar")))[:, 1]
     np.testing.assert_allclose(rate, 0.8 * np.exp(-2.0 / INERTIA * np.asarray(run.t)), atol=1e-5)
+
+
+def test_the_motion_of_joints_is_read_by_name():
+    scene = joined(Cylindrical(("a", "b"), AT, Y, name="pipe"))
+    run = vm.simulate(Scene(scene.bodies, scene.effects, project=True), ONE, macro_dt=0.05, num_steps=10)
+    assert scene.joint_motion(run, "pipe", "slide").shape == scene.joint_motion(run, "pipe", "turn").shape == (11,)
+    with pytest.raises(ValueError, match=r"of is 'auto'; pipe leaves turn and slide free"):
+        scene.joint_motion(run, "pipe")
+    with pytest.raises(ValueError, match=r"Scene.joint_motion: there is no joint 'pip'. Did you mean pipe"):
+        scene.joint_motion(run, "pip")
+    pair = Revolute([("ground", "a"), ("a", "b")], [[0, 0, 0], AT], Y, name="chain")
+    scene = Scene(two_bodies(), [pair], project=True)
+    run = vm.simulate(scene, ONE, macro_dt=0.05, num_steps=10)
+    assert list(scene.joint_motion(run, "chain")) == ["ground-a", "a-b"]
 
 
 def swing(t, params):
@@ -238,7 +243,15 @@ def test_a_fast_body_between_two_slow_ones_cannot_follow():
 
 
 def joined(*effects):
-    return Scene([*two_bodies(), Body("p", 1.0, [3.0, 0, 0]), RigidBody("rod", 1.0, Rod(1.0), [0, 2.0, 0])], effects)
+    return Scene(
+        [
+            *two_bodies(),
+            Body("p", 1.0, [3.0, 0, 0]),
+            Body("flat", 1.0, [3.0, 0]),
+            RigidBody("rod", 1.0, Rod(1.0), [0, 2.0, 0]),
+        ],
+        effects,
+    )
 
 
 @pytest.mark.parametrize(
@@ -251,6 +264,7 @@ def joined(*effects):
         ((Spherical(("a", "b")),), r"nothing says where a and b are joined; give at=\[x, y, z\]"),
         ((Spherical((("a", [0.5, 0, 0]), "b"), [0.5, 0, 0]),), "at is given too; give one of them"),
         ((Revolute(("a", "p")),), "revolute: p is a point, which has no axes"),
+        ((Spherical(("a", "flat"), [0, 0, 0]),), "spherical: flat has 2 coordinates; joints are between rigid bodies"),
         ((Revolute(("a", "rod"), [0, 2.0, 0]),), "revolute: .* sticks out of rod"),
         ((Revolute(("a", "b"), AT, [0, 0, 0]),), "axis is .*; it must not be zero"),
         ((Revolute(("a", "b"), AT, [0, 1.0]),), r"axis has shape \(2,\); give \(3,\)"),

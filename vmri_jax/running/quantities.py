@@ -92,6 +92,18 @@ class Quantities(ABC):
         run = self.whole()
         return _of_body(run.names, body, run.q_s, run.q_f)
 
+    def momentum(self, body: str):
+        """Momenta of a body at the saved nodes, (..., k, size).
+
+        Args:
+            body: its name; "q_s" or "q_f" for all coordinates of a system without names.
+
+        Raises:
+            ValueError: no body of this name.
+        """
+        run = self.whole()
+        return _of_body(run.names, body, run.p_s, run.p_f)
+
     def velocity(self, body: str):
         """Velocities (..., k, size) of a body, or of a coordinate that has a name.
 

@@ -13,7 +13,7 @@ from vmri_jax.scene.effects.joints import Cylindrical, Fixed, Joint, Prismatic, 
 from vmri_jax.scene.effects.links import Anchor, Guide, MovingPivot, RigidLink
 from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity
 from vmri_jax.scene.effects.springs import MovingAnchor, NonlinearSpring, Spring, SpringAnchor
-from vmri_jax.scene.rigid import RigidBody
+from vmri_jax.scene.rigid import RigidBody, angular_momentum, angular_velocity, quaternion, rotation
 from vmri_jax.scene.scene import Scene
 from vmri_jax.scene.shapes import Ball, Box, Cylinder, Rod
 
@@ -68,4 +68,8 @@ __all__ = [
     "SpringAnchor",
     "Torsion",
     "Universal",
+    "angular_momentum",
+    "angular_velocity",
+    "quaternion",
+    "rotation",
 ]

@@ -368,7 +368,7 @@ def angular_momentum(q, p):
 
     Args:
         q: (..., 12) coordinates, ``run.position("hub")``.
-        p: (..., 12) momenta, masses times velocities.
+        p: (..., 12) momenta, ``run.momentum("hub")``.
     """
     (phi, d), (push, turn) = split(np.asarray(q)), split(np.asarray(p))
     return np.cross(phi, push) + np.sum(np.cross(d, turn), axis=-2)

@@ -17,6 +17,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.body import AnyBody
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.joints import Joint, along_run
 from vmri_jax.scene.labels import names_of
 from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
@@ -170,6 +171,23 @@ class Scene:
     def state(self) -> State:
         """The consistent initial state, see `initial_state`."""
         return initial_state(self.system(), *self.start, project=self.project)
+
+    def joint_motion(self, run, joint: str, of: Literal["turn", "slide", "auto"] = "auto"):
+        """How far a joint has turned (rad) or moved along its axis (m) since the start, (k,); of several pairs a dict of these.
+
+        Args:
+            run: of this scene.
+            joint: name of the joint, a `Revolute`, `Prismatic` or `Cylindrical`.
+            of: which of both, where the joint leaves both free.
+
+        Raises:
+            ValueError: no joint of this name, or one that leaves no such freedom.
+        """
+        joints = {effect.name: effect for effect in self.effects if isinstance(effect, Joint)}
+        if joint not in joints:
+            raise ValueError(f"Scene.joint_motion: {unknown('joint', joint, joints)}")
+        found = along_run(joints[joint], run, self.by_name, of)
+        return found if len(found) > 1 else next(iter(found.values()))
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.

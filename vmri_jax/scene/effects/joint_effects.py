@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.scene.declare import effect_class, number, positive
 from vmri_jax.scene.effect import Effect, real_tree
-from vmri_jax.scene.effects.joints import FREEDOMS, M_PRIME, Freedom, Joint, M, dot, slide, triads
+from vmri_jax.scene.effects.joints import FREEDOMS, M_PRIME, Freedom, Joint, M, dot, freedom_of, slide, triads
 from vmri_jax.scene.effects.springs import elastic_energy
 
 
@@ -72,15 +72,10 @@ class InJoint(Effect):
     @property
     def freedom(self) -> Freedom:
         """Which freedom of the joint it acts on."""
-        joint = self.joint
-        free: list[Freedom] = ["turn"] * joint.turns + ["slide"] * joint.slides
-        for name in free:
-            if self.of == name:
-                return name
-        if self.of == "auto" and len(free) == 1:
-            return free[0]
-        left = " and ".join(free) or "neither an angle nor a way along an axis"
-        raise ValueError(f"{self.name}: of is {self.of!r}; {joint.name} leaves {left} free.")
+        try:
+            return freedom_of(self.joint, self.of)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from None
 
     def elements(self, bodies):
         return self.joint.elements(bodies)

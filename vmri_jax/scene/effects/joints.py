@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
-from vmri_jax.scene.body import GROUND, Attachment, body_of, label_of
+from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, squeeze
 from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.rigid import RigidBody, split
@@ -103,6 +103,16 @@ class Joint(Effect):
     def frame(self, count: int) -> list | None:
         """(n, 3, 3) the triads (m, m', n) in space at the start, None where the joint needs no direction."""
         return None
+
+    def check_bodies(self, bodies):
+        super().check_bodies(bodies)
+        for element in self.elements(bodies):
+            for name in element:
+                body = body_of(bodies, name)
+                if not body.rigid and (body.block or body.size != 3):
+                    raise ValueError(
+                        f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
+                    )
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
@@ -341,6 +351,38 @@ def slide(q, params):
 Freedom = Literal["turn", "slide"]
 FREEDOMS = {"turn": turn, "slide": slide}
 """What a joint can leave free."""
+
+
+def freedom_of(joint: Joint, of: str) -> Freedom:
+    """The freedom that a joint leaves: that which is asked for, or with "auto" the one that there is.
+
+    Raises:
+        ValueError: it leaves another one, several, or none.
+    """
+    if joint.turns and (of == "turn" or (of == "auto" and not joint.slides)):
+        return "turn"
+    if joint.slides and (of == "slide" or (of == "auto" and not joint.turns)):
+        return "slide"
+    free = [name for name, has in (("turn", joint.turns), ("slide", joint.slides)) if has]
+    left = " and ".join(free) or "neither an angle nor a way along an axis"
+    raise ValueError(f"of is {of!r}; {joint.name} leaves {left} free.")
+
+
+def along_run(joint: Joint, run, bodies: Bodies, of: str) -> dict[str, np.ndarray]:
+    """The freedom of a joint along a run, (k,) for every pair of bodies, angles without jumps; see `Scene.joint_motion`.
+
+    Args:
+        joint, bodies: of the scene.
+        run: of the scene.
+        of: as of `freedom_of`.
+    """
+    name, params, found = freedom_of(joint, of), joint.parameters(bodies), {}
+    for i, element in enumerate(joint.elements(bodies)):
+        _, own = joint.one(i, bodies, params)
+        q = tuple(GROUND_COORDINATES if body == GROUND else np.asarray(run.position(body)) for body in element)
+        values = np.asarray(FREEDOMS[name](q, own))
+        found["-".join(element)] = np.unwrap(values) if name == "turn" else values
+    return found
 
 
 def triad(axis):
