@@ -21,6 +21,10 @@ def history(t, params):
     return params["f"] * jnp.sin(t) * jnp.ones(3)
 
 
+def torque(t, params):
+    return params["f"] * jnp.sin(t)
+
+
 def path_of_b(t, params):
     return jnp.array([2.0, 0.0, 8.0]) + history(t, params)
 
@@ -74,10 +78,34 @@ EFFECTS = [
     sc.Force(wind, "b", {"f": 1.0}),
 ]
 
+RIGID = sc.Scene(
+    [
+        sc.RigidBody("hub", 9.0, [1.0, 2.0, 2.5], [0.0, 0.0, 0.0], pace="slow"),
+        sc.RigidBody("arm", 2.0, sc.Box((1.0, 0.2, 0.3)), [1.0, 0.0, 0.0], pace="fast"),
+        sc.RigidBody("free", 3.0, sc.Cylinder(0.3, 1.0), [0.0, 2.0, 0.0], [0.3, 0.0, 0.0], pace="fast"),
+    ],
+    [sc.Gravity(9.81), sc.Revolute(("hub", "arm"), [0.5, 0.0, 0.0], name="pin")],
+)
+PAIR, AT = ("hub", "free"), [0.0, 1.0, 0.0]
+RIGID_EFFECTS = [
+    sc.Spherical(PAIR, AT),
+    sc.Universal(PAIR, AT),
+    sc.Revolute(PAIR, AT),
+    sc.Fixed(PAIR, AT),
+    sc.Cylindrical(PAIR, AT),
+    sc.Prismatic(PAIR, AT),
+    sc.JointSpring("pin", 2.0),
+    sc.JointLimit("pin", -1.0, 1.0, stiffness=1e3, smoothing=0.01),
+    sc.JointDamper("pin", 0.1),
+    sc.JointDrive("pin", torque, {"f": 1.0}),
+    sc.JointMotion("pin", torque, {"f": 1.0}),
+]
+"""Joints, and what acts in them."""
 
-def scene_with(effect: sc.Effect) -> sc.Scene:
+
+def scene_with(effect: sc.Effect, base: sc.Scene = BASE) -> sc.Scene:
     """The base with an effect between its own two."""
-    return sc.Scene(BASE.bodies, (BASE.effects[0], effect, BASE.effects[1]))
+    return sc.Scene(base.bodies, (base.effects[0], effect, base.effects[1]))
 
 
 def weight(q_s, q_f, params):

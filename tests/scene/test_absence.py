@@ -1,37 +1,40 @@
 """What a scene does not call for costs nothing: every effect in turn put into a scene and taken out again."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.scene.effect_scenes import BASE, EFFECTS, base_by_hand, scene_with
+from tests.scene.effect_scenes import BASE, EFFECTS, RIGID, RIGID_EFFECTS, base_by_hand, scene_with
 from vmri_jax import fully_explicit, initial_state
 from vmri_jax import scene as sc
 from vmri_jax.scene.ledger import operations, prepare_steps, temporary_bytes
 
 
 def test_every_effect_is_in_the_list():
-    listed = {type(effect) for effect in (*EFFECTS, *BASE.effects)}
+    listed = {type(effect) for effect in (*EFFECTS, *RIGID_EFFECTS, *BASE.effects)}
     offered = {value for value in vars(sc).values() if isinstance(value, type) and issubclass(value, sc.Effect)}
-    assert offered - listed == {sc.Effect}
+    assert offered - listed == {sc.Effect, sc.Joint}
 
 
-@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
-def test_what_is_taken_out_was_never_there(effect):
+CASES = [(BASE, effect) for effect in EFFECTS] + [(RIGID, effect) for effect in RIGID_EFFECTS]
+
+
+@pytest.mark.parametrize(("base", "effect"), CASES, ids=lambda part: part.name if isinstance(part, sc.Effect) else "")
+def test_what_is_taken_out_was_never_there(base, effect):
     """Equal static structure and equal shapes: the compiled program is the same one, by the rule that `jax.jit` follows."""
-    scene = scene_with(effect)
-    with_it, without, never = scene.system(), scene.without(effect.name).system(), BASE.system()
+    scene = scene_with(effect, base)
+    with_it, without, never = scene.system(), scene.without(effect.name).system(), base.system()
     assert jax.tree.structure(without) == jax.tree.structure(never)
     assert jax.tree.all(jax.tree.map(np.array_equal, without, never))
     assert jax.tree.structure(with_it) != jax.tree.structure(never)
     rows = {row.name: row for row in scene.explain(fully_explicit(5), measure=False).rows}
-    values = scene.system().num_constraints(jnp.zeros(3), jnp.zeros(9))
-    assert rows[effect.name].multipliers == 5 * values[0] + values[1]
+    start = scene.start[:2]
+    micro, macro = (a - b for a, b in zip(with_it.num_constraints(*start), never.num_constraints(*start), strict=True))
+    assert rows[effect.name].multipliers == 5 * micro + macro
     q_s, q_f, v_s, v_f = (getattr(scene.problem(), name) for name in ("q_s", "q_f", "v_s", "v_f"))
     state = initial_state(with_it, q_s, q_f, v_s, v_f, project=True)  # every function can be evaluated there
     forces = jax.eval_shape(with_it.forces, state.t, q_s, q_f, v_s, v_f)
-    assert [f.shape for f in forces] == [(3,), (9,)]
+    assert [f.shape for f in forces] == [q_s.shape, q_f.shape]
 
 
 def test_program_is_that_of_the_system_written_by_hand():

@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 
 from tests.scene.effect_scenes import BASE, EFFECTS
-from vmri_jax.scene import Body, Gravity, MagneticField, PlaneContact, Scene, SpringAnchor
+from vmri_jax.scene import (
+    Body,
+    Gravity,
+    JointSpring,
+    MagneticField,
+    PlaneContact,
+    Revolute,
+    RigidBody,
+    Scene,
+    SpringAnchor,
+)
 
 
 def bouncing(x) -> Scene:
@@ -32,6 +42,24 @@ def test_traced_scenes_have_a_start(transform):
     assert drawings == [None]
     assert bouncing(x).problem().drawing == bouncing(x).drawing()
     assert bouncing(x).drawing()["bodies"][0]["radius"] == pytest.approx(0.7)
+
+
+def swinging(x) -> Scene:
+    """A number in mass, inertia, place, rotation, spin, joint and spring of a rigid body."""
+    moments, up = np.array([1.0, 2.0, 2.5]), np.array([0.0, 0.0, 1.0])
+    bar = RigidBody("bar", 2.0 * x, x * moments, x * up, x * np.array([0.1, 0.3, 0.2]), spin=x * up, pace="slow")
+    hinge = Revolute(("ground", ("bar", x * -up)), axis=x * np.array([0.1, 1.0, 0.2]), name="hinge")
+    return Scene([bar], [hinge, JointSpring("hinge", x, 0.1 * x, rate="slow")], project=True)
+
+
+def test_scenes_of_rigid_bodies_may_be_traced():
+    def start(x):
+        state, system = swinging(x).state(), swinging(x).system()
+        return jnp.sum(state.p_s * jnp.arange(12.0)) + system.slow_potential(state.q_s, state.q_f, system.params)
+
+    x, step = 0.7, 1e-5
+    difference = (start(x + step) - start(x - step)) / (2 * step)
+    assert jax.grad(start)(x) == pytest.approx(float(difference), rel=1e-6)
 
 
 def scaled(item, x, **changes):

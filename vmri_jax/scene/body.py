@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -42,7 +43,7 @@ def is_entry(item: Any) -> bool:
     if isinstance(item, str):
         return True
     pair = isinstance(item, tuple | list) and len(item) == 2 and isinstance(item[0], str)
-    return pair and not is_entry(item[1]) and not any(isinstance(x, str) for x in np.ravel(np.asarray(item[1], object)))
+    return pair and not is_entry(item[1]) and not any(isinstance(x, str) for x in jax.tree.leaves(item[1]))
 
 
 def entry(item: Any) -> str:

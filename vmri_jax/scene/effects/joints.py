@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, squeeze
 from vmri_jax.scene.effect import START, Effect
@@ -117,6 +117,8 @@ class Joint(Effect):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         for a, b, points in zip(*zip(*self._given(bodies), strict=True), self._points(bodies), strict=True):
+            if not is_concrete(points):
+                continue
             away = jnp.linalg.norm(points[1] - points[0])
             size = jnp.maximum(jnp.max(jnp.abs(points[0])), 1.0)
             where = " and ".join(
