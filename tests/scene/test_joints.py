@@ -157,7 +157,8 @@ def test_the_motion_of_joints_is_read_by_name():
     pair = Revolute([("ground", "a"), ("a", "b")], [[0, 0, 0], AT], Y, name="chain")
     scene = Scene(two_bodies(), [pair], project=True)
     run = vm.simulate(scene, ONE, macro_dt=0.05, num_steps=10)
-    assert list(scene.joint_motion(run, "chain")) == ["ground-a", "a-b"]
+    first, second = (scene.joint_motion(run, "chain", pair=pair) for pair in (0, 1))
+    assert np.abs(first - second).max() > 1e-3
 
 
 def swing(t, params):

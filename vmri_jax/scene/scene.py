@@ -172,22 +172,23 @@ class Scene:
         """The consistent initial state, see `initial_state`."""
         return initial_state(self.system(), *self.start, project=self.project)
 
-    def joint_motion(self, run, joint: str, of: Literal["turn", "slide", "auto"] = "auto"):
-        """How far a joint has turned (rad) or moved along its axis (m) since the start, (k,); of several pairs a dict of these.
+    def joint_motion(self, run, joint: str, of: Literal["turn", "slide", "auto"] = "auto", pair: int = 0) -> np.ndarray:
+        """How far a joint has turned (rad) or moved along its axis (m) since the start, (k,).
 
         Args:
             run: of this scene.
             joint: name of the joint, a `Revolute`, `Prismatic` or `Cylindrical`.
             of: which of both, where the joint leaves both free.
+            pair: number of the pair of bodies, where it joins several.
 
         Raises:
             ValueError: no joint of this name, or one that leaves no such freedom.
+            IndexError: no such pair.
         """
         joints = {effect.name: effect for effect in self.effects if isinstance(effect, Joint)}
         if joint not in joints:
             raise ValueError(f"Scene.joint_motion: {unknown('joint', joint, joints)}")
-        found = along_run(joints[joint], run, self.by_name, of)
-        return found if len(found) > 1 else next(iter(found.values()))
+        return along_run(joints[joint], run, self.by_name, of, pair)
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.

@@ -370,21 +370,23 @@ def freedom_of(joint: Joint, of: str) -> Freedom:
     raise ValueError(f"of is {of!r}; {joint.name} leaves {left} free.")
 
 
-def along_run(joint: Joint, run, bodies: Bodies, of: str) -> dict[str, np.ndarray]:
-    """The freedom of a joint along a run, (k,) for every pair of bodies, angles without jumps; see `Scene.joint_motion`.
+def along_run(joint: Joint, run, bodies: Bodies, of: str, pair: int) -> np.ndarray:
+    """The freedom of a joint along a run, (k,), angles without jumps; see `Scene.joint_motion`.
 
     Args:
         joint, bodies: of the scene.
         run: of the scene.
         of: as of `freedom_of`.
+        pair: number of the pair of bodies, where it joins several.
+
+    Raises:
+        IndexError: no such pair.
     """
-    name, params, found = freedom_of(joint, of), joint.parameters(bodies), {}
-    for i, element in enumerate(joint.elements(bodies)):
-        _, own = joint.one(i, bodies, params)
-        q = tuple(GROUND_COORDINATES if body == GROUND else np.asarray(run.position(body)) for body in element)
-        values = np.asarray(FREEDOMS[name](q, own))
-        found["-".join(element)] = np.unwrap(values) if name == "turn" else values
-    return found
+    name, element = freedom_of(joint, of), joint.elements(bodies)[pair]
+    _, params = joint.one(pair, bodies, joint.parameters(bodies))
+    q = tuple(GROUND_COORDINATES if body == GROUND else np.asarray(run.position(body)) for body in element)
+    values = np.asarray(FREEDOMS[name](q, params))
+    return np.unwrap(values) if name == "turn" else values
 
 
 def triad(axis):
