@@ -69,7 +69,6 @@ class Point(NamedTuple):
 
     name: str
     position: Any
-    velocity: Any
     mass: Any = None
     block: bool = False
 
@@ -240,7 +239,7 @@ class Body(AnyBody):
         """
         if at is not None:
             raise ValueError(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
-        return Point(self.name, self.position, self.velocity, self.mass, self.block)
+        return Point(self.name, self.position, self.mass, self.block)
 
 
 class Ground(AnyBody):
@@ -256,7 +255,7 @@ class Ground(AnyBody):
         """A point that stays where it is."""
         if at is None:
             raise ValueError('the ground has no centre; give a point of it, ("ground", [x, y, z]).')
-        return Point(GROUND, at, np.zeros(len(at)))
+        return Point(GROUND, at)
 
 
 Bodies = Mapping[str, AnyBody]
@@ -283,7 +282,7 @@ def end_of(bodies: Bodies, name: str, whole: bool = False) -> Point:
     """
     body, at = body_of(bodies, name), getattr(name, "at", None)
     if whole and body.rigid and at is None:
-        return Point(name, body.coordinates, body.rates)
+        return Point(name, body.coordinates)
     return body.point(at)
 
 

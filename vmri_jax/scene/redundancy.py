@@ -52,10 +52,12 @@ def without_redundant(sorting: Sorting) -> Sorting:
         sorting: bodies at their places, effects at their homes.
     """
     held = _held(sorting)
-    rows = [row for part in held for row in kept_rows(sorting, part)]
+    found = [(part, kept_rows(sorting, part)) for part in held]
+    rows = [row for _, own in found for row in own]
     if not rows:
         return sorting
-    own = np.array([isinstance(part.effect, Rigidity) for part in held for _ in kept_rows(sorting, part)])
+    counts = {part: len(own) for part, own in found}
+    own = np.repeat([isinstance(part.effect, Rigidity) for part in held], list(counts.values()))
     mass = np.concatenate(_of_all(sorting, "masses"))
     scaled = np.array([row for _, row in rows]) / np.sqrt(mass)
     scaled /= np.linalg.norm(scaled, axis=1, keepdims=True)
@@ -68,7 +70,7 @@ def without_redundant(sorting: Sorting) -> Sorting:
     placed, at = [], 0
     for part in sorting.placed:
         if part in held:
-            count = len(kept_rows(sorting, part))
+            count = counts[part]
             part = part._replace(dropped=tuple(k for k in range(count) if at + k in dropped))
             at += count
         placed.append(part)

@@ -250,14 +250,11 @@ class RigidBody(AnyBody):
     def point(self, at: Any = None) -> Point:
         """The centre of mass, or a point fixed in the body, at the start."""
         if at is None:
-            return Point(self.name, self.position, self.velocity, self.mass)
+            return Point(self.name, self.position, self.mass)
         if at.shape != (3,):
             raise ValueError(f"the point in {self.name} has shape {at.shape}; give (3,), in the axes of the body.")
         self.components(at)
-        arm = self.rotation @ at
-        moved = jnp.cross(self.spin, arm)
-        moved = np.asarray(moved) if is_concrete(moved) else moved
-        return Point(self.name, self.position + arm, self.velocity + moved)
+        return Point(self.name, self.position + self.rotation @ at)
 
 
 @effect_class

@@ -128,7 +128,8 @@ class Joint(Effect):
             self.require(away <= START * size, what, f"{float(away):.6g}", f"{where}; they must coincide at the start")
 
     def drawn_points(self, bodies):
-        points = {role: np.atleast_2d(values) for role, values in zip("ab", self._ends(bodies), strict=True)}
+        params = self.parameters(bodies)
+        points = {role: np.atleast_2d(params[f"point_{role}"]) for role in "ab"}
         return {
             self._end(element, name): (name, points[role][i])
             for i, element in enumerate(self.elements(bodies))
@@ -138,10 +139,6 @@ class Joint(Effect):
 
     def drawing(self, bodies):
         return {"links": [[name, end] for end, (name, _) in self.drawn_points(bodies).items()]}
-
-    def _ends(self, bodies):
-        params = self.parameters(bodies)
-        return params["point_a"], params["point_b"]
 
     @staticmethod
     def _sticks_out(name: str, point, bodies) -> bool:
