@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vmri_jax import kernels
 from vmri_jax.kernels import cpu as algebra
 from vmri_jax.kernels import plain
 
@@ -32,8 +33,8 @@ def test_inverses_of_several(n):
     [([], 0.0), ([-0.0], 0.0), ([1.0, -3.5, 2.0], 3.5), ([1.0, -np.inf], np.inf), ([np.inf, np.nan, 1.0], np.nan)],
 )
 def test_max_abs(values, expected):
-    for kernels in (algebra, plain):
-        found = (kernels.max_abs(jnp.asarray(values)), jax.vmap(kernels.max_abs)(jnp.asarray([values, values]))[1])
+    for module in (algebra, plain):
+        found = (module.max_abs(jnp.asarray(values)), jax.vmap(module.max_abs)(jnp.asarray([values, values]))[1])
         if np.isfinite(expected):
             assert np.array_equal(found, [expected] * 2)
         else:
@@ -66,3 +67,21 @@ def test_no_library_call_below_the_limit():
         jax.jit(lambda a, b: algebra.solve(a, b) + algebra.matmul(a, b)).lower(jnp.eye(12), jnp.ones((12, 2))).compile()
     )
     assert "custom-call" not in str(compiled.as_text())
+
+
+@pytest.mark.parametrize(("n", "width", "nodes"), [(30, 2, 1), (41, 3, 1), (30, 2, 2), (9, 8, 1)])
+def test_a_band_in_any_order_is_inverted_like_the_full_matrix(n, width, nodes):
+    rng = np.random.default_rng(n)
+    near = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= width
+    shuffled = rng.permutation(n)
+    pattern = near[np.ix_(shuffled, shuffled)]
+    blocks = np.tile(pattern, (nodes, nodes))
+    a = np.where(blocks, 0.1 * rng.normal(size=blocks.shape), 0.0) + np.diag(1 + rng.random(n * nodes))
+    g = rng.normal(size=n * nodes)
+
+    found = kernels.sparsity(pattern, nodes)
+    assert isinstance(found, kernels.Full if width == 8 else kernels.Band)
+    products = jnp.asarray(found.seeds @ a.T)
+    expected = np.linalg.solve(a, g)
+    assert np.abs(found.inverse(products).times(jnp.asarray(g)) - expected).max() < 1e-13
+    assert np.abs(found.solve(products, jnp.asarray(g)) - expected).max() < 1e-13

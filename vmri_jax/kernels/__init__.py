@@ -7,6 +7,7 @@ VMRI_KERNELS (``plain`` or ``cpu``, the default) chooses one when the package is
 import os
 
 from vmri_jax.kernels import cpu, plain
+from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity
 from vmri_jax.kernels.saddle import REGULARIZATION, regularized, saddle
 
 CHOICES = {"plain": plain, "cpu": cpu}
@@ -22,4 +23,19 @@ matvec = _chosen.matvec
 max_abs = _chosen.max_abs
 solve = _chosen.solve
 
-__all__ = ["REGULARIZATION", "inverse", "matmul", "matvec", "max_abs", "regularized", "saddle", "solve"]
+__all__ = [
+    "REGULARIZATION",
+    "Band",
+    "BandInverse",
+    "Full",
+    "FullInverse",
+    "Sparsity",
+    "inverse",
+    "matmul",
+    "matvec",
+    "max_abs",
+    "regularized",
+    "saddle",
+    "solve",
+    "sparsity",
+]

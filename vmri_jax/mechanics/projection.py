@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax import kernels
+from vmri_jax.kernels import Full, Sparsity
 from vmri_jax.mechanics.system import System
 
 MAX_ITERATIONS = 50
@@ -23,7 +24,7 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
     return jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
 
 
-def project_momentum(system: System, state, guess=None):
+def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):
     """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their velocities.
 
     v is the velocity of the projected momentum, ``p - G^T mu = dT/dv``: of all v with ``G v + dg/dt = 0`` the one that
@@ -33,27 +34,29 @@ def project_momentum(system: System, state, guess=None):
     Args:
         state: a `State`: time, positions and momenta.
         guess: velocities (v_s, v_f) where Newton's iteration starts, by default at rest.
+        sparsity: of ``G M^-1 G^T``, for constant masses; full by default.
 
     Returns:
         (p_s, p_f, v_s, v_f); NaN where Newton's iteration does not converge.
     """
     if system.has_constant_mass:
-        return _by_one_solve(system, state.t, state.q_s, state.q_f, state.p_s, state.p_f)
+        return _by_one_solve(system, state.t, state.q_s, state.q_f, state.p_s, state.p_f, sparsity)
     return _by_newton(system, state.t, state.q_s, state.q_f, state.p_s, state.p_f, guess)
 
 
-def _by_one_solve(system: System, t, q_s, q_f, p_s, p_f):
+def _by_one_solve(system: System, t, q_s, q_f, p_s, p_f, sparsity: Sparsity | None):
     """``G M^-1 G^T mu = G M^-1 p + dg/dt``."""
     velocity = system.kinetic.velocity
     constraints = partial(system.constraints, t)
     g, pull = jax.vjp(constraints, q_s, q_f)
     if g.size:
         push = jax.linearize(constraints, q_s, q_f)[1]
-        matrix = jax.vmap(lambda unit: push(*velocity(*pull(unit))))(jnp.eye(g.size))  # G M^-1 G^T
+        sparsity = sparsity or Full(g.size)
+        products = jax.vmap(lambda seed: push(*velocity(*pull(seed))))(sparsity.seeds)  # with G M^-1 G^T
         rates = push(*velocity(p_s, p_f))
         if system.is_rheonomic:
             rates = rates + _own_rates(system, t, q_s, q_f)
-        mu = kernels.solve(kernels.regularized(matrix), rates[:, None])[:, 0]
+        mu = sparsity.solve(products, rates)
         pull_s, pull_f = pull(mu)
         p_s, p_f = p_s - pull_s, p_f - pull_f
     return p_s, p_f, *velocity(p_s, p_f)

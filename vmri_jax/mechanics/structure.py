@@ -113,6 +113,11 @@ def has_constant_hessian(function: Callable, *args) -> bool:
     return not depends_on(product, args, args)[0]
 
 
+def is_linear(function: Callable, q) -> bool:
+    """Whether ``function(q) -> ()`` is at most linear in q."""
+    return not depends_on(jax.grad(function), q)[0]
+
+
 def has_diagonal_hessian(function: Callable, q) -> bool:
     """Whether ``function(q) -> ()`` is a sum over the elements of the vector q: each gradient entry sees its own alone."""
     jaxpr = jax.make_jaxpr(jax.grad(function))(q).jaxpr

@@ -1,6 +1,7 @@
 """One micro interval as a problem of its own, and the Newton matrix its fast increments are corrected with."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -8,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import inverse, matvec, max_abs, regularized, solve
+from vmri_jax.kernels import Full, Sparsity, inverse, matvec, max_abs, regularized, solve
 from vmri_jax.mechanics.arrays import Number
+from vmri_jax.mechanics.constraint_pattern import fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
-from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian
+from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations
@@ -21,6 +23,8 @@ from vmri_jax.schemes.scheme import Scheme
 
 ROUNDOFF = 4.0
 """Changes of the positions below so many units of round-off are accepted."""
+SMALL = 16
+"""Matrices of micro intervals up to this size are renewed with every macro step."""
 SAFETY = 10.0
 """Of the tolerance, and of how corrections shrink from one iteration to the next."""
 
@@ -88,6 +92,11 @@ def implicit_terms(system: System, scheme: Scheme) -> list[Term]:
     return [term for term in terms if isinstance(term, Term) and term.inside.groups]
 
 
+def _of_fast(term: Term, q_s, q_f):
+    """The integrand of a term at slow positions that are known."""
+    return term.integrand(*({"q_s": q_s, "q_f": q_f}[name] for name in term.arguments))
+
+
 class DiagonalMatrix(NamedTuple):
     """K of a micro interval for every coordinate alone.
 
@@ -134,11 +143,13 @@ class Interval:
         fast coordinate alone: fast equations are explicit, or W is a sum over the coordinates. V is then left out: it is the
         soft potential, and h^2 times its curvature is small beside the mass.
     is_constant: K is the same for a whole run.
+    sparsity: of ``G K^-1 G^T``.
     """
 
     is_explicit: bool
     is_diagonal: bool
     is_constant: bool
+    sparsity: Sparsity
 
     @classmethod
     def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "Interval":
@@ -146,7 +157,9 @@ class Interval:
         terms = implicit_terms(system, scheme)
         of_fast = [term for term in terms if term.arguments == ("q_f",)]
         sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
-        is_diagonal = isinstance(constant_mass(system).fast_mass, Diagonal) and (not terms or sums)
+        straight = all(is_linear(partial(_of_fast, term, q_s), q_f) for term in terms)
+        straight &= scheme.degree == 1 or q_f.size > SMALL  # few of high degree are taken together
+        is_diagonal = isinstance(constant_mass(system).fast_mass, Diagonal) and (straight or sums)
         is_constant = True
         if is_diagonal:
             terms = of_fast
@@ -157,7 +170,10 @@ class Interval:
             has_constant_hessian(term.integrand, *(q[a] for a in term.arguments)) for term in terms
         )
         is_explicit = scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
-        return cls(is_explicit, is_diagonal, is_constant)
+        sparsity = fast_rows(system, q_s, q_f, scheme.degree)
+        if not is_diagonal:
+            sparsity = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
+        return cls(is_explicit, is_diagonal, is_constant, sparsity)
 
     def no_matrix(self, equations: StepEquations) -> Matrix:
         """The shapes of K, all zero."""

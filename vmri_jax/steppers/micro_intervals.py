@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import inverse, matvec, max_abs, regularized
+from vmri_jax.kernels import BandInverse, FullInverse, Sparsity, max_abs
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
@@ -56,7 +56,7 @@ class Fast(NamedTuple):
     multiplier: Float[Array, "num_micro r n_g"]
     nodes: Float[Numbers, "num_micro r n_f"]
     bends: Float[Array, "num_micro r n_f"] | Float[Array, "num_micro r 0"]
-    schur: Float[Array, "num_micro r*n_g r*n_g"]
+    schur: FullInverse | BandInverse
 
 
 class March(NamedTuple):
@@ -66,12 +66,14 @@ class March(NamedTuple):
     is_explicit: whether fast increments follow from the multipliers, see `Interval`.
     matrix: K of the micro intervals.
     scale: what turns multipliers into unknowns.
+    sparsity: of ``G K^-1 G^T`` of one interval.
     """
 
     equations: StepEquations
     is_explicit: bool
     matrix: Matrix
     scale: Float[Numbers, "num_micro r 1"]
+    sparsity: Sparsity
 
     def first_pass(self, slow, lines: Lines) -> tuple[Fast, Left]:
         """With fast unknowns from where the intervals before lead to, for slow increments (r, n_s)."""
@@ -122,6 +124,8 @@ class March(NamedTuple):
         system, scheme = interval_problem(equations.system, equations.scheme)
         at_rest = jnp.zeros_like(q_s), jnp.zeros_like(arriving.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, arriving.q_f, *at_rest, h)
+        if schur is None:
+            schur = self.sparsity
         done = correct(local, steps, arriving.p_f, increments, mu, self.matrix, schur, self.is_explicit)
 
         start = arriving.start + done.start
@@ -161,7 +165,7 @@ class Corrected(NamedTuple):
     start: Float[Array, "n_s"]
     steps: Float[Array, "r n_s"]
     moved: Float[Array, ""]
-    schur: Float[Array, "r*n_g r*n_g"]
+    schur: FullInverse | BandInverse
 
 
 def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_explicit: bool) -> Corrected:
@@ -173,7 +177,7 @@ def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_
         p_f: momentum times h that arrives.
         increments, mu: (r, n_f), (r, n_g) its unknowns so far; explicit increments follow from mu.
         matrix: K.
-        schur: inverse of ``G_1 K^-1 G_0^T``; None to compute it here.
+        schur: inverse of ``G_1 K^-1 G_0^T``; or its sparsity, to compute it here.
     """
     system, (r, n_g) = local.system, mu.shape
     times = local.t + local.macro_dt * control_nodes(r)
@@ -196,11 +200,11 @@ def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_
         rows = jnp.concatenate([(d.fast_start - d_fast.sum(0)) + p_f, d_fast[:-1]])
         dx = -matrix.solve(rows - pull_f)
         g_then = g + push(dx)
-    if schur is None:
-        units = jnp.eye(r * n_g).reshape(r * n_g, r, n_g)
-        columns = jax.vmap(lambda unit: push(matrix.solve(pull(unit)[1])))(units)
-        schur = inverse(regularized(columns.reshape(r * n_g, r * n_g))).T
-    dmu = -matvec(schur, g_then.reshape(-1)).reshape(r, n_g)
+    if isinstance(schur, Sparsity):
+        seeds = schur.seeds
+        products = jax.vmap(lambda seed: push(matrix.solve(pull(seed)[1])))(seeds.reshape(len(seeds), r, n_g))
+        schur = schur.inverse(products.reshape(seeds.shape))
+    dmu = -schur.times(g_then.reshape(-1)).reshape(r, n_g)
     more_s, more_f = pull(dmu)
     if n_g:
         dx += matrix.solve(more_f)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import Accepted, Interval, Matrix, along, constant_mass, expected
+from vmri_jax.steppers.interval import SMALL, Accepted, Interval, Matrix, along, constant_mass, expected
 from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor
@@ -36,8 +36,6 @@ from vmri_jax.steppers.secant import SIZE, Pairs
 from vmri_jax.steppers.slow_equations import SlowEquations, Tied
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
-SMALL = 16
-"""Matrices of micro intervals up to this size are renewed with every macro step."""
 NOISE = 3e2
 """Secant pairs shorter than so many units of round-off of the positions are not kept."""
 MORE = 1
@@ -131,7 +129,8 @@ class Nested(Solver):
     def solve(self, equations: StepEquations, guess: Unknowns, own: NestedState) -> tuple[Solution, NestedState]:
         scheme, newton = equations.scheme, self.newton
         scale, _ = multiplier_scales(scheme, equations.macro_dt)
-        passes = _Passes(equations, own, March(equations, self.interval.is_explicit, own.matrix, scale), newton)
+        march = March(equations, self.interval.is_explicit, own.matrix, scale, self.interval.sparsity)
+        passes = _Passes(equations, own, march, newton)
         done = newton.iterate(passes.next, passes.first(), done=1)
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
@@ -183,7 +182,7 @@ class _Passes:
         """From the predicted unknowns."""
         slow, slow_multiplier = self._apart(self.own.slow.next(self.r * self.n_s))
         fast, left = self.march.first_pass(slow, self.own.lines)
-        tied = self.slow_equations.tied(fast.schur[0])
+        tied = self.slow_equations.tied(jax.tree.map(lambda a: a[0], fast.schur))
         return self._judged(slow, slow_multiplier, fast, left, tied, self.own.missed, left.moved, 1)
 
     def next(self, last: Pass) -> Pass:

@@ -18,6 +18,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from vmri_jax.kernels import Sparsity
+from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
@@ -29,10 +31,10 @@ from vmri_jax.steppers.composed import Composed, Projected
 from vmri_jax.steppers.coupled import Coupled
 from vmri_jax.steppers.decoupled import Decoupled
 from vmri_jax.steppers.free_flight import FreeFlight
-from vmri_jax.steppers.interval import Interval, implicit_terms
+from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
 from vmri_jax.steppers.kicked import Kicked, average_over_fast_motion
 from vmri_jax.steppers.linear import Linear
-from vmri_jax.steppers.nested import SMALL, Nested
+from vmri_jax.steppers.nested import Nested
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.parts import fast_alone, fast_part, slow_part
 from vmri_jax.steppers.rattle import Rattle
@@ -164,6 +166,7 @@ def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Ki
 def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Stepper:
     newton = choice.newton
     can_be_nested = _can_be_nested(system, scheme)
+    rows = all_rows(system, q_s, q_f)
     if newton.method == "nested" and not can_be_nested:
         raise ValueError(
             "Newton: method 'nested' needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the "
@@ -173,19 +176,21 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
         return FreeFlight(system)
     if not can_be_nested or newton.method not in ("auto", "nested"):
         linear_solver = newton.method if newton.method in ("dense", "null_space") else "arrowhead"
-        return Solved(system, scheme, Coupled(newton, linear_solver))
+        return Solved(system, scheme, Coupled(newton, linear_solver), rows)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
-    solver = _first_choice(system, scheme, newton, interval, q_s, q_f)
+    solver = _first_choice(system, scheme, newton, interval, rows, q_s, q_f)
     if choice.falls_back:
         solver = Fallback(solver, Coupled(newton, "arrowhead"))
-    return Solved(system, scheme, solver)
+    return Solved(system, scheme, solver, rows)
 
 
-def _first_choice(system: System, scheme: Scheme, newton: Newton, interval: Interval, q_s, q_f) -> Solver:
+def _first_choice(
+    system: System, scheme: Scheme, newton: Newton, interval: Interval, rows: Sparsity, q_s, q_f
+) -> Solver:
     if _is_drift(system, scheme):
-        return Rattle(newton)
+        return Rattle(newton, rows)
     single = scheme.num_micro == 1 and scheme.degree > 1
     small = (q_f.size or q_s.size) <= SMALL  # a large matrix is better kept for many steps, which the march does
     if single and small and system.force is None and not interval.is_diagonal:

@@ -6,13 +6,14 @@ after this is RATTLE (Andersen 1983).
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import inverse, matvec, max_abs, regularized
+from vmri_jax.kernels import Full, Sparsity, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.steppers.interval import Accepted, along, constant_mass
 from vmri_jax.steppers.newton import Newton
@@ -52,9 +53,12 @@ class Rattle(Solver):
     """Corrects the multipliers until one more correction would change no increment.
 
     Accepted are changes relative to the motion of the slow and of the fast variables, and round-off of the positions (`Accepted`).
+
+    sparsity: of ``G M^-1 G^T`` with all constraints.
     """
 
     newton: Newton
+    sparsity: Sparsity
 
     def init(self, equations: StepEquations, velocity) -> RattleState:
         count = sum(equations.system.num_constraints(equations.q_s, equations.q_f))
@@ -69,20 +73,29 @@ class Rattle(Solver):
         def constraints(t, q):
             return system.constraints(t, q[:n_s], q[n_s:])
 
-        jacobian = jax.jacrev(constraints, argnums=1)(equations.t, q)
-        columns = jnp.concatenate([velocity_s(jacobian[:, :n_s]), velocity_f(jacobian[:, n_s:])], axis=1)
+        def moves(forces):
+            return jnp.concatenate([velocity_s(forces[..., :n_s]), velocity_f(forces[..., n_s:])], axis=-1)
+
+        seeds = self.sparsity.seeds
+        pull = jax.vjp(partial(constraints, equations.t), q)[1]
+        forces = jax.vmap(lambda seed: pull(seed)[0])(seeds)
+        columns = moves(forces)
+        if isinstance(self.sparsity, Full):  # few rows: these are all of them
+            force, move = partial(along, increments=forces), partial(along, increments=columns)
+        else:
+            force, move = (lambda mu: pull(mu)[0]), (lambda mu: moves(pull(mu)[0]))
         straight = h * velocity_s(equations.p_s), h * velocity_f(equations.p_f)
         scale = self._scale(equations, own)
         mu = scale * (2 * own.multiplier[0] - own.multiplier[1])
-        x = jnp.concatenate(straight) - along(mu, columns)
+        x = jnp.concatenate(straight) - move(mu)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
-        schur = inverse(regularized(jax.vmap(push)(columns).T))
+        schur = self.sparsity.inverse(jax.vmap(push)(columns))
         accepted = Accepted.of(equations, newton).sizes(tuple(map(max_abs, straight)))
         per_slow, per_fast = (1 / size for size in accepted)
 
         def at(x, mu, g, iterations) -> Correction:
-            dmu = matvec(schur, g)
-            dx = along(dmu, columns)
+            dmu = schur.times(g)
+            dx = move(dmu)
             change = jnp.maximum(per_slow * max_abs(dx[:n_s]), per_fast * max_abs(dx[n_s:]))
             return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
 
@@ -93,7 +106,7 @@ class Rattle(Solver):
         first = corrected(at(x, mu, g, 0))  # nearly all steps take one: outside of the loop it is cheaper
         done = newton.iterate(corrected, first, done=1)
 
-        impulse = along(done.mu, jacobian) / h
+        impulse = force(done.mu) / h
         end = equations.q_f + done.x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
         status = status_of(
             equations, done.result, Method.RATTLE, done.iterations, 0.0, max_abs(done.g), newton.tolerance

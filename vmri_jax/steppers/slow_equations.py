@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import inverse, matmul, max_abs, solve
+from vmri_jax.kernels import BandInverse, FullInverse, inverse, matmul, max_abs, solve
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
@@ -59,8 +59,8 @@ class SlowEquations(NamedTuple):
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
         return cls(equations, kinetic, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
 
-    def tied(self, schur) -> Tied | None:
-        """The masses tied by the constraints of the first micro interval, with its (r n_g, r n_g) matrix S."""
+    def tied(self, schur: FullInverse | BandInverse) -> Tied | None:
+        """The masses tied by the constraints of the first micro interval, with its matrix S (r n_g, r n_g)."""
         equations, r, n_s = self.equations, self.equations.scheme.degree, self.equations.q_s.shape[0]
         jacobian = jax.jacrev(equations.system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
         if not jacobian.size:
@@ -69,8 +69,8 @@ class SlowEquations(NamedTuple):
         basis = slow_basis_at_control_nodes(equations.scheme.num_micro, r)[0]
         forces, values = (b[:, None, :, None] * jacobian[:, None, :] for b in (basis[:-1, :-1], basis[1:, 1:]))
         responses = jax.vmap(self._by_masses)(forces.reshape(-1, r, n_s))
-        multipliers = matmul(schur, values.reshape(-1, r * n_s))
-        both = np.eye(len(schur)) + matmul(multipliers, responses.reshape(-1, r * n_s).T)
+        multipliers = jax.vmap(schur.times, 1, 1)(values.reshape(-1, r * n_s))
+        both = np.eye(len(multipliers)) + matmul(multipliers, responses.reshape(-1, r * n_s).T)
         return Tied(responses, solve(both, multipliers).reshape(responses.shape))
 
     def update(self, x: Unknowns, start, increments, tied: Tied | None):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import max_abs
+from vmri_jax.kernels import Sparsity, max_abs
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.projection import project_momentum
@@ -79,11 +79,14 @@ class Solved(Stepper):
     """All unknowns of a step by a solver; the solution is differentiable in both modes, twice.
 
     The derivative is that of the root, ``dx = -(dR/dx)^-1 dR``, so that iterations are never differentiated.
+
+    sparsity: of ``G M^-1 G^T`` with all constraints.
     """
 
     system: System
     scheme: Scheme
     solver: Solver
+    sparsity: Sparsity
 
     def init(self, state: State, macro_dt) -> SolvedState:
         if self.system.has_constant_mass:
@@ -115,7 +118,7 @@ class Solved(Stepper):
         return end, info, SolvedState(own.velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
 
     def project(self, state: State, own: SolvedState) -> tuple[State, SolvedState]:
-        p_s, p_f, v_s, v_f = project_momentum(self.system, state, own.velocity)
+        p_s, p_f, v_s, v_f = project_momentum(self.system, state, own.velocity, self.sparsity)
         own = own._replace(velocity=(v_s, v_f), solver=self.solver.projected(own.solver))
         return State(state.t, state.q_s, state.q_f, p_s, p_f), own
 

@@ -1,0 +1,69 @@
+"""Which constraints share coordinates: the zeros of ``G M^-1 G^T``, found before anything is computed with it."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.kernels import Full, Sparsity, sparsity
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.masses import ConstantMass, Diagonal
+from vmri_jax.mechanics.system import System
+
+FEW = 128
+"""Up to so many rows the full matrix is as fast, and nothing is looked at."""
+CHANGE = 1e-6
+"""Part of the largest value of a constraint from which a change counts."""
+
+
+def all_rows(system: System, q_s, q_f) -> Sparsity:
+    """Of ``G M^-1 G^T`` with all constraints and all coordinates of these shapes."""
+    q = jnp.zeros(q_s.shape[0] + q_f.shape[0])
+    count = sum(system.num_constraints(q_s, q_f))
+    diagonal = isinstance(system.kinetic, ConstantMass) and all(
+        isinstance(mass, Diagonal) for mass in (system.kinetic.slow_mass, system.kinetic.fast_mass)
+    )
+    if count <= FEW or not diagonal:
+        return Full(count)
+    n_s = q_s.shape[0]
+    return _shared(lambda system, q: system.constraints(jnp.zeros(()), q[:n_s], q[n_s:]), system, q.size)
+
+
+def fast_rows(system: System, q_s, q_f, degree: int) -> Sparsity:
+    """Of the same with the fast constraints g and the fast coordinates, at the nodes of one interval.
+
+    Only for masses that are diagonal.
+    """
+    count = system.num_constraints(q_s, q_f)[0]
+    if count <= FEW:
+        return Full(degree * count)
+    slow = np.random.default_rng(1).normal(size=q_s.shape)
+    return _shared(lambda system, q: system.g(jnp.zeros(()), slow, q), system, q_f.shape[0], degree)
+
+
+def _shared(constraints, system: System, n: int, nodes: int = 1) -> Sparsity:
+    """From changes of the constraints with each coordinate, at a random position.
+
+    A change that is missed costs iterations, not accuracy: the matrix is only that of Newton's iteration.
+    """
+    rng = np.random.default_rng(0)
+    arrays, rest = eqx.partition(system, eqx.is_array_like)
+    numbers = jax.tree.map(partial(_known, rng), arrays)
+
+    def changes(arrays, q, moves):
+        system = eqx.combine(arrays, rest)
+        before = constraints(system, q)
+        after = jax.lax.map(lambda move: constraints(system, q + move), moves)
+        return jnp.abs(after - before) > CHANGE * jnp.max(jnp.abs(before)), jnp.isfinite(before)
+
+    with jax.ensure_compile_time_eval():
+        touched, finite = jax.jit(changes)(numbers, rng.normal(size=n), np.diag(rng.normal(size=n)))
+    rows = np.asarray(touched).T | ~np.asarray(finite)[:, None]
+    return sparsity((rows.astype(np.int32) @ rows.T.astype(np.int32)) > 0, nodes)
+
+
+def _known(rng, leaf):
+    """A leaf as it is, or random numbers where it is traced."""
+    return leaf if is_concrete(leaf) else rng.uniform(0.5, 1.5, np.shape(leaf))
