@@ -164,9 +164,19 @@ class Scene:
 
     def problem(self) -> Problem:
         """The system with positions and velocities at the start, and with the drawing unless its numbers are traced."""
+        if self._problems:
+            return self._problems[0]
         seen = is_concrete((self.params, [body.radius for body in self.bodies]))
         drawing = self.drawing() if seen else None
-        return Problem(self.system(), *self.start, drawing=drawing, project=self.project, names=self.names)
+        made = Problem(self.system(), *self.start, drawing=drawing, project=self.project, names=self.names)
+        if is_concrete((made.system, self.start)):
+            self._problems.append(made)
+        return made
+
+    @cached_property
+    def _problems(self) -> list[Problem]:
+        """What `problem` has built, kept unless its numbers are traced: a scene of a hundred joints takes a second."""
+        return []
 
     def state(self) -> State:
         """The consistent initial state, see `initial_state`."""
