@@ -20,15 +20,13 @@ CHANGE = 1e-6
 
 def all_rows(system: System, q_s, q_f) -> Sparsity:
     """Of ``G M^-1 G^T`` with all constraints and all coordinates of these shapes."""
-    q = jnp.zeros(q_s.shape[0] + q_f.shape[0])
     count = sum(system.num_constraints(q_s, q_f))
     diagonal = isinstance(system.kinetic, ConstantMass) and all(
         isinstance(mass, Diagonal) for mass in (system.kinetic.slow_mass, system.kinetic.fast_mass)
     )
     if count <= FEW or not diagonal:
         return Full(count)
-    n_s = q_s.shape[0]
-    return _shared(lambda system, q: system.constraints(jnp.zeros(()), q[:n_s], q[n_s:]), system, q.size)
+    return _shared(system, q_s.shape[0], q_f.shape[0])
 
 
 def fast_rows(system: System, q_s, q_f, degree: int) -> Sparsity:
@@ -39,29 +37,35 @@ def fast_rows(system: System, q_s, q_f, degree: int) -> Sparsity:
     count = system.num_constraints(q_s, q_f)[0]
     if count <= FEW:
         return Full(degree * count)
-    slow = np.random.default_rng(1).normal(size=q_s.shape)
-    return _shared(lambda system, q: system.g(jnp.zeros(()), slow, q), system, q_f.shape[0], degree)
+    return _shared(system, q_s.shape[0], q_f.shape[0], degree)
 
 
-def _shared(constraints, system: System, n: int, nodes: int = 1) -> Sparsity:
-    """From changes of the constraints with each coordinate, at a random position.
+def _shared(system: System, n_s: int, n_f: int, nodes: int | None = None) -> Sparsity:
+    """From changes of the constraints with each coordinate, at a random position: of g with q_f at `nodes` nodes, else of all.
 
     A change that is missed costs iterations, not accuracy: the matrix is only that of Newton's iteration.
     """
     rng = np.random.default_rng(0)
     arrays, rest = eqx.partition(system, eqx.is_array_like)
-    numbers = jax.tree.map(partial(_known, rng), arrays)
-
-    def changes(arrays, q, moves):
-        system = eqx.combine(arrays, rest)
-        before = constraints(system, q)
-        after = jax.lax.map(lambda move: constraints(system, q + move), moves)
-        return jnp.abs(after - before) > CHANGE * jnp.max(jnp.abs(before)), jnp.isfinite(before)
-
+    system = eqx.combine(jax.tree.map(partial(_known, rng), arrays), rest)
+    q, moves = rng.normal(size=n_s + n_f), np.diag(rng.normal(size=n_s + n_f))
     with jax.ensure_compile_time_eval():
-        touched, finite = jax.jit(changes)(numbers, rng.normal(size=n), np.diag(rng.normal(size=n)))
-    rows = np.asarray(touched).T | ~np.asarray(finite)[:, None]
-    return sparsity((rows.astype(np.int32) @ rows.T.astype(np.int32)) > 0, nodes)
+        touched, finite = _touched(system, n_s, q, moves if nodes is None else moves[n_s:], nodes is None)
+    rows = (np.asarray(touched).T | ~np.asarray(finite)[:, None]).astype(np.int32)
+    return sparsity(rows @ rows.T > 0, nodes or 1)
+
+
+@eqx.filter_jit
+def _touched(system: System, n_s: int, q, moves, slow_too: bool):
+    """Which constraints change with each of these moves (k, n), (k, m), and which are finite, (m,)."""
+
+    def constraints(q):
+        values = system.constraints if slow_too else system.g
+        return values(jnp.zeros(()), q[:n_s], q[n_s:])
+
+    before = constraints(q)
+    after = jax.lax.map(lambda move: constraints(q + move), moves)
+    return jnp.abs(after - before) > CHANGE * jnp.max(jnp.abs(before)), jnp.isfinite(before)
 
 
 def _known(rng, leaf):
