@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks import against, baseline, batch, compilation, cost, floor, fuzz, kills, orders, peers, tricks
+from benchmarks import against, baseline, batch, chains, compilation, cost, floor, fuzz, kills, orders, peers, tricks
 from benchmarks.gail2014.command import gail2014
 from benchmarks.hard_cases.command import hard
 from benchmarks.measure import prepare
@@ -34,7 +34,13 @@ def _plain_command(name: str, module) -> None:
         _measure(name, module, full, out)
 
 
-for _name, _module in {"cost": cost, "floor": floor, "compile": compilation, "orders": orders}.items():
+for _name, _module in {
+    "cost": cost,
+    "floor": floor,
+    "chains": chains,
+    "compile": compilation,
+    "orders": orders,
+}.items():
     _plain_command(_name, _module)
 
 

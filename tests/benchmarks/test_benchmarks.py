@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from benchmarks import __main__ as command_line
-from benchmarks import batch, c_loops, compilation, cost, curves, floor, linear, paper, programs, report, worker
+from benchmarks import batch, c_loops, chains, compilation, cost, curves, floor, linear, paper, programs, report, worker
 from benchmarks.curves import Case
 from benchmarks.measure import Ratio, interleaved, ratio, steps_for
 from benchmarks.report import Claim, Report
@@ -138,6 +138,7 @@ TINY = {
         floor.Size((floor.Pair("FPU l=3", 1e-3, 2, ("fully explicit", "explicit slow"), 2.5, 3.0),), 2, 1e-3),
     ),
     "batch": (batch, batch.Size((batch.Case("FPU l=3", 1e-3, 0.6, True),), (2, 256), 2, 1e-3, 1, 5120)),
+    "chains": (chains, chains.Size((2,), (2,), 1)),
     "compile": (compilation, compilation.Size(("FPU l=3",), ("fully explicit",), (10,), 1)),
 }
 
@@ -211,13 +212,25 @@ def check_batch(found):
     assert all(row["result"] == "CONVERGED" for row in found["rows"] if row["program"] != "C")
 
 
+def check_chains(found):
+    (row,) = found["rows"]
+    assert row["rows"] == 22
+    assert row["band, us"] != row["full, us"]
+
+
 def check_compile(found):
     (row,) = found["rows"]
     assert row["compilations"] == 1
     assert 0 < row["later call, s"] < row["first call, s"] < row["process, s"]
 
 
-CHECKS = {"cost": check_cost, "floor": check_floor, "batch": check_batch, "compile": check_compile}
+CHECKS = {
+    "cost": check_cost,
+    "floor": check_floor,
+    "batch": check_batch,
+    "chains": check_chains,
+    "compile": check_compile,
+}
 
 
 def test_floor_without_a_compiler(monkeypatch):
