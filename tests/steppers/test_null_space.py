@@ -75,3 +75,9 @@ def test_the_condition_does_not_depend_on_the_step(name):
         for step in 10.0 ** -np.arange(1, 7)
     ]
     assert max(found) < 1.01 * min(found)  # measured 1.000
+
+
+@pytest.mark.parametrize(("name", "few", "many"), [("triple_spherical_pendulum", 5, 7), ("simple_atomic_model", 9, 15)])
+def test_a_plan_says_how_many_unknowns_are_left(name, few, many):
+    planned = vm.plan(getattr(systems, name)(), vm.fully_implicit(num_micro=5), newton=NULL_SPACE)
+    assert f"unknowns of each micro interval: {few}, with multipliers {many}" in str(planned)

@@ -54,10 +54,12 @@ class Coupled(Solver):
 
     linear_solver: "arrowhead", block elimination in O(num_micro), "null_space", the same without multipliers, or "dense", one
         factorisation.
+    sizes: (n_s, n_gs, n_f, n_g) and the degree, which are told where multipliers are eliminated.
     """
 
     newton: Newton
     linear_solver: LinearSolver
+    sizes: tuple[int, int, int, int, int] | None = None
 
     def solve(self, equations: StepEquations, guess: Unknowns, own) -> tuple[Solution, Any]:
         x, result, iterations = self._root(equations, guess)
@@ -122,7 +124,13 @@ class Coupled(Solver):
         return done.x, done.result, done.iterations
 
     def lines(self) -> list[str]:
-        return [f"all unknowns of the step at once: Newton's iteration, {self.linear_solver.replace('_', ' ')}"]
+        head = f"all unknowns of the step at once: Newton's iteration, {self.linear_solver.replace('_', ' ')}"
+        if self.linear_solver != "null_space" or self.sizes is None:
+            return [head]
+        *counts, r = self.sizes
+        parts = zip(("slow variables", "each micro interval"), counts[::2], counts[1::2], strict=True)
+        few = [f"  unknowns of {what}: {r * (n - g)}, with multipliers {r * (n + g)}" for what, n, g in parts if g]
+        return [head, *few]
 
 
 class Part(NamedTuple):

@@ -176,7 +176,9 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
         return FreeFlight(system)
     if not can_be_nested or newton.method not in ("auto", "nested"):
         linear_solver = newton.method if newton.method in ("dense", "null_space") else "arrowhead"
-        return Solved(system, scheme, Coupled(newton, linear_solver), rows)
+        n_g, n_gs = system.num_constraints(q_s, q_f)
+        sizes = q_s.size, n_gs, q_f.size, n_g, scheme.degree
+        return Solved(system, scheme, Coupled(newton, linear_solver, sizes), rows)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
