@@ -216,6 +216,7 @@ def check_chains(found):
     (row,) = found["rows"]
     assert row["rows"] == 22
     assert row["band, us"] != row["full, us"]
+    assert row["band, us a body"] == row["band, us"] / 2
 
 
 def check_compile(found):

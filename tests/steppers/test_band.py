@@ -33,12 +33,12 @@ def test_a_band_takes_the_same_steps(scheme, monkeypatch):
     runs = []
     for few in (LINKS, LINKS - 1):
         monkeypatch.setattr(constraint_pattern, "FEW", few)
-        problem = chain()
+        problem = chain()  # of new functions: compiled anew
         rows = constraint_pattern.all_rows(problem.system, problem.q_s, problem.q_f)
         assert isinstance(rows, Full if few == LINKS else Band)
-        runs.append(vm.simulate(problem, scheme, macro_dt=0.02, num_steps=20 + len(runs)))
-    full, band = (np.asarray(run.q_f)[:21] for run in runs)
-    assert np.abs(full - band).max() < 1e-12
+        runs.append(vm.simulate(problem, scheme, macro_dt=0.02, num_steps=20))
+    full, band = (np.asarray(run.q_f) for run in runs)
+    assert 0 < np.abs(full - band).max() < 1e-12  # other programs differ by round-off
 
 
 def test_a_chain_is_a_band_of_its_neighbours():

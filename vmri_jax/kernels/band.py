@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -69,8 +69,8 @@ class BandInverse(NamedTuple):
     diagonal: Float[Array, "blocks b b"]
     upper: Float[Array, "blocks b b"]
     lower: Float[Array, "blocks b b"]
-    places: Float[Array, "blocks*b"]
-    back: Float[Array, "n"]
+    places: Int[Array, "blocks*b"]
+    back: Int[Array, "n"]
 
     def times(self, g):
         """The product with g (n,)."""

@@ -170,9 +170,8 @@ class Interval:
             has_constant_hessian(term.integrand, *(q[a] for a in term.arguments)) for term in terms
         )
         is_explicit = scheme.degree == 1 and not implicit_terms(system, scheme) and system.force is None
-        sparsity = fast_rows(system, q_s, q_f, scheme.degree)
-        if not is_diagonal:
-            sparsity = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
+        full = Full(scheme.degree * system.num_constraints(q_s, q_f)[0])
+        sparsity = fast_rows(system, q_s, q_f, scheme.degree) if is_diagonal else full
         return cls(is_explicit, is_diagonal, is_constant, sparsity)
 
     def no_matrix(self, equations: StepEquations) -> Matrix:

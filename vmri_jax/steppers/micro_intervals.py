@@ -86,7 +86,7 @@ class March(NamedTuple):
             mu, increments = scale * lines.multiplier.next(m), straight
             if not self.is_explicit:
                 increments = straight + self.equations.micro_dt**2 * lines.bend.next(m)
-            done, left = self._corrected(slow, arriving, m, basis, straight, increments, mu)
+            done, left = self._corrected(slow, arriving, m, basis, straight, increments, mu, self.sparsity)
             lines = Lines(lines.multiplier.add(m, done.multiplier / scale), lines.bend.add(m, done.bends))
             return (left, lines), done
 
@@ -117,15 +117,13 @@ class March(NamedTuple):
         zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(slow), jnp.zeros(())
         return Left(equations.q_f, equations.micro_dt * equations.p_f, *zero)
 
-    def _corrected(self, slow, arriving: Left, m, basis, straight, increments, mu, schur=None) -> tuple[Fast, Left]:
+    def _corrected(self, slow, arriving: Left, m, basis, straight, increments, mu, schur) -> tuple[Fast, Left]:
         """Interval m, corrected once by a Newton step on its exact residual, and what it leaves."""
         equations, h, n = self.equations, self.equations.micro_dt, self.equations.scheme.num_micro
         q_s, steps = equations.q_s + along(basis[0], slow), along(basis[1:] - basis[0], slow)
         system, scheme = interval_problem(equations.system, equations.scheme)
         at_rest = jnp.zeros_like(q_s), jnp.zeros_like(arriving.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, arriving.q_f, *at_rest, h)
-        if schur is None:
-            schur = self.sparsity
         done = correct(local, steps, arriving.p_f, increments, mu, self.matrix, schur, self.is_explicit)
 
         start = arriving.start + done.start
