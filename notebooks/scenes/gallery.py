@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 import vmri_jax as vm
-from vmri_jax.cli.catalogue import find_scene
+from vmri_jax.catalogue import find_scene
 from vmri_jax.diagnostics import energy_parts, velocity
 from vmri_jax.scene import Scene
 

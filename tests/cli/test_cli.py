@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import vmri_jax as vm
 from vmri_jax import cli
-from vmri_jax.cli.catalogue import SCHEMES, find_problem, find_scheme
+from vmri_jax.catalogue import SCHEMES, find_problem, find_scheme
 from vmri_jax.running.simulate import Simulation
 from vmri_jax.study import families, reference_solution
 

@@ -4,7 +4,7 @@ import pytest
 from typer.testing import CliRunner
 
 from vmri_jax import Problem, cli, systems
-from vmri_jax.cli.catalogue import find_problem, find_scene
+from vmri_jax.catalogue import find_problem, find_scene
 from vmri_jax.scene import Scene
 
 FILE = """

@@ -3,7 +3,7 @@
 from functools import cache
 from pathlib import Path
 
-from vmri_jax.cli.catalogue import find_scene
+from vmri_jax.catalogue import find_scene
 from vmri_jax.scene import Scene
 
 FOLDER = Path(__file__).parents[2] / "notebooks" / "scenes"

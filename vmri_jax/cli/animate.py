@@ -17,7 +17,7 @@ from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
-from vmri_jax.cli.catalogue import SYSTEMS, find_problem
+from vmri_jax.catalogue import SYSTEMS, find_problem
 from vmri_jax.cli.common import PICTURES, check_target_file, console, refusals
 from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.store import StoredTrajectory

@@ -3,7 +3,7 @@
 import numpy as np
 import typer
 
-from vmri_jax.cli.catalogue import SCHEMES, SYSTEMS
+from vmri_jax.catalogue import SCHEMES, SYSTEMS
 from vmri_jax.cli.common import console, plain_table
 from vmri_jax.schemes.composition import COMPOSITIONS
 

@@ -1,5 +1,6 @@
-"""Built-in systems and schemes by name, and problems from a user's own file: what the command line accepts."""
+"""Systems and schemes by name: the built-in ones, and problems from a user's own file or package."""
 
+import importlib
 import importlib.util
 import inspect
 import sys
@@ -7,8 +8,6 @@ import traceback
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
-
-import typer
 
 from vmri_jax import systems
 from vmri_jax.mechanics.names import near
@@ -97,7 +96,8 @@ MODELS = (".xml", ".mjcf", ".urdf")
 
 
 def find_problem(name: str) -> Problem:
-    """A built-in problem by name, or one of your own, ``my_file.py:my_problem``, or a model of MuJoCo, ``model.xml``.
+    """A built-in problem by name, or one of your own: in a file, ``my_file.py:my_problem``, in a package that is installed,
+    ``my_package.my_module:my_problem``, or a model of MuJoCo, ``model.xml``.
 
     In the file it is a `Problem`, a `Scene`, or a function without arguments making one; ``my_file.py`` alone stands for
     the one that it has, or for its ``scene`` or ``problem``, and then says so.
@@ -135,13 +135,17 @@ def _find_own(name: str) -> Problem | Scene:
             return Scene.from_mujoco(name)
         except ImportError as error:
             raise ValueError(str(error)) from error
-    if not colon and not file_name.endswith(".py"):
-        raise ValueError(f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem.")
+    if not file_name.endswith(".py"):
+        if not colon or not all(part.isidentifier() for part in file_name.split(".")):
+            raise ValueError(
+                f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or my_package.my_module:my_problem."
+            )
+        return _found_in(_import(file_name), file_name, attribute)
     path = Path(file_name)
     if not path.is_file():
         raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
     module = _run_file(path)
-    return _found_in(module, path, attribute or _only_name(module, file_name))
+    return _found_in(module, str(path), attribute or _only_name(module, file_name))
 
 
 def _only_name(module, file_name: str) -> str:
@@ -157,7 +161,7 @@ def _only_name(module, file_name: str) -> str:
         raise ValueError(f"{file_name}: say which problem in that file; {listed}.")
     others = [f"{file_name}:{name}" for name in names if name != named[0]]
     if others:
-        typer.echo(f"{file_name}: taking {named[0]}; there is also {', '.join(others)}.", err=True)
+        print(f"{file_name}: taking {named[0]}; there is also {', '.join(others)}.", file=sys.stderr)
     return named[0]
 
 
@@ -221,7 +225,17 @@ def _run_file(path: Path):
     return module
 
 
-def _found_in(module, path: Path, attribute: str) -> Problem | Scene:
+def _import(name: str):
+    """A module of a package that is installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ValueError(
+            f"the module {name} cannot be imported ({error}); install its package, or give the file, my_file.py:my_problem."
+        ) from error
+
+
+def _found_in(module, path: str, attribute: str) -> Problem | Scene:
     found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
     if attribute not in found:
         problems = _problems_in(module)
