@@ -38,10 +38,21 @@ from vmri_jax import systems  # isort: skip  (written with the names above)
 __version__ = version("vmri_jax")
 
 
+LATER = {
+    "plots": ("vmri_jax.plots", None),
+    "ensembles": ("vmri_jax.ensembles", None),
+    "ensemble": ("vmri_jax.ensembles.run", "ensemble"),
+    "open_ensemble": ("vmri_jax.ensembles.reading", "open_ensemble"),
+}
+"""Names that are imported when they are asked for: the module, and the name in it. matplotlib and scipy.stats take half a second."""
+
+
 def __getattr__(name: str):
-    """``vm.plots``, imported when it is asked for: matplotlib takes half a second."""
-    if name == "plots":
-        return import_module("vmri_jax.plots")
+    """What is in `LATER`."""
+    if name in LATER:
+        module, attribute = LATER[name]
+        found = import_module(module)
+        return found if attribute is None else getattr(found, attribute)
     raise AttributeError(f"module 'vmri_jax' has no attribute {name!r}")
 
 
@@ -72,6 +83,7 @@ __all__ = [
     "diagnostics",
     "discrete_lagrangian",
     "discrete_legendre",
+    "ensemble",
     "explicit_slow",
     "fully_explicit",
     "fully_implicit",
@@ -81,6 +93,7 @@ __all__ = [
     "macro_step",
     "micro",
     "mollified_impulse",
+    "open_ensemble",
     "plan",
     "prepare",
     "quadrature",

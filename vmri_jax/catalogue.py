@@ -235,13 +235,31 @@ def _import(name: str):
         ) from error
 
 
-def _found_in(module, path: str, attribute: str) -> Problem | Scene:
+def imported(name: str):
+    """What a name of a file or of a package stands for: ``my_file.py:name``, ``my_package.my_module:name``.
+
+    Raises:
+        ValueError: no such file or package, or no such name in it.
+    """
+    where, _, attribute = name.partition(":")
+    if not where.endswith(".py"):
+        return _attribute(_import(where), where, attribute)
+    if not Path(where).is_file():
+        raise ValueError(f"the file {where} does not exist (looked in {Path(where).resolve().parent}).")
+    return _attribute(_run_file(Path(where)), where, attribute)
+
+
+def _attribute(module, where: str, attribute: str):
     found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
     if attribute not in found:
         problems = _problems_in(module)
         listed = f" Problems in it: {', '.join(problems)}." if problems else ""
-        raise ValueError(f"{path} has no name {attribute!r}.{near(attribute, found)}{listed}")
-    problem = found[attribute]
+        raise ValueError(f"{where} has no name {attribute!r}.{near(attribute, found)}{listed}")
+    return found[attribute]
+
+
+def _found_in(module, path: str, attribute: str) -> Problem | Scene:
+    problem = _attribute(module, path, attribute)
     if callable(problem) and not isinstance(problem, Problem | Scene):
         try:
             problem = problem()

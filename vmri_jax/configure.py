@@ -7,7 +7,9 @@ Nothing here happens at import. The command line and the benchmarks configure th
     vm.configure()
 """
 
+import hashlib
 import os
+import platform
 import warnings
 from functools import lru_cache
 from pathlib import Path
@@ -82,6 +84,16 @@ def warn_if_slow() -> None:
 def cache_folder() -> Path:
     """Where the command line and the benchmarks keep compiled programs: ``$XDG_CACHE_HOME/vmri_jax``."""
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "vmri_jax"
+
+
+def processor() -> str:
+    """A name of this kind of processor and what it can do: compiled programs serve processors of one kind."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        about = sorted({line for line in lines if line.startswith(("model name", "flags", "CPU part", "Features"))})
+    except OSError:
+        about = [platform.processor()]
+    return f"{platform.machine()}-{hashlib.sha256(repr(about).encode()).hexdigest()[:8]}"
 
 
 def _devices() -> int:

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
+from vmri_jax.catalogue import find_problem
 from vmri_jax.check import Case, cases_for, run_cases
 from vmri_jax.cli import options
-from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.common import console, refusals
 from vmri_jax.running.progress import progress_shown
 

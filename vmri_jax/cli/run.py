@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from vmri_jax import plots
-from vmri_jax.cli import options
 from vmri_jax.catalogue import find_problem, find_scheme
+from vmri_jax.cli import options
 from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_failure, refusals
 from vmri_jax.running.arguments import NOTHING_FAST
 from vmri_jax.running.interrupts import Interrupted

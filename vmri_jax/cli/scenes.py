@@ -5,8 +5,8 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from vmri_jax.cli import options
 from vmri_jax.catalogue import find_scene, find_scheme
+from vmri_jax.cli import options
 from vmri_jax.cli.common import console, refusals, status
 from vmri_jax.running.arguments import NOTHING_FAST
 

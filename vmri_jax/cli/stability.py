@@ -8,8 +8,8 @@ import typer
 from rich.markup import escape
 
 from vmri_jax import plots
-from vmri_jax.cli import options
 from vmri_jax.catalogue import find_problem, find_scheme
+from vmri_jax.cli import options
 from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_written, refusals, status
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map

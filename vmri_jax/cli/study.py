@@ -9,8 +9,8 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from vmri_jax.cli import options
 from vmri_jax.catalogue import find_problem
+from vmri_jax.cli import options
 from vmri_jax.cli.common import (
     BadInput,
     check_target_file,

@@ -85,7 +85,7 @@ def simulate_batch(
     _check_devices(devices, chunk)
     run.check("simulate_batch: the first state", constraints=params is None)
     check_memory("simulate_batch", run.state, scheme.num_micro, run.num_saves, save_micro, lanes)
-    width = (_chunk(run) if chunk is None else chunk) * devices
+    width = (lanes_at_once(run) if chunk is None else chunk) * devices
     batch = {
         "params": None if params is None else [np.asarray(leaf) for leaf in jax.tree.leaves(params)],
         "state": tuple(np.asarray(a, dtype=float) for a in vars(states).values()),
@@ -150,8 +150,8 @@ def _check_devices(devices, chunk) -> None:
         whole_number("simulate_batch: chunk", chunk, otherwise=", or None")
 
 
-def _chunk(run: Simulation) -> int:
-    """A power of two of lanes: those that fit into the working set, but not too few."""
+def lanes_at_once(run: Simulation) -> int:
+    """The chunk that is chosen, a power of two: lanes that fit into the working set, but not too few."""
     nodes = run.scheme.num_micro * stage_scheme(run.scheme).degree
     size = nodes * (run.state.q_s.size + run.state.q_f.size)
     return 2 ** int(np.log2(np.clip(WORKING_SET / size, FEWEST, MOST)))

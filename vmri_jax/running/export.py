@@ -102,7 +102,7 @@ class Exports(Quantities):
             ValueError: this is a batch.
             ImportError: pandas is not installed.
         """
-        pandas = _extra("pandas", "to_pandas")
+        pandas = extra("pandas", "to_pandas")
         columns = self.columns()
         return pandas.DataFrame(columns).set_index("t")
 
@@ -115,7 +115,7 @@ class Exports(Quantities):
         Raises:
             ImportError: xarray is not installed.
         """
-        xarray = _extra("xarray", "to_xarray")
+        xarray = extra("xarray", "to_xarray")
         run = self.whole()
         names, rows = run.names, rows_of(run)
         lanes = ("lane",) * (rows["t"].ndim - 1)
@@ -142,9 +142,9 @@ def attributes(run: "Trajectory") -> dict:
     return found | ({} if names is None else {"names": json.dumps(names.to_dict())})
 
 
-def _extra(package: str, what: str):
-    """A package that is not always installed."""
+def extra(package: str, what: str, name: str = "xarray"):
+    """A package that is not always installed, by what needs it and the name of the extra that has it."""
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise ImportError(f"{what} needs {package}; install it with pip install 'vmri_jax[xarray]'.") from error
+        raise ImportError(f"{what} needs {package}; install it with pip install 'vmri_jax[{name}]'.") from error

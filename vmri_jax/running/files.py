@@ -1,6 +1,7 @@
 """Files that are replaced as a whole: a full disk or a kill leaves the old one."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +28,29 @@ def replaced(path: str | Path) -> Iterator[IO[bytes]]:
         partial.unlink(missing_ok=True)
         raise
     synchronize(path.parent)
+
+
+@contextmanager
+def made_beside(path: Path) -> Iterator[Path]:
+    """A new folder that takes the place of `path` when all went well; one that is there gives way only then."""
+    partial, old = (path.with_name(f".{path.name}.{os.getpid()}.{end}") for end in ("partial", "old"))
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        yield partial
+        if path.exists():
+            path.rename(old)
+        partial.rename(path)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+    synchronize(path.parent)
+
+
+def clear_partial(path: Path) -> None:
+    """Remove files in a folder whose writing did not come to its end."""
+    for file in path.rglob("*.partial"):
+        file.unlink()
 
 
 def check_place(path: Path) -> None:

@@ -17,6 +17,7 @@ from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.batch import simulate_batch
+from vmri_jax.running.export import extra
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
@@ -177,10 +178,7 @@ class ConvergenceStudy(ResultTable):
 
     def to_xarray(self):
         """An `xarray.Dataset` over (scheme, case, macro_dt); needs the extra ``vmri_jax[xarray]``."""
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError("to_xarray needs xarray; install it with pip install 'vmri_jax[xarray]'.") from error
+        xarray = extra("xarray", "to_xarray")
         steps = sorted({row.macro_dt for row in self.rows}, reverse=True)
         axes = {"scheme": self.schemes, "case": self.cases, "macro_dt": steps}
         shape = tuple(len(values) for values in axes.values())

@@ -19,11 +19,10 @@ zarr takes seconds to import: only the functions that need it do so.
 import io
 import json
 import os
-import shutil
 import warnings
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.running.export import DIMENSIONS, FILL, rows_of
-from vmri_jax.running.files import replaced, synchronize
+from vmri_jax.running.files import made_beside, replaced, synchronize
 from vmri_jax.running.simulate import Checkpoint
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
@@ -83,27 +82,13 @@ def create(path: Path, attributes: dict[str, Any], record: Record) -> None:
     """Make a store without rows; one that is at this place gives way when the new one is complete."""
     import zarr
 
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with locked(path) if path.exists() else nullcontext(), made_beside(path) as partial:
         group = zarr.create_group(partial, attributes={"format": FORMAT, **attributes})
         size = len(_packed(record))
         resume = group.create_group("resume")
         resume.create_array("checkpoint", shape=(size,), dtype="uint8", chunks=(size,), compressors=None)
         commit(partial, record)
-        _synchronize(_files(partial))
-        if path.exists():
-            old = path.with_name(f".{path.name}.{os.getpid()}.old")
-            with locked(path):
-                path.rename(old)
-                partial.rename(path)
-            shutil.rmtree(old)
-        else:
-            partial.rename(path)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-    synchronize(path.parent)
+        synchronize_files(_files(partial))
 
 
 def change_attributes(path: Path, **changes) -> None:
@@ -112,12 +97,6 @@ def change_attributes(path: Path, **changes) -> None:
     metadata["attributes"] |= changes
     with replaced(path / METADATA) as file:
         file.write(json.dumps(metadata, indent=2).encode())
-
-
-def clear(path: Path) -> None:
-    """Remove files whose writing did not come to its end."""
-    for file in path.rglob("*.partial"):
-        file.unlink()
 
 
 class Writer:
@@ -140,7 +119,7 @@ class Writer:
             self._arrays[name][first : last + 1] = value[1 if saved else 0 :]
             chunks = range(first // self._chunk, last // self._chunk + 1)
             files += [_chunk_file(self._path / name, value.ndim, k) for k in chunks]
-        _synchronize(files)  # after all have been written: the first wait is one for most of the others
+        synchronize_files(files)  # after all have been written: the first wait is one for most of the others
 
     def _make(self, values: dict[str, np.ndarray]) -> list[Path]:
         """Make all arrays; returns the files there are."""
@@ -148,7 +127,7 @@ class Writer:
 
         group = zarr.open_group(self._path, mode="r+")
         self._arrays = {name: _create_array(group, name, v, self._rows, self._chunk) for name, v in values.items()}
-        _consolidate(self._path)
+        consolidate(self._path)
         return _files(self._path)
 
     def _open(self, values: dict[str, np.ndarray]) -> list[Path]:
@@ -160,7 +139,7 @@ class Writer:
             if array.shape[0] != self._rows:
                 array.resize((self._rows, *value.shape[1:]))
             self._arrays[name] = array
-        _consolidate(self._path)
+        consolidate(self._path)
         return [self._path / METADATA, *(self._path / name / METADATA for name in values)]
 
 
@@ -277,7 +256,7 @@ def _create_array(group, name: str, like: np.ndarray, rows: int, chunk: int):
     )
 
 
-def _consolidate(path: Path) -> None:
+def consolidate(path: Path) -> None:
     """Copy the metadata of all arrays into that of the group, where datasets look for it first."""
     import zarr
 
@@ -294,7 +273,7 @@ def _files(path: Path) -> list[Path]:
     return [file for file in path.rglob("*") if file.is_file()]
 
 
-def _synchronize(files: list[Path]) -> None:
+def synchronize_files(files: list[Path]) -> None:
     """Wait until these files, and that they are there, are on disk."""
     for file in files:
         if file.exists():  # a vector of no coordinates has none

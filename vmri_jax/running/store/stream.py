@@ -12,6 +12,7 @@ from typing import Any
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.engine import room_for
+from vmri_jax.running.files import clear_partial
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, progress_shown, silent
 from vmri_jax.running.simulate import Simulation, simulation
@@ -105,7 +106,7 @@ def stream(
             stored = StoredTrajectory(path)
             _check_same_run(stored, attributes, chunk)
             _lengthen(stored, num_steps)
-            layout.clear(path)
+            clear_partial(path)
             for step in _go_on(StoredTrajectory(path), run, tell):
                 if interrupted():
                     raise Interrupted(StoredTrajectory(path), step, num_steps)

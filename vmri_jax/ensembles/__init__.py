@@ -1,0 +1,20 @@
+"""Ensembles: many runs of one system, from one core to a cluster, into a store on disk."""
+
+from vmri_jax.ensembles.design import Axis, Draw, Draws, Product, Table
+from vmri_jax.ensembles.quantities import QUANTITIES
+from vmri_jax.ensembles.reading import open_ensemble
+from vmri_jax.ensembles.run import Ensemble, EnsembleError, Stopped, ensemble
+
+__all__ = [
+    "QUANTITIES",
+    "Axis",
+    "Draw",
+    "Draws",
+    "Ensemble",
+    "EnsembleError",
+    "Product",
+    "Stopped",
+    "Table",
+    "ensemble",
+    "open_ensemble",
+]

@@ -1,0 +1,301 @@
+"""Designs: which runs an ensemble has. A design is a table with a row for each run, of which only parts are ever made.
+
+    Product({"omega": [10, 50], "num_micro": [1, 5]})          all combinations, the last axis varies first
+    Table({"omega": [10, 50], "v_s[0]": [0.1, 0.2]})           rows as they are given
+    Draws(1000, {"omega": ("uniform", 10, 50)}, seed=1)        random rows
+
+Rows are numbered from 0, and every row can be made alone: random ones depend on the seed and on their number only.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy import stats
+from scipy.stats import qmc
+
+from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.names import near
+
+Rows = dict[str, np.ndarray]
+"""Some rows of a design, by column; the first axis of every array is the rows."""
+
+MOST_SOBOL = 2**30
+"""Points of a sequence of Sobol with numbers of 30 bits."""
+MOST_LATIN = 2**22
+"""Points of a Latin hypercube, which is made as a whole."""
+METHODS = ("sobol", "latin-hypercube", "random")
+ALIASES = {"normal": "norm", "exponential": "expon"}
+"""Names of distributions besides those of `scipy.stats`."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Values of a column, with what readers of the results will want to know.
+
+    values: numbers, or labels of schemes.
+    unit, description: kept with the results.
+    """
+
+    values: Any
+    unit: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """A distribution from which the values of a column are drawn.
+
+    name: "uniform" (lowest, highest), "loguniform" (lowest, highest), "normal" (mean, standard deviation), or any continuous
+        distribution of `scipy.stats` with its arguments.
+    unit, description: kept with the results.
+    """
+
+    name: str
+    arguments: tuple[float, ...] = ()
+    unit: str = ""
+    description: str = ""
+
+    def quantiles(self, at: np.ndarray) -> np.ndarray:
+        """Values that parts `at` of all draws stay below.
+
+        Raises:
+            ValueError: an unknown distribution, or arguments that are none of it.
+        """
+        name = ALIASES.get(self.name, self.name)
+        distribution = getattr(stats, name, None)
+        if not isinstance(distribution, stats.rv_continuous):
+            known = [*ALIASES, *(n for n, d in vars(stats).items() if isinstance(d, stats.rv_continuous))]
+            raise ValueError(
+                f"Draws: there is no distribution {self.name!r}.{near(self.name, known)} Give uniform, loguniform, normal, or "
+                "another continuous one of scipy.stats."
+            )
+        arguments = self.arguments
+        try:
+            if name == "uniform" and arguments:
+                low, high = arguments
+                arguments = low, high - low if high > low else np.nan
+            values = np.asarray(distribution.ppf(at, *arguments), dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"Draws: {self.name} with the arguments {self.arguments}: {error}.") from None
+        if not np.isfinite(values).all():
+            raise ValueError(
+                f"Draws: {self.name} with the arguments {self.arguments} gives no numbers; uniform and loguniform take the "
+                "lowest and the highest value, normal the mean and the standard deviation."
+            )
+        return values
+
+
+@dataclass(frozen=True)
+class Product:
+    """All combinations of the values of some axes. The last axis varies first.
+
+    axes: by the name of the column, values or an `Axis`. None of them: a single run.
+
+    Raises:
+        ValueError: an axis without values, with values twice or that are not finite.
+    """
+
+    axes: Mapping[str, Any]
+
+    def __post_init__(self):
+        axes = {name: axis if isinstance(axis, Axis) else Axis(axis) for name, axis in self.axes.items()}
+        for name, axis in axes.items():
+            values = _values(f"the axis {name!r}", axis.values)
+            if values.ndim != 1 or not values.size:
+                raise ValueError(
+                    f"Product: the axis {name!r} has values of shape {values.shape}; give a list of one or more."
+                )
+            if len(np.unique(values)) < values.size:
+                raise ValueError(f"Product: the axis {name!r} has a value more than once: {values.tolist()}.")
+            axes[name] = Axis(values, axis.unit, axis.description)
+        object.__setattr__(self, "axes", axes)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Lengths of the axes."""
+        return tuple(axis.values.size for axis in self.axes.values())
+
+    def __len__(self) -> int:
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def rows(self, first: int, last: int) -> Rows:
+        """Rows number `first` to `last`, that one excluded."""
+        places = np.unravel_index(np.arange(first, last), self.shape) if self.axes else ()
+        return {name: axis.values[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)}
+
+    def combinations(self, names: Sequence[str]) -> Rows:
+        """All different combinations of the values of some columns."""
+        return (part := Product({name: self.axes[name] for name in names})).rows(0, len(part))
+
+    def described(self) -> dict[str, dict]:
+        """The columns as plain data."""
+        return {name: {**_words(axis), "values": axis.values.tolist()} for name, axis in self.axes.items()}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows as they are given.
+
+    columns: by name, values or an `Axis`; arrays whose first axis is the runs. Values may be vectors, of whole q_s or v_f, say.
+
+    Raises:
+        ValueError: no column, columns of different length, or values that are not finite.
+    """
+
+    columns: Mapping[str, Any]
+
+    def __post_init__(self):
+        columns = {name: axis if isinstance(axis, Axis) else Axis(axis) for name, axis in self.columns.items()}
+        columns = {
+            name: Axis(_values(f"the column {name!r}", axis.values), axis.unit, axis.description)
+            for name, axis in columns.items()
+        }
+        lengths = {name: axis.values.shape[:1] for name, axis in columns.items()}
+        if len(set(lengths.values())) != 1 or () in lengths.values() or (0,) in lengths.values():
+            found = ", ".join(f"{name} {shape[0] if shape else 'a single value'}" for name, shape in lengths.items())
+            raise ValueError(
+                f"Table: columns must have one value for each run, but their lengths are: {found or 'no columns'}. For all "
+                "combinations of values take Product."
+            )
+        object.__setattr__(self, "columns", columns)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())).values)
+
+    def rows(self, first: int, last: int) -> Rows:
+        """Rows number `first` to `last`, that one excluded."""
+        return {name: axis.values[first:last] for name, axis in self.columns.items()}
+
+    def combinations(self, names: Sequence[str]) -> Rows:
+        """All different combinations of the values of some columns."""
+        return unique_rows({name: self.columns[name].values for name in names})[0]
+
+    def described(self) -> dict[str, dict]:
+        """The columns as plain data, without their values."""
+        return {name: _words(axis) for name, axis in self.columns.items()}
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Random rows.
+
+    count: number of runs.
+    columns: by name a `Draw`, or a tuple of the name of a distribution and its arguments, ``("uniform", 10, 50)``.
+    method: "sobol" (a scrambled sequence: averages converge faster), "latin-hypercube", or "random" (independent).
+    seed: of the generator; the same seed gives the same rows.
+
+    Raises:
+        ValueError: bad arguments; more rows than a method can make.
+    """
+
+    count: int
+    columns: Mapping[str, Any]
+    method: str = "sobol"
+    seed: int = 0
+
+    def __post_init__(self):
+        whole_number("Draws: count", self.count)
+        whole_number("Draws: seed", self.seed, least=0)
+        if self.method not in METHODS:
+            raise ValueError(
+                f"Draws: method is {self.method!r}.{near(str(self.method), METHODS)} Give one of {', '.join(METHODS)}."
+            )
+        most = {"sobol": MOST_SOBOL, "latin-hypercube": MOST_LATIN}.get(self.method, self.count)
+        if self.count > most:
+            raise ValueError(
+                f"Draws: count is {self.count}, more than the {most} of the method {self.method}; take method='random'."
+            )
+        if not self.columns:
+            raise ValueError("Draws: there are no columns; give at least one, e.g. {'omega': ('uniform', 10, 50)}.")
+        columns = {name: _draw(name, draw) for name, draw in self.columns.items()}
+        for draw in columns.values():
+            draw.quantiles(np.array([0.5]))
+        object.__setattr__(self, "columns", columns)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def rows(self, first: int, last: int) -> Rows:
+        """Rows number `first` to `last`, that one excluded."""
+        points = np.clip(self._points(first, last), 2.0**-53, 1 - 2.0**-53)  # quantiles of 0 and 1 may be infinite
+        return {name: draw.quantiles(points[:, i]) for i, (name, draw) in enumerate(self.columns.items())}
+
+    def combinations(self, names: Sequence[str]) -> Rows:
+        """Refused: drawn values are all different.
+
+        Raises:
+            ValueError: always, but for no names.
+        """
+        if names:
+            raise ValueError(
+                f"Draws: {', '.join(names)} cannot be drawn, since runs with different values of it are computed by different "
+                "programs; give a Table of these runs."
+            )
+        return {}
+
+    def described(self) -> dict[str, dict]:
+        """The columns as plain data."""
+        return {
+            name: {**_words(draw), "distribution": [draw.name, *draw.arguments]} for name, draw in self.columns.items()
+        }
+
+    def _points(self, first: int, last: int) -> np.ndarray:
+        """(last - first, number of columns) numbers between 0 and 1."""
+        size = len(self.columns)
+        if self.method == "latin-hypercube":
+            return _latin_hypercube(self.count, size, self.seed)[first:last]
+        if self.method == "random":
+            blocks = -(-size // 4)  # the generator makes four numbers at a time
+            generator = np.random.Generator(np.random.Philox(key=self.seed).advance(first * blocks))
+            return generator.random((last - first, 4 * blocks))[:, :size]
+        sequence = qmc.Sobol(size, rng=np.random.default_rng(self.seed))
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "The balance properties")  # of parts of it
+            return sequence.fast_forward(first).random(last - first) if first else sequence.random(last)
+
+
+Design = Product | Table | Draws
+
+
+def unique_rows(rows: Rows) -> tuple[Rows, np.ndarray]:
+    """The different rows, and for each row the number of its like among them."""
+    if not rows:
+        return {}, np.zeros(0, dtype=int)
+    codes = [np.unique(values, return_inverse=True)[1] for values in rows.values()]
+    _, first, inverse = np.unique(np.stack(codes, axis=1), axis=0, return_index=True, return_inverse=True)
+    return {name: values[first] for name, values in rows.items()}, inverse.ravel()
+
+
+@lru_cache(maxsize=2)
+def _latin_hypercube(count: int, size: int, seed: int) -> np.ndarray:
+    return qmc.LatinHypercube(size, rng=np.random.default_rng(seed)).random(count)
+
+
+def _draw(name: str, given) -> Draw:
+    if isinstance(given, Draw):
+        return given
+    if not (isinstance(given, Sequence) and len(given) and isinstance(given[0], str)) or isinstance(given, str):
+        raise ValueError(
+            f"Draws: the column {name!r} is {given!r}; give the name of a distribution and its arguments, "
+            "('uniform', 10, 50) or ('normal', 0, 0.1)."
+        )
+    return Draw(given[0], tuple(float(x) for x in given[1:]))
+
+
+def _values(what: str, values) -> np.ndarray:
+    """Numbers as float64, whole numbers as int64, labels as strings."""
+    array = np.asarray(values)
+    if array.dtype.kind in "US":
+        return array.astype(str)
+    if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        raise ValueError(f"{what} has the values {values!r}; give finite numbers, or labels of schemes.")
+    return array.astype(np.int64 if array.dtype.kind in "iu" else np.float64)
+
+
+def _words(axis: Axis | Draw) -> dict[str, str]:
+    given = {"units": axis.unit, "description": axis.description}
+    return {name: text for name, text in given.items() if text}

@@ -1,0 +1,132 @@
+"""Where tasks run: in this process, in workers of this machine, or wherever an executor has them run."""
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from vmri_jax.ensembles.worker import call_packed, in_worker, known_versions, packed
+from vmri_jax.mechanics.arrays import whole_number
+
+RETRIES = 2
+"""Times that Dask tries a task again that raised an error. How often it does where workers died is its own setting."""
+AHEAD = 4
+"""Tasks per thread of the workers that are handed over before their time."""
+
+
+class Here(Executor):
+    """Runs every task in this process, when it is submitted."""
+
+    def submit(self, fn: Callable, /, *args, **kwargs) -> Future:
+        future: Future = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def executor_of(what: str, executor: Any, processes: int | None) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """An executor, and a function that says how many tasks it should have at a time.
+
+    Args:
+        what: the function that was called, for messages.
+        executor: None, a `concurrent.futures.Executor`, or a `dask.distributed.Client`.
+        processes: workers of this machine to start, None for none.
+
+    Raises:
+        TypeError, ValueError: something else, or both.
+        ImportError: `processes` without Dask.
+    """
+    if executor is not None and processes is not None:
+        raise ValueError(f"{what}: executor and processes are given; choose one of them.")
+    with ExitStack() as open_ones:
+        if processes is not None:
+            executor = open_ones.enter_context(local_workers(whole_number(f"{what}: processes", processes)))
+        if executor is None:
+            yield Here(), lambda: 1
+        elif isinstance(executor, Executor):
+            size = getattr(executor, "_max_workers", 1)
+            yield executor, lambda: AHEAD * size
+        elif hasattr(executor, "get_executor"):
+            client = executor
+            tasks = client.get_executor(retries=RETRIES, pure=False)
+            try:
+                yield tasks, lambda: AHEAD * max(1, sum(client.nthreads().values()))
+            finally:
+                tasks.shutdown(wait=False)  # what is not done is not wanted any more
+        else:
+            raise TypeError(
+                f"{what}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
+                "or the number of processes on this machine."
+            )
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[Any]:
+    """A client of so many workers on this machine, each a process with one thread.
+
+    Raises:
+        ImportError: Dask is not installed.
+    """
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ImportError("processes need Dask; install it with pip install 'vmri_jax[ensemble]'.") from error
+    cluster = LocalCluster(n_workers=count, threads_per_worker=1, processes=True, dashboard_address=":0")
+    with cluster, Client(cluster) as client:
+        yield client
+
+
+def as_done(
+    submit: Callable[..., Future], room: Callable[[], int], arguments: Iterable[tuple]
+) -> Iterator[tuple[tuple, Future]]:
+    """Submit all of these, not too many ahead, and yield them with their futures as they are done."""
+    waiting: dict[Future, tuple] = {}
+    left = iter(arguments)
+    try:
+        while True:
+            while len(waiting) < room() and (one := next(left, None)) is not None:
+                waiting[submit(*one)] = one
+            if not waiting:
+                return
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                yield waiting.pop(future), future
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def mapped(
+    what: str,
+    task: Callable,
+    arguments: Iterable[tuple],
+    executor: Any = None,
+    told: Callable[[int, tuple], None] | None = None,
+) -> list:
+    """``[task(*one) for one in arguments]``, computed by an executor; the first error is raised.
+
+    Args:
+        what: the function that was called, for messages.
+        task: a function of a module.
+        arguments: of every call; they can be pickled if workers are to have them.
+        executor: as of `ensemble`.
+        told: called with the number of calls done and the arguments of the last, after each.
+    """
+    given = list(arguments)
+    found: list = [None] * len(given)
+    with executor_of(what, executor, None) as (tasks, room):
+        here, versions = isinstance(tasks, Here), known_versions()
+        calls = ((i,) for i in range(len(given)))
+
+        def submit(i: int) -> Future:
+            if here:
+                return tasks.submit(task, *given[i])
+            return tasks.submit(in_worker, versions, call_packed, packed(what, (task, given[i])))
+
+        for done, ((i,), future) in enumerate(as_done(submit, room, calls), 1):
+            found[i] = future.result()
+            if told is not None:
+                told(done, given[i])
+    return found

@@ -1,0 +1,185 @@
+"""What is kept of a run: arrays by name, made from its saved nodes where it was computed."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.catalogue import imported
+from vmri_jax.mechanics.names import near
+from vmri_jax.running.export import DIMENSIONS
+from vmri_jax.running.simulate import Simulation
+from vmri_jax.running.trajectory import Trajectory
+
+LEVELS = (0.05, 0.5, 0.95)
+"""Parts of the saved nodes that lie below the quantiles."""
+
+
+class Kept(NamedTuple):
+    """An array that is kept of each run.
+
+    dimensions: names of its axes.
+    """
+
+    value: Any
+    dimensions: tuple[str, ...] = ()
+    description: str = ""
+
+
+class Quantity(NamedTuple):
+    """``function(trajectory)`` of a single run gives what is kept, by name.
+
+    over_nodes: whether it says little if only the end is saved.
+    """
+
+    function: Callable[[Trajectory], dict[str, Kept]]
+    over_nodes: bool
+    title: str
+
+
+def _end(run: Trajectory) -> dict[str, Kept]:
+    names = {"q": "positions", "p": "momenta"}
+    return {
+        f"{letter}_{part}": Kept(getattr(run, f"{letter}_{part}")[-1], (dimension,), f"{names[letter]} at the end")
+        for letter in "qp"
+        for part, dimension in (("s", "slow"), ("f", "fast"))
+    }
+
+
+def _nodes(run: Trajectory) -> dict[str, Kept]:
+    names = ("t", "q_s", "q_f", "p_s", "p_f", "energy")
+    axes = {name: ("node", *DIMENSIONS[name][1:]) for name in names}
+    return {f"node_{name}": Kept(getattr(run, name), axes[name], f"{name} at the saved nodes") for name in names}
+
+
+def _energy_error(run: Trajectory) -> dict[str, Kept]:
+    error = jnp.max(jnp.abs(run.energy - run.energy[0]))
+    return {"energy_error": Kept(error, (), "largest change of the energy since the start")}
+
+
+def _energy_drift(run: Trajectory) -> dict[str, Kept]:
+    t = run.t - jnp.mean(run.t)
+    slope = jnp.sum(t * run.energy) / jnp.sum(t * t)
+    return {
+        "energy_drift": Kept(slope * (run.t[-1] - run.t[0]), (), "change of a line fitted to the energy over the run")
+    }
+
+
+def _constraints(run: Trajectory) -> dict[str, Kept]:
+    largest = jnp.max(run.constraint_residual, axis=0)
+    return {"constraint_residual": Kept(largest, ("level",), "largest residual of the constraints")}
+
+
+def _iterations(run: Trajectory) -> dict[str, Kept]:
+    return {"iterations": Kept(jnp.max(run.info.iterations), (), "most Newton iterations of a step")}
+
+
+def _extremes(run: Trajectory) -> dict[str, Kept]:
+    found = {}
+    for part, dimension in (("s", "slow"), ("f", "fast")):
+        q = getattr(run, f"q_{part}")
+        found[f"min_q_{part}"] = Kept(jnp.min(q, axis=0), (dimension,), "smallest positions")
+        found[f"max_q_{part}"] = Kept(jnp.max(q, axis=0), (dimension,), "largest positions")
+    return found
+
+
+def _quantiles(run: Trajectory) -> dict[str, Kept]:
+    levels = jnp.array(LEVELS)
+    return {
+        f"quantiles_q_{part}": Kept(
+            jnp.quantile(getattr(run, f"q_{part}"), levels, axis=0),
+            ("quantile", dimension),
+            "quantiles of the positions over the saved nodes",
+        )
+        for part, dimension in (("s", "slow"), ("f", "fast"))
+    }
+
+
+QUANTITIES = {
+    "end": Quantity(_end, False, "positions and momenta at the end"),
+    "nodes": Quantity(_nodes, False, "times, positions, momenta and energy at all saved nodes"),
+    "energy_error": Quantity(_energy_error, True, "largest change of the energy since the start"),
+    "energy_drift": Quantity(_energy_drift, True, "change over the run of a line fitted to the energy"),
+    "constraint_residual": Quantity(_constraints, True, "largest residual of constraints, positions and velocities"),
+    "iterations": Quantity(_iterations, False, "most Newton iterations of a step"),
+    "extremes": Quantity(_extremes, True, "smallest and largest value of each position"),
+    "quantiles": Quantity(_quantiles, True, f"quantiles {LEVELS} of each position over the run"),
+}
+
+
+def quantity(name: str) -> Quantity:
+    """One of `QUANTITIES`, or a function of your own, ``my_file.py:function`` or ``my_package.my_module:function``.
+
+    An own function takes the `Trajectory` of a single run and returns an array, or arrays by name, with operations of JAX.
+
+    Raises:
+        ValueError: an unknown name, or no such function.
+    """
+    if name in QUANTITIES:
+        return QUANTITIES[name]
+    if ":" not in name:
+        raise ValueError(
+            f"ensemble: save has {name!r}.{near(name, QUANTITIES)} There are {', '.join(QUANTITIES)}; your own functions are "
+            "my_file.py:function, or my_package.my_module:function."
+        )
+    own = imported(name)
+    if not callable(own):
+        raise ValueError(
+            f"ensemble: save has {name!r}, which is {type(own).__name__}; give a function of a trajectory."
+        )
+    label = name.partition(":")[2]
+
+    def function(run: Trajectory) -> dict[str, Kept]:
+        found = own(run)
+        arrays = found if isinstance(found, dict) else {label: found}
+        about = (getattr(own, "__doc__", None) or "").strip().partition("\n")[0]
+        return {key: _own(key, jnp.asarray(value), about) for key, value in arrays.items()}
+
+    return Quantity(function, False, label)
+
+
+def _own(name: str, value, about: str) -> Kept:
+    return Kept(value, tuple(f"{name}_{i}" for i in range(value.ndim)), about)
+
+
+def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:
+    """All that is kept of a run.
+
+    Raises:
+        ValueError: two quantities with an array of one name.
+    """
+    found: dict[str, Kept] = {}
+    for one in quantities:
+        part = one.function(run)
+        both = sorted(set(found) & set(part))
+        if both:
+            raise ValueError(f"ensemble: save has two arrays called {', '.join(both)}; give one of them another name.")
+        found |= part
+    return found
+
+
+def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, Kept]:
+    """All that is kept of such a run, with shapes in place of values; nothing is computed.
+
+    Raises:
+        ValueError: two quantities with an array of one name, or a function of the user that cannot be traced.
+    """
+    found: dict[str, Kept] = {}
+
+    def shapes():
+        trajectory = run.engine.trajectory(run.leaves, run.start_arrays, run.macro_dt, run.save_every)
+        found.update(kept(quantities, trajectory))
+        return {name: one.value for name, one in found.items()}
+
+    values = jax.eval_shape(shapes)
+    return {name: one._replace(value=values[name]) for name, one in found.items()}
+
+
+def of_lanes(quantities: Sequence[Quantity]) -> Callable[[Trajectory], dict[str, Any]]:
+    """A compiled function that gives what is kept of every run of a batch."""
+
+    def of_one(run: Trajectory):
+        return {name: one.value for name, one in kept(quantities, run).items()}
+
+    return jax.jit(jax.vmap(of_one))

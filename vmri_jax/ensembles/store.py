@@ -1,0 +1,140 @@
+"""The store of an ensemble on disk, and what is written in which order.
+
+A store is a folder, a zarr group of format 3, that `xarray.open_zarr` reads as a dataset:
+
+    q_s, energy_error, ...   one array for everything that is kept, a row for each run, one file per chunk of runs
+    result, failed_at        the status of every run
+    design/...               columns of a design that is a table
+    resume/chunks            one file per chunk: the number of its runs that failed, once the chunk counts
+    attributes               format, design, settings, identity of the ensemble, what it was made with
+
+The last file of a chunk commits it: it is written when all others of the chunk are on disk. What is there of a chunk without it
+does not count and is written again. So any number of workers can write at once, and be killed at any moment.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vmri_jax.ensembles.design import Rows
+from vmri_jax.running.export import FILL
+from vmri_jax.running.files import made_beside, replaced
+from vmri_jax.running.store.layout import CONFIG, METADATA, consolidate, synchronize_files
+
+FORMAT = "vmri_jax ensemble store 1"
+COMMITTED = Path("resume", "chunks")
+DESIGN = "design"
+LANE = "lane"
+
+
+def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, dict], columns: Rows, chunk: int) -> None:
+    """Make a store without runs; what is at this place gives way when it is complete.
+
+    Args:
+        path: its folder.
+        attributes: of the store.
+        arrays: by name the shape, dtype, dimensions and attributes of what is kept of all runs.
+        columns: of a design that is a table.
+        chunk: runs of a chunk.
+    """
+    import zarr
+
+    lanes = attributes["lanes"]
+    with made_beside(path) as partial:
+        group = zarr.create_group(partial, attributes={"format": FORMAT, **attributes})
+        for name, array in arrays.items():
+            _create(group, name, (lanes, *array["shape"]), chunk, array)
+        for name, values in columns.items():
+            one = {"dtype": values.dtype, "dimensions": [f"{name}_{i}" for i in range(values.ndim - 1)]}
+            array = _create(group.require_group(DESIGN), name, values.shape, chunk, one)
+            array[:] = values
+        count = -(-lanes // chunk)
+        group.require_group(COMMITTED.parent.name).create_array(
+            COMMITTED.name, shape=(count,), chunks=(1,), dtype="<i4", fill_value=-1, compressors=None, **_KEYS
+        )
+        (partial / COMMITTED).mkdir(parents=True, exist_ok=True)
+        consolidate(partial)
+        synchronize_files([file for file in partial.rglob("*") if file.is_file()])
+
+
+def _create(group, name: str, shape: tuple[int, ...], chunk: int, like: dict):
+    from zarr.codecs import Crc32cCodec
+
+    dtype = np.dtype(like["dtype"])
+    return group.create_array(
+        name,
+        shape=shape,
+        chunks=(chunk, *(max(n, 1) for n in shape[1:])),
+        dtype=dtype,
+        fill_value=FILL.get(dtype.kind, 0),
+        compressors=Crc32cCodec(),
+        dimension_names=(LANE, *like["dimensions"]),
+        attributes=like.get("attributes", {}),
+        config=CONFIG,
+        **_KEYS,
+    )
+
+
+_KEYS: Any = {"chunk_key_encoding": {"name": "default", "separator": "."}}
+
+
+class Writer:
+    """Writes chunks of a store."""
+
+    def __init__(self, path: Path, chunk: int):
+        import zarr
+
+        self._path, self._chunk = path, chunk
+        group = zarr.open_group(path, mode="r+", use_consolidated=False)
+        self._arrays = {name: array.with_config(CONFIG) for name, array in group.arrays()}
+        self._columns = dict(group[DESIGN].arrays()) if DESIGN in group else {}  # pyright: ignore[reportAttributeAccessIssue]
+
+    def columns(self, first: int, last: int) -> Rows:
+        """Rows of a design that is a table."""
+        return {name: np.asarray(array[first:last]) for name, array in self._columns.items()}
+
+    def write(self, number: int, values: Rows) -> int:
+        """Write a chunk and commit it; returns how many of its runs failed."""
+        first = number * self._chunk
+        files = []
+        for name, value in values.items():
+            array = self._arrays[name]
+            array[first : first + len(value)] = value
+            files.append(self._path / name / ".".join(["c", str(number)] + ["0"] * (array.ndim - 1)))
+        synchronize_files(files)  # after all have been written: the first wait is one for most of the others
+        failed = int(np.count_nonzero(values["failed_at"] >= 0))
+        with replaced(self._path / COMMITTED / f"c.{number}") as file:
+            file.write(np.array([failed], "<i4").tobytes())
+        return failed
+
+
+def committed(path: Path) -> dict[int, int]:
+    """The chunks that count, each with the number of its runs that failed."""
+    found = {}
+    with os.scandir(path / COMMITTED) as entries:
+        for entry in entries:
+            if entry.name.startswith("c."):
+                found[int(entry.name[2:])] = int(np.frombuffer(Path(entry.path).read_bytes(), "<i4")[0])
+    return found
+
+
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Attributes of a store.
+
+    Raises:
+        FileNotFoundError: nothing there.
+        ValueError: something else than the store of an ensemble.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; give the folder of an ensemble.")
+    try:
+        attributes = json.loads((path / METADATA).read_text())["attributes"]
+        if attributes["format"] != FORMAT:
+            raise ValueError(f"its format is {attributes['format']!r}, that of ensembles is {FORMAT!r}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not the store of an ensemble ({type(error).__name__}: {error}).") from error
+    return attributes
