@@ -10,8 +10,8 @@ import typer
 
 from tests.scene.gallery_scenes import FOLDER, gallery_scene
 from vmri_jax import simulate
-from vmri_jax.cli import app
 from vmri_jax.catalogue import find_scheme
+from vmri_jax.cli import app
 
 SPEC = importlib.util.spec_from_file_location("gallery", FOLDER / "gallery.py")
 assert SPEC is not None

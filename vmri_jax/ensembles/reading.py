@@ -113,4 +113,7 @@ def drawn(attributes: dict[str, Any]) -> Draws:
 def _table(path: Path, xarray) -> dict[str, Any]:
     """Columns of a design that is a table."""
     found = xarray.open_zarr(path, group=store.DESIGN, chunks={}, consolidated=False, mask_and_scale=False)
-    return {name: array.data for name, array in found.items()}
+    return {
+        name: store.labelled(array.values, array.attrs) if store.LABELS in array.attrs else array.data
+        for name, array in found.items()
+    }

@@ -40,7 +40,7 @@ MOST_BYTES = 2**26
 """fits into so much memory,"""
 PARTS = 64
 """and is at most such a part of all runs, so that workers share them evenly."""
-NANOSECONDS = {"explicit": 1.0, "implicit": 3.0, "constrained": 25.0}
+NANOSECONDS = {"explicit": 1.0, "implicit": 25.0, "constrained": 25.0}
 """Rough times of a micro step for each coordinate of each run, in a batch."""
 
 
@@ -58,7 +58,8 @@ class EnsembleError(RuntimeError):
         lanes = ", ".join(_runs(ensemble.chunks, number) for number in list(self.failures)[:5])
         more = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
         super().__init__(
-            f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{more}. Chunk {first}: {why} "
+            f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{more}. Chunk {first}: "
+            f"{why.splitlines()[-1]} "
             f"All others are in {ensemble.path}; with resume=True only these are tried again."
         )
 
@@ -158,7 +159,8 @@ def ensemble(
             Several by label are an axis "scheme" of the design.
         design: `Product`, `Table` or `Draws` of `vmri_jax.ensembles`; a mapping is a `Product`. Columns are parameters of the
             system ("omega", "spring.stiffness", "masses[2]"), parts of the start ("q_s[0]", "v hub x", "q_f"), steps
-            ("macro_dt", "micro_dt", "num_steps") and schemes ("num_micro", "scheme").
+            ("macro_dt", "micro_dt", "num_steps") and schemes ("num_micro", "scheme"). All else stays: a parameter changes the
+            system, and not the positions and velocities that the problem starts from.
         out: folder of the store, a zarr group; conventionally named .zarr. All workers must see it.
         t_end, num_steps, macro_dt, micro_dt: two of them: the time at the end, the number of macro steps, and a step size.
         num_micro: for schemes given by name or by what makes them.

@@ -29,6 +29,8 @@ FORMAT = "vmri_jax ensemble store 1"
 COMMITTED = Path("resume", "chunks")
 DESIGN = "design"
 LANE = "lane"
+LABELS = "labels"
+"""Attribute of a column of labels, which are stored as their numbers in it."""
 
 
 def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, dict], columns: Rows, chunk: int) -> None:
@@ -49,9 +51,7 @@ def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, dict]
         for name, array in arrays.items():
             _create(group, name, (lanes, *array["shape"]), chunk, array)
         for name, values in columns.items():
-            one = {"dtype": values.dtype, "dimensions": [f"{name}_{i}" for i in range(values.ndim - 1)]}
-            array = _create(group.require_group(DESIGN), name, values.shape, chunk, one)
-            array[:] = values
+            _store_column(group.require_group(DESIGN), name, values, chunk)
         count = -(-lanes // chunk)
         group.require_group(COMMITTED.parent.name).create_array(
             COMMITTED.name, shape=(count,), chunks=(1,), dtype="<i4", fill_value=-1, compressors=None, **_KEYS
@@ -59,6 +59,17 @@ def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, dict]
         (partial / COMMITTED).mkdir(parents=True, exist_ok=True)
         consolidate(partial)
         synchronize_files([file for file in partial.rglob("*") if file.is_file()])
+
+
+def _store_column(group, name: str, values: np.ndarray, chunk: int) -> None:
+    """A column of a table; labels as numbers of a list of them, since zarr has no text of its own yet."""
+    about = {}
+    if values.dtype.kind == "U":
+        labels, values = np.unique(values, return_inverse=True)
+        about = {LABELS: labels.tolist()}
+    dimensions = [f"{name}_{i}" for i in range(values.ndim - 1)]
+    one = {"dtype": values.dtype, "dimensions": dimensions, "attributes": about}
+    _create(group, name, values.shape, chunk, one)[:] = values
 
 
 def _create(group, name: str, shape: tuple[int, ...], chunk: int, like: dict):
@@ -95,7 +106,7 @@ class Writer:
 
     def columns(self, first: int, last: int) -> Rows:
         """Rows of a design that is a table."""
-        return {name: np.asarray(array[first:last]) for name, array in self._columns.items()}
+        return {name: labelled(np.asarray(array[first:last]), array.attrs) for name, array in self._columns.items()}
 
     def write(self, number: int, values: Rows) -> int:
         """Write a chunk and commit it; returns how many of its runs failed."""
@@ -110,6 +121,11 @@ class Writer:
         with replaced(self._path / COMMITTED / f"c.{number}") as file:
             file.write(np.array([failed], "<i4").tobytes())
         return failed
+
+
+def labelled(values, attributes: Mapping[str, Any]):
+    """Values of a column of a table, labels in place of their numbers."""
+    return np.asarray(attributes[LABELS])[values] if LABELS in attributes else values
 
 
 def committed(path: Path) -> dict[int, int]:

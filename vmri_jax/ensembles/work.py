@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -74,6 +74,9 @@ class Work:
     save: tuple[str, ...] = ("end",)
     num_saves: int = 1
     sources: Mapping[str, str] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {one.name: getattr(self, one.name) for one in fields(self)}  # without what was made of them here
 
     def with_sources(self) -> "Work":
         """The same that knows what is in the user's files, which get their whole path."""

@@ -1,0 +1,52 @@
+"""What users keep in a file of their own: a quantity, a system, and quantities that go wrong."""
+
+import os
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax import systems
+
+POISON = 41.0
+"""A frequency at which the bad quantities go wrong."""
+
+slow_chain = systems.fermi_pasta_ulam(num_springs=2)
+
+
+def reach(run):
+    """Largest elongation of the first stiff spring."""
+    return jnp.max(jnp.abs(run.q_f[:, 0]))
+
+
+def raises(run):
+    """Raises where the energy at the start tells that a run is the poisoned one."""
+    return jax.pure_callback(_raise, jax.ShapeDtypeStruct((), float), run.q_s[0, 0], vmap_method="broadcast_all")
+
+
+def _raise(q):
+    if np.any(np.asarray(q) == POISON):
+        raise ValueError("poison")
+    return np.asarray(q)
+
+
+def dies(run):
+    """Kills its process at the poisoned run."""
+    return jax.pure_callback(_die, jax.ShapeDtypeStruct((), float), run.q_s[0, 0], vmap_method="broadcast_all")
+
+
+def _die(q):
+    if np.any(np.asarray(q) == POISON):
+        os._exit(1)
+    return np.asarray(q)
+
+
+def sleeps(run):
+    """Takes a while."""
+    return jax.pure_callback(_sleep, jax.ShapeDtypeStruct((), float), run.q_s[0, 0], vmap_method="broadcast_all")
+
+
+def _sleep(q):
+    time.sleep(0.2)
+    return np.asarray(q)

@@ -1,0 +1,318 @@
+"""Ensembles in this process: results, resuming, reading, refusals."""
+
+import errno
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.ensembles import own
+from vmri_jax.ensembles import QUANTITIES, Axis, Draws, EnsembleError, Product, Table, store
+from vmri_jax.ensembles.run import Ensemble
+from vmri_jax.running import files
+from vmri_jax.steppers.results import Result
+
+OWN = f"{Path(own.__file__)}"
+STEPS = {"t_end": 0.2, "macro_dt": 0.02}
+
+
+def few(out, **changes) -> Ensemble:
+    arguments = {"system": "fpu", "scheme": "explicit-slow", "design": {"omega": [20.0, 50.0]}, "num_micro": 3, **STEPS}
+    return vm.ensemble(**arguments | changes, out=out)
+
+
+def chain(omega: float, num_springs: int = 3) -> vm.Problem:
+    """The chain that starts as the one of omega = 50 does."""
+    problem = vm.systems.fermi_pasta_ulam(num_springs)
+    return replace(problem, system=problem.system.replace(params={"omega": np.asarray(omega)}))
+
+
+def test_runs_are_those_of_simulate(tmp_path):
+    schemes = {"explicit": vm.explicit_slow, "implicit": vm.fully_implicit}
+    axes = {"num_micro": [1, 4], "num_steps": [8, 16], "omega": [20.0, 50.0], "v_s[1]": [0.1, 0.3]}
+    save = ("end", "nodes", *(name for name in QUANTITIES if name not in ("end", "nodes")))
+    runs = vm.ensemble("fpu", schemes, axes, t_end=0.2, save=save, num_saves=4, out=tmp_path / "runs.zarr")
+    assert runs.complete
+    assert len(runs) == 32
+    assert runs.failed_runs == 0
+    data = runs.open()
+    assert dict(data.sizes) | {"scheme": 2, "num_micro": 2, "num_steps": 2, "omega": 2, "v_s[1]": 2} == dict(data.sizes)
+    for scheme, make in schemes.items():
+        at = {"scheme": scheme, "num_micro": 4, "num_steps": 16, "omega": 50.0, "v_s[1]": 0.3}
+        one = data.sel(at).load()
+        problem = chain(50.0)
+        v_s = np.array(problem.v_s)
+        v_s[1] = 0.3
+        problem = replace(problem, v_s=v_s)
+        run = vm.simulate(problem, make(4), macro_dt=0.2 / 16, num_steps=16, save_every=4)
+        for name in ("q_s", "q_f", "p_s", "p_f"):
+            assert np.allclose(one[name], getattr(run, name)[-1], rtol=0, atol=1e-13)  # 2e-15
+            assert np.allclose(one[f"node_{name}"], getattr(run, name), rtol=0, atol=1e-13)
+        assert one.energy_error == pytest.approx(float(np.abs(run.energy - run.energy[0]).max()), abs=1e-13)
+        line = np.polynomial.Polynomial.fit(run.t, run.energy, 1)
+        assert one.energy_drift == pytest.approx(line(run.t[-1]) - line(run.t[0]), abs=1e-12)
+        assert np.allclose(one.max_q_f, run.q_f.max(axis=0), rtol=0, atol=1e-13)
+        assert np.allclose(one.quantiles_q_s.sel(quantile=0.5), np.median(run.q_s, axis=0), rtol=0, atol=1e-13)
+        assert one.result == int(run.result)
+        assert one.iterations == int(run.info.iterations.max())
+
+
+def test_steps_of_their_own_in_a_table_in_any_order(tmp_path):
+    columns = {"num_steps": [20, 10, 20, 40, 10], "omega": [10.0, 20.0, 30.0, 40.0, 50.0]}
+    runs = few(tmp_path / "table.zarr", design=Table(columns), macro_dt=None, t_end=0.2)
+    data = runs.open()
+    assert data.omega.values.tolist() == columns["omega"]
+    for i in range(5):
+        steps = columns["num_steps"][i]
+        run = vm.simulate(chain(columns["omega"][i]), vm.explicit_slow(3), macro_dt=0.2 / steps, num_steps=steps)
+        assert np.allclose(data.q_f[i], run.q_f[-1], rtol=0, atol=1e-13)
+
+
+def test_steps_of_each_lane(tmp_path):
+    design = Table({"macro_dt": [0.01, 0.02, 0.013], "q_f": 0.01 * np.arange(9.0).reshape(3, 3)})
+    data = few(tmp_path / "lanes.zarr", design=design, macro_dt=None, t_end=None, num_steps=10).open()
+    problem = vm.systems.fermi_pasta_ulam()
+    problem = replace(problem, q_f=design.columns["q_f"].values[2])
+    run = vm.simulate(problem, vm.explicit_slow(3), macro_dt=0.013, num_steps=10)
+    assert np.allclose(data.p_s[2], run.p_s[-1], rtol=0, atol=1e-13)
+
+
+def test_draws_can_be_read_and_repeated(tmp_path):
+    design = Draws(300, {"omega": ("uniform", 20, 60), "v elongations[0]": ("normal", 0, 0.1)}, seed=5)
+    data = few(tmp_path / "draws.zarr", design=design, chunk=100).open()
+    rows = design.rows(0, 300)
+    assert np.array_equal(data.omega, rows["omega"])
+    assert np.array_equal(data["v elongations[0]"], rows["v elongations[0]"])
+    fast = data.where((data.omega > 40).compute(), drop=True)
+    assert 0 < fast.sizes["lane"] < 300
+    assert float(fast.omega.min()) > 40
+
+
+def test_own_quantities_systems_and_units(tmp_path):
+    axis = Axis([20.0, 30.0], "rad/s", "frequency of the stiff springs")
+    save = ("end", f"{OWN}:reach")
+    runs = few(tmp_path / "own.zarr", system=f"{OWN}:slow_chain", design={"omega": axis}, save=save, num_saves=5)
+    data = runs.open()
+    assert data.omega.attrs == {"units": "rad/s", "description": "frequency of the stiff springs"}
+    assert data.reach.attrs["description"] == "Largest elongation of the first stiff spring."
+    run = vm.simulate(chain(30.0, 2), vm.explicit_slow(3), macro_dt=0.02, num_steps=10, save_every=2)
+    assert data.reach.sel(omega=30.0) == pytest.approx(float(np.abs(run.q_f[:, 0]).max()), abs=1e-14)
+    again = few(tmp_path / "module.zarr", system="tests.ensembles.own:slow_chain", design={"omega": [30.0]}, save="end")
+    assert np.allclose(again.open().q_f[0], data.q_f[1], rtol=0, atol=1e-13)
+
+
+def test_failed_runs_have_a_status_and_others_do_not_notice(tmp_path):
+    runs = few(
+        tmp_path / "failed.zarr",
+        scheme="fully-explicit",
+        design={"omega": [20.0, 1e9]},
+        t_end=2.0,
+        save=("end", "energy_error"),
+        num_saves=10,
+    )
+    assert runs.failed_runs == 1
+    data = runs.open()
+    good, bad = data.isel(omega=0), data.isel(omega=1)
+    assert good.result <= Result.CONVERGED_AT_ROUNDOFF
+    assert good.failed_at == -1
+    assert np.isfinite(good.energy_error)
+    assert bad.result == Result.NON_FINITE
+    assert np.isnan(bad.q_f).all()
+    flags = dict(zip(data.result.attrs["flag_values"], data.result.attrs["flag_meanings"].split(), strict=True))
+    assert flags[int(bad.result)] == "non_finite"
+
+
+def test_a_poisoned_chunk_is_named_and_the_rest_goes_on(tmp_path):
+    out = tmp_path / "poison.zarr"
+    design = {"q_s[0]": [1.0, 2.0, own.POISON, 4.0]}
+    arguments = {"design": design, "save": f"{OWN}:raises", "chunk": 1}
+    with pytest.raises(
+        EnsembleError, match=r"1 of 4 chunks could not be computed: runs 2 to 2\. Chunk 2: .*poison"
+    ) as caught:
+        few(out, **arguments)
+    assert sorted(caught.value.ensemble.done) == [0, 1, 3]
+    data = vm.open_ensemble(out)
+    assert data.raises.isnull().values.tolist() == [False, False, True, False]
+    assert data.result.values.tolist() == [0, 0, -1, 0]
+    again = few(out, **arguments, resume=True, throw=False)
+    assert list(again.failures) == [2]
+    assert again.computed == 0
+
+
+def test_resume_computes_only_what_is_missing(tmp_path):
+    design = {"omega": np.linspace(20.0, 50.0, 40)}
+    whole = few(tmp_path / "whole.zarr", design=design, chunk=8)
+    part = few(tmp_path / "part.zarr", design=design, chunk=8)
+    for number in (1, 3):  # as if it had been killed while these were written
+        (part.path / store.COMMITTED / f"c.{number}").unlink()
+    next(part.path.glob("q_f/c.3.0")).write_bytes(b"torn")
+    (part.path / "q_f" / "c.1.0.1234.partial").write_bytes(b"torn")
+    data = vm.open_ensemble(part.path)
+    assert int((data.result == -1).sum()) == 16
+    assert int(data.p_f.isnull().any("fast").sum()) == 16
+    resumed = few(part.path, design=design, chunk=8, resume=True)
+    assert resumed.computed == 16
+    assert _files(part.path) == _files(whole.path)
+
+
+def test_resume_starts_what_is_not_there(tmp_path):
+    assert few(tmp_path / "new.zarr", resume=True).complete
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"design": {"omega": [20.0, 51.0]}}, r"column omega: \[20\.0, 51\.0\] here, \[20\.0, 50\.0\] in the store"),
+        ({"macro_dt": 0.01}, r"macro_dt: 0\.01 here, 0\.02 in the store"),
+        ({"num_micro": 4}, r"num_micro: 4 here, 3 in the store"),
+        ({"save": "energy_error", "num_saves": 5}, r"save: energy_error here, end in the store"),
+        ({"scheme": "fully-implicit"}, r"scheme"),
+        ({"system": f"{OWN}:slow_chain"}, r"state\.q_s"),
+        ({"chunk": 1}, r"chunk: 1 here, 2 in the store"),
+    ],
+)
+def test_another_ensemble_is_not_gone_on_with(tmp_path, changes, message):
+    few(tmp_path / "runs.zarr")
+    with pytest.raises(ValueError, match=r"holds another ensemble .*" + message):
+        few(tmp_path / "runs.zarr", **changes, resume=True)
+
+
+def test_what_is_in_the_way(tmp_path):
+    out = tmp_path / "runs.zarr"
+    few(out)
+    with pytest.raises(FileExistsError, match=r"holds an ensemble of 2 runs, 1 of 1 chunks done"):
+        few(out)
+    assert few(out, overwrite=True, design={"omega": [1.0]}).open().sizes["omega"] == 1
+    (tmp_path / "other").mkdir()
+    with pytest.raises(ValueError, match="is not the store of an ensemble"):
+        few(tmp_path / "other")
+    with pytest.raises(FileNotFoundError, match="does not exist; make it first"):
+        few(tmp_path / "no" / "runs.zarr")
+    with pytest.raises(ValueError, match="both resume and overwrite"):
+        few(out, resume=True, overwrite=True)
+    with pytest.raises(FileNotFoundError, match="does not exist; give the folder of an ensemble"):
+        vm.open_ensemble(tmp_path / "nothing.zarr")
+
+
+def test_a_place_that_cannot_be_written():
+    with pytest.raises(OSError, match=r"/proc/runs\.zarr cannot be written: .* Give another place"):
+        few("/proc/runs.zarr")
+
+
+def test_a_full_disk_keeps_the_chunks_before(tmp_path, monkeypatch):
+    out, written = tmp_path / "runs.zarr", []
+    design = {"omega": np.linspace(20.0, 50.0, 40)}
+
+    def write(writer, number, values):
+        if len(written) == 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written.append(number)
+        return whole(writer, number, values)
+
+    whole = store.Writer.write
+    with monkeypatch.context() as patch:
+        patch.setattr(store.Writer, "write", write)
+        with pytest.raises(
+            OSError, match=r"No space left on device\. 2 of 5 chunks are kept; go on with resume=True"
+        ) as caught:
+            few(out, design=design, chunk=8)
+    assert caught.value.errno == errno.ENOSPC
+    assert few(out, design=design, chunk=8, resume=True).computed == 24
+    assert not list(files.Path(out).rglob("*.partial"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        (
+            {"design": {"omga": [1.0]}},
+            ValueError,
+            r"nothing that the column 'omga' could change\. Did you mean omega\?",
+        ),
+        ({"design": {"q_s[7]": [1.0]}}, ValueError, r"has an index that q_s, of shape \(3,\), does not have"),
+        (
+            {"design": {"q_s[0]": [1.0], "centres[0]": [2.0]}},
+            ValueError,
+            r"'q_s\[0\]' and 'centres\[0\]' both give q_s\[0\]",
+        ),
+        (
+            {"design": {"q_s": [1.0]}},
+            ValueError,
+            r"each value of 'q_s' has the shape \(\); it must be numbers of shape \(3,\)",
+        ),
+        ({"design": {"scheme": ["leapfrog"]}}, ValueError, r"no scheme 'leapfrog'"),
+        (
+            {"design": {"num_micro": [2.5]}, "num_micro": None},
+            ValueError,
+            r"num_micro is 2\.5; it must be a whole number",
+        ),
+        ({"design": {"macro_dt": [0.03]}, "macro_dt": None}, ValueError, r"no whole number"),
+        ({"design": {"macro_dt": [0.01]}}, ValueError, r"macro_dt is a column and an argument"),
+        ({"design": {"macro_dt": [-0.01]}, "macro_dt": None}, ValueError, r"steps must be positive"),
+        (
+            {"design": Draws(4, {"num_steps": ("uniform", 1, 9)}), "macro_dt": None},
+            ValueError,
+            r"num_steps cannot be drawn",
+        ),
+        ({"t_end": None}, ValueError, r"of the steps macro_dt is given; give two of"),
+        ({"num_micro": None}, ValueError, r"num_micro is missing for the scheme 'explicit-slow'"),
+        ({"scheme": vm.fully_implicit(2)}, ValueError, r"has its num_micro already"),
+        ({"scheme": 3}, TypeError, r"scheme is .*3.*; give a Scheme"),
+        ({"scheme": {}}, TypeError, r"give a Scheme"),
+        ({"design": [1, 2]}, TypeError, r"design is list; give a Product, Table or Draws"),
+        ({"save": "enrgy_error"}, ValueError, r"save has 'enrgy_error'\. Did you mean energy_error\?"),
+        ({"save": "energy_error"}, ValueError, r"looks at the saved nodes of a run, and only its end is saved"),
+        ({"save": ("end", "end")}, ValueError, r"two arrays called"),
+        ({"save": f"{OWN}:rech"}, ValueError, r"has no name 'rech'\. Did you mean reach\?"),
+        ({"num_saves": 3}, ValueError, r"10 macro steps are no multiple of num_saves = 3"),
+        ({"system": "fup"}, ValueError, r"there is no system 'fup'"),
+        ({"system": "no.such:thing"}, ValueError, r"the module no\.such cannot be imported"),
+        ({"executor": 3}, TypeError, r"executor is int; give a dask\.distributed\.Client"),
+        ({"chunk": 0}, ValueError, r"chunk is 0"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_written(tmp_path, changes, error, message):
+    with pytest.raises(error, match=message):
+        few(tmp_path / "runs.zarr", **changes)
+    assert not any(tmp_path.iterdir())
+
+
+def test_several_schemes_need_a_column_in_a_table(tmp_path):
+    schemes = {"a": vm.explicit_slow(2), "b": vm.fully_implicit(2)}
+    with pytest.raises(ValueError, match="no column 'scheme'"):
+        few(tmp_path / "runs.zarr", scheme=schemes, num_micro=None, design=Table({"omega": [1.0]}))
+    design = Table({"omega": [20.0, 20.0], "scheme": ["b", "a"]})
+    data = few(tmp_path / "runs.zarr", scheme=schemes, num_micro=None, design=design).open()
+    assert data.scheme.values.tolist() == ["b", "a"]
+    assert not np.array_equal(data.q_f[0], data.q_f[1])
+
+
+def test_no_columns_are_a_single_run(tmp_path):
+    runs = few(tmp_path / "one.zarr", design=Product({}))
+    assert len(runs) == 1
+    assert runs.open().q_f.shape == (3,)
+
+
+def test_constrained_systems(tmp_path, tsp):
+    runs = vm.ensemble(
+        tsp,
+        vm.fully_implicit(2),
+        {"v_s[0]": [0.0, 0.1]},
+        macro_dt=0.01,
+        num_steps=10,
+        project=True,
+        save=("end", "constraint_residual"),
+        num_saves=5,
+        out=tmp_path / "tsp.zarr",
+    )
+    data = runs.open()
+    assert runs.failed_runs == 0
+    assert float(data.constraint_residual.max()) < 1e-11
+    assert data.level.values.tolist() == ["position", "velocity"]
+
+
+def _files(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
