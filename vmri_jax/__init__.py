@@ -2,6 +2,7 @@
 
 from importlib import import_module
 from importlib.metadata import version
+from typing import Any
 
 from vmri_jax import diagnostics
 from vmri_jax.configure import NotConfiguredWarning, configure
@@ -47,7 +48,7 @@ LATER = {
 """Names that are imported when they are asked for: the module, and the name in it. matplotlib and scipy.stats take half a second."""
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """What is in `LATER`."""
     if name in LATER:
         module, attribute = LATER[name]

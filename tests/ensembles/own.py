@@ -48,5 +48,5 @@ def sleeps(run):
 
 
 def _sleep(q):
-    time.sleep(0.2)
+    time.sleep(0.3)
     return np.asarray(q)

@@ -1,17 +1,21 @@
 """Where tasks run: in this process, in workers of this machine, or wherever an executor has them run."""
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
-from vmri_jax.ensembles.worker import call_packed, in_worker, known_versions, packed
+from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
 from vmri_jax.mechanics.arrays import whole_number
 
 RETRIES = 2
 """Times that Dask tries a task again that raised an error. How often it does where workers died is its own setting."""
 AHEAD = 4
 """Tasks per thread of the workers that are handed over before their time."""
+
+
+LOOK = 1.0
+"""Seconds after which futures are looked at: `wait` does not see those that Dask cancels when its scheduler is gone."""
 
 
 class Here(Executor):
@@ -50,17 +54,30 @@ def executor_of(what: str, executor: Any, processes: int | None) -> Iterator[tup
             size = getattr(executor, "_max_workers", 1)
             yield executor, lambda: AHEAD * size
         elif hasattr(executor, "get_executor"):
-            client = executor
-            tasks = client.get_executor(retries=RETRIES, pure=False)
+            tasks = executor.get_executor(retries=RETRIES, pure=False)
             try:
-                yield tasks, lambda: AHEAD * max(1, sum(client.nthreads().values()))
+                yield tasks, _room(executor)
             finally:
-                tasks.shutdown(wait=False)  # what is not done is not wanted any more
+                if executor.status == "running":
+                    tasks.shutdown(wait=False)  # what is not done is not wanted any more
         else:
             raise TypeError(
                 f"{what}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
                 "or the number of processes on this machine."
             )
+
+
+def _room(client: Any) -> Callable[[], int]:
+    """How many tasks its workers should have; as many as before while the scheduler does not answer, none once it is given up."""
+    known = AHEAD
+
+    def room() -> int:
+        nonlocal known
+        with suppress(OSError, RuntimeError, AttributeError):
+            known = AHEAD * max(1, sum(client.nthreads().values()))
+        return 0 if client.status == "closed" else known
+
+    return room
 
 
 @contextmanager
@@ -82,16 +99,23 @@ def local_workers(count: int) -> Iterator[Any]:
 def as_done(
     submit: Callable[..., Future], room: Callable[[], int], arguments: Iterable[tuple]
 ) -> Iterator[tuple[tuple, Future]]:
-    """Submit all of these, not too many ahead, and yield them with their futures as they are done."""
+    """Submit all of these, not too many ahead, and yield them with their futures as they are done.
+
+    Raises:
+        CancelledError: there is no room any more: the workers are gone.
+    """
     waiting: dict[Future, tuple] = {}
     left = iter(arguments)
     try:
         while True:
+            if not room():
+                raise CancelledError
             while len(waiting) < room() and (one := next(left, None)) is not None:
                 waiting[submit(*one)] = one
             if not waiting:
                 return
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+            wait(waiting, LOOK, FIRST_COMPLETED)
+            for future in [future for future in waiting if future.done()]:
                 yield waiting.pop(future), future
     finally:
         for future in waiting:
@@ -123,7 +147,7 @@ def mapped(
         def submit(i: int) -> Future:
             if here:
                 return tasks.submit(task, *given[i])
-            return tasks.submit(in_worker, versions, call_packed, packed(what, (task, given[i])))
+            return tasks.submit(*call_in_worker(versions, call_packed, packed(what, (task, given[i]))))
 
         for done, ((i,), future) in enumerate(as_done(submit, room, calls), 1):
             found[i] = future.result()

@@ -91,7 +91,7 @@ def _drawn(path: Path, attributes: dict[str, Any]):
     sizes = (*[chunk] * (lanes // chunk), *([lanes % chunk] if lanes % chunk else []))
 
     def of(name: str):
-        def block(block_info=None):
+        def block(block_info: Any = None):
             ((first, last),) = block_info[None]["array-location"]
             return design.rows(first, last)[name]
 

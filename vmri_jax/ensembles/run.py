@@ -18,7 +18,7 @@ from vmri_jax.ensembles.executors import Here, as_done, executor_of
 from vmri_jax.ensembles.quantities import Kept, what_is_kept
 from vmri_jax.ensembles.task import Chunks, Done, Job, job_of, run_chunk, run_packed_chunk
 from vmri_jax.ensembles.work import AnyScheme, Steps, Work, all_groups
-from vmri_jax.ensembles.worker import NotAWorker, in_worker, known_versions, packed
+from vmri_jax.ensembles.worker import NotAWorker, call_in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
@@ -248,7 +248,7 @@ def _compute(found: Ensemble, job: Job, tasks, room, tell: Progress, interrupted
         submit = lambda number: tasks.submit(run_chunk, job, number)  # noqa: E731
     else:
         data, versions = packed("ensemble", job), known_versions()
-        submit = lambda number: tasks.submit(in_worker, versions, run_packed_chunk, data, number)  # noqa: E731
+        submit = lambda number: tasks.submit(*call_in_worker(versions, run_packed_chunk, data, number))  # noqa: E731
     tell(_progress(found), _lanes_done(found), job.chunks.lanes)
     try:
         for (number,), future in as_done(submit, room, missing):
@@ -276,7 +276,7 @@ def _why(error: Exception, found: Ensemble) -> str:
 
     Raises:
         OSError: the store cannot be written.
-        RuntimeError: workers are gone, cannot import what they need, or have other versions.
+        RuntimeError: workers are gone, do not have this package, or have other versions.
     """
     if (
         isinstance(error, OSError)
@@ -287,8 +287,7 @@ def _why(error: Exception, found: Ensemble) -> str:
         raise _unwritable(found.path, error, kept) from error
     if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "vmri_jax":
         raise RuntimeError(
-            f"ensemble: a worker does not have vmri_jax ({error}). Install it in the environment of the workers, the version of "
-            "this process."
+            "ensemble: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this process."
         ) from error
     if isinstance(error, NotAWorker):
         raise error
@@ -299,7 +298,7 @@ def _why(error: Exception, found: Ensemble) -> str:
 
 def _gone(found: Ensemble) -> RuntimeError:
     return RuntimeError(
-        f"ensemble: the workers, or their scheduler, are gone. {len(found.done)} of {found.chunks.count} chunks are in {found.path}; "
+        f"ensemble: the workers, or their scheduler, are gone. {len(store.committed(found.path))} of {found.chunks.count} chunks are in {found.path}; "
         "go on with resume=True."
     )
 

@@ -275,9 +275,9 @@ def _states(system: System, params, start: tuple, project: bool) -> State:
     """Consistent states with these starts, (t, q_s, q_f, v_s, v_f), and parameters, a lane each."""
 
     def of_one(own, one):
-        t, *vectors = one
+        t, q_s, q_f, v_s, v_f = one
         lane = system if own is None else system.replace(params=own)
-        return initial_state(lane, *vectors, t, project=project)
+        return initial_state(lane, q_s, q_f, v_s, v_f, t, project=project)
 
     return jax.vmap(of_one, (None if params is None else 0, 0))(params, start)
 

@@ -49,6 +49,24 @@ def packed(what: str, value: Any) -> bytes:
     return data
 
 
+class _Call:
+    """A call whose pickle, when it is loaded, gives its result."""
+
+    def __init__(self, function: Callable, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+def call_in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain) -> tuple[Callable, bytes]:
+    """A function and its argument for an executor, which make the call of `in_worker`.
+
+    Both are none of this package, so that a worker without it can say so: Dask's end when they get a task that they cannot read.
+    """
+    return pickle.loads, pickle.dumps(_Call(in_worker, versions, task, packed, *plain))
+
+
 def in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain):
     """``task(packed, *plain)`` in another process, where JAX has its settings.
 
