@@ -1,4 +1,4 @@
-"""The command line ``vmri``: systems, schemes, one run, what accuracy costs, hard cases.
+"""The command line ``vmri``: systems, schemes, one run, many runs, what accuracy costs, hard cases.
 
 Each module has an ``app`` of its own with its commands; here they become one.
 """
@@ -11,6 +11,7 @@ import typer
 from vmri_jax.cli import lists, run, scenes, stability, study
 from vmri_jax.cli.animate import animate
 from vmri_jax.cli.check import check
+from vmri_jax.cli.sweep import sweep
 from vmri_jax.configure import cache_folder, configure
 
 app = typer.Typer(
@@ -23,6 +24,7 @@ for part in (lists, run, stability, study, scenes):
     app.add_typer(part.app)
 app.command()(check)
 app.command()(animate)
+app.command()(sweep)
 
 
 def main() -> None:

@@ -14,8 +14,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import stats
-from scipy.stats import qmc
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import near
@@ -65,6 +63,8 @@ class Draw:
         Raises:
             ValueError: an unknown distribution, or arguments that are none of it.
         """
+        from scipy import stats  # it takes a third of a second
+
         name = ALIASES.get(self.name, self.name)
         distribution = getattr(stats, name, None)
         if not isinstance(distribution, stats.rv_continuous):
@@ -252,6 +252,8 @@ class Draws:
             blocks = -(-size // 4)  # the generator makes four numbers at a time
             generator = np.random.Generator(np.random.Philox(key=self.seed).advance(first * blocks))
             return generator.random((last - first, 4 * blocks))[:, :size]
+        from scipy.stats import qmc
+
         sequence = qmc.Sobol(size, rng=np.random.default_rng(self.seed))
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "The balance properties")  # of parts of it
@@ -272,6 +274,8 @@ def unique_rows(rows: Rows) -> tuple[Rows, np.ndarray]:
 
 @lru_cache(maxsize=2)
 def _latin_hypercube(count: int, size: int, seed: int) -> np.ndarray:
+    from scipy.stats import qmc
+
     return qmc.LatinHypercube(size, rng=np.random.default_rng(seed)).random(count)
 
 

@@ -1,0 +1,199 @@
+"""`vmri sweep`: an ensemble that a file describes."""
+
+import os
+import tomllib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.markup import escape
+
+from vmri_jax import plots
+from vmri_jax.cli.common import (
+    PICTURES,
+    check_target_file,
+    console,
+    plain_table,
+    print_failure,
+    print_written,
+    refusals,
+)
+from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, Stopped, ensemble
+from vmri_jax.ensembles.executors import local_workers
+from vmri_jax.mechanics.names import near
+
+EXAMPLE = Path("sweep.toml")
+SETTINGS = ("t_end", "num_steps", "macro_dt", "micro_dt", "num_micro", "save", "num_saves", "project", "chunk")
+"""Entries that are arguments of `ensemble` as they are."""
+ENTRIES = ("system", "scheme", "out", *SETTINGS, "axes", "draws")
+AXIS = ("from", "to", "count", "log", "values", "unit", "description")
+DRAWS = ("count", "seed", "method", "columns")
+
+
+def sweep(
+    file: Annotated[Path, typer.Argument(help="The sweep, a .toml; see --example.")] = EXAMPLE,
+    workers: Annotated[int | None, typer.Option(help="Workers on this machine. [dim]this process[/dim]", min=1)] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a scheduler of Dask, tcp://host:port.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in the store.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is in the store.")] = False,
+    plot: Annotated[
+        Path | None, typer.Option(help="Draw the last of what is saved over the longest axes: .png, .svg or .pdf.")
+    ] = None,
+    example: Annotated[bool, typer.Option("--example", help="Write a file with comments that runs, and stop.")] = False,
+) -> None:
+    """Run a sweep of parameters, starts, steps and schemes, on one core or on a cluster, into a store on disk.
+
+    Whatever dies meanwhile, runs that were done stay, and --resume computes the others.
+    """
+    with refusals():
+        if example:
+            _write_example(file)
+            return
+        check_target_file("--plot", plot, PICTURES)
+        if workers is not None and scheduler is not None:
+            raise ValueError("--workers and --scheduler are given; choose one of them.")
+        given = read_sweep(file)
+        with _client(workers, scheduler) as client:
+            try:
+                runs = ensemble(**given, executor=client, resume=resume, overwrite=overwrite, progress=True)
+            except EnsembleError as error:
+                _print_summary(error.ensemble)
+                print_failure("Not all chunks could be computed", str(error))
+                raise typer.Exit(1) from error
+            except Stopped as stopped:
+                print_failure("Stopped", str(stopped).replace("resume=True", "--resume"))
+                raise typer.Exit(130) from stopped
+            except RuntimeError as error:
+                print_failure("Stopped", str(error).replace("resume=True", "--resume"))
+                raise typer.Exit(1) from error
+        _print_summary(runs)
+        if plot is not None:
+            plots.save(plots.plot_ensemble(runs.open(), title=file.stem), plot)
+            print_written("Figure", plot)
+
+
+def read_sweep(file: Path) -> dict[str, Any]:
+    """Arguments of `ensemble` from a file; its paths are seen from its folder.
+
+    Raises:
+        FileNotFoundError, ValueError: no such file, or something wrong in it.
+    """
+    if not file.is_file():
+        raise FileNotFoundError(f"{file} does not exist; write one with: vmri sweep --example")
+    try:
+        entries = tomllib.loads(file.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{file} is no TOML: {error}.") from error
+    _check_entries(f"{file}", entries, ENTRIES)
+    for name in ("system", "scheme", "out"):
+        if name not in entries:
+            raise ValueError(f"{file}: {name} is missing; see the file of vmri sweep --example.")
+    if ("axes" in entries) == ("draws" in entries):
+        raise ValueError(f"{file}: give either [axes] or [draws].")
+    folder = file.resolve().parent
+    scheme = entries["scheme"]
+    given = {name: entries[name] for name in SETTINGS if name in entries}
+    given["save"] = [_located(name, folder) for name in np.atleast_1d(given.get("save", "end")).tolist()]
+    return given | {
+        "system": _located(entries["system"], folder),
+        "scheme": scheme if isinstance(scheme, str) else {name: name for name in scheme},
+        "out": folder / entries["out"],
+        "design": _axes(file, entries["axes"]) if "axes" in entries else _draws(file, entries["draws"]),
+    }
+
+
+def _axes(file: Path, entries: Mapping[str, Any]) -> Product:
+    return Product({name: _axis(f"{file}: the axis {name}", axis) for name, axis in entries.items()})
+
+
+def _axis(what: str, entry) -> Any:
+    if not isinstance(entry, Mapping):
+        return np.atleast_1d(np.asarray(entry))
+    _check_entries(what, entry, AXIS)
+    about = entry.get("unit", ""), entry.get("description", "")
+    if "values" in entry:
+        return Axis(entry["values"], *about)
+    if not {"from", "to", "count"} <= set(entry):
+        raise ValueError(f"{what}: give values, or from, to and count.")
+    spaced = np.geomspace if entry.get("log") else np.linspace
+    return Axis(spaced(float(entry["from"]), float(entry["to"]), int(entry["count"])), *about)
+
+
+def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
+    _check_entries(f"{file}: draws", entries, DRAWS)
+    if not {"count", "columns"} <= set(entries):
+        raise ValueError(f"{file}: draws need a count and columns, [draws.columns].")
+    columns = {
+        name: Draw(
+            entry["distribution"][0],
+            tuple(entry["distribution"][1:]),
+            entry.get("unit", ""),
+            entry.get("description", ""),
+        )
+        if isinstance(entry, Mapping)
+        else entry
+        for name, entry in entries["columns"].items()
+    }
+    chosen = {name: entries[name] for name in ("seed", "method") if name in entries}
+    return Draws(entries["count"], columns, **chosen)
+
+
+def _check_entries(where: str, entries: Mapping[str, Any], known: Collection[str]) -> None:
+    for name in entries:
+        if name not in known:
+            raise ValueError(f"{where}: there is no entry {name!r}.{near(name, known)} There are {', '.join(known)}.")
+
+
+def _located(name: str, folder: Path) -> str:
+    """A name whose file, if it has one, is seen from a folder."""
+    file, colon, rest = name.partition(":")
+    return f"{folder / file}{colon}{rest}" if file.endswith((".py", ".xml", ".mjcf", ".urdf")) else name
+
+
+@contextmanager
+def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
+    """A client of workers of this machine or of a scheduler, None for neither; says where its dashboard is."""
+    if workers is None and scheduler is None:
+        yield None
+        return
+    if workers is not None:
+        opened = local_workers(workers)
+    else:
+        from distributed import Client  # Dask is an extra
+
+        try:
+            opened = Client(scheduler, timeout=10)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"--scheduler {scheduler}: no scheduler of Dask answers there ({error}).") from error
+    with opened as client:
+        if client.dashboard_link:
+            console.print(f"dashboard: [bold]{escape(client.dashboard_link)}[/bold]", soft_wrap=True)
+        yield client
+
+
+def _print_summary(runs: Ensemble) -> None:
+    table = plain_table("", "", show_header=False)
+    rows = {
+        "runs": f"{len(runs):,}" + (f", of which {runs.failed_runs:,} failed" if runs.failed_runs else ""),
+        "computed now": f"{runs.computed:,} in {runs.seconds:.1f} s"
+        + (f", {runs.runs_per_second:,.0f} a second" if runs.computed else ""),
+        "chunks": f"{len(runs.done)} of {runs.chunks.count} are in the store, {runs.chunks.size:,} runs each",
+        "store": f'{runs.path}; read it with vmri_jax.open_ensemble("{os.path.relpath(runs.path)}")',
+    }
+    for name, text in rows.items():
+        table.add_row(f"[dim]{name}[/dim]", escape(text))
+    console.print(table)
+
+
+def _write_example(file: Path) -> None:
+    if file.exists():
+        raise FileExistsError(f"{file} exists already; give another name.")
+    file.write_text(files("vmri_jax.cli").joinpath("sweep.toml").read_text())
+    console.print(
+        f"wrote {escape(str(file))}; run it with: [bold]vmri sweep {escape(str(file))} --workers 2[/bold]",
+        soft_wrap=True,
+    )

@@ -1,0 +1,255 @@
+"""Figures of ensembles: responses over one or two parameters, distributions, trajectories with bands."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
+
+from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, legend_beside, log_ticks, new_figure, panel_grid
+from vmri_jax.steppers.results import Result
+
+if TYPE_CHECKING:
+    import xarray
+
+COORDINATES = ("slow", "fast", "level", "quantile", "node")
+"""Dimensions of what is kept of a single run."""
+STATUS = ("result", "failed_at")
+BANDS = (0.05, 0.25, 0.5, 0.75, 0.95)
+MOST_CURVES, MOST_PANELS = 6, 12
+DECADES = 30.0
+"""Values that span more than this are shown on a logarithmic scale."""
+
+
+def plot_ensemble(
+    data: "xarray.Dataset",
+    quantity: str | None = None,
+    x: str | None = None,
+    y: str | None = None,
+    *,
+    title: str = "",
+    theme: Theme = LIGHT,
+) -> NotebookFigure:
+    """What an ensemble gave, over its parameters.
+
+    Over two axes it is a map in colours, with a panel for each value of a third and fourth one; runs that failed are grey.
+    Over one axis it is curves, or bands where there are too many. Over a column of a table or of draws it is a cloud of points.
+    Without parameters it is a histogram. What is kept of all saved nodes is drawn against time, with the bands that hold
+    half and nine tenths of the runs that did not fail.
+
+    Args:
+        data: from `vmri_jax.open_ensemble`, or a selection of it.
+        quantity: what is drawn; the last one that is a single number per run if None.
+        x, y: names of axes or columns; the two longest axes if both are None and the design has axes.
+        title: over the figure.
+        theme: colours.
+
+    Raises:
+        ValueError: an unknown name, a quantity with several numbers per run, or more panels than can be drawn.
+    """
+    quantity = _quantity(data, quantity)
+    values = data[quantity]
+    if "node" in values.dims:
+        return _plot_bands(data, values.where(~_failed(data, values)), title, theme)
+    several = [name for name in values.dims if name in COORDINATES]
+    if several:
+        raise ValueError(
+            f"plot_ensemble: {quantity} has several numbers per run; choose one, "
+            f"data.isel({several[0]}=0) or data.sel({several[0]}={data[several[0]].values[0]!r})."
+        )
+    for name in (x, y):
+        if name is not None and name not in data.coords:
+            raise ValueError(
+                f"plot_ensemble: there is no axis or column {name!r}; there are {', '.join(map(str, data.coords))}."
+            )
+    axes = sorted((str(d) for d in values.dims if d != "lane"), key=lambda d: -values.sizes[d])
+    if x is None and y is None and "lane" not in values.dims:
+        numbers = [name for name in axes if values[name].dtype.kind in "if" and values.sizes[name] > 1]
+        x, y = [*numbers[:2], None, None][:2]
+    if x is None:
+        return _plot_histogram(values, title, theme)
+    if "lane" in values.dims:
+        return _plot_cloud(values, x, y, title, theme)
+    if y is None:
+        return _plot_curves(values, x, title, theme)
+    return _plot_maps(values, _failed(data, values), x, y, title, theme)
+
+
+def _failed(data: "xarray.Dataset", values):
+    """Which runs did not come to their end."""
+    return data.result > int(Result.CONVERGED_AT_ROUNDOFF) if "result" in data else values.isnull()
+
+
+def _quantity(data: "xarray.Dataset", name: str | None) -> str:
+    if name is not None:
+        if name not in data:
+            raise ValueError(f"plot_ensemble: there is no {name!r}; there are {', '.join(map(str, data.data_vars))}.")
+        return name
+    single = [
+        str(n) for n, array in data.data_vars.items() if not set(array.dims) & set(COORDINATES) and n not in STATUS
+    ]
+    return single[-1] if single else "result"
+
+
+def _label(array) -> str:
+    unit = array.attrs.get("units")
+    return f"{array.name}" + (f" in {unit}" if unit else "")
+
+
+def _panels(values, drawn: Sequence[str]) -> list[tuple[str, Any]]:
+    """The array for each value of the axes that are not drawn, with their names and values."""
+    others = [d for d in values.dims if d not in drawn]
+    count = int(np.prod([values.sizes[d] for d in others], dtype=int))
+    if count > MOST_PANELS:
+        raise ValueError(
+            f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, others))} with {count} combinations of values; "
+            f"select some, data.sel({others[-1]}=...)."
+        )
+    found = []
+    for place in np.ndindex(*(values.sizes[d] for d in others)):
+        at = dict(zip(others, place, strict=True))
+        named = "\n".join(_named(d, values[d].values[i]) for d, i in at.items())
+        found.append((named, values.isel(at)))
+    return found
+
+
+def _named(axis: str, value) -> str:
+    """A value of an axis in words; labels speak for themselves."""
+    if isinstance(value, str):
+        return value
+    return f"{axis} = {value:.4g}" if isinstance(value, float | np.floating) else f"{axis} = {value}"
+
+
+def _plot_maps(values, failed, x: str, y: str, title: str, theme: Theme) -> NotebookFigure:
+    values, failed = values.compute(), failed.compute()
+    panels, marks = _panels(values, (x, y)), [panel for _, panel in _panels(failed, (x, y))]
+    norm = _norm(values.values)
+    columns = min(4, len(panels))
+    rows = -(-len(panels) // columns)
+    with new_figure(1.2 + 2.6 * columns, 0.9 + 2.3 * rows, title, theme) as figure:
+        grid = panel_grid(figure, len(panels), columns)
+        for axes, (name, panel), mark in zip(grid, panels, marks, strict=True):
+            mesh = axes.pcolormesh(
+                values[x], values[y], panel.transpose(y, x), norm=norm, cmap="viridis", rasterized=True
+            )
+            hidden = np.ma.masked_where(~mark.transpose(y, x).values, np.ones((values.sizes[y], values.sizes[x])))
+            axes.pcolormesh(values[x], values[y], hidden, cmap=ListedColormap([theme.faint]), rasterized=True)
+            axes.set_title(name)
+            axes.grid(visible=False)
+            _scale(axes, values[x], values[y])
+        for axes in grid[-columns:]:
+            axes.set(xlabel=_label(values[x]))
+        for axes in grid[::columns]:
+            axes.set(ylabel=_label(values[y]))
+        bar = figure.colorbar(mesh, ax=list(grid), label=_label(values), pad=0.02)
+        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+        if failed.any():
+            figure.text(0.99, 0.005, "grey: runs that failed", ha="right", va="bottom", fontsize=8)
+    return figure
+
+
+def _plot_curves(values, x: str, title: str, theme: Theme) -> NotebookFigure:
+    values = values.compute()
+    others = [d for d in values.dims if d != x]
+    with new_figure(7.0, 3.8, title, theme) as figure:
+        axes = figure.subplots()
+        if int(np.prod([values.sizes[d] for d in others], dtype=int)) <= MOST_CURVES:
+            for name, curve in _panels(values, (x,)):
+                axes.plot(values[x], curve, label=name.replace("\n", ", ") or None)
+            if others:
+                legend_beside(axes)
+        else:
+            _fill_bands(axes, values[x].values, values.quantile(BANDS, dim=others, skipna=True).values, theme)
+            legend_beside(axes)
+        _scale(axes, values[x], values)
+        axes.set(xlabel=_label(values[x]), ylabel=_label(values))
+    return figure
+
+
+def _plot_cloud(values, x: str, y: str | None, title: str, theme: Theme) -> NotebookFigure:
+    values = values.compute()
+    along, up = values[x].values, (values if y is None else values[y]).values
+    with new_figure(6.0, 3.9, title, theme) as figure:
+        axes = figure.subplots()
+        size = float(np.clip(3e4 / max(len(along), 1), 0.5, 20.0))
+        if y is None:
+            axes.scatter(along, up, s=size, color=theme.curves[0], alpha=0.6, linewidths=0, rasterized=True)
+            axes.set(ylabel=_label(values))
+        else:
+            points = axes.scatter(along, up, s=size, c=values, norm=_norm(values.values), linewidths=0, rasterized=True)
+            figure.colorbar(points, ax=axes, label=_label(values))
+            axes.set(ylabel=_label(values[y]))
+        axes.set(xlabel=_label(values[x]))
+        _scale(axes, values[x], values if y is None else values[y])
+    return figure
+
+
+def _plot_histogram(values, title: str, theme: Theme) -> NotebookFigure:
+    numbers = np.asarray(values).ravel()
+    numbers = numbers[np.isfinite(numbers)]
+    with new_figure(6.0, 3.6, title, theme) as figure:
+        axes = figure.subplots()
+        logarithmic = numbers.size > 0 and _is_wide(numbers)
+        bins = np.geomspace(numbers.min(), numbers.max(), 61) if logarithmic else 60
+        axes.hist(numbers, bins=bins, color=theme.curves[0])
+        axes.set(xlabel=_label(values), ylabel="runs")
+        if logarithmic:
+            axes.set_xscale("log")
+            log_ticks(axes.xaxis, numbers)
+    return figure
+
+
+def _plot_bands(data, values, title: str, theme: Theme) -> NotebookFigure:
+    """Median and bands of all runs against time, a panel for each coordinate."""
+    runs = [d for d in values.dims if d not in COORDINATES]
+    others = [str(d) for d in values.dims if d in COORDINATES and d != "node"]
+    time = data.node_t.mean(runs, skipna=True).values if "node_t" in data else np.arange(values.sizes["node"])
+    values = values.chunk(dict.fromkeys(runs, -1)) if runs else values
+    bands = (
+        values.quantile(BANDS, dim=runs, skipna=True).compute() if runs else values.expand_dims(quantile=5).compute()
+    )
+    panels = _panels(bands, ("quantile", "node"))
+    columns = min(3, len(panels))
+    with new_figure(0.8 + 3.0 * columns, 0.8 + 2.2 * -(-len(panels) // columns), title, theme) as figure:
+        grid = panel_grid(figure, len(panels), columns)
+        for axes, (name, panel) in zip(grid, panels, strict=True):
+            _fill_bands(axes, time, panel.transpose("quantile", "node").values, theme)
+            axes.set_title(name if others else _label(values))
+        for axes in grid[-columns:]:
+            axes.set(xlabel="time")
+        shown = grid[0].get_legend_handles_labels()
+        figure.legend(*shown, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _fill_bands(axes: Axes, along: np.ndarray, bands: np.ndarray, theme: Theme) -> None:
+    lowest, low, middle, high, highest = bands
+    colour = theme.curves[0]
+    axes.fill_between(along, lowest, highest, color=colour, alpha=0.18, linewidth=0, label="nine tenths of the runs")
+    axes.fill_between(along, low, high, color=colour, alpha=0.32, linewidth=0, label="half of them")
+    axes.plot(along, middle, color=colour, label="median")
+
+
+def _is_wide(values: np.ndarray) -> bool:
+    finite = values[np.isfinite(values)]
+    return finite.size > 0 and finite.min() > 0 and finite.max() > DECADES * finite.min()
+
+
+def _norm(values: np.ndarray) -> Normalize:
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return Normalize(0.0, 1.0)
+    positive = finite[finite > 0]
+    if positive.size and finite.min() >= 0 and positive.max() > DECADES * np.quantile(positive, 0.02):
+        return LogNorm(np.quantile(positive, 0.02), np.quantile(positive, 0.98), clip=True)
+    return Normalize(finite.min(), finite.max())
+
+
+def _scale(axes: Axes, x, y) -> None:
+    """Logarithmic axes where values span decades."""
+    for values, axis, set_scale in ((x, axes.xaxis, axes.set_xscale), (y, axes.yaxis, axes.set_yscale)):
+        numbers = np.asarray(values)
+        if _is_wide(numbers.ravel()):
+            set_scale("log")
+            log_ticks(axis, numbers.ravel())
