@@ -1,5 +1,6 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
+from contextlib import nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ from benchmarks.gail2014.command import gail2014
 from benchmarks.hard_cases.command import hard
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
+from vmri_jax.ensembles.executors import local_workers
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__, pretty_exceptions_show_locals=False)
 
@@ -122,6 +124,9 @@ def fuzz_command(
     limit: Annotated[
         float, typer.Option(help="Seconds after which a run, compiling included, counts as a hang.")
     ] = 600.0,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Workers of this machine, by Dask; one by default.")
+    ] = None,
     reduce: Annotated[
         int | None, typer.Option(help="Simplify this run, as long as it goes wrong in the same way.")
     ] = None,
@@ -134,8 +139,8 @@ def fuzz_command(
         for part in fuzz.reduce(seed, reduce, console.log):
             console.print(part)
         return
-    with progress("fuzz") as tell:
-        found = fuzz.fuzz(count, seed, out / f"fuzz_{seed}.jsonl", limit, tell)
+    with progress("fuzz") as tell, nullcontext() if workers is None else local_workers(workers) as executor:
+        found = fuzz.fuzz(count, seed, out / f"fuzz_{seed}.jsonl", limit, tell, executor)
     fuzz.table(found, console)
     if wrong := fuzz.wrong(found):
         console.print(f"\nsimplify one with: python -m benchmarks fuzz --seed {seed} --reduce {min(wrong)}")

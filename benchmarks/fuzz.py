@@ -11,6 +11,7 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from random import Random
 
@@ -22,6 +23,8 @@ from rich.table import Table
 import vmri_jax as vm
 from benchmarks.measure import Tell, silent
 from tests.verification import random_systems as rs
+from vmri_jax.ensembles.executors import as_done, executor_of
+from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 
 DRAWS = 50
@@ -186,7 +189,22 @@ def outcomes(seed: int, runs: list[int], limit: float) -> Iterator[tuple[int, st
                 yield run, ended
 
 
-def fuzz(count: int, seed: int, path: Path, limit: float, tell: Tell = silent) -> dict[int, str]:
+def outcomes_of_workers(seed: int, runs: list[int], executor) -> Iterator[tuple[int, str]]:
+    """The same computed by an executor; "crash" where workers died of a run, hangs are not noticed."""
+    with executor_of("fuzz", executor, None) as (tasks, room):
+
+        def submit(*together: int) -> Future:
+            call = packed("fuzz", (compute, (seed, together)))
+            return tasks.submit(*call_in_worker(known_versions(), call_packed, call))
+
+        for together, future in as_done(submit, room, calls(runs, seed)):
+            try:
+                yield from zip(together, future.result(), strict=False)
+            except Exception as error:
+                yield from ((run, f"crash: {type(error).__name__}") for run in together)
+
+
+def fuzz(count: int, seed: int, path: Path, limit: float, tell: Tell = silent, executor=None) -> dict[int, str]:
     """Outcomes of the runs 0 to count - 1; those that `path` has are not computed again."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = path.read_text().splitlines() if path.exists() else []
@@ -194,7 +212,9 @@ def fuzz(count: int, seed: int, path: Path, limit: float, tell: Tell = silent) -
     for run in found:
         tell(f"run {run}")
     with path.open("a") as file:
-        for run, outcome in outcomes(seed, [run for run in range(count) if run not in found], limit):
+        left = [run for run in range(count) if run not in found]
+        ended = outcomes(seed, left, limit) if executor is None else outcomes_of_workers(seed, left, executor)
+        for run, outcome in ended:
             found[run] = outcome
             file.write(json.dumps({"run": run, "outcome": outcome}) + "\n")
             file.flush()

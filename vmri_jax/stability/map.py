@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vmri_jax.ensembles.executors import mapped
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
@@ -119,6 +120,7 @@ def stability_map(
     state: State | None = None,
     kappa: Sequence[float] | None = None,
     tolerance: float = TOLERANCE,
+    executor: Any = None,
 ) -> StabilityMap:
     """Where macro steps of length H are stable: multipliers of the step of small motions about a state.
 
@@ -136,6 +138,7 @@ def stability_map(
         kappa: values of ``params["kappa"]`` of the system, one row each, for a single scheme.
         state: where motions are small; None for the start of the problem.
         tolerance: growth per macro step above which a step is unstable.
+        executor: where the rows are computed, as of `vmri_jax.ensemble`; None for this process.
 
     Raises:
         TypeError: a system or scheme of the wrong kind.
@@ -157,7 +160,7 @@ def stability_map(
     omega = next(iter(rows.values()))[0].omega
     if omega == 0:
         raise ValueError("stability_map: the system has no frequency that could scale omega_H; nothing vibrates there.")
-    measured = [measure(motions, s, grid / omega, tolerance) for motions, s in rows.values()]
+    measured = mapped("stability_map", measure, [(*row, grid / omega, tolerance) for row in rows.values()], executor)
     return StabilityMap(
         axis="scheme" if kappa is None else "kappa",
         rows=tuple(rows),

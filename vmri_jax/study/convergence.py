@@ -15,6 +15,7 @@ import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
+from vmri_jax.ensembles.executors import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.export import extra
@@ -203,6 +204,7 @@ def convergence_study(
     momentum_maps: Sequence[Callable] = (),
     reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
     newton: Newton | None = None,
+    executor: Any = None,
     progress: Progress = silent,
 ) -> ConvergenceStudy:
     """Run every scheme with every macro step to `t_end` and compare with a reference.
@@ -221,7 +223,8 @@ def convergence_study(
         momentum_maps: infinitesimal generators of symmetries, see `vmri_jax.diagnostics.momentum_map`.
         reference: compare with this (by label of the parameters if there are several); by default `reference_solution`.
         newton: how implicit equations are solved.
-        progress: told about every run before it starts.
+        executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
+        progress: told about every run when it is done.
 
     Raises:
         ValueError: no scheme, a step that does not divide `t_end` as above, a reference of another shape.
@@ -238,16 +241,31 @@ def convergence_study(
     total = len(schemes) * len(steps)
     references = _references(cases, reference, t_end, num_saves, progress, total)
 
-    rows = []
-    for i, (label, scheme) in enumerate(schemes.items()):
-        run = _runner(list(cases.values()), scheme, t_end, num_saves, newton)
-        by_step = []
-        for j, num_steps in enumerate(steps):
-            progress(f"{label}, H = {t_end / num_steps:g}", i * len(steps) + j, total)
-            by_step.append((t_end / num_steps, run(num_steps)))
-        for k, (case, changed) in enumerate(cases.items()):
-            for dt, runs in by_step:
-                rows.append(_row(label, case, scheme, dt, changed.system, momentum_maps, runs[k], references[case]))
+    problems = list(cases.values())
+    labels = [(label, num_steps) for label in schemes for num_steps in steps]
+    runs = mapped(
+        "convergence_study",
+        _runs,
+        [(problems, schemes[label], num_steps, t_end, num_saves, newton) for label, num_steps in labels],
+        executor,
+        lambda done, run: progress(f"H = {t_end / run[2]:g}", done, total),
+    )
+    found = dict(zip(labels, runs, strict=True))
+    rows = [
+        _row(
+            label,
+            case,
+            scheme,
+            t_end / num_steps,
+            changed.system,
+            momentum_maps,
+            found[label, num_steps][k],
+            references[case],
+        )
+        for label, scheme in schemes.items()
+        for k, (case, changed) in enumerate(cases.items())
+        for num_steps in steps
+    ]
     progress("done", total, total)
     return ConvergenceStudy(tuple(rows), references)
 
@@ -261,28 +279,25 @@ def _cases(problem: Problem, params: Mapping[str, Any] | None) -> dict[str, Prob
     return {case: replace(problem, system=problem.system.replace(params=p)) for case, p in params.items()}
 
 
-def _runner(problems: Sequence[Problem], scheme, t_end: float, num_saves: int, newton):
-    """``run(num_steps)``: a trajectory of each problem."""
+def _runs(
+    problems: Sequence[Problem], scheme, num_steps: int, t_end: float, num_saves: int, newton
+) -> list[Trajectory]:
+    """A trajectory of each problem."""
     if len(problems) == 1:
-        program = Program(problems[0], scheme, t_end, num_saves, newton)
-        return lambda num_steps: [program(num_steps)]
+        return [Program(problems[0], scheme, t_end, num_saves, newton)(num_steps)]
     states = jax.tree.map(lambda *a: jnp.stack(a), *(problem.state() for problem in problems))
     params = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *(p.system.params for p in problems))
-
-    def run(num_steps: int) -> list[Trajectory]:
-        batch = simulate_batch(
-            problems[0].system,
-            scheme,
-            states,
-            macro_dt=t_end / num_steps,
-            num_steps=num_steps,
-            save_every=num_steps // num_saves,
-            params=params,
-            newton=newton,
-        )
-        return [jax.tree.map(lambda a, i=i: a[i], batch) for i in range(len(problems))]
-
-    return run
+    batch = simulate_batch(
+        problems[0].system,
+        scheme,
+        states,
+        macro_dt=t_end / num_steps,
+        num_steps=num_steps,
+        save_every=num_steps // num_saves,
+        params=params,
+        newton=newton,
+    )
+    return [jax.tree.map(lambda a, i=i: a[i], batch) for i in range(len(problems))]
 
 
 def _references(cases, reference, t_end, num_saves, progress, total) -> dict[str, Any]:

@@ -1,12 +1,13 @@
 """Work and precision: what an error costs in time and in evaluations, run by run, and the best of all runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vmri_jax import diagnostics, plots
+from vmri_jax.ensembles.executors import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.schemes.composition import Composition
@@ -167,6 +168,7 @@ def work_precision(
     reference: ReferenceSolution | None = None,
     newton: Newton | None = None,
     repeats: int = 5,
+    executor: Any = None,
     progress: Progress = silent,
 ) -> WorkPrecision:
     """Error against wall time and evaluations for every scheme over a ladder of macro steps.
@@ -184,6 +186,9 @@ def work_precision(
         reference: compare with this; by default `reference_solution`.
         newton: how implicit equations are solved.
         repeats: timed samples of every run.
+        executor: where runs are computed and timed, a task for each scheme, as of `vmri_jax.ensemble`. Times are then those
+            of the workers, and only runs of one scheme take turns: for times give each worker a core of its own. None for
+            this process.
         progress: told about every run.
 
     Raises:
@@ -197,23 +202,57 @@ def work_precision(
     if reference is None:
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
     frequency = float(diagnostics.frequencies(problem)[0])
-    runs: list[tuple[Program, WorkRow]] = []
-    for i, (label, scheme) in enumerate(schemes.items()):
-        program = Program(problem, scheme, t_end, num_saves, newton)
-        coarsest = num_saves * max(1, int(frequency * t_end / scheme.num_micro / scheme.degree / num_saves))
-        ladder, seen = list(num_steps or [coarsest]), []
-        while ladder:
-            n = ladder.pop(0)
-            progress(f"{label}, {n} steps", i, len(schemes) + 1)
-            seconds = program.seconds(n, 1, 0.0)
-            seen.append(work_row(label, program, n, reference).timed(seconds))
-            runs.append((program, seen[-1]))
-            if num_steps is None and _goes_on(seen, reference):
-                ladder = [2 * n]
-    progress("measuring times", len(schemes), len(schemes) + 1)
-    rows = timed_in_turn(runs, repeats)
+    total = len(schemes) + 1
+    ladders = [
+        _Ladder(problem, label, scheme, t_end, num_saves, newton, num_steps, reference, frequency)
+        for label, scheme in schemes.items()
+    ]
+    if executor is None:
+        runs: list[tuple[Program, WorkRow]] = []
+        for i, ladder in enumerate(ladders):
+            runs += _climbed(ladder, lambda n, i=i: progress(f"{ladders[i].label}, {n} steps", i, total))
+        progress("measuring times", len(schemes), total)
+        rows = timed_in_turn(runs, repeats)
+    else:
+        timed = [(ladder, repeats) for ladder in ladders]
+        told = lambda done, one: progress(one[0].label, done, total)  # noqa: E731
+        rows = [row for part in mapped("work_precision", _timed, timed, executor, told) for row in part]
     progress("done", 1, 1)
     return WorkPrecision(tuple(rows), t_end, reference)
+
+
+class _Ladder(NamedTuple):
+    """Runs of one scheme with fewer and with more steps."""
+
+    problem: Problem
+    label: str
+    scheme: Scheme | Composition
+    t_end: float
+    num_saves: int
+    newton: Newton | None
+    num_steps: Sequence[int] | None
+    reference: ReferenceSolution
+    frequency: float
+
+
+def _climbed(ladder: _Ladder, told: Callable[[int], None] = lambda _: None) -> list[tuple[Program, WorkRow]]:
+    """All runs of a ladder, with the time of one call each."""
+    program = Program(ladder.problem, ladder.scheme, ladder.t_end, ladder.num_saves, ladder.newton)
+    per_save = ladder.frequency * ladder.t_end / ladder.scheme.num_micro / ladder.scheme.degree / ladder.num_saves
+    left, seen = list(ladder.num_steps or [ladder.num_saves * max(1, int(per_save))]), []
+    while left:
+        n = left.pop(0)
+        told(n)
+        seconds = program.seconds(n, 1, 0.0)
+        seen.append(work_row(ladder.label, program, n, ladder.reference).timed(seconds))
+        if ladder.num_steps is None and _goes_on(seen, ladder.reference):
+            left = [2 * n]
+    return [(program, row) for row in seen]
+
+
+def _timed(ladder: _Ladder, repeats: int) -> list[WorkRow]:
+    """The rows of a ladder."""
+    return timed_in_turn(_climbed(ladder), repeats)
 
 
 def timed_in_turn(runs: Sequence[tuple[Program, WorkRow]], repeats: int) -> list[WorkRow]:

@@ -1,0 +1,58 @@
+"""Studies on workers give what they give here."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from benchmarks import fuzz
+from tests.user_systems import two_oscillators
+from vmri_jax.stability import stability_map
+from vmri_jax.study import convergence_study, work_precision
+
+distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.filterwarnings("default")  # of Dask, about ports and slow loops
+
+
+@pytest.fixture(scope="module")
+def client():
+    cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0")
+    with cluster, distributed.Client(cluster) as client:
+        yield client
+
+
+def test_convergence_study(client):
+    schemes = {"implicit": vm.fully_implicit(2), "explicit": vm.explicit_slow(2)}
+    study = partial(convergence_study, two_oscillators(), schemes, [0.02, 0.01], 0.2, num_saves=2)
+    here, there = study(), study(executor=client)
+    assert here.rows == there.rows
+    params = {"soft": {"kappa": 20.0, "omega": 50.0}, "stiff": {"kappa": 20.0, "omega": 80.0}}
+    assert study(params=params).rows == study(params=params, executor=client).rows
+
+
+def test_stability_map(client):
+    schemes = {n: vm.explicit_slow(n) for n in (2, 5)}
+    grid = np.linspace(0.1, 4.0, 40) * np.pi
+    problem = two_oscillators()
+    here, there = (stability_map(problem, schemes, grid, executor=executor) for executor in (None, client))
+    assert np.allclose(here.radius, there.radius, rtol=0, atol=1e-12)
+    assert here.rows == there.rows
+    assert len(here.windows(5)) == len(there.windows(5))
+
+
+def test_work_precision(client):
+    schemes = {"implicit": vm.fully_implicit(2), "explicit": vm.explicit_slow(2)}
+    study = partial(work_precision, two_oscillators(), schemes, 0.2, num_steps=[10, 20], repeats=1)
+    here, there = study(), study(executor=client)
+    assert [(row.scheme, row.num_steps, row.error_q) for row in here.rows] == [
+        (row.scheme, row.num_steps, row.error_q) for row in there.rows
+    ]
+    assert all(row.seconds > 0 for row in there.rows)
+
+
+def test_fuzzing(client, tmp_path):
+    here = fuzz.fuzz(6, 1, tmp_path / "here.jsonl", 300.0)
+    there = fuzz.fuzz(6, 1, tmp_path / "there.jsonl", 300.0, executor=client)
+    assert here == there
+    assert not fuzz.wrong(there)
