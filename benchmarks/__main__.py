@@ -7,7 +7,21 @@ from typing import Annotated
 
 import typer
 
-from benchmarks import against, baseline, batch, chains, compilation, cost, floor, fuzz, kills, orders, peers, tricks
+from benchmarks import (
+    against,
+    baseline,
+    batch,
+    chains,
+    compilation,
+    cost,
+    ensembles,
+    floor,
+    fuzz,
+    kills,
+    orders,
+    peers,
+    tricks,
+)
 from benchmarks.gail2014.command import gail2014
 from benchmarks.hard_cases.command import hard
 from benchmarks.measure import prepare
@@ -99,6 +113,17 @@ def tricks_command(
 ) -> None:
     prepare(core)
     _measure("tricks", tricks, full, out, markdown=True, only=only or ())
+
+
+@app.command("ensembles", help=ensembles.__doc__)
+def ensembles_command(
+    only: Annotated[list[str] | None, typer.Option(help=f"Of {', '.join(ensembles.PARTS)}; may be repeated.")] = None,
+    full: Full = False,
+    out: Out = OUT,
+) -> None:
+    prepare()
+    for name in only or ensembles.PARTS:
+        _measure(f"ensembles, {name}", ensembles.part(name), full, out)
 
 
 @app.command("baseline")

@@ -100,6 +100,15 @@ class Report:
             yield [("ratio", "seen (quartiles)", "target", "holds"), *claims]
 
 
+@dataclass(frozen=True)
+class Part:
+    """One table of a benchmark that has several, with what `python -m benchmarks` asks for."""
+
+    COLUMNS: tuple[str, ...]
+    run: Callable[..., Iterator[Report]]
+    sizes: Callable[[str], Any]
+
+
 def spread(what: str, seen: Ratio) -> dict:
     """Columns of a row: a median by its name, and its quartiles."""
     return {what: seen.value, "low": seen.low, "high": seen.high}

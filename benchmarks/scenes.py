@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,7 +12,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks import programs
 from benchmarks.measure import Tell, interleaved, quartiles, ratio, silent
-from benchmarks.report import Claim, Report
+from benchmarks.report import Claim, Part, Report
 from tests.scene.effect_scenes import BASE, EFFECTS, base_by_hand, scene_with
 from tests.scene.forced_bodies import EFFECT_OF, convergence
 from tests.scene.gallery_scenes import gallery_scene
@@ -59,15 +59,6 @@ def sizes(name: str) -> Size:
     if name == "quick":
         return Size(9, ("fully explicit",), 10, 2e-4, 2000, 15, orders)
     return Size(1, tuple(programs.SCHEMES), 10, 2e-4, 2000, 25, orders)
-
-
-@dataclass(frozen=True)
-class Part:
-    """One table of the report, with the functions that `python -m benchmarks` asks for."""
-
-    COLUMNS: tuple[str, ...]
-    run: Callable[..., Iterator[Report]]
-    sizes: Callable[[str], Size] = sizes
 
 
 # --- absence ---------------------------------------------------------------------------------------------------------
@@ -212,13 +203,16 @@ PARTS = {
             *("same", "compiled", "unknowns", "formula", "calls with", "calls without"),
         ),
         absence,
+        sizes,
     ),
     "presence": Part(
         ("system", "scheme", "program", "µs/micro step", "quartiles", "operations", "bytes"),
         presence,
+        sizes,
     ),
     "orders": Part(
         ("effect", "scheme", "order", "of q, p", "of balance", "finest error", "finest balance", "holds"),
         orders,
+        sizes,
     ),
 }

@@ -127,7 +127,7 @@ def mapped(
     task: Callable,
     arguments: Iterable[tuple],
     executor: Any = None,
-    told: Callable[[int, tuple], None] | None = None,
+    told: Callable[[int, int], None] = lambda done, number: None,
 ) -> list:
     """``[task(*one) for one in arguments]``, computed by an executor; the first error is raised.
 
@@ -136,7 +136,7 @@ def mapped(
         task: a function of a module.
         arguments: of every call; they can be pickled if workers are to have them.
         executor: as of `ensemble`.
-        told: called with the number of calls done and the arguments of the last, after each.
+        told: ``told(done, number)``, how many are done when number `number` is handed over.
     """
     given = list(arguments)
     found: list = [None] * len(given)
@@ -145,12 +145,11 @@ def mapped(
         calls = ((i,) for i in range(len(given)))
 
         def submit(i: int) -> Future:
+            told(sum(part is not None for part in found), i)
             if here:
                 return tasks.submit(task, *given[i])
             return tasks.submit(*call_in_worker(versions, call_packed, packed(what, (task, given[i]))))
 
-        for done, ((i,), future) in enumerate(as_done(submit, room, calls), 1):
+        for (i,), future in as_done(submit, room, calls):
             found[i] = future.result()
-            if told is not None:
-                told(done, given[i])
     return found

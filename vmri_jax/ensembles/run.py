@@ -8,7 +8,7 @@ from concurrent.futures import BrokenExecutor, CancelledError
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,7 +35,9 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
 
 SECONDS = 1.0
-"""A chunk takes about so long,"""
+"""A chunk takes about so long, longer where there would be more than"""
+MOST_CHUNKS = 20_000
+"""of them: a scheduler hands out a thousand in a second, and each has its files. It"""
 MOST_BYTES = 2**26
 """fits into so much memory,"""
 PARTS = 64
@@ -210,10 +212,7 @@ def ensemble(
         save=(save,) if isinstance(save, str) else tuple(save),
         num_saves=whole_number("ensemble: num_saves", num_saves),
     ).with_sources()
-    runs = _checked(work, design)
-    run = runs[0]
-    arrays = _arrays(work, run)
-    chunks = _chunks(runs, len(design), arrays, chunk)
+    arrays, chunks, run = prepared(work, design, chunk)
     attributes = _attributes(work, design, run, chunks)
     if resume and path.exists():
         there = store.read_attributes(path)
@@ -355,6 +354,29 @@ def _design(design) -> Design:
     return design
 
 
+class Prepared(NamedTuple):
+    """What is known of an ensemble before it is computed.
+
+    arrays: what the store has of each run, by name: shape, dtype, dimensions and attributes.
+    run: the longest one.
+    """
+
+    arrays: dict[str, dict]
+    chunks: Chunks
+    run: Simulation
+
+
+def prepared(work: Work, design: Design, chunk: int | None = None) -> Prepared:
+    """What is known before anything is computed; all that can be wrong with the arguments is refused.
+
+    Raises:
+        ValueError, TypeError: bad arguments.
+    """
+    runs = _checked(work, design)
+    arrays = _arrays(work, runs[0])
+    return Prepared(arrays, _chunks(runs, len(design), arrays, chunk), runs[0])
+
+
 def _checked(work: Work, design: Design) -> list[Simulation]:
     """A run of each group, the longest first; all that can be wrong with the arguments is refused."""
     work.check_values(design.rows(0, 1))
@@ -406,7 +428,7 @@ def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, dict], chunk: 
     seconds = 1e-9 * NANOSECONDS[kind] * _micro_steps(run) * run.scheme.degree**2 * size_q
     kept = sum(np.dtype(one["dtype"]).itemsize * int(np.prod(one["shape"])) for one in arrays.values())
     bytes_of_run = kept + 8 * (2 * size_q + 8) * (run.num_saves + 1)
-    most = min(SECONDS / seconds, MOST_BYTES / bytes_of_run, lanes / PARTS)
+    most = min(max(SECONDS / seconds, lanes / MOST_CHUNKS), MOST_BYTES / bytes_of_run, lanes / PARTS)
     size = width * 2 ** max(0, int(np.log2(max(most / width, 1.0))))
     return Chunks(lanes, min(size, lanes), width)
 

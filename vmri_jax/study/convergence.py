@@ -224,7 +224,7 @@ def convergence_study(
         reference: compare with this (by label of the parameters if there are several); by default `reference_solution`.
         newton: how implicit equations are solved.
         executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
-        progress: told about every run when it is done.
+        progress: told about every run before it starts.
 
     Raises:
         ValueError: no scheme, a step that does not divide `t_end` as above, a reference of another shape.
@@ -248,7 +248,7 @@ def convergence_study(
         _runs,
         [(problems, schemes[label], num_steps, t_end, num_saves, newton) for label, num_steps in labels],
         executor,
-        lambda done, run: progress(f"H = {t_end / run[2]:g}", done, total),
+        lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][1]:g}", done, total),
     )
     found = dict(zip(labels, runs, strict=True))
     rows = [

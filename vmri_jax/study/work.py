@@ -215,7 +215,7 @@ def work_precision(
         rows = timed_in_turn(runs, repeats)
     else:
         timed = [(ladder, repeats) for ladder in ladders]
-        told = lambda done, one: progress(one[0].label, done, total)  # noqa: E731
+        told = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
         rows = [row for part in mapped("work_precision", _timed, timed, executor, told) for row in part]
     progress("done", 1, 1)
     return WorkPrecision(tuple(rows), t_end, reference)

@@ -1,0 +1,344 @@
+"""Ensembles: lanes per second and worker, what a task costs, a million runs, and what large ensembles would take."""
+
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import jax
+import numpy as np
+import psutil
+
+import vmri_jax as vm
+from benchmarks.measure import Ratio, Tell, ratio, silent
+from benchmarks.report import Claim, Part, Report
+from vmri_jax import plots
+from vmri_jax.ensembles import Axis, Draws, Ensemble, Product
+from vmri_jax.ensembles.executors import as_done, executor_of, local_workers
+from vmri_jax.ensembles.run import prepared
+from vmri_jax.ensembles.store import committed
+from vmri_jax.ensembles.work import Steps, Work
+from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
+
+PARTS = ("speed", "paper", "million", "study")
+COLUMNS = {
+    "speed": ("what", "lanes", "lanes a second", "low", "high"),
+    "paper": ("lanes", "workers", "chunk", "tasks", "hours", "GB", "files", "limit"),
+    "million": ("lanes", "chunks", "seconds", "lanes a second", "MB on disk", "RSS MB at a tenth", "RSS MB at the end"),
+    "study": ("scheme", "num_micro", "lanes", "failed", "accurate"),
+}
+START = {"omega": ("uniform", 20.0, 80.0), "v_s[0]": ("normal", 0.0, 0.1), "v_f[0]": ("normal", 0.0, 0.1)}
+RUN = {"t_end": 1.0, "macro_dt": 0.01}
+SCHEME = vm.fully_implicit(10)
+SLEEPERS = 16
+"""Workers of the run whose work is sleeping."""
+NAP = 0.5
+EMPTY = 2000
+"""Tasks without work, which show what a task costs."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is run.
+
+    chunks: of the ensembles that are timed; repeats: how often.
+    million: runs of the large one.
+    omega, steps: points of the axes of the study.
+    """
+
+    chunks: int
+    repeats: int
+    million: int
+    omega: int
+    steps: int
+
+
+def sizes(name: str) -> Size:
+    """ "quick" or "full"."""
+    return Size(8, 3, 100_000, 60, 8) if name == "quick" else Size(16, 5, 1_000_000, 280, 24)
+
+
+def part(name: str) -> Part:
+    """What `python -m benchmarks` asks of one of `PARTS`."""
+    measured = {"speed": speed, "paper": paper, "million": million, "study": study}[name]
+
+    def run(size: Size, how: str, tell: Tell = silent) -> Iterator[Report]:
+        with TemporaryDirectory() as folder:
+            yield measured(size, how, Path(folder), tell)
+
+    return Part(COLUMNS[name], run, sizes)
+
+
+def _sweep(out: Path, lanes: int, **how) -> Ensemble:
+    shutil.rmtree(out, ignore_errors=True)
+    return vm.ensemble("fpu", SCHEME, Draws(lanes, START), **RUN, out=out, **how)
+
+
+# --- lanes per second ------------------------------------------------------------------------------------------------
+def speed(size: Size, name: str, folder: Path, tell: Tell) -> Report:
+    """In this process, and by one and two workers; and what the store and the tasks cost on top of `simulate_batch`."""
+    tell("compiling")
+    chunk = _picked(10**6)
+    lanes = size.chunks * chunk
+    batches = [_batch(number * chunk, (number + 1) * chunk) for number in range(size.chunks)]
+    samples: dict[str, list[float]] = {"simulate_batch": [], "this process": [], "1 worker": [], "2 workers": []}
+    problem = vm.systems.fermi_pasta_ulam()
+
+    def alone(states, params):
+        return vm.simulate_batch(problem, SCHEME, states, params=params, macro_dt=0.01, num_steps=100, save_every=100)
+
+    alone(*batches[0])
+    with local_workers(1) as one, local_workers(2) as two:
+        ways = {"this process": {}, "1 worker": {"executor": one}, "2 workers": {"executor": two}}
+        for how in ways.values():
+            _sweep(folder / "runs.zarr", 2 * chunk, chunk=chunk, **how)  # compiled, on all workers
+        for repeat in range(size.repeats):
+            tell(f"speed, {repeat + 1} of {size.repeats}")
+            begin = time.perf_counter()
+            for batch in batches:
+                alone(*batch)
+            samples["simulate_batch"].append(lanes / (time.perf_counter() - begin))
+            for what, how in ways.items():
+                samples[what].append(_sweep(folder / "runs.zarr", lanes, chunk=chunk, **how).runs_per_second)
+    rows = [
+        {"what": what, "lanes": lanes, "lanes a second": float(np.median(of)), "low": min(of), "high": max(of)}
+        for what, of in samples.items()
+    ]
+    claims = [
+        Claim("2 workers over 1", ratio(samples["2 workers"], samples["1 worker"]), at_least=1.8),
+        Claim(
+            "time over that of simulate_batch", ratio(samples["simulate_batch"], samples["this process"]), at_most=1.05
+        ),
+    ]
+    seconds = chunk / float(np.median(samples["this process"]))
+    return Report("ensembles_speed", name, rows, claims, [f"chunks of {chunk} runs, {seconds:.2f} s each"])
+
+
+def _batch(first: int, last: int):
+    """Runs of the ensemble as `simulate_batch` takes them."""
+    problem, rows = vm.systems.fermi_pasta_ulam(), Draws(last, START).rows(first, last)
+    v_s, v_f = (np.repeat(np.asarray(v)[None], last - first, axis=0) for v in (problem.v_s, problem.v_f))
+    v_s[:, 0], v_f[:, 0] = rows["v_s[0]"], rows["v_f[0]"]
+    make = jax.vmap(lambda a, b: vm.initial_state(problem.system, problem.q_s, problem.q_f, a, b))
+    return make(v_s, v_f), {"omega": rows["omega"]}
+
+
+# --- large ensembles on paper, and by sleeping -----------------------------------------------------------------------
+def paper(size: Size, name: str, folder: Path, tell: Tell) -> Report:
+    """What a task costs, measured; what large ensembles take, by that; and the same for sleeping workers, measured."""
+    tell("lanes a second")
+    _sweep(folder / "runs.zarr", 2**14, chunk=4096)
+    runs = _sweep(folder / "runs.zarr", 2**15, chunk=4096)
+    files = [file for file in runs.path.rglob("*") if file.is_file()]
+    per_lane = sum(file.stat().st_size for file in files) / len(runs)
+    per_chunk = sum("/c." in str(file) for file in files) / runs.chunks.count
+    listing = _listing(runs.path)
+    with local_workers(1) as client:
+        tell("compiling in a worker")
+        first = _sweep(folder / "runs.zarr", 4096, chunk=4096, executor=client)
+        again = _sweep(folder / "runs.zarr", 4096, chunk=4096, executor=client)
+        compiling = first.seconds - again.seconds
+    tell(f"{SLEEPERS} workers")
+    with local_workers(SLEEPERS) as client:
+        _sleep(client, 4 * SLEEPERS, 0.0)  # all have imported the package
+        empty = _sleep(client, EMPTY, 0.0) / EMPTY
+        tasks = 40 * SLEEPERS
+        slept = _sleep(client, tasks, NAP)
+    predicted = max(tasks * (NAP + empty) / SLEEPERS, tasks * empty)
+    rate = runs.runs_per_second
+    rows = []
+    for lanes in (10**6, 10**9):
+        for workers in (1, 16, 1000):
+            chunk = _picked(lanes)
+            count = -(-lanes // chunk)
+            computing, handing = lanes / rate / workers, count * empty
+            rows.append(
+                {
+                    "lanes": f"{lanes:.0e}",
+                    "workers": workers,
+                    "chunk": chunk,
+                    "tasks": count,
+                    "hours": (compiling + max(computing, handing)) / 3600,
+                    "GB": lanes * per_lane / 1e9,
+                    "files": round(count * per_chunk),
+                    "limit": "workers" if computing > handing else "scheduler",
+                }
+            )
+    seconds = 4096 / rate
+    notes = [
+        f"{rate:,.0f} runs a second and worker ({seconds:.2f} s a chunk of 4096); {per_lane:.0f} bytes and {per_chunk / 4096:.4f} "
+        f"files a run; a worker's first chunk takes {compiling:.1f} s longer.",
+        f"A task without work takes {1e3 * empty:.2f} ms of this process and the scheduler: with chunks of {seconds:.2f} s they "
+        f"are enough for {seconds / empty:,.0f} workers. To see which of 1e6 chunks are done takes {1e6 * listing:.0f} s.",
+    ]
+    seen = Ratio(slept / predicted, slept / predicted, slept / predicted)
+    claims = [Claim(f"{tasks} tasks of {NAP} s on {SLEEPERS} workers, over the prediction", seen, at_most=1.1)]
+    return Report("ensembles_paper", name, rows, claims, notes)
+
+
+def _listing(path: Path) -> float:
+    """Seconds per chunk to see which are done."""
+    begin = time.perf_counter()
+    count = len(committed(path))
+    return (time.perf_counter() - begin) / count
+
+
+def _picked(lanes: int) -> int:
+    """The chunk that the library takes for so many runs."""
+    work = Work("fpu", {"scheme": SCHEME}, tuple(START), Steps(RUN["t_end"], None, RUN["macro_dt"]))
+    return prepared(work, Draws(lanes, START)).chunks.size
+
+
+def _sleep(client, count: int, seconds: float) -> float:
+    """Time that so many tasks take that do nothing but sleep."""
+    call, versions = packed("sleep", (time.sleep, (seconds,))), known_versions()
+    with executor_of("sleep", client, None) as (tasks, room):
+
+        def submit(_: int) -> Future:
+            return tasks.submit(*call_in_worker(versions, call_packed, call))
+
+        begin = time.perf_counter()
+        for _, future in as_done(submit, room, ((i,) for i in range(count))):
+            future.result()
+    return time.perf_counter() - begin
+
+
+# --- a million runs --------------------------------------------------------------------------------------------------
+def million(size: Size, name: str, folder: Path, tell: Tell) -> Report:
+    """Many runs through the store in this process, with the memory it takes, and read back without loading them."""
+    tell(f"{size.million:,} runs")
+    out = folder / "million.zarr"
+    with _memory() as seen:
+        runs = vm.ensemble("fpu", "fully-explicit", Draws(size.million, START), num_micro=10, **RUN, out=out)
+    after = psutil.Process().memory_info().rss / 1e6
+    data = runs.open()
+    mean = float(data.q_s.mean())
+    read = psutil.Process().memory_info().rss / 1e6
+    t, rss = np.array(seen).T
+    tenth, end = (float(np.interp(part * t[-1], t, rss)) for part in (0.1, 1.0))
+    bytes_there = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+    row = {
+        "lanes": len(runs),
+        "chunks": runs.chunks.count,
+        "seconds": runs.seconds,
+        "lanes a second": runs.runs_per_second,
+        "MB on disk": bytes_there / 1e6,
+        "RSS MB at a tenth": tenth,
+        "RSS MB at the end": end,
+    }
+    notes = [f"mean of all q_s, read chunk by chunk: {mean:.6f}; memory {after:.0f} MB before, {read:.0f} MB after."]
+    claims = [
+        Claim("memory at the end over that at a tenth", Ratio(end / tenth, end / tenth, end / tenth), at_most=1.1)
+    ]
+    figure = partial(_draw_memory, t, rss, len(runs))
+    return Report("ensembles_million", name, [row], claims, notes, {"ensembles_million": figure})
+
+
+@contextmanager
+def _memory() -> Iterator[list[tuple[float, float]]]:
+    """Meanwhile, times and the memory of this process in MB."""
+    process, seen, end, begin = psutil.Process(), [], threading.Event(), time.perf_counter()
+
+    def watch() -> None:
+        while not end.wait(0.1):
+            seen.append((time.perf_counter() - begin, process.memory_info().rss / 1e6))
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    yield seen
+    end.set()
+    thread.join()
+
+
+def _draw_memory(t: np.ndarray, rss: np.ndarray, lanes: int):
+    with plots.new_figure(6.0, 2.8, f"memory of {lanes:,} runs of the FPU chain, into a store", plots.LIGHT) as figure:
+        axes = figure.subplots()
+        axes.plot(t, rss)
+        axes.set(xlabel="seconds", ylabel="MB", ylim=(0, None))
+    return figure
+
+
+# --- the study of the paper, over omega, H and num_micro --------------------------------------------------------------
+ACCURATE = 1e-2
+"""Largest change of the energy, relative to that at the start, of a run that counts as accurate."""
+
+
+def relative_energy_error(trajectory: vm.Trajectory):
+    """Largest change of the energy, relative to the energy at the start."""
+    return jax.numpy.max(jax.numpy.abs(trajectory.energy / trajectory.energy[0] - 1))
+
+
+def study(size: Size, name: str, folder: Path, tell: Tell) -> Report:
+    """Where each scheme is stable and accurate: the FPU chain over omega, H and num_micro, drawn from the store."""
+    tell("study")
+    schemes = {
+        "fully implicit": vm.fully_implicit,
+        "explicit slow": vm.explicit_slow,
+        "fully explicit": vm.fully_explicit,
+    }
+    numbers = np.unique(np.round(np.geomspace(40, 4000, size.steps) / 40).astype(int) * 40)[::-1]
+    omega = Axis(np.geomspace(10.0, 1000.0, size.omega), "rad/s", "frequency of the stiff springs")
+    axes = {"num_micro": [1, 2, 5, 10, 20], "num_steps": numbers, "omega": omega}
+    axes = Product({"scheme": list(schemes), **axes})
+    save = "benchmarks.ensembles:relative_energy_error"
+    runs = vm.ensemble(
+        "fpu", schemes, axes, t_end=40.0, save=save, num_saves=40, out=folder / "study.zarr", processes=2
+    )
+    data = runs.open().load()
+    error = data.relative_energy_error.where(data.result <= 1)
+    rows = [
+        {
+            "scheme": scheme,
+            "num_micro": int(n),
+            "lanes": error.sel(scheme=scheme, num_micro=n).size,
+            "failed": int((data.result.sel(scheme=scheme, num_micro=n) > 1).sum()),
+            "accurate": int((error.sel(scheme=scheme, num_micro=n) < ACCURATE).sum()),
+        }
+        for scheme in schemes
+        for n in data.num_micro.values
+    ]
+    notes = [
+        f"{len(runs):,} runs in {runs.seconds:.0f} s, {runs.runs_per_second:,.0f} a second, {runs.failed_runs:,} failed"
+    ]
+    figure = partial(_draw_study, error, plots.LIGHT)
+    return Report("ensembles_study", name, rows, [], notes, {"ensembles_study": figure})
+
+
+def _draw_study(error, theme: plots.Theme):
+    """A row of maps for each scheme, omega against the macro step, a column for each num_micro."""
+    from matplotlib.colors import LogNorm
+
+    schemes, numbers = error.scheme.values, error.num_micro.values
+    macro_dt = 40.0 / error.num_steps.values
+    title = "FPU chain, t = 40: largest relative change of the energy"
+    with plots.new_figure(1.6 + 1.75 * len(numbers), 0.8 + 1.75 * len(schemes), title, theme) as figure:
+        grid = figure.subplots(len(schemes), len(numbers), sharex=True, sharey=True, squeeze=False)
+        for row, scheme in zip(grid, schemes, strict=True):
+            for axes, n in zip(row, numbers, strict=True):
+                one = error.sel(scheme=scheme, num_micro=n).transpose("omega", "num_steps")
+                axes.set_facecolor(theme.faint)
+                mesh = axes.pcolormesh(
+                    macro_dt, error.omega, one, norm=LogNorm(1e-6, 1.0, clip=True), cmap="viridis", rasterized=True
+                )
+                axes.contour(macro_dt, error.omega, one, [ACCURATE], colors=[theme.paper], linewidths=0.9)
+                h = np.array([macro_dt.min(), macro_dt.max()])
+                axes.plot(h, 2 * n / h, color=theme.ink, linewidth=0.8, linestyle=":")
+                axes.set(xscale="log", yscale="log", ylim=(error.omega.min(), error.omega.max()))
+                axes.grid(visible=False)
+        for axes, n in zip(grid[0], numbers, strict=True):
+            axes.set_title(f"num_micro = {n}")
+        for axes in grid[-1]:
+            axes.set_xlabel("macro step $H$")
+        for axes, scheme in zip(grid[:, 0], schemes, strict=True):
+            axes.set_ylabel(f"{scheme}\n$\\omega$")
+        bar = figure.colorbar(mesh, ax=grid, pad=0.01)
+        bar.outline.set_visible(False)
+        text = f"white: {ACCURATE:g}; dotted: micro step 2 / $\\omega$; grey: failed"
+        figure.text(0.99, 0.002, text, ha="right", va="bottom", fontsize=7.5)
+    return figure
