@@ -1,5 +1,6 @@
 """Where tasks run: in this process, in workers of this machine, or wherever an executor has them run."""
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from contextlib import ExitStack, contextmanager, suppress
@@ -15,7 +16,8 @@ AHEAD = 4
 
 
 LOOK = 1.0
-"""Seconds after which futures are looked at: `wait` does not see those that Dask cancels when its scheduler is gone."""
+"""Seconds after which workers are counted anew, and futures looked at: `wait` does not see those that Dask cancels when its
+scheduler is gone."""
 
 
 class Here(Executor):
@@ -69,12 +71,14 @@ def executor_of(what: str, executor: Any, processes: int | None) -> Iterator[tup
 
 def _room(client: Any) -> Callable[[], int]:
     """How many tasks its workers should have; as many as before while the scheduler does not answer, none once it is given up."""
-    known = AHEAD
+    known, asked = AHEAD, -LOOK
 
     def room() -> int:
-        nonlocal known
-        with suppress(OSError, RuntimeError, AttributeError):
-            known = AHEAD * max(1, sum(client.nthreads().values()))
+        nonlocal known, asked
+        if time.monotonic() - asked > LOOK:
+            asked = time.monotonic()
+            with suppress(OSError, RuntimeError, AttributeError):
+                known = AHEAD * max(1, sum(client.nthreads().values()))
         return 0 if client.status == "closed" else known
 
     return room

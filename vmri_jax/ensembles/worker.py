@@ -20,6 +20,7 @@ class NotAWorker(RuntimeError):
     """A process cannot be a worker: it has other versions, or JAX runs there with other settings."""
 
 
+@lru_cache
 def known_versions() -> dict[str, str]:
     """Versions that decide the last digits of a run."""
     found = environment()
