@@ -158,6 +158,15 @@ def test_resume_computes_only_what_is_missing(tmp_path):
     assert _files(part.path) == _files(whole.path)
 
 
+def test_a_store_that_takes_the_place_of_another(tmp_path):
+    """The first one's arrays are shorter."""
+    few(tmp_path / "runs.zarr", design={"omega": [20.0]}, chunk=1)
+    design = {"omega": [20.0, 30.0, 40.0]}
+    longer = few(tmp_path / "runs.zarr", design=design, chunk=1, overwrite=True)
+    assert _files(longer.path) == _files(few(tmp_path / "other.zarr", design=design, chunk=1).path)
+    assert np.isfinite(longer.open().q_f).all()
+
+
 def test_resume_starts_what_is_not_there(tmp_path):
     assert few(tmp_path / "new.zarr", resume=True).complete
 

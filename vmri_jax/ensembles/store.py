@@ -114,6 +114,8 @@ class Writer:
         files = []
         for name, value in values.items():
             array = self._arrays[name]
+            if first + len(value) > array.shape[0]:  # zarr would write nothing, and say nothing
+                raise ValueError(f"{self._path}: {name} has {array.shape[0]} rows, none for chunk {number}.")
             array[first : first + len(value)] = value
             files.append(self._path / name / ".".join(["c", str(number)] + ["0"] * (array.ndim - 1)))
         synchronize_files(files)  # after all have been written: the first wait is one for most of the others
@@ -126,6 +128,12 @@ class Writer:
 def labelled(values, attributes: Mapping[str, Any]):
     """Values of a column of a table, labels in place of their numbers."""
     return np.asarray(attributes[LABELS])[values] if LABELS in attributes else values
+
+
+def made(path: Path) -> tuple[int, int]:
+    """What tells a store from others at the same place."""
+    found = (path / METADATA).stat()
+    return found.st_ino, found.st_mtime_ns
 
 
 def committed(path: Path) -> dict[int, int]:

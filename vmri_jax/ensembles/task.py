@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vmri_jax.ensembles.design import Design, Table
-from vmri_jax.ensembles.store import Writer
+from vmri_jax.ensembles.store import Writer, made
 from vmri_jax.ensembles.work import Work
 
 
@@ -69,7 +69,7 @@ def run_chunk(job: Job, number: int) -> Done:
     """Compute a chunk and write it."""
     begin = time.perf_counter()
     first, last = job.chunks.ends(number)
-    writer = _writer(job.path, job.chunks.size)
+    writer = _writer(job.path, job.chunks.size, made(Path(job.path)))
     rows = writer.columns(first, last) if job.design is None else job.design.rows(first, last)
     start = time.perf_counter()
     values = job.work.compute(rows, last - first, job.chunks.width)
@@ -91,5 +91,6 @@ def _job(packed: bytes) -> Job:
 
 
 @lru_cache(maxsize=4)
-def _writer(path: str, chunk: int) -> Writer:
+def _writer(path: str, chunk: int, made: tuple[int, int]) -> Writer:
+    """Of a store, told apart from others that were at its place before by when it was made."""
     return Writer(Path(path), chunk)
