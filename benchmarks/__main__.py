@@ -14,12 +14,14 @@ from benchmarks import (
     chains,
     compilation,
     cost,
+    ensemble_kills,
     ensembles,
     floor,
     fuzz,
     kills,
     orders,
     peers,
+    savings,
     tricks,
 )
 from benchmarks.gail2014.command import gail2014
@@ -56,6 +58,7 @@ for _name, _module in {
     "chains": chains,
     "compile": compilation,
     "orders": orders,
+    "savings": savings,
 }.items():
     _plain_command(_name, _module)
 
@@ -140,6 +143,16 @@ def baseline_command(
 def kills_command(count: Annotated[int, typer.Option(min=1, help="Kills.")] = 100, out: Out = OUT) -> None:
     prepare(cache=False)
     _measure("kills", kills, False, out, count=count)
+
+
+@app.command("ensemble-kills", help=ensemble_kills.__doc__)
+def ensemble_kills_command(
+    workers: Annotated[int, typer.Option(min=0, help="Workers to kill.")] = 50,
+    mains: Annotated[int, typer.Option(min=0, help="Whole processes to kill.")] = 20,
+    out: Out = OUT,
+) -> None:
+    prepare()
+    _measure("ensemble kills", ensemble_kills, False, out, workers=workers, mains=mains)
 
 
 @app.command("fuzz")
