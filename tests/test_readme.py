@@ -39,6 +39,15 @@ def test_scenes_run():
         assert vm.simulate(scene, vm.fully_implicit(num_micro=10), macro_dt=0.01, num_steps=10).success
 
 
+def test_many_runs(tmp_path):
+    program = next(program for program in PROGRAMS if "vm.ensemble(" in program)
+    run = [sys.executable, "-c", program]
+    done = subprocess.run(run, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"It prints `{done.stdout.strip()}`." in TEXT, done.stdout
+    assert (tmp_path / "runs.png").stat().st_size > 10_000
+
+
 @pytest.mark.full
 def test_a_gradient_over_many_steps_in_little_memory(fpu):
     recipe = next(program for program in PROGRAMS if "jax.checkpoint" in program)

@@ -86,6 +86,13 @@ def test_a_store(tmp_path):
     np.testing.assert_allclose(stored.load().q_f, run.q_f, rtol=0, atol=1e-14)
 
 
+def test_an_ensemble(tmp_path):
+    design = {"omega": [20.0, 50.0], "num_micro": [1, 3]}
+    runs = vm.ensemble("fpu", "explicit-slow", design, t_end=0.2, macro_dt=0.02, chunk=2, out=tmp_path / "runs.zarr")
+    assert runs.complete
+    assert (runs.failed_runs, runs.computed, runs.chunks.count) == (0, 4, 2)
+
+
 def test_the_command_line(tmp_path):
     out = tmp_path / "run.npz"
     command = [sys.executable, "-c", "from vmri_jax.cli import main; main()", "simulate", "fpu"]

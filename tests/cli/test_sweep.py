@@ -1,0 +1,126 @@
+"""`vmri sweep`: files, stores, what is said."""
+
+import re
+import tomllib
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import vmri_jax as vm
+from vmri_jax import cli
+from vmri_jax.cli.sweep import read_sweep
+
+SMALL = """
+system = "fpu"
+scheme = "explicit-slow"
+out = "runs.zarr"
+macro_dt = 0.05
+num_steps = 4
+num_micro = 2
+[axes]
+omega = [20.0, 50.0]
+"""
+
+
+@pytest.fixture
+def vmri(tmp_path, monkeypatch):
+    """Runs ``vmri`` in an empty folder: (exit code, everything printed with frames and line breaks taken out)."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sweep.toml").write_text(SMALL)
+
+    def run(*arguments):
+        result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+        return result.exit_code, re.sub(r"[\s│╭╮╰╯─]+", " ", result.output)
+
+    return run
+
+
+def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):
+    code, text = vmri("sweep", "sweep.toml", "--plot", "map.png")
+    assert code == 0
+    assert re.search(r"runs 2 computed now 2 in [\d.]+ s", text)
+    assert "chunks 1 of 1 are in the store, 2 runs each" in text
+    assert 'vmri_jax.open_ensemble("runs.zarr")' in text
+    assert (tmp_path / "map.png").stat().st_size > 5000
+    assert vm.open_ensemble("runs.zarr").omega.values.tolist() == [20.0, 50.0]
+    code, text = vmri("sweep")
+    assert code == 2
+    assert "holds an ensemble of 2 runs, 1 of 1 chunks done" in text
+    assert "computed now 0" in vmri("sweep", "--resume")[1]
+    assert "computed now 2" in vmri("sweep", "--overwrite")[1]
+
+
+def test_workers(vmri, tmp_path):
+    pytest.importorskip("distributed")
+    code, text = vmri("sweep", "--workers", "1")
+    assert code == 0
+    assert re.search(r"dashboard: http://[\d.:]+/status", text)
+    assert "computed now 2" in text
+
+
+def test_the_example_is_complete(vmri, tmp_path):
+    code, text = vmri("sweep", "--example", "mine.toml")
+    assert code == 0
+    assert "vmri sweep mine.toml --workers 2" in text
+    given = read_sweep(tmp_path / "mine.toml")
+    assert list(given["scheme"]) == ["explicit-slow", "fully-implicit"]
+    assert given["design"].axes["omega"].unit == "rad/s"
+    assert len(given["design"]) == 2 * 3 * 91
+    assert vmri("sweep", "--example", "mine.toml")[0] == 2
+
+
+def test_every_comment_of_the_example_is_valid(tmp_path):
+    """With its lines of axes taken out, and those in comments put in."""
+    text = files("vmri_jax.cli").joinpath("sweep.toml").read_text()
+    head, axes = text.split("[axes]")
+    commented = axes[axes.index("# [draws]") :]
+    draws = "\n".join(line.removeprefix("# ") for line in commented.splitlines())
+    (tmp_path / "draws.toml").write_text(f"{head}\nnum_steps = 10\nnum_micro = 2\n{draws}")
+    assert tomllib.loads((tmp_path / "draws.toml").read_text())["draws"]["seed"] == 0
+    given = read_sweep(tmp_path / "draws.toml")
+    assert given["design"].rows(0, 3).keys() == {"omega", "v_s[0]"}
+
+
+def test_axes_and_files_are_seen_from_the_folder(tmp_path):
+    (tmp_path / "a.toml").write_text(
+        'system = "mine.py:chain"\nscheme = "galerkin"\nout = "a.zarr"\nsave = ["mine.py:own", "end"]\n'
+        "[axes]\na = { from = 1, to = 100, count = 3, log = true }\nb = { values = [1, 2], unit = 'm' }\nc = 3.0\n"
+    )
+    given = read_sweep(tmp_path / "a.toml")
+    assert given["system"] == f"{tmp_path / 'mine.py'}:chain"
+    assert given["save"] == [f"{tmp_path / 'mine.py'}:own", "end"]
+    assert given["out"] == tmp_path / "a.zarr"
+    axes = given["design"].axes
+    assert np.allclose(axes["a"].values, [1, 10, 100])
+    assert (axes["b"].unit, axes["c"].values.tolist()) == ("m", [3.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("out =", "oout ="), "no entry 'oout'. Did you mean out?"),
+        (('system = "fpu"\n', ""), "system is missing"),
+        (("omega = [20.0, 50.0]", "omega = { from = 1 }"), "the axis omega: give values, or from, to and count"),
+        (("omega = [20.0, 50.0]", "omega = { form = 1 }"), "no entry 'form'. Did you mean from?"),
+        (("omega", "omga"), "nothing that the column 'omga' could change. Did you mean omega?"),
+        (("[axes]", "[draws]"), "no entry 'omega'"),
+        (("[axes]", "[draws]\ncount = 3\n[axes]"), "give either [axes] or [draws]"),
+        (("macro_dt", "macro_dt ="), "is no TOML"),
+        (("fpu", "fup"), "there is no system 'fup'"),
+    ],
+)
+def test_bad_files_are_refused(vmri, tmp_path, change, message):
+    (tmp_path / "sweep.toml").write_text(SMALL.replace(*change))
+    code, text = vmri("sweep")
+    assert code == 2
+    assert message in text
+    assert not (tmp_path / "runs.zarr").exists()
+
+
+def test_bad_options_are_refused(vmri):
+    assert "choose one of them" in vmri("sweep", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1")[1]
+    assert "does not exist; write one with: vmri sweep --example" in vmri("sweep", "nothing.toml")[1]
+    assert "must end in .png" in vmri("sweep", "--plot", "map.txt")[1]

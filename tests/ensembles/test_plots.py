@@ -1,0 +1,73 @@
+"""Figures of ensembles: what is drawn, and what is refused."""
+
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax import plots
+from vmri_jax.ensembles import Axis, Draws
+
+xarray = pytest.importorskip("xarray")
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory):
+    """Three axes; some runs fail."""
+    axes = {"num_micro": [1, 3], "omega": Axis([20.0, 50.0, 1e9], "rad/s"), "v_s[0]": [0.0, 0.1, 0.2, 0.3]}
+    out = tmp_path_factory.mktemp("grid") / "runs.zarr"
+    save = ("nodes", "extremes", "energy_error")
+    return vm.ensemble("fpu", "fully-explicit", axes, t_end=1.0, macro_dt=0.05, save=save, num_saves=5, out=out).open()
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory):
+    design = Draws(50, {"omega": ("uniform", 20, 60), "v_s[0]": ("normal", 0, 0.1)})
+    out = tmp_path_factory.mktemp("cloud") / "runs.zarr"
+    return vm.ensemble(
+        "fpu", "explicit-slow", design, num_micro=2, t_end=1.0, macro_dt=0.05, save="energy_error", num_saves=5, out=out
+    ).open()
+
+
+def test_a_map_has_a_panel_for_each_value_of_the_third_axis(grid):
+    figure = plots.plot_ensemble(grid, title="map")
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles[:2] == ["num_micro = 1", "num_micro = 3"]
+    assert figure.axes[0].get_xlabel() == "v_s[0]"
+    assert figure.axes[0].get_ylabel() == "omega in rad/s"
+    assert any("failed" in text.get_text() for text in figure.texts)
+
+
+def test_curves_bands_points_and_counts(grid, cloud):
+    few = grid.isel(omega=0)
+    curves = plots.plot_ensemble(few, "energy_error", "v_s[0]").axes[0]
+    assert [text.get_text() for text in curves.get_legend().get_texts()] == ["num_micro = 1", "num_micro = 3"]
+    assert np.allclose(curves.lines[0].get_ydata(), few.energy_error.isel(num_micro=0))
+    bands = plots.plot_ensemble(grid.isel(omega=[0, 1] * 2), "energy_error", "v_s[0]").axes[0]
+    assert "median" in [text.get_text() for text in bands.get_legend().get_texts()]
+    points = plots.plot_ensemble(cloud, "energy_error", "omega").axes[0].collections[0]
+    assert points.get_offsets().shape == (50, 2)
+    coloured = plots.plot_ensemble(cloud, "energy_error", "omega", "v_s[0]").axes[0].collections[0]
+    assert np.allclose(coloured.get_array(), cloud.energy_error)
+    counts = plots.plot_ensemble(cloud).axes[0]
+    assert sum(bar.get_height() for bar in counts.patches) == 50
+
+
+def test_trajectories_have_bands_of_runs_that_did_not_fail(grid):
+    figure = plots.plot_ensemble(grid, "node_q_s", theme=plots.DARK)
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [f"centres[{i}]" for i in range(3)]
+    middle = figure.axes[0].lines[0].get_ydata()
+    good = grid.node_q_s.isel(slow=0).where(grid.result <= 1).median(("num_micro", "omega", "v_s[0]"))
+    assert np.allclose(middle, good)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("enrgy",), "there is no 'enrgy'"),
+        (("max_q_s",), r"several numbers per run; choose one, data\.isel\(slow=0\)"),
+        (("energy_error", "omga"), "there is no axis or column 'omga'"),
+    ],
+)
+def test_bad_names_are_refused(grid, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        plots.plot_ensemble(grid, *arguments)
