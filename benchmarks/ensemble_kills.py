@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ COLUMNS = ("ensemble", "kills", "chunks before a resume", "calls", "identical")
 LANES, CHUNK = 30_000, 500
 PER_ENSEMBLE = 10
 """Workers that are killed during one ensemble."""
+EARLY = 5
+"""Every so many processes are killed at any time after their start, the others after their first chunk."""
 PATIENCE = 120.0
 
 
@@ -116,7 +119,13 @@ def kill_processes(count: int, random, folder: Path, expected: dict[str, bytes],
         while code != 0:
             child = context.Process(target=_child, args=(str(out),))
             child.start()
-            child.join(PATIENCE if done + kills >= count else random.uniform(4.0, 9.0))
+            if done + kills >= count:
+                child.join(PATIENCE)
+            elif calls % EARLY == EARLY - 1:
+                child.join(random.uniform(0.0, 6.0))
+            else:
+                _wait_for_chunk(child, out, chunks[-1] if chunks else 0)
+                child.join(random.uniform(0.0, 1.0))
             if child.exitcode is None:
                 child.kill()
                 child.join()
@@ -126,6 +135,15 @@ def kill_processes(count: int, random, folder: Path, expected: dict[str, bytes],
             tell(f"{done + kills} of {count} processes killed")
         done += kills
         yield _row("process killed", kills, chunks, calls, contents(out) == expected)
+
+
+def _wait_for_chunk(child, out: Path, known: int) -> None:
+    """Until there are more chunks, or the process has ended."""
+    end = time.monotonic() + PATIENCE
+    while child.is_alive() and time.monotonic() < end:
+        if out.exists() and len(committed(out)) > known:
+            return
+        time.sleep(0.01)
 
 
 def _row(what: str, kills: int, chunks: list[int], calls: int, same: bool) -> dict:

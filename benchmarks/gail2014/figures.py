@@ -101,6 +101,7 @@ class CostPanel:
 
     dense, structured: make the problem that each solver gets; dense_num_micro and dense_t_end are those of the first.
     paper_minimum: the num_micro that was cheapest in the paper, None if it does not say.
+    others: further methods of `vmri_jax.Newton`, on the structured problem.
     """
 
     title: str
@@ -114,10 +115,11 @@ class CostPanel:
     dense_t_end: float
     t_end: float
     repeats: int
+    others: tuple[str, ...] = ()
 
     def measure(self, progress: Progress) -> CostStudy:
         """Time both solvers."""
-        runs = [("arrowhead", self.structured, self.num_micro, self.t_end)]
+        runs = [(method, self.structured, self.num_micro, self.t_end) for method in ("arrowhead", *self.others)]
         if self.dense_num_micro:
             runs.insert(0, ("dense", self.dense, self.dense_num_micro, self.dense_t_end))
         studies = [

@@ -98,7 +98,7 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
     n, m = size.fpu_num_micro, size.sam_num_micro
     small = (
         CostPanel("FPU, l = 3", chain, chain, vm.fully_implicit, 60, n, n, 0.01, 20.0, 20.0, size.repeats),
-        CostPanel("SAM", atoms, atoms, vm.fully_implicit, 20, m, m, 0.001, 0.2, 1.0, size.repeats),
+        CostPanel("SAM", atoms, atoms, vm.fully_implicit, 20, m, m, 0.001, 0.2, 1.0, size.repeats, ("null_space",)),
     )
     chains = tuple(_chain_panel(size, name, length) for name in SCHEMES for length in size.chain_lengths[name])
     return (
