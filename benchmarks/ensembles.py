@@ -21,7 +21,7 @@ from benchmarks.report import Claim, Part, Report
 from vmri_jax import plots
 from vmri_jax.ensembles import Axis, Draws, Ensemble, Product
 from vmri_jax.ensembles.executors import as_done, executor_of, local_workers
-from vmri_jax.ensembles.run import prepared
+from vmri_jax.ensembles.prepared import prepared
 from vmri_jax.ensembles.store import committed
 from vmri_jax.ensembles.work import Steps, Work
 from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
@@ -61,7 +61,7 @@ class Size:
 
 def sizes(name: str) -> Size:
     """ "quick" or "full"."""
-    return Size(8, 3, 100_000, 60, 8) if name == "quick" else Size(16, 5, 1_000_000, 280, 24)
+    return Size(8, 3, 100_000, 60, 8) if name == "quick" else Size(16, 5, 1_000_000, 340, 24)
 
 
 def part(name: str) -> Part:
@@ -320,10 +320,7 @@ def _draw_study(error, theme: plots.Theme):
 
     schemes, numbers = error.scheme.values, error.num_micro.values
     macro_dt = 40.0 / error.num_steps.values
-    title = (
-        f"FPU chain, t = 40: largest relative change of the energy (white: {ACCURATE:g}; dotted: micro step $2/\\omega$; "
-        "grey: failed)"
-    )
+    title = f"FPU chain to t = 40: {error.size:,} runs"
     with plots.new_figure(1.6 + 1.75 * len(numbers), 0.8 + 1.75 * len(schemes), title, theme) as figure:
         grid = figure.subplots(len(schemes), len(numbers), sharex=True, sharey=True, squeeze=False)
         for row, scheme in zip(grid, schemes, strict=True):
@@ -344,6 +341,7 @@ def _draw_study(error, theme: plots.Theme):
             axes.set_xlabel("macro step $H$")
         for axes, scheme in zip(grid[:, 0], schemes, strict=True):
             axes.set_ylabel(f"{scheme}\n$\\omega$")
-        bar = figure.colorbar(mesh, ax=grid, pad=0.01)
+        about = f"largest relative change of the energy; white: {ACCURATE:g}, grey: failed, dotted: $h = 2/\\omega$"
+        bar = figure.colorbar(mesh, ax=grid, pad=0.01, label=about)
         bar.outline.set_visible(False)
     return figure

@@ -10,7 +10,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.ensembles import own
-from vmri_jax.ensembles import QUANTITIES, Axis, Draws, EnsembleError, Product, Table, store
+from vmri_jax.ensembles import QUANTITIES, Axis, Draws, EnsembleError, Product, Stopped, Table, store
 from vmri_jax.ensembles.run import Ensemble
 from vmri_jax.running import files
 from vmri_jax.steppers.results import Result
@@ -140,6 +140,15 @@ def test_a_poisoned_chunk_is_named_and_the_rest_goes_on(tmp_path):
     again = few(out, **arguments, resume=True, throw=False)
     assert list(again.failures) == [2]
     assert again.computed == 0
+
+
+def test_ctrl_c_keeps_the_chunk_at_work(tmp_path):
+    design = {"q_s[0]": [1.0, own.POISON, 3.0]}
+    arguments = {"design": design, "save": f"{OWN}:interrupts", "chunk": 1}
+    with pytest.raises(Stopped, match=r"stopped after 2 of 3 chunks; go on with resume=True") as caught:
+        few(tmp_path / "runs.zarr", **arguments)
+    assert sorted(caught.value.ensemble.done) == [0, 1]
+    assert few(tmp_path / "runs.zarr", **arguments, resume=True).complete
 
 
 def test_resume_computes_only_what_is_missing(tmp_path):

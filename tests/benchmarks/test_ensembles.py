@@ -1,0 +1,46 @@
+"""Benchmarks of ensembles and of savings: tiny ones run, figures are drawn."""
+
+import numpy as np
+import pytest
+
+from benchmarks import ensemble_kills, ensembles, savings
+
+xarray = pytest.importorskip("xarray")
+
+
+def test_many_runs(tmp_path):
+    report = ensembles.million(ensembles.Size(1, 1, 2000, 2, 2), "quick", tmp_path, lambda _: None)
+    (row,) = report.rows
+    assert row["lanes"] == 2000
+    assert row["MB on disk"] == pytest.approx(0.22, abs=0.05)  # 104 bytes a run, and metadata
+    assert set(row) == set(ensembles.COLUMNS["million"])
+    assert len(report.figures["ensembles_million"]().axes) == 1
+
+
+def test_the_study_has_a_panel_for_each_scheme_and_number_of_micro_steps():
+    axes = {"scheme": ["a", "b"], "num_micro": [1, 5], "num_steps": [4000, 400, 40], "omega": np.geomspace(10, 1000, 6)}
+    error = xarray.DataArray(np.geomspace(1e-7, 10, 72).reshape(2, 2, 3, 6), coords=axes, dims=list(axes))
+    figure = ensembles._draw_study(error.where(error < 1), ensembles.plots.LIGHT)
+    assert [panel.get_title(loc="left") for panel in figure.axes[:2]] == ["num_micro = 1", "num_micro = 5"]
+    assert len(figure.axes) == 5  # and the bar of colours
+
+
+def test_savings_are_taken_at_the_same_error():
+    single = np.array([1e-2, 1e-4]), np.array([1.0, 100.0])
+    assert savings.ratio_at(single, 1e-3, 5.0) == pytest.approx(2.0)
+    assert savings.ratio_at(single, 1e-5, 5.0) is None
+    assert len(savings._draw({"engine": {1: single, 5: single}}).axes) == 1
+
+
+@pytest.mark.full
+def test_speed(tmp_path):
+    report = ensembles.speed(ensembles.Size(1, 1, 0, 0, 0), "quick", tmp_path, lambda _: None)
+    assert [row["what"] for row in report.rows] == ["simulate_batch", "this process", "1 worker", "2 workers"]
+
+
+@pytest.mark.full
+@pytest.mark.filterwarnings("default")
+def test_kills():
+    (report,) = ensemble_kills.run(ensemble_kills.Size(2, 2), "quick")
+    assert [row["identical"] for row in report.rows] == ["yes", "yes"]
+    assert sum(row["kills"] for row in report.rows) == 4
