@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,7 +35,7 @@ COLUMNS = {
     "study": ("scheme", "num_micro", "lanes", "failed", "accurate"),
 }
 START = {"omega": ("uniform", 20.0, 80.0), "v_s[0]": ("normal", 0.0, 0.1), "v_f[0]": ("normal", 0.0, 0.1)}
-RUN = {"t_end": 1.0, "macro_dt": 0.01}
+RUN: dict[str, Any] = {"t_end": 1.0, "macro_dt": 0.01}
 SCHEME = vm.fully_implicit(10)
 SLEEPERS = 16
 """Workers of the run whose work is sleeping."""

@@ -2,7 +2,7 @@
 
 from importlib import import_module
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vmri_jax import diagnostics
 from vmri_jax.configure import NotConfiguredWarning, configure
@@ -38,6 +38,9 @@ from vmri_jax import systems  # isort: skip  (written with the names above)
 
 __version__ = version("vmri_jax")
 
+
+if TYPE_CHECKING:
+    from vmri_jax.ensembles import ensemble, open_ensemble
 
 LATER = {
     "plots": ("vmri_jax.plots", None),

@@ -1,5 +1,7 @@
 """Figures of ensembles: what is drawn, and what is refused."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -37,19 +39,26 @@ def test_a_map_has_a_panel_for_each_value_of_the_third_axis(grid):
     assert any("failed" in text.get_text() for text in figure.texts)
 
 
+def panel(*arguments) -> Any:
+    """The first panel of a figure."""
+    return plots.plot_ensemble(*arguments).axes[0]
+
+
+def names(axes) -> list[str]:
+    """What is in its legend."""
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
 def test_curves_bands_points_and_counts(grid, cloud):
     few = grid.isel(omega=0)
-    curves = plots.plot_ensemble(few, "energy_error", "v_s[0]").axes[0]
-    assert [text.get_text() for text in curves.get_legend().get_texts()] == ["num_micro = 1", "num_micro = 3"]
+    curves = panel(few, "energy_error", "v_s[0]")
+    assert names(curves) == ["num_micro = 1", "num_micro = 3"]
     assert np.allclose(curves.lines[0].get_ydata(), few.energy_error.isel(num_micro=0))
-    bands = plots.plot_ensemble(grid.isel(omega=[0, 1] * 2), "energy_error", "v_s[0]").axes[0]
-    assert "median" in [text.get_text() for text in bands.get_legend().get_texts()]
-    points = plots.plot_ensemble(cloud, "energy_error", "omega").axes[0].collections[0]
-    assert points.get_offsets().shape == (50, 2)
-    coloured = plots.plot_ensemble(cloud, "energy_error", "omega", "v_s[0]").axes[0].collections[0]
+    assert "median" in names(panel(grid.isel(omega=[0, 1] * 2), "energy_error", "v_s[0]"))
+    assert panel(cloud, "energy_error", "omega").collections[0].get_offsets().shape == (50, 2)
+    coloured = panel(cloud, "energy_error", "omega", "v_s[0]").collections[0]
     assert np.allclose(coloured.get_array(), cloud.energy_error)
-    counts = plots.plot_ensemble(cloud).axes[0]
-    assert sum(bar.get_height() for bar in counts.patches) == 50
+    assert sum(bar.get_height() for bar in panel(cloud).patches) == 50
 
 
 def test_trajectories_have_bands_of_runs_that_did_not_fail(grid):
