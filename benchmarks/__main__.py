@@ -22,6 +22,7 @@ from benchmarks import (
     orders,
     peers,
     savings,
+    squeezer,
     tricks,
 )
 from benchmarks.gail2014.command import gail2014
@@ -59,6 +60,7 @@ for _name, _module in {
     "compile": compilation,
     "orders": orders,
     "savings": savings,
+    "squeezer": squeezer,
 }.items():
     _plain_command(_name, _module)
 

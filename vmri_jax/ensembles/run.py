@@ -27,6 +27,10 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 
 
+GIVE_UP = 10
+"""So many chunks that cannot be computed, and none that can: then others are not tried."""
+
+
 class EnsembleError(RuntimeError):
     """Chunks of an ensemble could not be computed, all others are in its store.
 
@@ -40,10 +44,12 @@ class EnsembleError(RuntimeError):
         first, why = next(iter(self.failures.items()))
         lanes = ", ".join(_runs(ensemble.chunks, number) for number in list(self.failures)[:5])
         more = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
+        whole = len(ensemble.done) + len(self.failures) == ensemble.chunks.count
+        rest = "All others are" if whole else f"No chunk could; others were not tried. {len(ensemble.done)} chunks are"
         super().__init__(
             f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{more}. Chunk {first}: "
             f"{why.splitlines()[-1]} "
-            f"All others are in {ensemble.path}; with resume=True only these are tried again."
+            f"{rest} in {ensemble.path}; with resume=True only those that are missing are tried again."
         )
 
 
@@ -239,6 +245,8 @@ def _compute(found: Ensemble, job: Job, tasks, room, tell: Progress, interrupted
             else:
                 found.done[number] = done.failed
                 found.computed += done.lanes
+            if not found.computed and len(found.failures) >= GIVE_UP:
+                return
             found.seconds = time.perf_counter() - begin
             tell(_progress(found), _lanes_done(found), job.chunks.lanes)
             if interrupted():
