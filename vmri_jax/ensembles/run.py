@@ -26,7 +26,6 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 
-
 GIVE_UP = 10
 """So many chunks that cannot be computed, and none that can: then others are not tried."""
 
