@@ -10,6 +10,7 @@ def test_scipy_in_seven_angles():
     assert np.abs(squeezer.by_scipy(1e-8) - squeezer.PUBLISHED).max() < 1e-7  # 1.3e-8
 
 
+@pytest.mark.full
 def test_ours_in_seven_angles():
     assert np.abs(squeezer.by_angles(2, 300) - squeezer.PUBLISHED).max() < 3e-6  # 1.0e-6
 

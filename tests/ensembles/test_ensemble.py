@@ -284,6 +284,7 @@ def test_a_full_disk_keeps_the_chunks_before(tmp_path, monkeypatch):
             ValueError,
             r"num_steps cannot be drawn",
         ),
+        ({"design": {"t": [0.0, 1.0]}}, ValueError, r"t is a column, so that t_end is no number of steps"),
         ({"t_end": None}, ValueError, r"of the steps macro_dt is given; give two of"),
         ({"num_micro": None}, ValueError, r"num_micro is missing for the scheme 'explicit-slow'"),
         ({"scheme": vm.fully_implicit(2)}, ValueError, r"has its num_micro already"),

@@ -25,15 +25,12 @@ def client():
 def test_convergence_study(client):
     schemes = {"implicit": vm.fully_implicit(2), "explicit": vm.explicit_slow(2)}
     study = partial(convergence_study, two_oscillators(), schemes, [0.02, 0.01], 0.2, num_saves=2)
-    here, there = study(), study(executor=client)
-    assert here.rows == there.rows
-    params = {"soft": {"kappa": 20.0, "omega": 50.0}, "stiff": {"kappa": 20.0, "omega": 80.0}}
-    assert study(params=params).rows == study(params=params, executor=client).rows
+    assert study().rows == study(executor=client).rows
 
 
 def test_stability_map(client):
     schemes = {n: vm.explicit_slow(n) for n in (2, 5)}
-    grid = np.linspace(0.1, 4.0, 40) * np.pi
+    grid = np.linspace(0.5, 2.0, 12) * np.pi
     problem = two_oscillators()
     here, there = (stability_map(problem, schemes, grid, executor=executor) for executor in (None, client))
     assert np.allclose(here.radius, there.radius, rtol=0, atol=1e-12)
@@ -52,7 +49,7 @@ def test_work_precision(client):
 
 
 def test_fuzzing(client, tmp_path):
-    here = fuzz.fuzz(6, 1, tmp_path / "here.jsonl", 300.0)
-    there = fuzz.fuzz(6, 1, tmp_path / "there.jsonl", 300.0, executor=client)
+    here = fuzz.fuzz(2, 1, tmp_path / "here.jsonl", 300.0)
+    there = fuzz.fuzz(2, 1, tmp_path / "there.jsonl", 300.0, executor=client)
     assert here == there
     assert not fuzz.wrong(there)

@@ -159,7 +159,8 @@ def ensemble(
         chunk: runs of a chunk; None for about a second's work. The store keeps it.
         executor: where chunks are computed: None for this process; a `dask.distributed.Client`, of a cluster of any kind; or a
             `concurrent.futures.Executor` that spawns processes.
-        processes: or so many workers on this machine, started by Dask (needs the extra ``vmri_jax[ensemble]``).
+        processes: or so many workers on this machine, started by Dask (needs the extra ``vmri_jax[ensemble]``). They import the
+            program that starts them, which therefore begins with ``if __name__ == "__main__":``.
         resume: go on with the ensemble that is in `out`, which must be the same; start it if there is none.
         overwrite: replace an ensemble that is in `out`.
         throw: raise `EnsembleError` at the end if chunks could not be computed.

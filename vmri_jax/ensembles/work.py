@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -208,7 +208,7 @@ class Work:
 
     @cached_property
     def _kept(self) -> Callable[[Trajectory], dict[str, Any]]:
-        return of_lanes(self.quantities)
+        return _kept_of(self.save, tuple(self.sources.items()))
 
     def _scheme(self, values: Mapping[str, Any]) -> Scheme | Composition:
         label = str(values.get("scheme", next(iter(self.schemes))))
@@ -248,6 +248,8 @@ class Work:
                 f"ensemble: of the steps {', '.join(sorted(known)) or 'nothing'} is given; give two of t_end, num_steps and one of "
                 "macro_dt and micro_dt, as arguments or columns."
             )
+        if "t" in self.columns and "t_end" in known:
+            raise ValueError("ensemble: t is a column, so that t_end is no number of steps; give num_steps and a step.")
         if "num_steps" in given:
             given["num_steps"] = _whole("num_steps", given["num_steps"])
         start = float(self.problem.t)
@@ -280,6 +282,12 @@ def _states(system: System, params, start: tuple, project: bool) -> State:
         return initial_state(lane, q_s, q_f, v_s, v_f, t, project=project)
 
     return jax.vmap(of_one, (None if params is None else 0, 0))(params, start)
+
+
+@lru_cache(maxsize=8)
+def _kept_of(save: tuple[str, ...], sources: tuple) -> Callable[[Trajectory], dict[str, Any]]:
+    """What is kept, compiled once for all ensembles of a process that keep the same, by functions of the same files."""
+    return of_lanes([quantity(name) for name in save])
 
 
 def _whole(name: str, value) -> int:
