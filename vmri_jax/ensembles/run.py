@@ -279,7 +279,7 @@ def _why(error: Exception, found: Ensemble) -> str:
         ) from error
     if isinstance(error, NotAWorker):
         raise error
-    if isinstance(error, BrokenExecutor):
+    if isinstance(error, BrokenExecutor | CancelledError):
         raise _gone(found) from error
     return f"{type(error).__name__}: {error}".rstrip(".") + "."
 
