@@ -1,7 +1,6 @@
 """A task: one chunk of runs, computed and written to its part of the store. It needs the store and some bytes, nothing else."""
 
 import pickle
-import time
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -47,17 +46,10 @@ class Job(NamedTuple):
 
 
 class Done(NamedTuple):
-    """What a task says when its chunk is written.
+    """What a task says when its chunk is written: its runs, and those of them that failed."""
 
-    lanes, failed: runs of the chunk, and those of them that failed.
-    seconds: of the whole task; computing: of these, those that it took to compute the runs.
-    """
-
-    number: int
     lanes: int
     failed: int
-    seconds: float
-    computing: float
 
 
 def job_of(path: Path, chunks: Chunks, work: Work, design: Design) -> Job:
@@ -67,15 +59,11 @@ def job_of(path: Path, chunks: Chunks, work: Work, design: Design) -> Job:
 
 def run_chunk(job: Job, number: int) -> Done:
     """Compute a chunk and write it."""
-    begin = time.perf_counter()
     first, last = job.chunks.ends(number)
     writer = _writer(job.path, job.chunks.size, made(Path(job.path)))
     rows = writer.columns(first, last) if job.design is None else job.design.rows(first, last)
-    start = time.perf_counter()
     values = job.work.compute(rows, last - first, job.chunks.width)
-    computing = time.perf_counter() - start
-    failed = writer.write(number, values)
-    return Done(number, last - first, failed, time.perf_counter() - begin, computing)
+    return Done(last - first, writer.write(number, values))
 
 
 def run_packed_chunk(packed: bytes, number: int) -> Done:
