@@ -14,13 +14,13 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.batch import lanes_at_once
 from vmri_jax.running.simulate import Simulation
-from vmri_jax.running.store.identity import describe, differences, environment, identity
+from vmri_jax.running.store.identity import changed_conditions, describe, differences, environment, identity
 from vmri_jax.steppers.results import Result
 
 SECONDS = 1.0
 """A chunk takes about so long, longer where there would be more than"""
 MOST_CHUNKS = 20_000
-"""of them: a scheduler hands out a thousand in a second, and each has its files. It"""
+"""of them: a scheduler hands out some hundreds in a second, and each has its files. It"""
 MOST_BYTES = 2**26
 """fits into so much memory,"""
 PARTS = 64
@@ -181,7 +181,7 @@ def check_same(path: Path, attributes: dict, there: dict, chunk: int | None) -> 
             f"{path} holds another ensemble and cannot go on with this one. What differs: {'; '.join(found)}. Give the arguments it "
             "was started with, or another name."
         )
-    changed = [f"{name} {value} ({made.get(name)} then)" for name, value in now.items() if value != made.get(name)]
+    changed = changed_conditions(now, made)
     if changed:
         warnings.warn(
             f"{path} was started under other conditions; the last digits of its runs may differ. Now: {', '.join(changed)}.",

@@ -35,7 +35,6 @@ class Quantity(NamedTuple):
 
     function: Callable[[Trajectory], dict[str, Kept]]
     over_nodes: bool
-    title: str
 
 
 def _end(run: Trajectory) -> dict[str, Kept]:
@@ -97,14 +96,14 @@ def _quantiles(run: Trajectory) -> dict[str, Kept]:
 
 
 QUANTITIES = {
-    "end": Quantity(_end, False, "positions and momenta at the end"),
-    "nodes": Quantity(_nodes, False, "times, positions, momenta and energy at all saved nodes"),
-    "energy_error": Quantity(_energy_error, True, "largest change of the energy since the start"),
-    "energy_drift": Quantity(_energy_drift, True, "change over the run of a line fitted to the energy"),
-    "constraint_residual": Quantity(_constraints, True, "largest residual of constraints, positions and velocities"),
-    "iterations": Quantity(_iterations, False, "most Newton iterations of a step"),
-    "extremes": Quantity(_extremes, True, "smallest and largest value of each position"),
-    "quantiles": Quantity(_quantiles, True, f"quantiles {LEVELS} of each position over the run"),
+    "end": Quantity(_end, False),
+    "nodes": Quantity(_nodes, False),
+    "energy_error": Quantity(_energy_error, True),
+    "energy_drift": Quantity(_energy_drift, True),
+    "constraint_residual": Quantity(_constraints, True),
+    "iterations": Quantity(_iterations, False),
+    "extremes": Quantity(_extremes, True),
+    "quantiles": Quantity(_quantiles, True),
 }
 
 
@@ -136,7 +135,7 @@ def quantity(name: str) -> Quantity:
         about = (getattr(own, "__doc__", None) or "").strip().partition("\n")[0]
         return {key: _own(key, jnp.asarray(value), about) for key, value in arrays.items()}
 
-    return Quantity(function, False, label)
+    return Quantity(function, False)
 
 
 def _own(name: str, value, about: str) -> Kept:

@@ -45,7 +45,7 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
     if attributes["design"]["kind"] == "Product":
         data = _on_axes(data, about, xarray)
     else:
-        columns = _drawn(path, attributes) if attributes["design"]["kind"] == "Draws" else _table(path, xarray)
+        columns = _drawn(attributes) if attributes["design"]["kind"] == "Draws" else _table(path, xarray)
         data = data.assign_coords(
             {name: ((LANE, *(f"{name}_{i}" for i in range(array.ndim - 1))), array) for name, array in columns.items()}
         )
@@ -82,11 +82,11 @@ def _on_axes(data, about: dict[str, dict], xarray):
     return xarray.Dataset(arrays, coords=axes)
 
 
-def _drawn(path: Path, attributes: dict[str, Any]):
+def _drawn(attributes: dict[str, Any]):
     """Columns of random rows, each made when it is needed."""
     import dask.array
 
-    design = drawn(attributes)
+    design = _design_of(attributes)
     chunk, lanes = attributes["chunk"], attributes["lanes"]
     sizes = (*[chunk] * (lanes // chunk), *([lanes % chunk] if lanes % chunk else []))
 
@@ -100,7 +100,7 @@ def _drawn(path: Path, attributes: dict[str, Any]):
     return {name: of(name) for name in design.columns}
 
 
-def drawn(attributes: dict[str, Any]) -> Draws:
+def _design_of(attributes: dict[str, Any]) -> Draws:
     """The random design of a store."""
     about = attributes["design"]
     columns = {}

@@ -44,6 +44,11 @@ def differences(here: dict[str, str], there: dict[str, str], same_jax: bool) -> 
     return [f"{name}: {here.get(name, 'none')} here, {there.get(name, 'none')} in the store" for name in names]
 
 
+def changed_conditions(here: dict[str, str], there: dict[str, str]) -> list[str]:
+    """What of two environments differs, in words."""
+    return [f"{name} {value} ({there.get(name)} then)" for name, value in here.items() if value != there.get(name)]
+
+
 def describe(name: str, value) -> dict[str, str]:
     """Everything in a value in words, by the name of its place."""
     if dataclasses.is_dataclass(value) and not isinstance(value, TracedOnce):

@@ -17,7 +17,7 @@ from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, progress_shown, silent
 from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.store import layout
-from vmri_jax.running.store.identity import differences, environment, identity
+from vmri_jax.running.store.identity import changed_conditions, differences, environment, identity
 from vmri_jax.running.store.layout import Record
 from vmri_jax.running.store.stored import StoredTrajectory
 from vmri_jax.schemes.composition import Composition
@@ -182,7 +182,7 @@ def _check_same_run(stored: StoredTrajectory, attributes: dict[str, Any], chunk:
             f"{stored.path} holds another run and cannot go on with this one. What differs: {'; '.join(found)}. Give the "
             "arguments it was started with, or another name."
         )
-    changed = [f"{name} {value} ({there.get(name)} then)" for name, value in here.items() if value != there.get(name)]
+    changed = changed_conditions(here, there)
     if changed and not stored.complete:
         warnings.warn(
             f"{stored.path} was started under other conditions; its last digits may differ from those of an uninterrupted "
