@@ -14,6 +14,7 @@ from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.loops import PLAIN, SHORT, Loops, Recursive, Stored
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
@@ -47,15 +48,29 @@ class Engine:
         return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)))
 
     @cached_property
-    def whole_of_known_length(self):
-        """The same as a `Trajectory`, with `save_every` static: loops of known length have derivatives in reverse mode."""
-        return jax.jit(self.trajectory, static_argnums=3)
+    def stored(self):
+        """``stored(leaves, state, macro_dt, save_every)``: `trajectory` with `save_every` static, to be differentiated in any mode."""
+
+        def stored(leaves, state, macro_dt, save_every):
+            return self.trajectory(leaves, state, macro_dt, save_every, loops=Stored())
+
+        return jax.jit(stored, static_argnums=3)
+
+    @cached_property
+    def checkpointed(self):
+        """The same with derivatives in reverse mode only, that need memory like the logarithm of the number of steps."""
+
+        def checkpointed(leaves, state, macro_dt, save_every):
+            loops = Stored() if self.num_saves * save_every <= SHORT else Recursive(save_every)
+            return self.trajectory(leaves, state, macro_dt, save_every, loops=loops, once=True)
+
+        return jax.jit(checkpointed, static_argnums=3)
 
     @cached_property
     def start(self):
         """``start(leaves, state, macro_dt)``: what the stepper takes along into the first step."""
         return jax.jit(
-            lambda leaves, state, macro_dt: self._stepper(leaves, State(*state)).init(State(*state), macro_dt)
+            lambda leaves, state, macro_dt: self.stepper(leaves, State(*state)).init(State(*state), macro_dt)
         )
 
     @cached_property
@@ -66,24 +81,33 @@ class Engine:
         """
 
         def onwards(leaves, state, own, t_start, macro_dt, step, save_every, saves):
-            stepper = self._stepper(leaves, State(*state))
+            stepper = self.stepper(leaves, State(*state))
             piece, *end = self._run(stepper, State(*state), own, t_start, macro_dt, step, save_every, saves)
             return jax.tree.leaves(piece), *end
 
         return jax.jit(onwards)
 
-    def trajectory(self, leaves, state, macro_dt, save_every, saves=None) -> Trajectory:
-        """A run from its first step, not compiled; of all saved intervals, or of the first `saves` of them."""
+    def trajectory(
+        self, leaves, state, macro_dt, save_every, saves=None, loops: Loops = PLAIN, once: bool = False
+    ) -> Trajectory:
+        """A run from its first step, not compiled; of all saved intervals, or of the first `saves` of them.
+
+        Args:
+            once: as of `plan`.
+        """
         start = State(*state)
-        stepper = self._stepper(leaves, start)
+        stepper = self.stepper(leaves, start, once)
         own = stepper.init(start, macro_dt)
-        return self._run(stepper, start, own, start.t, macro_dt, 0, save_every, saves)[0]
+        return self._run(stepper, start, own, start.t, macro_dt, 0, save_every, saves, loops)[0]
 
-    def _stepper(self, leaves, state: State) -> Plan:
+    def stepper(self, leaves, state: State, once: bool = False) -> Plan:
+        """How its steps are taken."""
         newton, scheme, system = jax.tree.unflatten(self.structure, leaves)
-        return plan(system, scheme, state, newton, fallback=self.falls_back)
+        return plan(system, scheme, state, newton, fallback=self.falls_back, once=once)
 
-    def _run(self, stepper: Plan, state: State, own, t_start, macro_dt, step, save_every, saves=None):
+    def _run(
+        self, stepper: Plan, state: State, own, t_start, macro_dt, step, save_every, saves=None, loops: Loops = PLAIN
+    ):
         """`num_saves * save_every` macro steps from step number `step`, or `saves * save_every` of them."""
         system, tolerance, num_micro = stepper.system, stepper.newton.tolerance, stepper.scheme.num_micro
         no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
@@ -91,22 +115,32 @@ class Engine:
         take = _step_of(stepper, t_start, macro_dt, self.save_micro)
 
         def interval(at: _At):
-            at, worst, micro = jax.lax.fori_loop(0, save_every, take, (at, no_info, no_micro))
+            at, worst, micro = loops.repeat(save_every, take, (at, no_info, no_micro))
             if stepper.projects_rarely:
                 state, own = stepper.project(at.state, at.own)
                 at = at._replace(state=state, own=own)
             return at, worst, micro
 
-        def save(at: _At, moves):  # one place for the first node and all others: compiled once
-            at, worst, micro = jax.lax.cond(moves, interval, lambda at: (at, no_info, no_micro), at)
+        def save(at: _At, moves):
+            at, worst, micro = (
+                interval(at) if moves is None else jax.lax.cond(moves, interval, lambda at: (at, *none), at)
+            )
             node, at = _node(system, tolerance, at)
             return at, (node, worst, micro)
 
-        at = _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
-        number = np.arange(self.num_saves + 1)
-        moves = number > 0 if saves is None else (number > 0) & (number <= saves)
-        at, (nodes, *between) = jax.lax.scan(save, at, moves)
-        worst, micro = jax.tree.map(lambda a: a[1:], between)
+        at, none = (
+            _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1)),
+            (no_info, no_micro),
+        )
+        if loops is PLAIN:  # one place for the first node and all others: compiled once
+            number = np.arange(self.num_saves + 1)
+            moves = number > 0 if saves is None else (number > 0) & (number <= saves)
+            at, (nodes, *between) = jax.lax.scan(save, at, moves)
+            worst, micro = jax.tree.map(lambda a: a[1:], between)
+        else:  # derivatives of that would take twice as long to compile
+            first, at = _node(system, tolerance, at)
+            at, (nodes, worst, micro) = loops.scan(save, at, self.num_saves)
+            nodes = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, nodes)
         t_micro = None if micro is None else nodes[0][1:, None] - macro_dt * (1 - stepper.scheme.micro_times)
         status = {"result": at.result, "failed_at": at.failed_at}
         trajectory = Trajectory(*nodes, info=worst, **status, t_micro=t_micro, q_f_micro=micro)

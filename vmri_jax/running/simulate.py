@@ -17,6 +17,7 @@ from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.adjoints import check_adjoint
 from vmri_jax.running.arguments import NOTHING_FAST, check_run, check_vectors
 from vmri_jax.running.engine import Engine, engine, room_for
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
@@ -49,6 +50,7 @@ def simulate(
     newton: Newton | None = None,
     throw: bool = True,
     progress: bool = False,
+    adjoint: str = "auto",
 ) -> Trajectory:
     """Simulate `num_steps` macro steps, or up to `t_end`, and save every `save_every`-th macro node.
 
@@ -71,6 +73,10 @@ def simulate(
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN from the failure on.
         progress: show a progress bar; the run is then compiled for a part of its saved nodes.
+        adjoint: how the run is differentiated, see `vmri_jax.running.adjoints`: "stored" keeps the solution of every step, and
+            has all modes and orders of derivatives; "checkpoint" and "reversible" have first ones in reverse mode, with memory
+            for some thousand steps or for the saved nodes alone; "forward" turns forward mode around, for few parameters. "auto"
+            is "stored" up to 10 000 steps, then "reversible" for symmetric schemes without forces, else "checkpoint".
 
     Returns:
         The `Trajectory`, with ``num_steps / save_every + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
@@ -82,9 +88,10 @@ def simulate(
         Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
     """
     check_flags(throw=throw, progress=progress)
+    check_adjoint(adjoint, scheme)
     run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     if not run.is_concrete:
-        return run.traced()
+        return run.traced(adjoint)
     run.check()
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     trajectory = run.in_parts() if progress else run()
@@ -286,10 +293,10 @@ class Simulation:
         numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.leaves)
         _check_once(_Known((self.structure, shapes, numbers), self.system, self.state, what, constraints))
 
-    def traced(self) -> Trajectory:
+    def traced(self, adjoint: str = "auto") -> Trajectory:
         """The whole run under transformations of JAX."""
         check_system(self.system, self.state.q_s, self.state.q_f)
-        return traced_run(self)
+        return traced_run(self, adjoint)
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """Before the first step; or from a state before step number `step`, as if that was the first one."""

@@ -44,10 +44,11 @@ from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 @dataclass(frozen=True)
 class _Choice:
-    """How implicit equations are solved, and whether the first choice may give way to another one."""
+    """How implicit equations are solved, whether the first choice may give way to another one, and how often it is differentiated."""
 
     newton: Newton
     falls_back: bool
+    once: bool
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,7 @@ def plan(
     newton: Newton | None = None,
     *,
     fallback: bool = True,
+    once: bool = False,
 ) -> Plan:
     """How macro steps of a system under a scheme are taken; ``print`` shows it in words.
 
@@ -114,13 +116,14 @@ def plan(
         state: any state of the system; only the shapes of its arrays matter.
         newton: how implicit equations are solved.
         fallback: whether a first choice that does not converge gives way to another one, which takes long to compile.
+        once: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:
         ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
     """
     system, state = start_of("plan", system, state)
     newton = newton or Newton()
-    choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None)
+    choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None, once)
     stepper: Stepper = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
     rarely = _projects_rarely(stepper)
     if not rarely and (system.is_constrained or not system.has_constant_mass):
@@ -178,14 +181,14 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
         linear_solver = newton.method if newton.method in ("dense", "null_space") else "arrowhead"
         n_g, n_gs = system.num_constraints(q_s, q_f)
         sizes = q_s.size, n_gs, q_f.size, n_g, scheme.degree
-        return Solved(system, scheme, Coupled(newton, linear_solver, sizes), rows)
+        return Solved(system, scheme, Coupled(newton, linear_solver, sizes), rows, choice.once)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
     solver = _first_choice(system, scheme, newton, interval, rows, q_s, q_f)
     if choice.falls_back:
         solver = Fallback(solver, Coupled(newton, "arrowhead"))
-    return Solved(system, scheme, solver, rows)
+    return Solved(system, scheme, solver, rows, choice.once)
 
 
 def _first_choice(

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from vmri_jax.kernels import Sparsity, max_abs
@@ -18,9 +19,12 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns, physical_multipliers
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
-from vmri_jax.steppers.newton.implicit import differentiable
+from vmri_jax.steppers.newton.implicit import differentiable, differentiable_once
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
+
+ROOT = "root"
+"""Name of the solution of a step for `jax.checkpoint`: with it, derivatives need not solve the step again."""
 
 
 class Solution(NamedTuple):
@@ -81,12 +85,14 @@ class Solved(Stepper):
     The derivative is that of the root, ``dx = -(dR/dx)^-1 dR``, so that iterations are never differentiated.
 
     sparsity: of ``G M^-1 G^T`` with all constraints.
+    once: differentiable in reverse mode only, once, in half the time.
     """
 
     system: System
     scheme: Scheme
     solver: Solver
     sparsity: Sparsity
+    once: bool = False
 
     def init(self, state: State, macro_dt) -> SolvedState:
         if self.system.has_constant_mass:
@@ -109,7 +115,9 @@ class Solved(Stepper):
             v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)  # with the kicks
         guess = equations.guess(v_s, v_f, own.multiplier, own.slow_multiplier)
         found, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, own.solver)))
-        x, (q_f, p_s, p_f) = differentiable(equations, found.x, found.end)
+        root = checkpoint_name((found.x, found.end), ROOT)
+        derivative = differentiable_once if self.once else differentiable
+        x, (q_f, p_s, p_f) = derivative(equations, *root)
 
         lambdas = physical_multipliers(self.scheme, macro_dt, x.multiplier, x.slow_multiplier)
         q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])

@@ -1,15 +1,32 @@
-"""Derivative of the solution of a step: that of a root, never of the iterations that found it."""
+"""Derivative of the solution of a step: that of a root, never of the iterations that found it.
+
+The unknowns x of a step solve ``R(e, x) = 0``, where e are the equations with all that they depend on: the state at the start,
+the step, the parameters. So ``dx = -(dR/dx)^-1 (dR/de) de``, with one matrix in both modes.
+"""
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
+from vmri_jax import kernels
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.newton import arrowhead
+from vmri_jax.steppers.newton.null_space import inverse_with_multipliers
+
+SECOND = (
+    "the adjoint of this run has first derivatives in reverse mode only. For second derivatives and forward mode take "
+    "vmri_jax.simulate(..., adjoint='stored')."
+)
 
 
-def _direction(equations: StepEquations, x: Unknowns, residual: Unknowns) -> Unknowns:
-    """``-(dR/dx)^-1 residual`` with the matrix at x."""
-    return arrowhead.solve(arrowhead.factor(equations, x), residual)
+def _direction(equations: StepEquations, x: Unknowns):
+    """``residual -> -(dR/dx)^-1 residual`` with the matrix at x, itself without derivative."""
+    elementwise = equations.scheme.degree == 1  # nearly symmetric blocks need no pivots
+    inverted = kernels.inverse if elementwise else jnp.linalg.inv
+    factors = arrowhead.factor(equations, x, partial(inverse_with_multipliers, inverted=inverted))
+    factors = jax.lax.stop_gradient(factors)
+    return lambda residual: arrowhead.solve(factors, residual)
 
 
 def _end(equations: StepEquations, x: Unknowns):
@@ -19,17 +36,62 @@ def _end(equations: StepEquations, x: Unknowns):
 
 @jax.custom_jvp
 def differentiable(equations: StepEquations, x: Unknowns, end):
-    """x and end unchanged, with the derivative of the root: ``dx = -(dR/dx)^-1 (dR/dequations) dequations``."""
+    """x and end unchanged, with the derivative of the root; in both modes, twice."""
     return x, end
 
 
 @differentiable.defjvp
 def _implicit_derivative(primals, tangents):
     equations, root, _ = primals
-    # One more Newton step moves nothing, but makes the root depend on the equations, for second derivatives. To call
+    direction = _direction(equations, root)
+    # For second derivatives: one more Newton step moves nothing, but makes the root depend on the equations; and one more
+    # correction of dx changes nothing, but makes it depend on the matrix at x, so that one set of factors does for all. To call
     # `differentiable` again would not do: in reverse mode JAX forgets the rules of what it has evaluated already.
-    x = jax.tree.map(jnp.add, root, _direction(equations, root, equations.residual(root)))
+    x = jax.tree.map(jnp.add, root, direction(equations.residual(root)))
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
-    dx = _direction(equations, x, change)
+    dx = direction(change)
+    _, cancels = jax.jvp(equations.residual, (x,), (dx,))
+    dx = jax.tree.map(jnp.add, dx, direction(jax.tree.map(jnp.add, cancels, change)))
     end, d_end = jax.jvp(_end, (equations, x), (tangents[0], dx))
     return (x, end), (dx, d_end)
+
+
+@jax.custom_vjp
+def differentiable_once(equations: StepEquations, x: Unknowns, end):
+    """The same in reverse mode only, once: half the work. Another derivative is refused."""
+    return x, end
+
+
+def _kept(equations, x, end):
+    return (x, end), (equations, x)
+
+
+def _pulled_back(kept, cotangents):
+    equations, x = only_once(kept)
+    d_x, d_end = cotangents
+    _, pull = jax.vjp(_end, equations, x)
+    by_end, more = pull(d_end)
+    d_x = jax.tree.map(jnp.add, d_x, more)
+    (d_residual,) = jax.linear_transpose(_direction(equations, x), x)(d_x)
+    _, pull = jax.vjp(lambda e: e.residual(x), equations)
+    (by_residual,) = pull(d_residual)
+    return jax.tree.map(_sum, by_end, by_residual), *jax.tree.map(jnp.zeros_like, (x, d_end))
+
+
+def _sum(a, b):
+    """Of cotangents; those of integers are nothing."""
+    return a if a.dtype == jax.dtypes.float0 else a + b
+
+
+differentiable_once.defvjp(_kept, _pulled_back)
+
+
+@jax.custom_jvp
+def only_once(tree):
+    """The tree unchanged; its derivative is refused."""
+    return tree
+
+
+@only_once.defjvp
+def _refused(primals, tangents):
+    raise TypeError(SECOND)

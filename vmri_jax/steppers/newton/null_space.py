@@ -21,6 +21,7 @@ part I, Comput. Methods Appl. Mech. Engng 194 (2005); S. Leyendecker, J. E. Mars
 constrained dynamical systems, ZAMM 88 (2008).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -69,10 +70,14 @@ def inverse(a, g_0, g_1):
     return jnp.concatenate([top, bottom], axis=-2)
 
 
-def inverse_with_multipliers(a, g_0, g_1):
-    """The same by elimination with the multipliers among the unknowns, kept regular where constraints become dependent."""
+def inverse_with_multipliers(a, g_0, g_1, inverted: Callable = jnp.linalg.inv):
+    """The same by elimination with the multipliers among the unknowns, kept regular where constraints become dependent.
+
+    Args:
+        inverted: inverts the matrices.
+    """
     down, across = (_block_diagonal(g) for g in (g_1, g_0))
-    return jnp.linalg.inv(saddle(a, -jnp.swapaxes(across, -1, -2), down))
+    return inverted(saddle(a, -jnp.swapaxes(across, -1, -2), down))
 
 
 def _block_diagonal(blocks):

@@ -1,0 +1,192 @@
+"""Adjoints of runs against each other: the same derivatives, less memory, and what they refuse."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.support import PROBLEMS
+from tests.user_systems import cart
+from vmri_jax.running import adjoints, engine, loops
+
+CHAIN = vm.systems.fermi_pasta_ulam(1)
+SYMMETRIC = vm.fully_explicit(2)
+UNSYMMETRIC = replace(SYMMETRIC, fast=vm.micro(vm.quadrature.left))
+LONG = ("fpu", "tsp", "composed")
+OTHERS = ("checkpoint", "reversible", "forward")
+CASES = {  # problem, scheme, macro_dt, steps
+    "fpu": (PROBLEMS["fpu"], vm.fully_implicit(4), 0.02, 40),
+    "tsp": (PROBLEMS["tsp"], vm.fully_implicit(3), 0.01, 40),
+    "cart": (cart, vm.fully_explicit(2), 0.05, 40),
+    "composed": (cart, vm.compose(vm.fully_explicit(2), "suzuki4"), 0.05, 12),
+}
+
+
+def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, newton=None, **options):
+    """A function of everything a run depends on and tells, ``cost(params, p_s, p_f, macro_dt)``, and where to take it."""
+    state, system = problem.state(), problem.system
+
+    def cost(params, p_s, p_f, macro_dt):
+        start = vm.State(state.t, state.q_s, state.q_f, p_s, p_f)
+        run = vm.simulate(
+            system.replace(params=params),
+            scheme,
+            start,
+            macro_dt=macro_dt,
+            num_steps=steps,
+            save_every=save_every,
+            newton=newton,
+            **options,
+        )
+        inside = jnp.sum(jnp.sin(run.q_f_micro)) + jnp.sum(run.t_micro) if options.get("save_micro") else 0.0
+        ends = jnp.sum(jnp.cos(run.q_f[1:])) + jnp.sum(run.q_s[-1] ** 2) + jnp.sum(run.p_s[1] ** 2) + jnp.sum(run.t)
+        return ends + jnp.mean(run.energy) + inside
+
+    return cost, (jax.tree.map(jnp.asarray, system.params), state.p_s, state.p_f, jnp.asarray(macro_dt))
+
+
+@cache
+def gradient(case: str, save_every: int, adjoint: str, save_micro: bool = False):
+    make, scheme, macro_dt, steps = CASES[case]
+    newton = vm.Newton("nested") if case != "composed" else None
+    cost, at = cost_of(make(), scheme, macro_dt, steps, save_every, newton, adjoint=adjoint, save_micro=save_micro)
+    found = jax.jit(jax.grad(cost, argnums=(0, 1, 2, 3)))(*at)
+    return np.concatenate([np.ravel(a) for a in jax.tree.leaves(found)])
+
+
+def assert_agree(found, expected, tolerance=1e-10):
+    """Measured: 1e-14 to 1e-12."""
+    assert np.max(np.abs(found - expected)) <= tolerance * np.max(np.abs(expected))
+
+
+@pytest.mark.parametrize("adjoint", OTHERS)
+@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.full if c in LONG else ()) for c in CASES])
+def test_all_adjoints_agree(case, adjoint):
+    assert_agree(gradient(case, 4, adjoint), gradient(case, 4, "stored"))
+
+
+@pytest.mark.parametrize("adjoint", OTHERS)
+def test_they_agree_on_micro_nodes(adjoint):
+    assert_agree(gradient("cart", 5, adjoint, True), gradient("cart", 5, "stored", True))
+
+
+def test_every_node_saved_needs_no_step_back():
+    assert_agree(gradient("cart", 1, "reversible"), gradient("cart", 1, "stored"))
+
+
+@pytest.mark.parametrize(("save_every", "width"), [(1, 3), (40, 40), (40, 3), (5, 3)])
+def test_levels_of_checkpoints(monkeypatch, save_every, width):
+    monkeypatch.setattr(loops, "WIDTH", width)
+    monkeypatch.setattr(engine, "SHORT", 1)
+    scheme = vm.fully_implicit(2)
+    cost, at = cost_of(
+        CHAIN, scheme, 0.05, 40, save_every, vm.Newton("nested", tolerance=1e-13 / width), adjoint="checkpoint"
+    )
+    other, _ = cost_of(CHAIN, scheme, 0.05, 40, save_every, vm.Newton("nested"), adjoint="stored")
+    found, expected = (jax.tree.leaves(jax.jit(jax.grad(f, argnums=(0, 2)))(*at)) for f in (cost, other))
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-13)
+
+
+def memory(adjoint: str, steps: int, save_every: int) -> float:
+    """Bytes that the program of a gradient needs besides what goes in and out."""
+    cost, at = cost_of(CHAIN, vm.fully_implicit(2), 0.02, steps, save_every, vm.Newton("nested"), adjoint=adjoint)
+    analysis = jax.jit(jax.grad(cost)).lower(*at).compile().memory_analysis()
+    assert analysis is not None
+    return analysis.temp_size_in_bytes
+
+
+def test_memory_of_long_gradients():
+    """From 10^3 to 10^6 steps: measured 1.0 for reversible steps, 1.9 for three levels of checkpoints."""
+    reversible = [memory("reversible", steps, steps // 10) for steps in (1000, 1_000_000)]
+    assert reversible[1] < 1.2 * reversible[0]
+    checkpoint = [memory("checkpoint", steps, steps) for steps in (1000, 1_000_000)]
+    assert checkpoint[1] < 4 * checkpoint[0]
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("adjoint", ["checkpoint", "reversible"])
+def test_where_the_march_fails_the_arrowhead_is_differentiated(adjoint):
+    """With steps that the nested march does not solve."""
+    problem = PROBLEMS["tsp"]()
+    found = {}
+    for name in ("stored", adjoint):
+        cost, at = cost_of(problem, vm.fully_implicit(1), 0.3, 4, 2, adjoint=name)
+        found[name] = jax.jit(jax.grad(cost))(*at)
+    run = vm.simulate(problem, vm.fully_implicit(1), macro_dt=0.3, num_steps=4)
+    assert max(run.info.method) == vm.Method.ARROWHEAD
+    for a, b in zip(*map(jax.tree.leaves, found.values()), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+
+
+def simple_cost(adjoint, steps=6):
+    """Of a small system without constraints, a function of the momenta at the start alone."""
+    cost, at = cost_of(CHAIN, vm.fully_implicit(2), 0.05, steps, steps, vm.Newton("nested"), adjoint=adjoint)
+    return (lambda p_f: cost(at[0], at[1], p_f, at[3])), at[2]
+
+
+def test_lanes_of_gradients():
+    for adjoint in ("checkpoint", "reversible"):
+        cost, at = simple_cost(adjoint)
+        starts = jnp.stack([at, 1.1 * at])
+        lanes = jax.vmap(jax.grad(cost))(starts)
+        np.testing.assert_allclose(lanes[1], jax.grad(cost)(starts[1]), rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("adjoint", ["checkpoint", "reversible"])
+@pytest.mark.parametrize("second", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_second_derivatives_are_refused(adjoint, second, compiled):
+    cost, at = simple_cost(adjoint)
+    gradient = jax.grad(cost)
+    with pytest.raises(TypeError, match="stored"):
+        second(jax.jit(gradient) if compiled else gradient)(at)
+
+
+def test_stored_steps_have_second_derivatives():
+    cost, at = simple_cost("stored")
+    hessian = jax.hessian(cost)(at)
+    gradient = jax.grad(cost)
+    h = 1e-5
+    expected = jnp.stack([(gradient(at + h * e) - gradient(at - h * e)) / (2 * h) for e in jnp.eye(at.size)])
+    np.testing.assert_allclose(hessian, expected, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(jax.jacrev(gradient)(at), hessian, rtol=1e-9, atol=1e-11)
+
+
+def test_what_auto_chooses(monkeypatch):
+    choose = partial(adjoints.chosen, "auto")
+    assert choose(vm.fully_implicit(2), adjoints.SHORT, False) == "stored"
+    assert choose(vm.fully_implicit(2), adjoints.SHORT + 1, False) == "reversible"
+    assert choose(vm.fully_implicit(2), adjoints.SHORT + 1, True) == "checkpoint"
+    assert choose(UNSYMMETRIC, adjoints.SHORT + 1, False) == "checkpoint"
+    monkeypatch.setattr(adjoints, "SHORT", 5)
+    cost, at = simple_cost("auto")
+    with pytest.warns(UserWarning, match="6 steps are taken by adjoint='reversible'"):
+        found = jax.grad(cost)(at)
+    np.testing.assert_allclose(found, jax.grad(simple_cost("stored")[0])(at), rtol=1e-11, atol=1e-12)
+
+
+def test_bad_adjoints():
+    with pytest.raises(ValueError, match="adjoint is 'revers'; it must be one of 'auto', 'stored'"):
+        vm.simulate(cart(), vm.fully_explicit(2), macro_dt=0.1, num_steps=1, adjoint="revers")
+    with pytest.raises(ValueError, match="needs a symmetric scheme"):
+        vm.simulate(cart(), UNSYMMETRIC, macro_dt=0.1, num_steps=1, adjoint="reversible")
+
+
+def test_a_gap_is_said(monkeypatch):
+    monkeypatch.setattr(adjoints, "GAP", 0.0)
+    cost, at = simple_cost("reversible", steps=7)
+    gradient = jax.jit(jax.grad(cost))
+    with pytest.warns(UserWarning, match="missed the one before by"):
+        jax.block_until_ready(gradient(at))
+
+
+def test_forward_by_many_numbers_is_said(monkeypatch):
+    monkeypatch.setattr(adjoints, "MANY", 0)
+    cost, at = simple_cost("forward", steps=5)
+    with pytest.warns(UserWarning, match=f"each of the {at.size} numbers"):
+        jax.grad(cost)(at)
