@@ -5,11 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-import pytest
-
 import vmri_jax as vm
 
 TEXT = (Path(__file__).parent.parent / "README.md").read_text()
@@ -46,25 +41,3 @@ def test_many_runs(tmp_path):
     assert done.returncode == 0, done.stderr
     assert f"It prints `{done.stdout.strip()}`." in TEXT, done.stdout
     assert (tmp_path / "runs.png").stat().st_size > 10_000
-
-
-@pytest.mark.full
-def test_a_gradient_over_many_steps_in_little_memory(fpu):
-    recipe = next(program for program in PROGRAMS if "jax.checkpoint" in program)
-    scheme = vm.fully_implicit(10)
-    scope = {"jax": jax, "vm": vm, "system": fpu.system, "scheme": scheme}
-    exec(recipe, scope)
-
-    def whole(state):
-        return vm.simulate(fpu.system, scheme, state, macro_dt=0.01, num_steps=10_000, save_every=10_000).final_state
-
-    found = []
-    for end in (scope["end"], whole):
-        gradient = jax.grad(lambda state, end=end: jnp.sum(end(state).q_f ** 2))
-        program = jax.jit(gradient).lower(fpu.state()).compile()
-        memory = program.memory_analysis()
-        assert memory is not None
-        found.append((memory.temp_size_in_bytes / 1e6, program(fpu.state())))
-    (little, ours), (much, theirs) = found
-    assert (round(little), round(much)) == (2, 195)
-    assert np.allclose(ours.q_f, theirs.q_f, rtol=1e-6)

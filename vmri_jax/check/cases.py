@@ -41,6 +41,8 @@ LONGER, SLOWER = 8, 0.75
 what turns back or settles slows down to less than this part of it."""
 ROUND_OFF_BAND = 1e-9
 """Bands of the energy below this are round-off."""
+SHADOW = 2_000
+"""Steps that the drift meter looks at."""
 ENERGY_CRITERION = (
     "no line explains more than half of the band, or it flattens in a longer run, or the band is below 1e-9"
 )
@@ -94,11 +96,20 @@ class Resolved:
         e = np.asarray(trajectory.energy)
         return Outcome(
             f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per 1e5 steps "
-            f"({change.share:.0%} of the band over the run)",
+            f"({change.share:.0%} of the band over the run){self._shadow()}",
             trajectory.success and not trend,
             {"band": change.band, "drift_per_1e5": change.drift},
             {"t": trajectory.t, "energy error": e - e[0]},
         )
+
+    def _shadow(self) -> str:
+        """What the drift meter sees in the first steps, if it applies and the scheme resolves the motion."""
+        try:
+            start = run(self.problem, self.scheme, self.macro_dt, SHADOW)
+            meter = diagnostics.shadow_energy(self.problem, self.scheme, start)
+        except ValueError:  # forces, constraints that depend on time, a run that failed
+            return ""
+        return f"; first {SHADOW} steps: {meter}"
 
     def _energy(self, steps: int) -> tuple[Trajectory, Energy]:
         trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)

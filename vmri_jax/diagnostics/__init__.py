@@ -2,6 +2,7 @@
 
 from vmri_jax.diagnostics.linear import frequencies, null_space_condition, step_condition, symplectic_defect, tangents
 from vmri_jax.diagnostics.orders import OrderFit, fit_order, observed_order
+from vmri_jax.diagnostics.shadow import ShadowEnergy, shadow_energy
 from vmri_jax.mechanics.invariants import (
     all_constraints,
     constraint_residual,
@@ -16,6 +17,7 @@ from vmri_jax.mechanics.invariants import (
 
 __all__ = [
     "OrderFit",
+    "ShadowEnergy",
     "all_constraints",
     "constraint_residual",
     "energy",
@@ -27,6 +29,7 @@ __all__ = [
     "observed_order",
     "oscillatory_energies",
     "rotation_about",
+    "shadow_energy",
     "step_condition",
     "symplectic_defect",
     "tangents",
