@@ -41,11 +41,14 @@ __version__ = version("vmri_jax")
 
 if TYPE_CHECKING:
     from vmri_jax.ensembles import ensemble, open_ensemble
+    from vmri_jax.fitting import fit
 
 LATER = {
     "plots": ("vmri_jax.plots", None),
     "ensembles": ("vmri_jax.ensembles", None),
     "ensemble": ("vmri_jax.ensembles.run", "ensemble"),
+    "fit": ("vmri_jax.fitting.fit", "fit"),
+    "fitting": ("vmri_jax.fitting", None),
     "open_ensemble": ("vmri_jax.ensembles.reading", "open_ensemble"),
 }
 """Names that are imported when they are asked for: the module, and the name in it. matplotlib and scipy.stats take half a second."""
@@ -89,6 +92,7 @@ __all__ = [
     "discrete_legendre",
     "ensemble",
     "explicit_slow",
+    "fit",
     "fully_explicit",
     "fully_implicit",
     "galerkin",

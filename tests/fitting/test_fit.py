@@ -1,0 +1,209 @@
+"""Identification: parameters are found within their errors, intervals cover, and what cannot work is refused."""
+
+import sys
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import vmri_jax as vm
+from tests.support import PROBLEMS
+from vmri_jax.fitting import Measured, Unknown
+from vmri_jax.fitting.unknowns import Unknowns
+
+CHAIN = vm.systems.fermi_pasta_ulam(1, omega=20.0)
+SCHEME = vm.fully_implicit(2)
+DT = 0.05
+
+
+def measured(steps=60, sigma=1e-3, seed=0, problem=CHAIN, dt=DT):
+    """Noisy positions of a run."""
+    run = vm.simulate(problem, SCHEME, macro_dt=dt, num_steps=steps)
+    q = np.concatenate([run.q_s, run.q_f], axis=1)
+    noise = np.random.default_rng(seed).standard_normal(q.shape)
+    return Measured(run.t, q + sigma * noise, sigma=sigma)
+
+
+def product(parameters):
+    """Only the product of two parameters counts."""
+    omega = parameters["a"] * parameters["b"]
+    return vm.Problem(CHAIN.system.replace(params={"omega": omega}), CHAIN.q_s, CHAIN.q_f, CHAIN.v_s, CHAIN.v_f)
+
+
+def slow_position(state):
+    return state.q_s[0]
+
+
+@pytest.fixture(scope="module")
+def found():
+    return vm.fit(
+        CHAIN, measured(), {"omega": Unknown(19.5, lower=0), "v_s": CHAIN.v_s + 0.05}, scheme=SCHEME, macro_dt=DT
+    )
+
+
+def test_parameters_are_found_within_their_errors(found):
+    truth = {"omega": 20.0, "v_s[0]": float(CHAIN.v_s[0])}
+    assert found.converged
+    assert found.labels == list(truth)
+    for label, (low, high) in found.intervals(0.9999).items():
+        assert low < truth[label] < high
+    assert found.standard_errors["omega"] < 0.01
+    assert 0.01 < found.probability < 0.99
+    assert not found.undetermined
+    assert "chance of worse" in str(found)
+    assert isinstance(vm.plots.plot_fit(found), Figure)
+
+
+def test_the_run_of_a_fit_goes_to_the_last_measurement(found):
+    run = found.simulate()
+    assert run.t[-1] == pytest.approx(60 * DT)
+    misses = np.concatenate([run.q_s, run.q_f], axis=1) - found.shooting.data[0].values
+    np.testing.assert_allclose(misses.ravel() / 1e-3, found.residuals, atol=1e-6)
+
+
+def test_intervals_cover(found):
+    """Of 300 intervals of 95 %, 285 +- 4."""
+    coverage = found.bootstrap(300).coverage()
+    assert all(0.91 < part < 0.98 for part in coverage.values())
+
+
+def test_some_values_of_some_quantities():
+    whole = measured()
+    values = whole.values.copy()
+    values[::3, 0] = np.nan
+    slow = Measured(whole.t[10:30], whole.values[10:30, 0], sigma=1e-3, observe=slow_position)
+    fit = vm.fit(CHAIN, [Measured(whole.t, values, sigma=1e-3), slow], {"omega": 19.8}, scheme=SCHEME, macro_dt=DT)
+    assert len(fit.residuals) == np.isfinite(values).sum() + 20
+    assert fit.values[0] == pytest.approx(20.0, abs=5 * fit.standard_errors["omega"])
+
+
+def test_a_sigma_that_is_not_known_is_estimated():
+    whole = measured(sigma=2e-3)
+    fit = vm.fit(CHAIN, whole, {"omega": 19.8}, scheme=SCHEME, macro_dt=DT)
+    unknown = vm.fit(CHAIN, Measured(whole.t, whole.values), {"omega": 19.8}, scheme=SCHEME, macro_dt=DT)
+    assert unknown.sigma == pytest.approx(2e-3, rel=0.2)
+    assert unknown.standard_errors["omega"] == pytest.approx(fit.standard_errors["omega"], rel=0.2)
+    assert "sigma estimated" in str(unknown)
+
+
+def test_long_motion_needs_several_parts():
+    """Off by two per cent, the fast phase is wrong by many turns at the end."""
+    data = measured(steps=800, sigma=1e-4, dt=DT)
+    start = {"omega": Unknown(20.4, lower=0)}
+    single = vm.fit(CHAIN, data, start, scheme=SCHEME, macro_dt=DT)
+    several = vm.fit(CHAIN, data, start, scheme=SCHEME, macro_dt=DT, segments=20)
+    assert single.probability < 1e-6
+    assert "starts=8" in str(single)
+    assert several.values[0] == pytest.approx(20.0, abs=5 * several.standard_errors["omega"])
+    assert several.gap < 1e-6
+    assert "20 segments" in str(several)
+
+
+def test_several_starts_find_the_best_one():
+    start = {"omega": Unknown(24.0, lower=0)}
+    fit = vm.fit(CHAIN, measured(), start, scheme=SCHEME, macro_dt=DT, starts=12, spread=0.2)
+    assert fit.squares.shape == (12,)
+    assert fit.values[0] == pytest.approx(20.0, abs=5 * fit.standard_errors["omega"])
+
+
+@pytest.mark.full
+def test_constrained_motion_in_one_part_and_in_several():
+    problem = PROBLEMS["tsp"]()
+    data = measured(steps=60, sigma=1e-4, problem=problem, dt=0.01)
+    start = {"gravity": Unknown(9.0, lower=0)}
+    for segments in (1, 4):
+        fit = vm.fit(problem, data, start, scheme=SCHEME, macro_dt=0.01, segments=segments)
+        assert fit.values[0] == pytest.approx(9.81, abs=5 * fit.standard_errors["gravity"])
+
+
+def test_what_is_not_determined_is_said():
+    fit = vm.fit(
+        product, measured(), {"a": Unknown(4.0, lower=0), "b": Unknown(4.9, lower=0)}, scheme=SCHEME, macro_dt=DT
+    )
+    assert fit.undetermined == ["a combination of a, b"]
+    assert float(fit.parameters["a"] * fit.parameters["b"]) == pytest.approx(20.0, abs=0.05)
+    assert fit.standard_errors["a"] == np.inf
+    assert "does not determine a combination of a, b" in str(fit)
+
+
+@pytest.mark.parametrize(
+    ("unknown", "low", "high"),
+    [
+        (Unknown(2.0, lower=0), 0, np.inf),
+        (Unknown(-2.0, upper=1.0), -np.inf, 1),
+        (Unknown([0.5, 2.0], lower=0, upper=[1.0, 3.0]), 0, 3),
+        (Unknown(0.0), -np.inf, np.inf),
+    ],
+)
+def test_bounds_are_kept(unknown, low, high):
+    for u in (-30.0, -1.0, 0.0, 2.0, 30.0):
+        at = np.asarray(unknown.at(np.full(unknown.start.shape, u)))
+        assert np.all((low <= at) & (at <= high))
+    np.testing.assert_allclose(unknown.at(np.zeros(unknown.start.shape)), unknown.start, atol=1e-15)
+
+
+def test_labels():
+    assert Unknowns({"m": Unknown([1.0, 2.0]), "k": Unknown(3.0)}).labels == ["m[0]", "m[1]", "k"]
+
+
+GOOD = measured(5)
+
+
+@pytest.mark.parametrize(
+    ("error", "message", "call"),
+    [
+        (ValueError, "sigma is 0.0; it must be positive", lambda: Measured([0.1], [1.0], sigma=0.0)),
+        (ValueError, "sigma has shape", lambda: Measured([0.1], [[1.0, 2.0]], sigma=[1.0, 1.0, 1.0])),
+        (ValueError, "one row for each time", lambda: Measured([0.1, 0.2], [1.0])),
+        (ValueError, "must lie between lower", lambda: Unknown(1.0, lower=2.0)),
+        (ValueError, "scale is -1.0", lambda: Unknown(1.0, scale=-1.0)),
+        (
+            ValueError,
+            "the time 0.07 lies between its nodes 0.05 and 0.1",
+            lambda: fit(Measured([0.07], [[0.0, 0.0]], sigma=1.0)),
+        ),
+        (ValueError, "lies before the start", lambda: fit(Measured([-0.05], [[0.0, 0.0]], sigma=1.0))),
+        (ValueError, "'stifness', which is none of system.params", lambda: fit(GOOD, {"stifness": 1.0})),
+        (ValueError, "start of 'omega' has shape", lambda: fit(GOOD, {"omega": [1.0, 2.0]})),
+        (ValueError, "parameters is empty", lambda: fit(GOOD, {})),
+        (ValueError, "data is empty", lambda: fit([])),
+        (TypeError, "fit: data", lambda: fit([np.zeros(3)])),
+        (ValueError, "some of data have a sigma", lambda: fit([GOOD, Measured(GOOD.t, GOOD.values)])),
+        (
+            ValueError,
+            "1 values for 2 unknown numbers",
+            lambda: fit(Measured([0.05], [0.0], sigma=1.0, observe=slow_position), {"omega": 1.0, "v_s": [0.0]}),
+        ),
+        (
+            ValueError,
+            "all times of measurement are that of the start",
+            lambda: fit(Measured([0.0], [[0.0, 0.0]], sigma=1.0)),
+        ),
+        (TypeError, "the model", lambda: vm.fit(lambda p: 3, GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),
+        (ValueError, "segments is 0", lambda: fit(GOOD, segments=0)),
+    ],
+)
+def test_bad_input(error, message, call):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def fit(data, parameters=None, **options):
+    parameters = {"omega": 19.0} if parameters is None else parameters
+    return vm.fit(CHAIN, data, parameters, scheme=SCHEME, macro_dt=DT, **options)
+
+
+def test_a_parameter_that_nothing_depends_on_is_refused():
+    def model(parameters):
+        return vm.Problem(
+            CHAIN.system.replace(params={"omega": parameters["a"]}), CHAIN.q_s, CHAIN.q_f, CHAIN.v_s, CHAIN.v_f
+        )
+
+    with pytest.raises(ValueError, match="nothing that was measured depends on b"):
+        vm.fit(model, GOOD, {"a": 19.0, "b": 1.0}, scheme=SCHEME, macro_dt=DT)
+
+
+def test_without_optimistix(monkeypatch):
+    monkeypatch.setitem(sys.modules, "optimistix", None)
+    with pytest.raises(ImportError, match=r"vmri_jax\[fit\]"):
+        fit(GOOD)

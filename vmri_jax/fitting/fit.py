@@ -1,0 +1,272 @@
+"""Identification: parameters of a system from measurements of its motion, with what is known about them afterwards."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.fitting.measured import Measured
+from vmri_jax.fitting.result import Fit
+from vmri_jax.fitting.shooting import Shooting
+from vmri_jax.fitting.unknowns import Unknown, Unknowns
+from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.checks import check_type
+from vmri_jax.mechanics.state import HasProblem, Problem, opened
+from vmri_jax.running.simulate import prepare
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+
+START = ("q_s", "q_f", "v_s", "v_f")
+"""Names of unknowns that are the start of a problem."""
+TIGHTER = (1e-2, 1.0, 1e2, 1e4, 1e6)
+"""How much the parts of multiple shooting are held together, stage by stage: the weight of a gap as large as the motion itself, over the
+root of the number of values."""
+TOLERANCE = 1e-6
+"""Changes of the search variables at which the search ends."""
+BAD = 1e6
+"""What a value counts as missed by, in standard deviations, where a run fails."""
+
+
+def fit(
+    problem: Problem | HasProblem | Callable[[Mapping], Problem],
+    data: Measured | Sequence[Measured],
+    parameters: Mapping[str, Unknown | float],
+    *,
+    scheme: Scheme | Composition,
+    macro_dt: float,
+    segments: int = 1,
+    starts: int = 1,
+    spread: float = 0.3,
+    max_steps: int = 100,
+    newton: Newton | None = None,
+    seed: int = 0,
+) -> Fit:
+    """Find the parameters for which the motion comes closest to what was measured.
+
+        data = vm.fitting.Measured(t, values, sigma=0.01, observe=lambda state: state.q_f)
+        found = vm.fit(problem, data, {"stiffness": vm.fitting.Unknown(3000.0, lower=0)}, scheme=scheme, macro_dt=0.01)
+        print(found)
+
+    It minimises ``sum ((predicted - measured) / sigma)^2`` by the method of Levenberg and Marquardt (`optimistix`), with the
+    Jacobian in forward mode.
+
+    Args:
+        problem: whose ``system.params`` is a dict; `parameters` then name entries of it, or "q_s", "q_f", "v_s", "v_f" for
+            the start. Or a function ``{name: value} -> Problem``, for everything else.
+        data: one or several sets of measurements.
+        parameters: an `Unknown` for each name, or a number to start from.
+        scheme, macro_dt, newton: as of `simulate`. The times of measurement must be macro nodes. Runs are made without a fallback
+            where the scheme allows it.
+        segments: parts of multiple shooting; more than one for long or chaotic motion.
+        starts: searches side by side, the first from the start itself, the others from around it.
+        spread: standard deviation of the search variables of those, about the relative change of a parameter.
+        max_steps: most iterations of a search.
+        seed: of the starts.
+
+    Returns:
+        The `Fit`: parameters, their covariance, what the data does not determine, the run.
+
+    Raises:
+        ValueError, TypeError: bad arguments; times off the grid; a parameter that nothing depends on; a start whose run fails.
+        ImportError: optimistix is not installed.
+    """
+    _optimistix()
+    model = _model(problem, parameters)
+    unknowns = Unknowns({name: u if isinstance(u, Unknown) else Unknown(u) for name, u in parameters.items()})
+    data = [data] if isinstance(data, Measured) else list(data)
+    _check(data, segments, starts, max_steps)
+    first = model(unknowns.at(np.zeros(unknowns.size)))
+    check_type("fit: the model", first, Problem, "a vmri_jax.Problem from its parameters")
+    steps = [m.steps(float(first.t), macro_dt) for m in data]
+    if max(s.max() for s in steps) < 1:
+        raise ValueError("fit: all times of measurement are that of the start; measure later ones, too.")
+    run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), newton=newton)
+    if newton is None and run.plan.has_fallback:
+        newton = Newton("nested")
+    shooting = Shooting(model, unknowns, data, steps, scheme, newton or Newton(), float(macro_dt), segments)
+    run(throw=True)
+    search = _Search(shooting, max_steps)
+    u = np.zeros((starts, unknowns.size))
+    u[1:] = spread * np.random.default_rng(seed).standard_normal((starts - 1, unknowns.size))
+    search.check_dependence()
+    return search.result(u)
+
+
+def _optimistix():
+    try:
+        import optimistix
+    except ImportError:
+        raise ImportError(
+            "fit searches with optimistix, which is not installed: pip install 'vmri_jax[fit]'."
+        ) from None
+    return optimistix
+
+
+def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
+    if not parameters:
+        raise ValueError(
+            "fit: parameters is empty; name what is to be found, e.g. {'stiffness': Unknown(3000.0, lower=0)}."
+        )
+    if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
+        return cast(Callable[[Mapping], Problem], problem)
+    given = opened(problem)
+    if not isinstance(given, Problem):
+        raise TypeError(
+            f"fit: problem is {type(given).__name__}; give a Problem, a scene, or a function from parameters to a Problem."
+        )
+    params = given.system.params
+    known = params if isinstance(params, Mapping) else {}
+    for name, unknown in parameters.items():
+        if name not in known and name not in START:
+            raise ValueError(
+                f"fit: parameters has {name!r}, which is none of system.params ({', '.join(known) or 'no dict'}) nor of "
+                f"{', '.join(START)}. Give a function from parameters to a Problem for anything else."
+            )
+        expected = np.shape(known[name] if name in known else getattr(given, name))
+        start = unknown.start if isinstance(unknown, Unknown) else unknown
+        if np.shape(start) != expected:
+            raise ValueError(
+                f"fit: the start of {name!r} has shape {np.shape(start)}; in the problem it has {expected}."
+            )
+
+    def model(values: Mapping) -> Problem:
+        inside = {name: value for name, value in values.items() if name in known}
+        start = {name: value for name, value in values.items() if name not in known}
+        system = given.system.replace(params={**known, **inside}) if inside else given.system
+        return replace(given, system=system, **start)
+
+    return model
+
+
+def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
+    if not data:
+        raise ValueError("fit: data is empty; give what was measured, vm.fitting.Measured(t, values, sigma).")
+    for m in data:
+        check_type("fit: data", m, Measured, "vm.fitting.Measured(t, values, sigma), or several of them")
+    if len({m.sigma is None for m in data}) > 1:
+        raise ValueError("fit: some of data have a sigma and some have none; give it for all or for none.")
+    for name, value in (("segments", segments), ("starts", starts), ("max_steps", max_steps)):
+        whole_number(f"fit: {name}", value)
+
+
+class _Search:
+    """The search of a fit; its programs are compiled once, and run for several starts and several sets of values."""
+
+    def __init__(self, shooting: Shooting, max_steps: int):
+        self.shooting, self.max_steps = shooting, max_steps
+        self.size = shooting.unknowns.size
+        self.count = len(shooting.values)
+        if self.count < self.size:
+            raise ValueError(
+                f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some of them."
+            )
+        none = np.zeros(self.size)
+        self.others = shooting.starts(none) if shooting.segments > 1 else np.zeros((0, 0))
+        if shooting.segments == 1:
+            self.others = np.zeros((0, len(shooting.start(none))))
+        scale = np.concatenate([self.others, np.asarray(shooting.start(none))[None]])
+        self.scale = np.maximum(np.abs(scale).max(axis=0), 1e-3 * np.abs(scale).max() + 1e-12)
+
+    def residual(self, x, values, weight):
+        """Misses of all values in standard deviations, then weighted gaps. x are u and the starts of the other parts in units of `scale`."""
+        u, z = x
+        predicted, gaps = self.shooting.predict(u, z * self.scale)
+        misses = (predicted - values) / self.shooting.sigma
+        finite = jnp.isfinite(misses)
+        misses = jnp.where(finite, misses, BAD)
+        gaps = jnp.where(jnp.isfinite(gaps), gaps, BAD)
+        return misses, weight * np.sqrt(self.count) * gaps / self.scale
+
+    def solve(self, u, z, values):
+        """The search from u, z: (u, z, sum of squares of the misses, iterations, whether it converged, largest gap)."""
+        optimistix = _optimistix()
+        solver = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
+        weights = jnp.asarray(TIGHTER if self.shooting.segments > 1 else (1.0,))
+
+        def stage(x, weight):
+            found = optimistix.least_squares(
+                lambda x, args: self.residual(x, *args),
+                solver,
+                x,
+                (values, weight),
+                max_steps=self.max_steps,
+                throw=False,
+            )
+            good = found.result == optimistix.RESULTS.successful
+            return found.value, (found.stats["num_steps"], good)
+
+        (u, z), (iterations, good) = jax.lax.scan(stage, (u, z), weights)
+        misses, gaps = self.residual((u, z), values, 1.0)
+        return u, z, jnp.sum(misses**2), jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
+
+    def jacobian(self, u, z, values):
+        """Of the misses and of tightly weighted gaps by the numbers of the parameters themselves and the starts."""
+
+        def joined(x):
+            u, z = jnp.split(x, [self.size])
+            return jnp.concatenate([jnp.ravel(a) for a in self.residual((u, z.reshape(shape)), values, TIGHTER[-1])])
+
+        shape = jnp.shape(z)
+        whole = jax.jacfwd(joined)(jnp.concatenate([u, jnp.ravel(z)]))
+        by_parameters = jax.jacfwd(lambda u: self.shooting.unknowns.vector(self.shooting.unknowns.at(u)))(u)
+        return whole[:, : self.size] / jnp.diagonal(by_parameters), whole[:, self.size :]
+
+    @cached_property
+    def compiled_jacobian(self) -> Callable:
+        """`jacobian`, compiled."""
+        return jax.jit(self.jacobian)
+
+    def check_dependence(self) -> None:
+        """Refuse parameters that change nothing that was measured."""
+        at = np.zeros(self.size), self.others / self.scale, self.shooting.values
+        by_parameters = np.asarray(self.compiled_jacobian(*at)[0])
+        dead = np.flatnonzero(~by_parameters.any(axis=0))
+        if dead.size:
+            labels = self.shooting.unknowns.labels
+            raise ValueError(
+                f"fit: nothing that was measured depends on {', '.join(labels[i] for i in dead)} at the start of the search. Leave "
+                "it out, or start elsewhere."
+            )
+
+    def result(self, u) -> Fit:
+        """The best of the searches from the rows of u."""
+        z = np.broadcast_to(self.others / self.scale, (len(u), *self.others.shape))
+        solve = jax.jit(jax.vmap(self.solve, (0, 0, None)))
+        found = [np.asarray(a) for a in solve(u, z, self.shooting.values)]
+        squares = np.where(np.isfinite(found[2]), found[2], np.inf)
+        best = int(np.argmin(squares))
+        u, z, _, iterations, good, gap = (a[best] for a in found)
+        by_parameters, by_starts = (np.asarray(a) for a in self.compiled_jacobian(u, z, self.shooting.values))
+        misses = np.asarray(self.residual((u, z), self.shooting.values, 1.0)[0])
+        return Fit.of(
+            self.shooting,
+            u,
+            misses,
+            by_parameters,
+            by_starts,
+            int(iterations),
+            bool(good),
+            float(gap),
+            squares,
+            partial(_again, self, u, z),
+        )
+
+
+def _again(search: _Search, u, z, values):
+    """(k, p) parameters and their covariances (k, p, p) for other values (k, m), searched for from those that were found."""
+    unknowns = search.shooting.unknowns
+
+    @jax.jit
+    def one(values):
+        found_u, found_z, *_ = search.solve(u, z, values)
+        by_parameters, by_starts = search.jacobian(found_u, found_z, values)
+        whole = jnp.concatenate([by_parameters, by_starts], axis=1)
+        covariance = jnp.linalg.pinv(whole.T @ whole, hermitian=True)[: search.size, : search.size]
+        return unknowns.vector(unknowns.at(found_u)), covariance
+
+    return jax.lax.map(one, values, batch_size=50)

@@ -1,0 +1,89 @@
+"""Measurements: values at times, how exact they are, and what of a state they are values of."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.state import State
+
+ON_THE_GRID = 1e-6
+"""Part of a macro step that a time of measurement may be off its node by."""
+
+
+def positions(state: State):
+    """All positions of a state, slow ones first."""
+    return jnp.concatenate([state.q_s, state.q_f])
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Values that were measured along a motion.
+
+        vm.fitting.Measured(t, values, sigma=0.01, observe=lambda state: state.q_f[:2])
+
+    Attributes:
+        t: (k,) times, nodes of the macro grid of the fit.
+        values: (k, m) or (k,), NaN where there is none.
+        sigma: standard deviation of their errors, positive: a number, (m,) or (k, m). None if it is not known; it is then
+            estimated from what the fit leaves, and must be so for all measurements.
+        observe: what is measured, ``observe(state) -> (m,)`` or ``()``; all positions by default.
+
+    Raises:
+        TypeError, ValueError: no real numbers, other shapes, a sigma that is not positive.
+    """
+
+    t: Any
+    values: Any
+    sigma: Any = None
+    observe: Callable[[State], Any] = positions
+
+    def __post_init__(self):
+        t = np.asarray(real_array("Measured: t", self.t, ndim=1))
+        values = np.asarray(real_array("Measured: values", self.values))
+        if values.ndim not in (1, 2) or len(values) != len(t) or not len(t):
+            raise ValueError(
+                f"Measured: values have shape {values.shape} for times of shape {t.shape}; give one row for each time."
+            )
+        values = values.reshape(len(t), -1)
+        if not np.isfinite(t).all() or not np.isfinite(values).any():
+            raise ValueError("Measured: t must be finite, and at least one value must be a number.")
+        if self.sigma is not None:
+            sigma = np.asarray(real_array("Measured: sigma", self.sigma))
+            if not (np.isfinite(sigma).all() and np.all(sigma > 0)):
+                raise ValueError(
+                    f"Measured: sigma is {self.sigma}; it must be positive. Leave it out if it is not known: it is then estimated."
+                )
+            try:
+                sigma = np.broadcast_to(sigma, values.shape)
+            except ValueError:
+                raise ValueError(
+                    f"Measured: sigma has shape {sigma.shape}; values have {values.shape}. Give a number, one for each quantity, "
+                    "or one for each value."
+                ) from None
+            object.__setattr__(self, "sigma", sigma)
+        object.__setattr__(self, "t", t)
+        object.__setattr__(self, "values", values)
+
+    def steps(self, t_start: float, macro_dt: float) -> np.ndarray:
+        """Numbers of the macro nodes that the times are at.
+
+        Raises:
+            ValueError: a time before the start, or off the grid.
+        """
+        exact = (self.t - t_start) / macro_dt
+        steps = np.rint(exact).astype(int)
+        off = np.flatnonzero(np.abs(exact - steps) > ON_THE_GRID)
+        if off.size:
+            t = self.t[off[0]]
+            raise ValueError(
+                f"fit: macro_dt is {macro_dt:g}, and the time {t:g} lies between its nodes {t_start + int(exact[off[0]]) * macro_dt:g} "
+                f"and {t_start + (int(exact[off[0]]) + 1) * macro_dt:g}. Values are not interpolated: take a step that divides the "
+                "times, or interpolate the measurements to the nodes."
+            )
+        if steps.min() < 0:
+            raise ValueError(f"fit: the time {self.t.min():g} lies before the start of the problem, {t_start:g}.")
+        return steps

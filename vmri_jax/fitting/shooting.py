@@ -1,0 +1,175 @@
+"""Shooting: what a model predicts for all measurements, from the start of the motion or from the starts of parts of it.
+
+With one part the start follows from the parameters. With several, each part starts where it likes, and is asked to end where the
+next one starts: *multiple shooting*. No part is long enough for errors to grow by much, so that the search is well behaved where a
+single run would be chaotic, or many periods away from the measurements (Bock 1983).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from math import gcd
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.fitting.measured import Measured
+from vmri_jax.fitting.unknowns import Unknowns
+from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.running.simulate import simulate
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+
+
+@dataclass(frozen=True, eq=False)
+class Shooting:
+    """The runs of a fit, cut into parts of equal length.
+
+    Attributes:
+        model: the problem for parameters by name.
+        unknowns: the parameters.
+        data: what was measured.
+        steps: of each of `data`, the numbers of the macro nodes.
+        segments: parts.
+    """
+
+    model: Callable[[Mapping], Problem]
+    unknowns: Unknowns
+    data: Sequence[Measured]
+    steps: Sequence[np.ndarray]
+    scheme: Scheme | Composition
+    newton: Newton
+    macro_dt: float
+    segments: int
+
+    @cached_property
+    def every(self) -> int:
+        """Macro steps between saved nodes."""
+        numbers = {int(n) for steps in self.steps for n in steps} | {self._least}
+        return gcd(*numbers)
+
+    @cached_property
+    def _least(self) -> int:
+        return max(int(steps.max()) for steps in self.steps)
+
+    @cached_property
+    def length(self) -> int:
+        """Macro steps of a part."""
+        nodes = -(-self._least // self.every)
+        return self.every * max(-(-nodes // self.segments), 1)
+
+    @cached_property
+    def values(self) -> np.ndarray:
+        """All values that are numbers, in a row."""
+        return np.concatenate([m.values[np.isfinite(m.values)] for m in self.data])
+
+    @cached_property
+    def sigma(self) -> np.ndarray:
+        """Their standard deviations; 1 where they are not known."""
+        sigmas = [np.ones_like(m.values) if m.sigma is None else m.sigma for m in self.data]
+        return np.concatenate([s[np.isfinite(m.values)] for s, m in zip(sigmas, self.data, strict=True)])
+
+    @property
+    def knows_sigma(self) -> bool:
+        """Whether they are known."""
+        return self.data[0].sigma is not None
+
+    def start(self, u):
+        """(2 n,) positions and velocities at the start of the motion, for the search variables u of the parameters."""
+        problem = self.model(self.unknowns.at(u))
+        return _phase(problem, problem.state())
+
+    def starts(self, u) -> np.ndarray:
+        """(segments - 1, 2 n) starts of the other parts along one run."""
+        problem = self.model(self.unknowns.at(u))
+        run = simulate(
+            problem,
+            self.scheme,
+            macro_dt=self.macro_dt,
+            num_steps=self.length * self.segments,
+            save_every=self.length,
+            newton=self.newton,
+        )
+        nodes = State(*(np.asarray(getattr(run, name))[1:-1] for name in ("t", "q_s", "q_f", "p_s", "p_f")))
+        return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
+
+    def predict(self, u, starts):
+        """Predicted values, and what the ends of the parts miss the starts of the next ones by, (segments - 1, 2 n).
+
+        Args:
+            u: search variables of the parameters.
+            starts: (segments - 1, 2 n) positions and velocities where the parts after the first one start.
+        """
+        if self.segments == 1:  # JAX's own forward mode, by the parameters alone
+            observed, ends = jax.tree.map(lambda a: a[None], self._part(u, self.start(u), 0))
+        else:
+            observed, ends = self._parts(u, jnp.concatenate([self.start(u)[None], starts]))
+        predicted = [
+            jnp.where(np.isfinite(m.values), jnp.reshape(o[part, node], m.values.shape), 0.0)[np.isfinite(m.values)]
+            for m, o, (part, node) in zip(self.data, observed, self._places, strict=True)
+        ]
+        return jnp.concatenate(predicted), ends[:-1] - starts
+
+    @cached_property
+    def _places(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of each measurement, the parts that its times are in, and the numbers of the nodes there."""
+        parts = [np.minimum(steps // self.length, self.segments - 1) for steps in self.steps]
+        return [(k, (steps - k * self.length) // self.every) for k, steps in zip(parts, self.steps, strict=True)]
+
+    @cached_property
+    def _parts(self) -> Callable:
+        """``(u, starts of all parts) -> observed quantities at the nodes of all parts, ends of all parts``.
+
+        Its derivative is that of each part by its own start and by the parameters, in forward mode: a few runs beside each run,
+        however many parts there are.
+        """
+
+        @jax.custom_jvp
+        def parts(u, starts):
+            return jax.vmap(self._part, (None, 0, 0))(u, starts, jnp.arange(self.segments))
+
+        @parts.defjvp
+        def derivative(primals, tangents):
+            u, starts = primals
+
+            def part(together, number):
+                return self._part(together[: u.size], together[u.size :], number)
+
+            together, d_together = (
+                jnp.concatenate([jnp.broadcast_to(u, (self.segments, u.size)), starts], axis=1)
+                for u, starts in (primals, tangents)
+            )
+            by_each = jax.vmap(jax.jacfwd(part))(together, jnp.arange(self.segments))
+            return parts(u, starts), jax.tree.map(lambda a: jnp.einsum("k...i,ki->k...", a, d_together), by_each)
+
+        return parts
+
+    def _part(self, u, start, number):
+        """Observed quantities at the nodes of a part, and where it ends."""
+        problem = self.model(self.unknowns.at(u))
+        system, n_s, n = problem.system, problem.q_s.size, problem.q_s.size + problem.q_f.size
+        t = problem.t + number * (self.length * self.macro_dt)
+        phase = jnp.split(start, [n_s, n, n + n_s])
+        state = initial_state(system, *phase, t=t, project=self.segments > 1 and system.is_constrained)
+        run = simulate(
+            system,
+            self.scheme,
+            state,
+            macro_dt=self.macro_dt,
+            num_steps=self.length,
+            save_every=self.every,
+            newton=self.newton,
+            throw=False,
+            adjoint="stored",
+        )
+        nodes = State(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
+        observed = [jax.vmap(m.observe)(nodes) for m in self.data]
+        return observed, _phase(problem, jax.tree.map(lambda a: a[-1], nodes))
+
+
+def _phase(problem: Problem, state: State):
+    v_s, v_f = velocity(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)
+    return jnp.concatenate([state.q_s, state.q_f, v_s, v_f])

@@ -1,0 +1,99 @@
+"""Unknown parameters: where the search starts, and the bounds that it keeps."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import real_array
+
+NEAR = 1e-3
+"""Where a start lies at a bound, it is moved inside by this part of the range."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A parameter that is to be found, a number or an array.
+
+    The search goes over u with ``x = start + scale u`` if there are no bounds, ``x = lower + (start - lower) e^u`` and the like with
+    one, and ``x = lower + (upper - lower) / (1 + e^-(c + u))`` with two: what it tries is always inside.
+
+    Attributes:
+        start: where the search starts, inside of the bounds.
+        lower, upper: bounds, None for none; ``lower=0`` for what is positive.
+        scale: size of a change, without bounds; None for the size of the start, or 1.
+
+    Raises:
+        TypeError, ValueError: no real numbers; a start that is not between its bounds.
+    """
+
+    start: Any
+    lower: Any = None
+    upper: Any = None
+    scale: Any = None
+
+    def __post_init__(self):
+        start = np.asarray(real_array("Unknown: start", self.start))
+        object.__setattr__(self, "start", start)
+        if not np.isfinite(start).all():
+            raise ValueError(f"Unknown: start is {self.start}; it must be finite.")
+        for name in ("lower", "upper", "scale"):
+            value = getattr(self, name)
+            if value is not None:
+                value = np.asarray(real_array(f"Unknown: {name}", value))
+                object.__setattr__(self, name, np.broadcast_to(value, start.shape))
+        below = self.lower is not None and not np.all(self.lower < start)
+        above = self.upper is not None and not np.all(start < self.upper)
+        if below or above:
+            raise ValueError(
+                f"Unknown: start is {start}; it must lie between lower={self.lower} and upper={self.upper}."
+            )
+        if self.scale is not None and not np.all(self.scale > 0):
+            raise ValueError(f"Unknown: scale is {self.scale}; it must be positive.")
+
+    def at(self, u):
+        """The parameter for a search variable of the same shape; 0 is the start."""
+        if self.lower is None and self.upper is None:
+            return self.start + self._step() * u
+        if self.upper is None:
+            return self.lower + (self.start - self.lower) * jnp.exp(u)
+        if self.lower is None:
+            return self.upper - (self.upper - self.start) * jnp.exp(u)
+        part = (self.start - self.lower) / (self.upper - self.lower)
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(np.log(part / (1 - part)) + u)
+
+    def _step(self):
+        if self.scale is not None:
+            return self.scale
+        return np.where(self.start == 0, 1.0, np.abs(self.start))
+
+
+class Unknowns:
+    """Several of them as one vector: the search variables of all, one after the other."""
+
+    def __init__(self, unknowns: Mapping[str, Unknown]):
+        self.unknowns = dict(unknowns)
+        self.sizes = {name: unknown.start.size for name, unknown in self.unknowns.items()}
+        self.size = sum(self.sizes.values())
+
+    def at(self, u) -> dict:
+        """The parameters by name."""
+        parts = jnp.split(jnp.asarray(u), np.cumsum(list(self.sizes.values()))[:-1])
+        shaped = zip(self.unknowns.items(), parts, strict=True)
+        return {name: unknown.at(part.reshape(unknown.start.shape)) for (name, unknown), part in shaped}
+
+    def vector(self, parameters: Mapping) -> jax.Array:
+        """All numbers in a row."""
+        return jnp.concatenate([jnp.ravel(parameters[name]) for name in self.unknowns])
+
+    @property
+    def labels(self) -> list[str]:
+        """A name for every number: ``stiffness``, ``masses[1]``."""
+        return [
+            name + (f"[{', '.join(map(str, index))}]" if index else "")
+            for name, unknown in self.unknowns.items()
+            for index in np.ndindex(unknown.start.shape)
+        ]

@@ -1,0 +1,50 @@
+"""Figures of fits: what is left of the measurements, and how the parameters are correlated."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy import stats
+
+from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, new_figure
+
+if TYPE_CHECKING:
+    from vmri_jax.fitting.result import Fit
+
+INSIDE = 1.96
+"""Standard deviations that hold 95 %."""
+
+
+def plot_fit(fit: "Fit", *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+    """Misses over time, how they are distributed, and the correlations of the parameters.
+
+    Args:
+        fit: of `vmri_jax.fit`.
+        title: over the figure.
+        theme: colours.
+    """
+    with new_figure(11, 3.6, title, theme) as figure:
+        over_time, spread, correlation = figure.subplots(1, 3, width_ratios=[2, 1, 1.2])
+        first = 0
+        for number, m in enumerate(fit.shooting.data):
+            is_number = np.isfinite(m.values)
+            misses = np.full(m.values.shape, np.nan)
+            misses[is_number] = fit.residuals[first : first + is_number.sum()]
+            first += int(is_number.sum())
+            over_time.plot(m.t, misses, ".", markersize=2, color=f"C{number}")
+        over_time.axhspan(-INSIDE, INSIDE, alpha=0.12)
+        over_time.set(xlabel="t", ylabel="miss / sigma", title="misses, and where 95 % of them belong")
+
+        width = max(4.0, float(np.abs(fit.residuals).max()))
+        at = np.linspace(-width, width, 200)
+        spread.hist(fit.residuals, bins=40, range=(-width, width), density=True, alpha=0.6)
+        spread.plot(at, stats.norm.pdf(at))
+        spread.set(xlabel="miss / sigma", title="their distribution", yticks=[])
+
+        errors = np.sqrt(np.diag(fit.covariance))
+        image = correlation.imshow(fit.covariance / np.outer(errors, errors), vmin=-1, vmax=1, cmap="RdBu")
+        correlation.set_xticks(range(len(fit.labels)), fit.labels, rotation=45, ha="right")
+        correlation.set_yticks(range(len(fit.labels)), fit.labels)
+        correlation.set_title("correlations")
+        correlation.grid(False)
+        figure.colorbar(image, ax=correlation)
+    return figure
