@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from benchmarks import (
+    adjoints,
     against,
     baseline,
     batch,
@@ -54,6 +55,7 @@ def _plain_command(name: str, module) -> None:
 
 
 for _name, _module in {
+    "adjoints": adjoints,
     "cost": cost,
     "floor": floor,
     "chains": chains,

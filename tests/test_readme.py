@@ -41,3 +41,12 @@ def test_many_runs(tmp_path):
     assert done.returncode == 0, done.stderr
     assert f"It prints `{done.stdout.strip()}`." in TEXT, done.stdout
     assert (tmp_path / "runs.png").stat().st_size > 10_000
+
+
+def test_a_fit(tmp_path):
+    program = next(program for program in PROGRAMS if "vm.fit(" in program)
+    run = [sys.executable, "-c", program]
+    done = subprocess.run(run, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().splitlines()[0] in TEXT, done.stdout
+    assert (tmp_path / "fit.png").stat().st_size > 10_000

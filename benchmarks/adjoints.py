@@ -1,0 +1,160 @@
+"""Gradients of runs: time over that of a run, memory, compile time and agreement of all adjoints, and of diffrax if it is there."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vmri_jax as vm
+from benchmarks.measure import Ratio, Tell, interleaved, quartiles, silent
+from benchmarks.peers import autodiff
+from benchmarks.peers.cases import Case as PeerCase
+from benchmarks.report import Claim, Report
+
+COLUMNS = ("system", "gradient", "steps", "compile s", "over a run", "MB", "apart")
+ADJOINTS = ("stored", "checkpoint", "reversible", "forward")
+FACTOR, AGREEMENT, GROWTH = 4.0, 1e-10, 1.2
+"""Targets: time over that of a run, differences of gradients, memory of reversible steps over a thousand times as many."""
+SHORT, LONG = 1_000, 1_000_000
+"""Steps of the gradients that are timed, and of those whose memory is read off the compiled program."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A system whose squared positions at the end are differentiated by its parameters and the momenta of the start."""
+
+    name: str
+    problem: Callable[[], vm.Problem]
+    macro_dt: float
+
+
+@dataclass(frozen=True)
+class Size:
+    """Cases, and samples of a time."""
+
+    cases: tuple[Case, ...]
+    repeats: int
+
+
+def sizes(name: str) -> Size:
+    """ "quick" or "full"."""
+    fpu = Case("FPU", vm.systems.fermi_pasta_ulam, 0.01)
+    if name == "quick":
+        return Size((fpu,), 5)
+    others = (
+        Case("TSP", vm.systems.triple_spherical_pendulum, 0.002),
+        Case("SAM", vm.systems.simple_atomic_model, 0.001),
+    )
+    return Size((fpu, *others), 15)
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """A report after each system."""
+    rows, claims, notes = [], [], []
+    for case in size.cases:
+        found, ratios = measured(case, size.repeats, tell)
+        rows += found
+        for adjoint in ADJOINTS[:3]:
+            claims.append(Claim(f"{case.name}: {adjoint} over a run", ratios[adjoint], at_most=FACTOR))
+        memory = {(row["gradient"], row["steps"]): row["MB"] for row in found}
+        for adjoint in ("reversible", "checkpoint"):
+            growth = memory[adjoint, LONG] / memory[adjoint, SHORT]
+            target = GROWTH if adjoint == "reversible" else None
+            claims.append(
+                Claim(
+                    f"{case.name}: memory of {adjoint}, {LONG} over {SHORT} steps",
+                    Ratio(growth, growth, growth),
+                    target,
+                )
+            )
+        notes.append(f"{case.name}: a run takes {found[0]['run us']:.1f} microseconds a step.")
+        yield Report("adjoints", name, list(rows), list(claims), list(notes))
+
+
+def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str, Ratio]]:
+    """A row for each adjoint and number of steps, and times over that of a run."""
+    problem, scheme, newton = case.problem(), vm.fully_implicit(10), vm.Newton("nested")
+    start, params = problem.state(), jax.tree.map(jnp.asarray, problem.system.params)
+
+    def gradient(adjoint: str, steps: int):
+        def cost(params, p_f):
+            state = vm.State(start.t, start.q_s, start.q_f, start.p_s, p_f)
+            end = vm.simulate(
+                problem.system.replace(params=params),
+                scheme,
+                state,
+                macro_dt=case.macro_dt,
+                num_steps=steps,
+                save_every=steps // 10,
+                newton=newton,
+                adjoint=adjoint,
+            )
+            return jnp.sum(end.q_s[-1] ** 2) + jnp.sum(end.q_f[-1] ** 2)
+
+        began = time.perf_counter()
+        program = jax.jit(jax.grad(cost, (0, 1))).lower(params, start.p_f).compile()
+        return program, time.perf_counter() - began
+
+    forward = vm.prepare(
+        problem, scheme, macro_dt=case.macro_dt, num_steps=SHORT, save_every=SHORT // 10, newton=newton
+    ).timed()
+    calls, rows, expected = {"run": forward}, [], None
+    for adjoint in ADJOINTS:
+        tell(f"{case.name}, {adjoint}")
+        program, seconds = gradient(adjoint, SHORT)
+        found = jnp.concatenate([jnp.ravel(a) for a in jax.tree.leaves(program(params, start.p_f))])
+        expected = found if expected is None else expected
+        apart = float(jnp.max(jnp.abs(found - expected)) / jnp.max(jnp.abs(expected)))
+        calls[adjoint] = lambda program=program: jax.block_until_ready(program(params, start.p_f))
+        rows.append(_row(case, adjoint, SHORT, seconds, program) | {"apart": apart})
+        if adjoint in ("checkpoint", "reversible"):
+            program, seconds = gradient(adjoint, LONG)
+            rows.append(_row(case, adjoint, LONG, seconds, program))
+    rows += _diffrax(case, problem, calls, tell)
+    samples = interleaved(calls, repeats)
+    run, ratios = np.array(samples["run"]), {}
+    for row in rows:
+        if row["steps"] == SHORT:
+            ratios[row["gradient"]] = quartiles(list(np.array(samples[row["gradient"]]) / run))
+            row |= {"over a run": ratios[row["gradient"]].value, "run us": 1e6 * float(np.median(run)) / SHORT}
+    return rows, ratios
+
+
+def _row(case: Case, gradient: str, steps: int, seconds: float, program) -> dict:
+    memory = program.memory_analysis().temp_size_in_bytes / 1e6
+    return {"system": case.name, "gradient": gradient, "steps": steps, "compile s": seconds, "MB": memory}
+
+
+def _diffrax(case: Case, problem: vm.Problem, calls: dict, tell: Tell) -> list[dict]:
+    """Its gradient by the momenta at a tolerance of 1e-8, the equations by automatic differentiation of the same Lagrangian."""
+    try:
+        import diffrax  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return []
+    tell(f"{case.name}, diffrax")
+    t_end = SHORT * case.macro_dt
+    peer = PeerCase(case.name, case.name, problem, t_end, np.zeros(0))
+    acceleration, q = autodiff.acceleration(peer), jnp.asarray(peer.q)
+
+    def cost(v):
+        end = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, _: (y[1], acceleration(*y))),
+            diffrax.Dopri8(),
+            0.0,
+            t_end,
+            case.macro_dt / 10,
+            (q, v),
+            stepsize_controller=diffrax.PIDController(rtol=1e-8, atol=1e-8),
+            max_steps=100_000,
+        )
+        assert end.ys is not None
+        return jnp.sum(end.ys[0][-1] ** 2)
+
+    began = time.perf_counter()
+    program = jax.jit(jax.grad(cost)).lower(jnp.asarray(peer.v)).compile()
+    seconds = time.perf_counter() - began
+    calls["diffrax"] = lambda: jax.block_until_ready(program(jnp.asarray(peer.v)))
+    return [_row(case, "diffrax", SHORT, seconds, program)]
