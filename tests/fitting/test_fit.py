@@ -1,6 +1,7 @@
 """Identification: parameters are found within their errors, intervals cover, and what cannot work is refused."""
 
 import sys
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -179,7 +180,7 @@ GOOD = measured(5)
             "all times of measurement are that of the start",
             lambda: fit(Measured([0.0], [[0.0, 0.0]], sigma=1.0)),
         ),
-        (TypeError, "the model", lambda: vm.fit(lambda p: 3, GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),
+        (TypeError, "the model", lambda: vm.fit(cast(Any, lambda p: 3), GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),
         (ValueError, "segments is 0", lambda: fit(GOOD, segments=0)),
     ],
 )
