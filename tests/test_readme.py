@@ -50,3 +50,10 @@ def test_a_fit(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip().splitlines()[0] in TEXT, done.stdout
     assert (tmp_path / "fit.png").stat().st_size > 10_000
+
+
+def test_optimal_control():
+    scope = {}
+    exec(next(program for program in PROGRAMS if "vm.control.minimize(" in program), scope)
+    assert scope["found"].converged
+    assert abs(scope["found"].cost - 6) < 1e-3

@@ -47,6 +47,7 @@ LATER = {
     "plots": ("vmri_jax.plots", None),
     "ensembles": ("vmri_jax.ensembles", None),
     "ensemble": ("vmri_jax.ensembles.run", "ensemble"),
+    "control": ("vmri_jax.control", None),
     "fit": ("vmri_jax.fitting.fit", "fit"),
     "fitting": ("vmri_jax.fitting", None),
     "open_ensemble": ("vmri_jax.ensembles.reading", "open_ensemble"),

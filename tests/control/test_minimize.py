@@ -1,0 +1,202 @@
+"""Optimal control against solutions that are known, and under constraints."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad_vec
+from scipy.linalg import expm
+
+import vmri_jax as vm
+from tests.user_systems import cart
+from vmri_jax.control import minimize
+
+NONE = np.zeros(0)
+POINT = vm.Problem(vm.System(vm.ConstantMass([1.0], NONE)), [0.0], NONE)
+"""On a straight line, moved by a force."""
+STIFFNESS = np.array([4.0, 9.0])
+TIPS = np.array([0.1, 0.05])
+
+
+def push(q_s, q_f, u, params):
+    return u, 0 * q_f
+
+
+def effort(state, u):
+    return u @ u / 2
+
+
+def at_rest_at_one(state):
+    return jnp.concatenate([state.q_s - 1.0, state.q_f - 1.0, state.p_s, state.p_f])
+
+
+def point(steps: int):
+    return minimize(
+        POINT,
+        push,
+        effort,
+        num_controls=1,
+        goal=at_rest_at_one,
+        scheme=vm.fully_explicit(1),
+        macro_dt=1 / steps,
+        num_steps=steps,
+    )
+
+
+def test_a_double_integrator():
+    """u = 6 - 12 t, J = 6, multipliers (-12, 6); order 2, and one iteration, since the problem is linear."""
+    found = {steps: point(steps) for steps in (10, 20)}
+    for steps, optimum in found.items():
+        assert optimum.converged
+        assert optimum.iterations <= 2
+        assert optimum.miss < 1e-12
+        middle = optimum.t + 0.5 / steps
+        assert np.abs(optimum.controls[:, 0] - (6 - 12 * middle)).max() < 6.0 / steps**2
+        np.testing.assert_allclose(optimum.multipliers, [-12, 6], rtol=1.5 / steps**2)
+    errors = [found[steps].cost - 6 for steps in found]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
+    assert "converged" in str(found[10])
+
+
+def springs(q_s, q_f, params):
+    return jnp.sum(params["stiffness"] * (q_f - q_s[0]) ** 2) / 2
+
+
+HUB = vm.Problem(
+    vm.System(vm.ConstantMass([1.0], TIPS), slow_potential=springs, params={"stiffness": jnp.asarray(STIFFNESS)}),
+    [0.0],
+    [0.0, 0.0],
+)
+
+
+def gramian_solution() -> tuple[float, np.ndarray, np.ndarray]:
+    """Least cost and multiplier of the hub with its tips: ``J = z_T . W^-1 z_T / 2``, and A."""
+    mass = np.diag([1.0, *TIPS])
+    stiffness = np.zeros((3, 3))
+    for i, k in enumerate(STIFFNESS):
+        stiffness[np.ix_([0, i + 1], [0, i + 1])] += k * np.array([[1, -1], [-1, 1]])
+    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.linalg.solve(mass, stiffness), np.zeros((3, 3))]])
+    B = np.zeros(6)
+    B[3] = 1.0
+    end = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    W, _ = quad_vec(lambda s: np.outer(expm(A * s) @ B, expm(A * s) @ B), 0.0, 1.0, epsabs=1e-13)
+    at_end = np.linalg.solve(W, end)
+    return float(end @ at_end / 2), at_end, A
+
+
+def test_a_hub_with_flexible_modes():
+    """Order 2 in the cost; u* = B^T exp(A^T (T - t)) W^-1 z_T."""
+    cost, at_end, A = gramian_solution()
+    errors = []
+    for steps in (40, 80):
+        found = minimize(
+            HUB,
+            push,
+            effort,
+            num_controls=1,
+            goal=at_rest_at_one,
+            scheme=vm.fully_implicit(1),
+            macro_dt=1 / steps,
+            num_steps=steps,
+        )
+        errors.append(abs(found.cost - cost) / cost)
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.2)
+    expected = [(expm(A.T * (1 - t - 0.5 / 80)) @ at_end)[3] for t in found.t]
+    assert np.abs(found.controls[:, 0] - expected).max() < 0.02 * np.abs(expected).max()
+
+
+def test_a_cart_with_a_pendulum_from_rest_to_rest():
+    """Under a constraint, with controls on the micro grid; the bob hangs still at the end."""
+
+    def there(state):
+        return jnp.concatenate([state.q_s - 0.5, state.q_f[:1] - 0.5, state.p_s, state.p_f[:1]])
+
+    problem = cart()
+    problem = vm.Problem(
+        problem.system.replace(params={"stiffness": 0.0}, slow_potential=gravity), problem.q_s, problem.q_f
+    )
+    optimum = minimize(
+        problem,
+        push,
+        effort,
+        num_controls=1,
+        goal=there,
+        scheme=vm.fully_implicit(2),
+        macro_dt=0.1,
+        num_steps=12,
+        grid="micro",
+    )
+    assert optimum.converged
+    assert optimum.controls.shape == (12, 2, 1)
+    assert optimum.t.shape == (12, 2)
+    assert optimum.miss < 1e-8
+    assert np.abs(optimum.trajectory.constraint_residual).max() < 1e-10
+    assert optimum.trajectory.q_f[-1] == pytest.approx([0.5, -0.5], abs=1e-6)
+
+
+def gravity(q_s, q_f, params):
+    return 9.81 * q_f[1]
+
+
+def idle(q_s, q_f, u, params):
+    return 0 * u, 0 * q_f
+
+
+def test_a_goal_out_of_reach_is_said():
+    optimum = minimize(
+        POINT,
+        idle,
+        effort,
+        num_controls=1,
+        goal=at_rest_at_one,
+        scheme=vm.fully_explicit(1),
+        macro_dt=0.1,
+        num_steps=10,
+        max_iterations=3,
+    )
+    assert not optimum.converged
+    assert optimum.miss == pytest.approx(1.0)
+    assert "not converged: the best that was found; goal missed by 1.0e+00" in str(optimum)
+
+
+def wrong(q_s, q_f, u, params):
+    return u[:0], q_f
+
+
+@pytest.mark.parametrize(
+    ("message", "options"),
+    [
+        ("actuate returns", {"actuate": wrong}),
+        ("cost has shape", {"cost": lambda state, u: u}),
+        ("final_cost has shape", {"final_cost": lambda state: state.q_s}),
+        ("goal must return a vector", {"goal": lambda state: state.q_s[0]}),
+        ("grid is 'fine'", {"grid": "fine"}),
+        ("num_controls is 0", {"num_controls": 0}),
+        (r"start has shape \(3,\); the controls have \(10, 1\)", {"start": [1.0, 2.0, 3.0]}),
+        ("tolerance", {"tolerance": -1.0}),
+    ],
+)
+def test_bad_input(message, options):
+    given = {
+        "actuate": push,
+        "cost": effort,
+        "num_controls": 1,
+        "scheme": vm.fully_explicit(1),
+        "macro_dt": 0.1,
+        "num_steps": 10,
+    }
+    with pytest.raises(ValueError, match=message):
+        minimize(POINT, **(given | options))
+
+
+def test_params_must_be_a_dict():
+    system = vm.System(vm.ConstantMass([1.0], NONE), params=jnp.ones(2))
+    with pytest.raises(TypeError, match="need it to be a dict"):
+        minimize(
+            vm.Problem(system, [0.0], NONE),
+            push,
+            effort,
+            num_controls=1,
+            scheme=vm.fully_explicit(1),
+            macro_dt=0.1,
+            num_steps=10,
+        )

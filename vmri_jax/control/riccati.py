@@ -1,0 +1,89 @@
+"""The linear-quadratic problem of a stage structure, in one sweep back and one forward: O(N).
+
+    min  sum_k (1/2 (dz, du) H_k (dz, du) + h_k . (dz, du))_k + 1/2 dz_N S dz_N + s . dz_N
+    dz_{k+1} = A_k dz_k + B_k du_k + c_k        dz_0 = 0        G dz_N + g = 0
+
+The cost from a stage on is quadratic in dz and in the multipliers nu of the goal,
+``1/2 dz S dz + s . dz + nu . (M^T dz + m) - 1/2 nu W nu``; the sweep back carries its coefficients, W is the Gramian of the goal.
+
+Source: A. E. Bryson, Y.-C. Ho, Applied Optimal Control, Hemisphere (1975), section 5.3.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Stages(NamedTuple):
+    """All stages, each with n numbers of the state and m of the control."""
+
+    hessian: Float[Array, "N n+m n+m"]
+    gradient: Float[Array, "N n+m"]
+    A: Float[Array, "N n n"]
+    B: Float[Array, "N n m"]
+    c: Float[Array, "N n"]
+
+
+class Final(NamedTuple):
+    """What is asked of the last state: a quadratic cost and ``G dz + g = 0``."""
+
+    S: Float[Array, "n n"]
+    s: Float[Array, "n"]
+    G: Float[Array, "e n"]
+    g: Float[Array, "e"]
+
+
+class Solution(NamedTuple):
+    """Changes of the states after the first one, of the controls, and the multipliers of the goal."""
+
+    dz: Float[Array, "N n"]
+    du: Float[Array, "N m"]
+    nu: Float[Array, "e"]
+
+
+class _Value(NamedTuple):
+    S: Float[Array, "n n"]
+    s: Float[Array, "n"]
+    M: Float[Array, "n e"]
+    m: Float[Array, "e"]
+    W: Float[Array, "e e"]
+
+
+def solve(stages: Stages, final: Final) -> Solution:
+    """The solution; where the goal cannot be reached, the one that misses it least."""
+    n, e = final.S.shape[0], len(final.g)
+
+    def back(value: _Value, stage: Stages):
+        A, B, c = stage.A, stage.B, stage.c
+        Q, N, R = stage.hessian[:n, :n], stage.hessian[n:, :n], stage.hessian[n:, n:]
+        q, r = stage.gradient[:n], stage.gradient[n:]
+        S, s, M = value.S, value.s, value.M
+        ahead = S @ c + s
+        H_ux = N + B.T @ S @ A
+        right = jnp.concatenate([H_ux, (r + B.T @ ahead)[:, None], B.T @ M], axis=1)
+        gains = -jnp.linalg.solve(R + B.T @ S @ B, right)
+        K, k, K_nu = gains[:, :n], gains[:, n], gains[:, n + 1 :]
+        S_before = Q + A.T @ S @ A + H_ux.T @ K
+        before = _Value(
+            (S_before + S_before.T) / 2,
+            q + A.T @ ahead + H_ux.T @ k,
+            A.T @ M + H_ux.T @ K_nu,
+            value.m + M.T @ (c + B @ k),
+            value.W - M.T @ B @ K_nu,
+        )
+        return before, (K, k, K_nu)
+
+    last = _Value(final.S, final.s, final.G.T, final.g, jnp.zeros((e, e)))
+    first, gains = jax.lax.scan(back, last, stages, reverse=True)
+    nu = jnp.linalg.lstsq(first.W, first.m)[0] if e else first.m
+
+    def forward(dz, at):
+        stage, (K, k, K_nu) = at
+        du = K @ dz + k + K_nu @ nu
+        dz = stage.A @ dz + stage.B @ du + stage.c
+        return dz, (dz, du)
+
+    _, (dz, du) = jax.lax.scan(forward, jnp.zeros(n), (stages, gains))
+    return Solution(dz, du, nu)

@@ -1,0 +1,156 @@
+"""Discrete mechanics and optimal control: stages of a controlled motion, and their derivatives.
+
+A stage is a macro step of the scheme, ``z_{k+1} = Phi(z_k, u_k)`` with ``z = (q_s, q_f, p_s, p_f)``; its discrete forced equations
+are the constraints of the optimisation. Controls are constant over a macro interval, or over each micro interval.
+
+Source: S. Ober-Bloebaum, O. Junge, J. E. Marsden, Discrete mechanics and optimal control, ESAIM: COCV 17 (2011); S. Leyendecker,
+S. Ober-Bloebaum, J. E. Marsden, M. Ortiz, Optim. Control Appl. Meth. 31 (2010), with constraints; T. Lishkova, S. Ober-Bloebaum,
+M. Cannon, S. Leyendecker, IFAC-PapersOnLine 53 (2020), on two grids.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.control.riccati import Final, Stages
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.macro_step import macro_step
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Result
+
+CONTROL = "vmri_jax.control"
+"""Name among the parameters of a system of the controls of a step, with its start and the length of the parts that they are held for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transcription:
+    """An optimal control problem on a macro grid.
+
+    Attributes:
+        system: without the controls; its params are a dict.
+        start: the state that the motion starts from.
+        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``.
+        cost: per time, ``cost(state, u) -> ()``.
+        final_cost: ``final_cost(state) -> ()``.
+        goal: ``goal(state) -> (e,)``, zero at the end.
+        parts: of a macro interval, for each of which there are own controls: 1, or num_micro.
+    """
+
+    system: System
+    start: State
+    scheme: Scheme | Composition
+    newton: Newton
+    macro_dt: float
+    actuate: Callable
+    cost: Callable
+    final_cost: Callable
+    goal: Callable
+    parts: int
+
+    @property
+    def controlled(self) -> System:
+        """The system with the forces of its controls."""
+        return self.system.replace(force=_forces(self.system.force, self.actuate, self.parts))
+
+    def state(self, z, k) -> State:
+        """The state at node k."""
+        n_s, n = self.start.q_s.size, self.start.q_s.size + self.start.q_f.size
+        return State(self.start.t + k * self.macro_dt, *jnp.split(z, [n_s, n, n + n_s]))
+
+    @property
+    def z_start(self) -> jax.Array:
+        """The first state, (n,)."""
+        return phase(self.start)
+
+    def step(self, z, u, k):
+        """The next state, and whether the step was solved; u (parts, m)."""
+        state = self.state(z, k)
+        held = u, state.t, self.macro_dt / self.parts
+        system = self.controlled.replace(params={**self.system.params, CONTROL: held})
+        end, info = macro_step(system, self.scheme, state, self.macro_dt, self.newton)
+        return phase(end), info.result <= Result.CONVERGED_AT_ROUNDOFF
+
+    def stage_cost(self, z, u, z_next, k):
+        """``H`` times the mean of the cost at both ends of the interval, over the parts."""
+        ends = self.state(z, k), self.state(z_next, k + 1)
+        return self.macro_dt * sum(jnp.mean(jax.vmap(lambda u, s=s: self.cost(s, u))(u)) for s in ends) / 2
+
+    def total(self, z, u):
+        """The cost of nodes z (N, n) after the first one, and controls u (N, parts, m)."""
+        stages = jax.vmap(self.stage_cost)(jnp.concatenate([self.z_start[None], z[:-1]]), u, z, jnp.arange(len(u)))
+        return jnp.sum(stages) + self.final_cost(self.state(z[-1], len(u)))
+
+    def misses(self, z, u):
+        """Gaps between the ends of steps and the nodes, (N, n), and the goal, (e,). Infinite where a step fails."""
+        before = jnp.concatenate([self.z_start[None], z[:-1]])
+        ends, solved = jax.vmap(self.step)(before, u, jnp.arange(len(u)))
+        gaps = jnp.where(solved[:, None], ends - z, jnp.inf)
+        return gaps, self.goal(self.state(z[-1], len(u)))
+
+    def linearised(self, z, u) -> tuple[Stages, Final]:
+        """The linear-quadratic problem at nodes z and controls u: derivatives of all steps, by `jax.vmap` over them."""
+        count, n = len(u), z.shape[1]
+        flat = u.reshape(count, -1)
+
+        def stage(z, v, z_next, k):
+            def end(x):
+                return self.step(x[:n], x[n:].reshape(u.shape[1:]), k)[0]
+
+            def cost(y):
+                x, z_next = y[: n + v.size], y[n + v.size :]
+                return self.stage_cost(x[:n], x[n:].reshape(u.shape[1:]), z_next, k)
+
+            x = jnp.concatenate([z, v])
+            reached, slopes = end(x), jax.jacfwd(end)(x)
+            y = jnp.concatenate([x, z_next])
+            gradient, hessian = jax.grad(cost)(y), convex(jax.hessian(cost)(y))
+            along = jnp.concatenate([jnp.eye(x.size), slopes])  # of (z, u, z_next) by (z, u)
+            c = reached - z_next
+            shift = jnp.concatenate([jnp.zeros(x.size), c])
+            return Stages(
+                along.T @ hessian @ along, along.T @ (gradient + hessian @ shift), slopes[:, :n], slopes[:, n:], c
+            )
+
+        before = jnp.concatenate([self.z_start[None], z[:-1]])
+        stages = jax.vmap(stage)(before, flat, z, jnp.arange(count))
+
+        def last(of):
+            return lambda z: of(self.state(z, count))
+
+        goal, final_cost = last(self.goal), last(self.final_cost)
+        S, s = convex(jax.hessian(final_cost)(z[-1])), jax.grad(final_cost)(z[-1])
+        return stages, Final(S, s, jax.jacfwd(goal)(z[-1]), goal(z[-1]))
+
+
+@lru_cache(maxsize=32)
+def _forces(own: Callable | None, actuate: Callable, parts: int) -> Callable:
+    """The forces of a system and of its controls; the same function for the same ones, so that nothing is compiled again."""
+
+    def force(t, q_s, q_f, v_s, v_f, params: Mapping[str, Any]):
+        u, t_start, length = params[CONTROL]
+        part = jnp.clip(jnp.floor((t - t_start) / length).astype(int), 0, parts - 1)
+        f_s, f_f = actuate(q_s, q_f, u[part], params)
+        if own is None:
+            return f_s, f_f
+        more_s, more_f = own(t, q_s, q_f, v_s, v_f, params)
+        return f_s + more_s, f_f + more_f
+
+    return force
+
+
+def phase(state: State):
+    """``(q_s, q_f, p_s, p_f)``, joined."""
+    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
+
+
+def convex(hessian):
+    """A symmetric matrix without its negative part."""
+    values, vectors = jnp.linalg.eigh(hessian)
+    return (vectors * jnp.maximum(values, 0.0)) @ vectors.T
