@@ -1,5 +1,6 @@
 """The sweep against the dense equations of the same linear-quadratic problem."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.control.riccati import Final, Stages, solve
@@ -16,9 +17,9 @@ def random_problem(seed: int) -> tuple[Stages, Final]:
     rng = np.random.default_rng(seed)
     hessian = np.stack([positive(rng, STATES + CONTROLS) for _ in range(N)])
     shapes = (STATES + CONTROLS,), (STATES, STATES), (STATES, CONTROLS), (STATES,)
-    stages = Stages(hessian, *(rng.standard_normal((N, *shape)) for shape in shapes))
+    stages = Stages(*map(jnp.asarray, (hessian, *(rng.standard_normal((N, *shape)) for shape in shapes))))
     rest = rng.standard_normal(STATES), rng.standard_normal((GOALS, STATES)), rng.standard_normal(GOALS)
-    return stages, Final(positive(rng, STATES), *rest)
+    return stages, Final(*map(jnp.asarray, (positive(rng, STATES), *rest)))
 
 
 def dense(stages: Stages, final: Final):
@@ -58,7 +59,7 @@ def test_the_sweep_solves_the_whole_problem():
 def test_a_goal_that_cannot_be_reached_is_missed_by_the_least():
     """Without controls nothing can be done about it."""
     stages, final = random_problem(0)
-    stages = stages._replace(B=np.zeros_like(stages.B))
+    stages = stages._replace(B=jnp.zeros_like(stages.B))
     found = solve(stages, final)
     assert np.isfinite(np.asarray(found.du)).all()
     np.testing.assert_allclose(found.nu, 0.0, atol=1e-12)
