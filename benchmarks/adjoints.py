@@ -59,6 +59,10 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         rows += found
         for adjoint in ADJOINTS[:3]:
             claims.append(Claim(f"{case.name}: {adjoint} over a run", ratios[adjoint], at_most=FACTOR))
+            apart = max(row.get("apart", 0.0) for row in found if row["gradient"] == adjoint)
+            claims.append(
+                Claim(f"{case.name}: {adjoint} apart from stored", Ratio(apart, apart, apart), at_most=AGREEMENT)
+            )
         memory = {(row["gradient"], row["steps"]): row["MB"] for row in found}
         for adjoint in ("reversible", "checkpoint"):
             growth = memory[adjoint, LONG] / memory[adjoint, SHORT]

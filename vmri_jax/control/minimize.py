@@ -3,12 +3,12 @@
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
 from vmri_jax.control.riccati import solve
 from vmri_jax.control.transcription import Transcription
@@ -19,12 +19,13 @@ from vmri_jax.mechanics.state import Movable, opened, start_of
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import progress_shown, silent
 from vmri_jax.running.simulate import prepare
-from vmri_jax.running.trajectory import RunInfo, Trajectory, know
+from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import plan
-from vmri_jax.steppers.results import Method, Result
+from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.stepper import Status
 
 SHORTEST = 2.0**-10
 """Part of an update below which the line search gives up."""
@@ -46,6 +47,7 @@ class Optimum:
         gap: the most that a step misses the next node by.
         iterations: linear-quadratic problems that were solved.
         converged: whether updates, gaps and the goal ended below the tolerance.
+        history: cost, gap, miss, update and the part of it that was taken, of every iteration.
     """
 
     controls: Float[np.ndarray, "N ..."]
@@ -122,7 +124,8 @@ def minimize(
     setup = _setup(problem, actuate, cost, num_controls, scheme, macro_dt, num_steps, final_cost, goal, grid, newton)
     shape = (num_steps, setup.parts, num_controls)
     u = _start(start, shape, grid)
-    z = jax.jit(lambda u: _along(setup, u))(u)
+    motion = jax.jit(lambda u: _along(setup, u))
+    z, _ = motion(u)
     if not np.isfinite(z).all():
         raise ValueError(
             "minimize: the motion with the controls to start from fails; give others, start=..., or a smaller macro_dt."
@@ -138,7 +141,13 @@ def minimize(
             converged = max(told["update"], told["gap"], told["miss"]) <= tolerance
             if converged or told["part"] == 0.0:
                 break
-    return _optimum(setup, problem, grid, z, u, np.asarray(nu), history, converged)
+    trajectory = _trajectory(setup, *motion(u)).of(Origin(names_of(opened(problem)), setup.system, setup.system.params))
+    controls = np.asarray(u)
+    held = np.asarray(trajectory.t)[:-1, None] + np.arange(setup.parts) * (setup.macro_dt / setup.parts)
+    if grid == "macro":
+        controls, held = controls[:, 0], held[:, 0]
+    least, miss, gap = (history[-1][name] for name in ("cost", "miss", "gap"))
+    return Optimum(controls, held, trajectory, least, np.asarray(nu), miss, gap, len(history), converged, history)
 
 
 def _setup(
@@ -196,13 +205,23 @@ def _start(start, shape, grid: str):
 
 
 def _along(setup: Transcription, u):
-    """Nodes of the motion with controls u, after the first one."""
+    """Nodes of the motion with controls u after the first one, NaN from a failure on, and the status of its steps."""
 
     def step(z, at):
-        z, solved = setup.step(z, *at)
-        return z, jnp.where(solved, z, jnp.nan)
+        z, status = setup.step(z, *at)
+        z = jnp.where(status.result <= Result.CONVERGED_AT_ROUNDOFF, z, jnp.nan)
+        return z, (z, status)
 
     return jax.lax.scan(step, setup.z_start, (u, jnp.arange(len(u))))[1]
+
+
+class _Trial(NamedTuple):
+    """A part of an update that was tried, what it leaves of the constraints, and whether the merit is small enough."""
+
+    part: Float[Array, ""]
+    gaps: Float[Array, "N n"]
+    goal: Float[Array, "e"]
+    good: Bool[Array, ""]
 
 
 def _iterate(setup: Transcription, z, u, rho):
@@ -213,23 +232,25 @@ def _iterate(setup: Transcription, z, u, rho):
     rho = jnp.maximum(rho, 2 * jnp.max(jnp.abs(change.nu), initial=0.0))
     slope = jax.jvp(setup.total, (z, u), (change.dz, du))[1]
 
-    def merit(z, u):
-        gaps, goal = setup.misses(z, u)
+    def merit(z, u, gaps, goal):
         return setup.total(z, u) + rho * (jnp.sum(jnp.abs(gaps)) + jnp.sum(jnp.abs(goal)))
 
-    before = merit(z, u)
-    infeasible = jnp.sum(jnp.abs(stages.c)) + jnp.sum(jnp.abs(final.g))
-    expected = slope - rho * infeasible
+    before = merit(z, u, stages.c, final.g)
+    expected = slope - rho * (jnp.sum(jnp.abs(stages.c)) + jnp.sum(jnp.abs(final.g)))
 
-    def too_long(part):
-        after = merit(z + part * change.dz, u + part * du)
-        worse = ~(after <= before + ENOUGH * part * jnp.minimum(expected, 0.0) + 1e-12 * (1 + jnp.abs(before)))
-        return worse & (part >= SHORTEST)
+    def shorter(last: _Trial) -> _Trial:
+        part = last.part / 2
+        at = z + part * change.dz, u + part * du
+        misses = setup.misses(*at)
+        allowed = before + ENOUGH * part * jnp.minimum(expected, 0.0) + 1e-12 * (1 + jnp.abs(before))
+        return _Trial(part, *misses, merit(*at, *misses) <= allowed)
 
-    part = jax.lax.while_loop(too_long, lambda part: part / 2, jnp.ones(()))
-    part = jnp.where(part >= SHORTEST, part, 0.0)
+    none = _Trial(jnp.zeros(()), stages.c, final.g, jnp.asarray(False))
+    tried = jax.lax.while_loop(
+        lambda last: ~last.good & (last.part > SHORTEST), shorter, none._replace(part=2 * jnp.ones(()))
+    )
+    part, gaps, goal, _ = jax.tree.map(lambda a, b: jnp.where(tried.good, a, b), tried, none)
     z, u = z + part * change.dz, u + part * du
-    gaps, goal = setup.misses(z, u)
     size_z, size_u = (jnp.maximum(jnp.max(jnp.abs(a)), 1e-12) for a in (z, u))
     told = {
         "cost": setup.total(z, u),
@@ -241,27 +262,18 @@ def _iterate(setup: Transcription, z, u, rho):
     return z, u, change.nu, rho, told
 
 
-def _optimum(setup: Transcription, problem, grid: str, z, u, nu, history: list[dict], converged: bool) -> Optimum:
-    nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(len(u) + 1))
+def _trajectory(setup: Transcription, z, status: Status) -> Trajectory:
+    """The run with these nodes after the first one."""
+    count = len(z)
+    nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(count + 1))
     phases = nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f
-    count = len(u)
-    trajectory = Trajectory(
+    failed = np.flatnonzero(np.asarray(status.result) > Result.CONVERGED_AT_ROUNDOFF)
+    return Trajectory(
         nodes.t,
         *phases,
         energy=jax.vmap(lambda *z: invariants.energy(setup.system, *z))(*phases),
         constraint_residual=jax.vmap(lambda s: invariants.constraint_residual(setup.system, s))(nodes),
-        info=RunInfo(np.full(count, int(Method.NESTED)), np.zeros(count, int), np.zeros(count)),
-        result=np.asarray(int(Result.CONVERGED)),
-        failed_at=np.asarray(-1),
-        t_micro=None,
-        q_f_micro=None,
-    )
-    trajectory = know(trajectory, Origin(names_of(opened(problem)), setup.system, setup.system.params))
-    last = history[-1]
-    starts = np.asarray(nodes.t)[:-1, None] + np.arange(setup.parts) * (setup.macro_dt / setup.parts)
-    controls = np.asarray(u)
-    if grid == "macro":
-        controls, starts = controls[:, 0], starts[:, 0]
-    return Optimum(
-        controls, starts, trajectory, last["cost"], nu, last["miss"], last["gap"], len(history), converged, history
+        info=RunInfo(status.method, status.iterations, status.residual),
+        result=status.result[failed[0]] if failed.size else jnp.max(status.result),
+        failed_at=np.asarray(failed[0] if failed.size else -1),
     )

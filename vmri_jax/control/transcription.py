@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.control.riccati import Final, Stages
+from vmri_jax.diagnostics.linear import phase_splits, phase_vector
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
@@ -61,21 +62,24 @@ class Transcription:
 
     def state(self, z, k) -> State:
         """The state at node k."""
-        n_s, n = self.start.q_s.size, self.start.q_s.size + self.start.q_f.size
-        return State(self.start.t + k * self.macro_dt, *jnp.split(z, [n_s, n, n + n_s]))
+        return State(self.start.t + k * self.macro_dt, *jnp.split(z, phase_splits(self.start)))
 
     @property
     def z_start(self) -> jax.Array:
         """The first state, (n,)."""
-        return phase(self.start)
+        return phase_vector(self.start)
+
+    def before(self, z):
+        """The nodes that the steps to the nodes z (N, n) start from."""
+        return jnp.concatenate([self.z_start[None], z[:-1]])
 
     def step(self, z, u, k):
-        """The next state, and whether the step was solved; u (parts, m)."""
+        """The next state, and the `Status` of the step; u (parts, m)."""
         state = self.state(z, k)
         held = u, state.t, self.macro_dt / self.parts
         system = self.controlled.replace(params={**self.system.params, CONTROL: held})
         end, info = macro_step(system, self.scheme, state, self.macro_dt, self.newton)
-        return phase(end), info.result <= Result.CONVERGED_AT_ROUNDOFF
+        return phase_vector(end), info.status
 
     def stage_cost(self, z, u, z_next, k):
         """``H`` times the mean of the cost at both ends of the interval, over the parts."""
@@ -84,13 +88,13 @@ class Transcription:
 
     def total(self, z, u):
         """The cost of nodes z (N, n) after the first one, and controls u (N, parts, m)."""
-        stages = jax.vmap(self.stage_cost)(jnp.concatenate([self.z_start[None], z[:-1]]), u, z, jnp.arange(len(u)))
+        stages = jax.vmap(self.stage_cost)(self.before(z), u, z, jnp.arange(len(u)))
         return jnp.sum(stages) + self.final_cost(self.state(z[-1], len(u)))
 
     def misses(self, z, u):
         """Gaps between the ends of steps and the nodes, (N, n), and the goal, (e,). Infinite where a step fails."""
-        before = jnp.concatenate([self.z_start[None], z[:-1]])
-        ends, solved = jax.vmap(self.step)(before, u, jnp.arange(len(u)))
+        ends, status = jax.vmap(self.step)(self.before(z), u, jnp.arange(len(u)))
+        solved = status.result <= Result.CONVERGED_AT_ROUNDOFF
         gaps = jnp.where(solved[:, None], ends - z, jnp.inf)
         return gaps, self.goal(self.state(z[-1], len(u)))
 
@@ -101,14 +105,15 @@ class Transcription:
 
         def stage(z, v, z_next, k):
             def end(x):
-                return self.step(x[:n], x[n:].reshape(u.shape[1:]), k)[0]
+                reached, _ = self.step(x[:n], x[n:].reshape(u.shape[1:]), k)
+                return reached, reached
 
             def cost(y):
                 x, z_next = y[: n + v.size], y[n + v.size :]
                 return self.stage_cost(x[:n], x[n:].reshape(u.shape[1:]), z_next, k)
 
             x = jnp.concatenate([z, v])
-            reached, slopes = end(x), jax.jacfwd(end)(x)
+            slopes, reached = jax.jacfwd(end, has_aux=True)(x)
             y = jnp.concatenate([x, z_next])
             gradient, hessian = jax.grad(cost)(y), convex(jax.hessian(cost)(y))
             along = jnp.concatenate([jnp.eye(x.size), slopes])  # of (z, u, z_next) by (z, u)
@@ -118,8 +123,7 @@ class Transcription:
                 along.T @ hessian @ along, along.T @ (gradient + hessian @ shift), slopes[:, :n], slopes[:, n:], c
             )
 
-        before = jnp.concatenate([self.z_start[None], z[:-1]])
-        stages = jax.vmap(stage)(before, flat, z, jnp.arange(count))
+        stages = jax.vmap(stage)(self.before(z), flat, z, jnp.arange(count))
 
         def last(of):
             return lambda z: of(self.state(z, count))
@@ -143,11 +147,6 @@ def _forces(own: Callable | None, actuate: Callable, parts: int) -> Callable:
         return f_s + more_s, f_f + more_f
 
     return force
-
-
-def phase(state: State):
-    """``(q_s, q_f, p_s, p_f)``, joined."""
-    return jnp.concatenate([state.q_s, state.q_f, state.p_s, state.p_f])
 
 
 def convex(hessian):

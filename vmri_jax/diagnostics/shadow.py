@@ -31,6 +31,7 @@ from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.coupled import Coupled
+from vmri_jax.steppers.kicked import kicked
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
 
@@ -163,22 +164,18 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     """A step with all its control points: the state at its end, its discrete Lagrangian and its `Result`."""
     terms = lagrangian(system, scheme)
 
-    def kicked(p_s, p_f, q_s, q_f, end: str):
-        for term in terms.kicks:
-            weight = getattr(term, end)
-            if weight is not None:
-                impulse, (d_s, d_f) = term.times_step(macro_dt) * weight, term.gradient(q_s, q_f)
-                p_s, p_f = p_s + impulse * d_s, p_f + impulse * d_f
-        return p_s, p_f
+    def with_kicks(state: State, end: str) -> State:
+        gradients = [term.gradient(state.q_s, state.q_f) for term in terms.kicks]
+        return kicked(state, terms.kicks, gradients, macro_dt, (end,))
 
-    p_s, p_f = kicked(state.p_s, state.p_f, state.q_s, state.q_f, "start")
-    equations = StepEquations(system, scheme, state.t, state.q_s, state.q_f, p_s, p_f, macro_dt)
+    start = with_kicks(state, "start")
+    equations = StepEquations.of(system, scheme, start, macro_dt)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
-    v_s, v_f = velocity(system, state.q_s, state.q_f, p_s, p_f)
+    v_s, v_f = velocity(system, start.q_s, start.q_f, start.p_s, start.p_f)
     guess = equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs))
     solution, _ = Coupled(Newton(), "arrowhead").solve(equations, guess, ())
     q_s, (q_f, p_s, p_f) = state.q_s + solution.x.slow[-1], solution.end
-    end = State(state.t + macro_dt, q_s, q_f, *kicked(p_s, p_f, q_s, q_f, "end"))
+    end = with_kicks(State(state.t + macro_dt, q_s, q_f, p_s, p_f), "end")
     return end, terms(equations.path(solution.x)), solution.status.result
 
 

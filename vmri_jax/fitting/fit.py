@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.fitting.measured import Measured
-from vmri_jax.fitting.result import Fit
+from vmri_jax.fitting.result import Fit, without_starts
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
@@ -86,10 +86,10 @@ def fit(
     if max(s.max() for s in steps) < 1:
         raise ValueError("fit: all times of measurement are that of the start; measure later ones, too.")
     run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), newton=newton)
+    run(throw=True)
     if newton is None and run.plan.has_fallback:
         newton = Newton("nested")
     shooting = Shooting(model, unknowns, data, steps, scheme, newton or Newton(), float(macro_dt), segments)
-    run(throw=True)
     search = _Search(shooting, max_steps)
     u = np.zeros((starts, unknowns.size))
     u[1:] = spread * np.random.default_rng(seed).standard_normal((starts - 1, unknowns.size))
@@ -166,9 +166,7 @@ class _Search:
                 f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some of them."
             )
         none = np.zeros(self.size)
-        self.others = shooting.starts(none) if shooting.segments > 1 else np.zeros((0, 0))
-        if shooting.segments == 1:
-            self.others = np.zeros((0, len(shooting.start(none))))
+        self.others = shooting.starts(none)
         scale = np.concatenate([self.others, np.asarray(shooting.start(none))[None]])
         self.scale = np.maximum(np.abs(scale).max(axis=0), 1e-3 * np.abs(scale).max() + 1e-12)
 
@@ -183,7 +181,7 @@ class _Search:
         return misses, weight * np.sqrt(self.count) * gaps / self.scale
 
     def solve(self, u, z, values):
-        """The search from u, z: (u, z, sum of squares of the misses, iterations, whether it converged, largest gap)."""
+        """The search from u, z: (u, z, misses, iterations, whether it converged, largest gap)."""
         optimistix = _optimistix()
         solver = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
         weights = jnp.asarray(TIGHTER if self.shooting.segments > 1 else (1.0,))
@@ -202,7 +200,7 @@ class _Search:
 
         (u, z), (iterations, good) = jax.lax.scan(stage, (u, z), weights)
         misses, gaps = self.residual((u, z), values, 1.0)
-        return u, z, jnp.sum(misses**2), jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
+        return u, z, misses, jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
 
     def jacobian(self, u, z, values):
         """Of the misses and of tightly weighted gaps by the numbers of the parameters themselves and the starts."""
@@ -238,11 +236,9 @@ class _Search:
         z = np.broadcast_to(self.others / self.scale, (len(u), *self.others.shape))
         solve = jax.jit(jax.vmap(self.solve, (0, 0, None)))
         found = [np.asarray(a) for a in solve(u, z, self.shooting.values)]
-        squares = np.where(np.isfinite(found[2]), found[2], np.inf)
-        best = int(np.argmin(squares))
-        u, z, _, iterations, good, gap = (a[best] for a in found)
+        squares = np.sum(found[2] ** 2, axis=1)
+        u, z, misses, iterations, good, gap = (a[np.argmin(squares)] for a in found)
         by_parameters, by_starts = (np.asarray(a) for a in self.compiled_jacobian(u, z, self.shooting.values))
-        misses = np.asarray(self.residual((u, z), self.shooting.values, 1.0)[0])
         return Fit.of(
             self.shooting,
             u,
@@ -264,9 +260,8 @@ def _again(search: _Search, u, z, values):
     @jax.jit
     def one(values):
         found_u, found_z, *_ = search.solve(u, z, values)
-        by_parameters, by_starts = search.jacobian(found_u, found_z, values)
-        whole = jnp.concatenate([by_parameters, by_starts], axis=1)
-        covariance = jnp.linalg.pinv(whole.T @ whole, hermitian=True)[: search.size, : search.size]
+        jacobian = without_starts(*search.jacobian(found_u, found_z, values))
+        covariance = jnp.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
         return unknowns.vector(unknowns.at(found_u)), covariance
 
     return jax.lax.map(one, values, batch_size=50)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
@@ -15,6 +16,8 @@ from vmri_jax.running.trajectory import Trajectory
 
 UNDETERMINED = 1e-7
 """Directions that change the predictions by less than this part of the best determined one, relative to the parameters, count as none."""
+RANK = 1e-12
+"""Directions of the starts with singular values below this part of the largest count as none."""
 UNLIKELY = 1e-6
 """Chance of misses as large as they are, below which the report doubts the fit."""
 
@@ -120,8 +123,7 @@ class Fit:
 
     def simulate(self, **options) -> Trajectory:
         """The run with the parameters that were found, up to the last measurement; `options` as of `vmri_jax.simulate`."""
-        last = max(int(steps.max()) for steps in self.shooting.steps)
-        given = {"macro_dt": self.shooting.macro_dt, "num_steps": last} | options
+        given = {"macro_dt": self.shooting.macro_dt, "num_steps": self.shooting.last} | options
         return simulate(self.problem, self.shooting.scheme, **given)
 
     def bootstrap(self, repeats: int, seed: int = 0) -> "Bootstrap":
@@ -189,14 +191,19 @@ class Bootstrap:
         return dict(zip(self.labels, covers.mean(axis=0).tolist(), strict=True))
 
 
+def without_starts(by_parameters, by_starts):
+    """The Jacobian by the parameters, without what the starts of the parts can do instead."""
+    if not by_starts.size:
+        return by_parameters
+    q, sizes, _ = jnp.linalg.svd(by_starts, full_matrices=False)
+    q = q * (sizes > RANK * sizes[0])
+    return by_parameters - q @ (q.T @ by_parameters)
+
+
 def _covariance(by_parameters, by_starts, numbers, labels) -> tuple[np.ndarray, list[str]]:
     """``(J^T J)^-1`` of the parameters, and the combinations of them that are not determined."""
     scale = np.where(numbers == 0, 1.0, np.abs(numbers))
-    jacobian = by_parameters * scale
-    if by_starts.size:  # what the starts of the parts can do instead
-        q, sizes, _ = np.linalg.svd(by_starts, full_matrices=False)
-        q = q[:, sizes > 1e-12 * sizes[0]]
-        jacobian = jacobian - q @ (q.T @ jacobian)
+    jacobian = np.asarray(without_starts(by_parameters * scale, by_starts))
     _, sizes, directions = np.linalg.svd(jacobian, full_matrices=False)
     known = sizes > UNDETERMINED * sizes[0]
     covariance = directions[known].T @ np.diag(sizes[known] ** -2.0) @ directions[known] * np.outer(scale, scale)

@@ -48,17 +48,17 @@ class Shooting:
     @cached_property
     def every(self) -> int:
         """Macro steps between saved nodes."""
-        numbers = {int(n) for steps in self.steps for n in steps} | {self._least}
-        return gcd(*numbers)
+        return gcd(*(int(n) for steps in self.steps for n in steps))
 
-    @cached_property
-    def _least(self) -> int:
+    @property
+    def last(self) -> int:
+        """Macro steps up to the last measurement."""
         return max(int(steps.max()) for steps in self.steps)
 
     @cached_property
     def length(self) -> int:
         """Macro steps of a part."""
-        nodes = -(-self._least // self.every)
+        nodes = -(-self.last // self.every)
         return self.every * max(-(-nodes // self.segments), 1)
 
     @cached_property
@@ -84,6 +84,8 @@ class Shooting:
 
     def starts(self, u) -> np.ndarray:
         """(segments - 1, 2 n) starts of the other parts along one run."""
+        if self.segments == 1:
+            return np.zeros((0, self.start(u).size))
         problem = self.model(self.unknowns.at(u))
         run = simulate(
             problem,
@@ -108,7 +110,7 @@ class Shooting:
         else:
             observed, ends = self._parts(u, jnp.concatenate([self.start(u)[None], starts]))
         predicted = [
-            jnp.where(np.isfinite(m.values), jnp.reshape(o[part, node], m.values.shape), 0.0)[np.isfinite(m.values)]
+            jnp.reshape(o[part, node], m.values.shape)[np.isfinite(m.values)]
             for m, o, (part, node) in zip(self.data, observed, self._places, strict=True)
         ]
         return jnp.concatenate(predicted), ends[:-1] - starts
@@ -133,17 +135,18 @@ class Shooting:
 
         @parts.defjvp
         def derivative(primals, tangents):
-            u, starts = primals
+            u, _ = primals
 
             def part(together, number):
-                return self._part(together[: u.size], together[u.size :], number)
+                found = self._part(together[: u.size], together[u.size :], number)
+                return found, found
 
             together, d_together = (
                 jnp.concatenate([jnp.broadcast_to(u, (self.segments, u.size)), starts], axis=1)
                 for u, starts in (primals, tangents)
             )
-            by_each = jax.vmap(jax.jacfwd(part))(together, jnp.arange(self.segments))
-            return parts(u, starts), jax.tree.map(lambda a: jnp.einsum("k...i,ki->k...", a, d_together), by_each)
+            by_each, found = jax.vmap(jax.jacfwd(part, has_aux=True))(together, jnp.arange(self.segments))
+            return found, jax.tree.map(lambda a: jnp.einsum("k...i,ki->k...", a, d_together), by_each)
 
         return parts
 

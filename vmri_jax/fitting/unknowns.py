@@ -10,9 +10,6 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import real_array
 
-NEAR = 1e-3
-"""Where a start lies at a bound, it is moved inside by this part of the range."""
-
 
 @dataclass(frozen=True)
 class Unknown:

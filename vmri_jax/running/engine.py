@@ -14,7 +14,7 @@ from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.loops import PLAIN, SHORT, Loops, Recursive, Stored
+from vmri_jax.running.loops import PLAIN, WHOLE, Loops, Recursive, Stored
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
@@ -61,7 +61,7 @@ class Engine:
         """The same with derivatives in reverse mode only, that need memory like the logarithm of the number of steps."""
 
         def checkpointed(leaves, state, macro_dt, save_every):
-            loops = Stored() if self.num_saves * save_every <= SHORT else Recursive(save_every)
+            loops = Stored() if self.num_saves * save_every <= WHOLE else Recursive(save_every)
             return self.trajectory(leaves, state, macro_dt, save_every, loops=loops, once=True)
 
         return jax.jit(checkpointed, static_argnums=3)
@@ -121,17 +121,15 @@ class Engine:
                 at = at._replace(state=state, own=own)
             return at, worst, micro
 
+        def nothing(at: _At):
+            return at, no_info, no_micro
+
         def save(at: _At, moves):
-            at, worst, micro = (
-                interval(at) if moves is None else jax.lax.cond(moves, interval, lambda at: (at, *none), at)
-            )
+            at, worst, micro = interval(at) if moves is None else jax.lax.cond(moves, interval, nothing, at)
             node, at = _node(system, tolerance, at)
             return at, (node, worst, micro)
 
-        at, none = (
-            _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1)),
-            (no_info, no_micro),
-        )
+        at = _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
         if loops is PLAIN:  # one place for the first node and all others: compiled once
             number = np.arange(self.num_saves + 1)
             moves = number > 0 if saves is None else (number > 0) & (number <= saves)

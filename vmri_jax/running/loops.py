@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from vmri_jax.steppers.solved import ROOT
 
-SHORT = 1000
+WHOLE = 1000
 """Runs of so many steps are kept as a whole."""
 WIDTH = 100
 """Parts that are kept at a time, at every level of `Recursive`."""

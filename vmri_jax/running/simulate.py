@@ -73,10 +73,8 @@ def simulate(
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN from the failure on.
         progress: show a progress bar; the run is then compiled for a part of its saved nodes.
-        adjoint: how the run is differentiated, see `vmri_jax.running.adjoints`: "stored" keeps the solution of every step, and
-            has all modes and orders of derivatives; "checkpoint" and "reversible" have first ones in reverse mode, with memory
-            for some thousand steps or for the saved nodes alone; "forward" turns forward mode around, for few parameters. "auto"
-            is "stored" up to 10 000 steps, then "reversible" for symmetric schemes without forces, else "checkpoint".
+        adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
+            "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
 
     Returns:
         The `Trajectory`, with ``num_steps / save_every + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
@@ -91,7 +89,8 @@ def simulate(
     check_adjoint(adjoint, scheme)
     run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     if not run.is_concrete:
-        return run.traced(adjoint)
+        check_system(run.system, run.state.q_s, run.state.q_f)
+        return traced_run(run, adjoint)
     run.check()
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     trajectory = run.in_parts() if progress else run()
@@ -292,11 +291,6 @@ class Simulation:
         shapes = tuple(a.shape for a in self.start_arrays)
         numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.leaves)
         _check_once(_Known((self.structure, shapes, numbers), self.system, self.state, what, constraints))
-
-    def traced(self, adjoint: str = "auto") -> Trajectory:
-        """The whole run under transformations of JAX."""
-        check_system(self.system, self.state.q_s, self.state.q_f)
-        return traced_run(self, adjoint)
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """Before the first step; or from a state before step number `step`, as if that was the first one."""

@@ -48,10 +48,10 @@ class Kicked(Stepper):
         return own._replace(inner=self.inner.renew(state, own.inner, macro_dt))
 
     def move(self, state: State, own: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
-        state = self._kick(state, macro_dt, own.gradients, ("start",))
+        state = kicked(state, self.kicks, own.gradients, macro_dt, ("start",))
         state, info, inner = self.inner.move(state, own.inner, macro_dt)
         gradients = self._gradients(state, macro_dt)
-        return self._kick(state, macro_dt, gradients, ("end",)), info, KickedState(gradients, inner)
+        return kicked(state, self.kicks, gradients, macro_dt, ("end",)), info, KickedState(gradients, inner)
 
     def move_many(self, state: State, own: KickedState, macro_dt, count: int) -> tuple[State, StepInfo, KickedState]:
         """`count` steps; the kicks of two steps at the node they share are merged into one."""
@@ -59,7 +59,7 @@ class Kicked(Stepper):
         def move(state, inner, ends):
             state, info, inner = self.inner.move(state, inner, macro_dt)
             gradients = self._gradients(state, macro_dt)
-            return self._kick(state, macro_dt, gradients, ends), info, KickedState(gradients, inner)
+            return kicked(state, self.kicks, gradients, macro_dt, ends), info, KickedState(gradients, inner)
 
         def between(carry, _):
             state, inner, worst = carry
@@ -67,7 +67,7 @@ class Kicked(Stepper):
             along = info.q_f_micro[0], info.multiplier[0]
             return (state, own.inner, worst.worse(info.status)), along
 
-        state = self._kick(state, macro_dt, own.gradients, ("start",))
+        state = kicked(state, self.kicks, own.gradients, macro_dt, ("start",))
         none = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
         (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, own.inner, none), length=count - 1)
         state, last, own = move(state, inner, ("end",))
@@ -96,21 +96,23 @@ class Kicked(Stepper):
 
         return tuple(map(gradient, self.kicks))
 
-    def _kick(self, state: State, macro_dt, gradients, ends: tuple[str, ...]) -> State:
-        p_s, p_f = state.p_s, state.p_f
-        for term, (d_s, d_f) in zip(self.kicks, gradients, strict=True):
-            weights = [w for w in (getattr(term, end) for end in ends) if w is not None]
-            if weights:
-                impulse = term.times_step(macro_dt) * sum(weights)
-                p_s, p_f = p_s + impulse * d_s, p_f + impulse * d_f
-        return State(state.t, state.q_s, state.q_f, p_s, p_f)
-
     def lines(self) -> list[str]:
         if not self.kicks:
             return self.inner.lines()
         names = ", ".join(term.name for term in self.kicks)
         averaged = ", at averaged fast positions" if self.average is not None else ""
         return [f"kicks of {names} at both ends{averaged}", *indented(self.inner.lines())]
+
+
+def kicked(state: State, kicks: tuple[Term, ...], gradients, macro_dt, ends: tuple[str, ...]) -> State:
+    """A state after kicks with these gradients, with the weights that they have at these ends of the interval."""
+    p_s, p_f = state.p_s, state.p_f
+    for term, (d_s, d_f) in zip(kicks, gradients, strict=True):
+        weights = [w for w in (getattr(term, end) for end in ends) if w is not None]
+        if weights:
+            impulse = term.times_step(macro_dt) * sum(weights)
+            p_s, p_f = p_s + impulse * d_s, p_f + impulse * d_f
+    return State(state.t, state.q_s, state.q_f, p_s, p_f)
 
 
 def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
