@@ -49,6 +49,8 @@ def test_a_double_integrator():
         assert optimum.converged
         assert optimum.iterations <= 2
         assert optimum.miss < 1e-12
+        assert optimum.trajectory.success
+        assert optimum.trajectory.q_s[-1, 0] == pytest.approx(1.0, abs=1e-12)
         middle = optimum.t + 0.5 / steps
         assert np.abs(optimum.controls[:, 0] - (6 - 12 * middle)).max() < 6.0 / steps**2
         np.testing.assert_allclose(optimum.multipliers, [-12, 6], rtol=1.5 / steps**2)

@@ -98,6 +98,9 @@ def test_long_motion_needs_several_parts():
     assert several.values[0] == pytest.approx(20.0, abs=5 * several.standard_errors["omega"])
     assert several.gap < 1e-6
     assert "20 segments" in str(several)
+    again = several.bootstrap(2)
+    np.testing.assert_allclose(again.errors[:, 0], several.standard_errors["omega"], rtol=0.01)
+    assert np.all(np.abs(again.found - again.truth) < 5 * again.errors)
 
 
 def test_several_starts_find_the_best_one():
