@@ -32,8 +32,8 @@ def at_rest_at_one(state):
 def point(steps: int):
     return minimize(
         POINT,
-        push,
         effort,
+        actuate=push,
         num_controls=1,
         goal=at_rest_at_one,
         scheme=vm.fully_explicit(1),
@@ -92,8 +92,8 @@ def test_a_hub_with_flexible_modes():
     for steps in (40, 80):
         found = minimize(
             HUB,
-            push,
             effort,
+            actuate=push,
             num_controls=1,
             goal=at_rest_at_one,
             scheme=vm.fully_implicit(1),
@@ -118,8 +118,8 @@ def test_a_cart_with_a_pendulum_from_rest_to_rest():
     )
     optimum = minimize(
         problem,
-        push,
         effort,
+        actuate=push,
         num_controls=1,
         goal=there,
         scheme=vm.fully_implicit(2),
@@ -146,8 +146,8 @@ def idle(q_s, q_f, u, params):
 def test_a_goal_out_of_reach_is_said():
     optimum = minimize(
         POINT,
-        idle,
         effort,
+        actuate=idle,
         num_controls=1,
         goal=at_rest_at_one,
         scheme=vm.fully_explicit(1),
@@ -195,8 +195,8 @@ def test_params_must_be_a_dict():
     with pytest.raises(TypeError, match="need it to be a dict"):
         minimize(
             vm.Problem(system, [0.0], NONE),
-            push,
             effort,
+            actuate=push,
             num_controls=1,
             scheme=vm.fully_explicit(1),
             macro_dt=0.1,

@@ -13,42 +13,44 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from vmri_jax.mechanics.arrays import Numbers
 
 
 class Stages(NamedTuple):
     """All stages, each with n numbers of the state and m of the control."""
 
-    hessian: Float[Array, "N n+m n+m"]
-    gradient: Float[Array, "N n+m"]
-    A: Float[Array, "N n n"]
-    B: Float[Array, "N n m"]
-    c: Float[Array, "N n"]
+    hessian: Float[Numbers, "N n+m n+m"]
+    gradient: Float[Numbers, "N n+m"]
+    A: Float[Numbers, "N n n"]
+    B: Float[Numbers, "N n m"]
+    c: Float[Numbers, "N n"]
 
 
 class Final(NamedTuple):
     """What is asked of the last state: a quadratic cost and ``G dz + g = 0``."""
 
-    S: Float[Array, "n n"]
-    s: Float[Array, "n"]
-    G: Float[Array, "e n"]
-    g: Float[Array, "e"]
+    S: Float[Numbers, "n n"]
+    s: Float[Numbers, "n"]
+    G: Float[Numbers, "e n"]
+    g: Float[Numbers, "e"]
 
 
 class Solution(NamedTuple):
     """Changes of the states after the first one, of the controls, and the multipliers of the goal."""
 
-    dz: Float[Array, "N n"]
-    du: Float[Array, "N m"]
-    nu: Float[Array, "e"]
+    dz: Float[Numbers, "N n"]
+    du: Float[Numbers, "N m"]
+    nu: Float[Numbers, "e"]
 
 
 class _Value(NamedTuple):
-    S: Float[Array, "n n"]
-    s: Float[Array, "n"]
-    M: Float[Array, "n e"]
-    m: Float[Array, "e"]
-    W: Float[Array, "e e"]
+    S: Float[Numbers, "n n"]
+    s: Float[Numbers, "n"]
+    M: Float[Numbers, "n e"]
+    m: Float[Numbers, "e"]
+    W: Float[Numbers, "e e"]
 
 
 def solve(stages: Stages, final: Final) -> Solution:

@@ -15,7 +15,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from vmri_jax.control.bounded import Limits
 from vmri_jax.control.riccati import Final, Stages
 from vmri_jax.diagnostics.linear import phase_splits, phase_vector
 from vmri_jax.mechanics.state import State
@@ -29,6 +31,9 @@ from vmri_jax.steppers.results import Result
 CONTROL = "vmri_jax.control"
 """Name among the parameters of a system of the controls of a step, with its start and the length of the parts that they are held for."""
 
+BETWEEN = 1e-6
+"""Times that are nearer to the border of two parts, over the length of a part, are between them."""
+
 
 @dataclass(frozen=True, eq=False)
 class Transcription:
@@ -41,6 +46,8 @@ class Transcription:
         cost: per time, ``cost(state, u) -> ()``.
         final_cost: ``final_cost(state) -> ()``.
         goal: ``goal(state) -> (e,)``, zero at the end.
+        limits: ``limits(state, u) -> (c,)``, not above zero at the end of every part of an interval; None for none.
+        bounds: least and largest controls, (m,) each.
         parts: of a macro interval, for each of which there are own controls: 1, or num_micro.
     """
 
@@ -53,12 +60,29 @@ class Transcription:
     cost: Callable
     final_cost: Callable
     goal: Callable
+    limits: Callable | None
+    bounds: tuple[np.ndarray, np.ndarray]
     parts: int
+
+    @property
+    def bounded(self) -> bool:
+        """Whether there are inequalities."""
+        return self.limits is not None or bool(np.isfinite(self.bounds).any())
 
     @property
     def controlled(self) -> System:
         """The system with the forces of its controls."""
-        return self.system.replace(force=_forces(self.system.force, self.actuate, self.parts))
+        return self.system.replace(force=_forces(self.system.force, self.actuate))
+
+    def times(self, count: int) -> np.ndarray:
+        """(count, parts) times from which on controls are held."""
+        start = float(self.start.t) + self.macro_dt * np.arange(count)
+        return start[:, None] + np.arange(self.parts) * (self.macro_dt / self.parts)
+
+    def driven(self, u) -> System:
+        """The system with the forces of controls u (N, parts, m), from the start on."""
+        held = jnp.reshape(u, (-1, u.shape[-1])), self.start.t, self.macro_dt / self.parts
+        return self.controlled.replace(params={**self.system.params, CONTROL: held})
 
     def state(self, z, k) -> State:
         """The state at node k."""
@@ -81,6 +105,16 @@ class Transcription:
         end, info = macro_step(system, self.scheme, state, self.macro_dt, self.newton)
         return phase_vector(end), info.status
 
+    def along(self, u):
+        """Nodes of the motion with controls u after the first one, NaN from a failure on, and the `Status` of its steps."""
+
+        def step(z, at):
+            z, status = self.step(z, *at)
+            z = jnp.where(status.result <= Result.CONVERGED_AT_ROUNDOFF, z, jnp.nan)
+            return z, (z, status)
+
+        return jax.lax.scan(step, self.z_start, (u, jnp.arange(len(u))))[1]
+
     def stage_cost(self, z, u, z_next, k):
         """``H`` times the mean of the cost at both ends of the interval, over the parts."""
         ends = self.state(z, k), self.state(z_next, k + 1)
@@ -97,6 +131,25 @@ class Transcription:
         solved = status.result <= Result.CONVERGED_AT_ROUNDOFF
         gaps = jnp.where(solved[:, None], ends - z, jnp.inf)
         return gaps, self.goal(self.state(z[-1], len(u)))
+
+    def over(self, z, u):
+        """Values of the limits at nodes z (N, n) after the first one, (N, parts c)."""
+
+        def stage(z, u, k):
+            state, limits = self.state(z, k + 1), self.limits
+            return jnp.zeros(0) if limits is None else jnp.ravel(jax.vmap(lambda u: limits(state, u))(u))
+
+        return jax.vmap(stage)(z, u, jnp.arange(len(u)))
+
+    def limited(self, z, u) -> Limits:
+        """The inequalities, linearised at nodes z and controls u."""
+
+        def stage(z, u):
+            return self.over(z[None], u[None])[0]
+
+        C, D = jax.vmap(jax.jacfwd(stage, (0, 1)))(z, u)
+        lower, upper = (jnp.tile(bound, self.parts) - u.reshape(len(u), -1) for bound in self.bounds)
+        return Limits(C, D.reshape(*D.shape[:2], u[0].size), self.over(z, u), lower, upper)
 
     def linearised(self, z, u) -> tuple[Stages, Final]:
         """The linear-quadratic problem at nodes z and controls u: derivatives of all steps, by `jax.vmap` over them."""
@@ -134,19 +187,23 @@ class Transcription:
 
 
 @lru_cache(maxsize=32)
-def _forces(own: Callable | None, actuate: Callable, parts: int) -> Callable:
+def _forces(own: Callable | None, actuate: Callable) -> Callable:
     """The forces of a system and of its controls; the same function for the same ones, so that nothing is compiled again."""
 
     def force(t, q_s, q_f, v_s, v_f, params: Mapping[str, Any]):
-        u, t_start, length = params[CONTROL]
-        part = jnp.clip(jnp.floor((t - t_start) / length).astype(int), 0, parts - 1)
-        f_s, f_f = actuate(q_s, q_f, u[part], params)
+        f_s, f_f = actuate(q_s, q_f, held(t, *params[CONTROL]), params)
         if own is None:
             return f_s, f_f
         more_s, more_f = own(t, q_s, q_f, v_s, v_f, params)
         return f_s + more_s, f_f + more_f
 
     return force
+
+
+def held(t, u, t_start, length):
+    """Controls at a time: those of its part, (parts, m), and between two parts the mean, so that each acts over its whole length."""
+    sides = (t - t_start) / length + jnp.array([-BETWEEN, BETWEEN])
+    return jnp.mean(u[jnp.clip(jnp.floor(sides).astype(int), 0, len(u) - 1)], axis=0)
 
 
 def convex(hessian):

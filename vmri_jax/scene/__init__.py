@@ -4,6 +4,7 @@ from vmri_jax.scene.body import Body
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.angles import Angle, Bending, Torsion
 from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
+from vmri_jax.scene.effects.controls import Controlled
 from vmri_jax.scene.effects.custom import Constraint, Force, Kinetic, Potential
 from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag, RayleighDamping
 from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, HarmonicDrive
@@ -26,6 +27,7 @@ __all__ = [
     "Box",
     "ConstantForce",
     "Constraint",
+    "Controlled",
     "Coulomb",
     "Cylinder",
     "Cylindrical",

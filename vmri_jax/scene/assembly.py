@@ -1,4 +1,4 @@
-"""The `System` of a sorted scene."""
+"""The `System` of a sorted scene, and the forces of its controls."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.scene.layout import join
 from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import FUNCTIONS, MASS, SomeRows
+from vmri_jax.scene.terms import FUNCTIONS, MASS, Actuation, SomeRows
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
@@ -24,7 +24,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         if part.effect.kind == "potential":
             potentials[name] = (*potentials.get(name, ()), *made)
         terms.setdefault(part.home, []).extend([SomeRows(made, part.dropped)] if part.dropped else made)
-    functions: dict[str, Any] = {home: FUNCTIONS[home](tuple(some)) for home, some in terms.items() if some}
+    functions: dict[str, Any] = {home: FUNCTIONS[home](tuple(terms[home])) for home in FUNCTIONS if terms.get(home)}
     for home in ("constraint", "slow_constraint"):
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])
@@ -34,3 +34,15 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         params[MASS] = {"slow": slow, "fast": fast}
     kinetic = functions.pop("kinetic", None) or ConstantMass(slow, fast)
     return System(kinetic, **functions, params=params)
+
+
+def actuation(sorting: Sorting) -> Actuation | None:
+    """The forces of the controls of a scene, None where nothing is controlled.
+
+    Args:
+        sorting: bodies at their places, effects at their homes.
+    """
+    controls = [part for part in sorting.placed if part.home == "control"]
+    terms = [part.effect.terms(part.elements, sorting.bodies, sorting.places, {}) for part in controls]
+    names = tuple(part.effect.components(sorting.bodies) for part in controls)
+    return Actuation(tuple(term for (term,) in terms), names) if controls else None

@@ -17,7 +17,7 @@ from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
 from vmri_jax.scene.layout import Rows
 from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, Role, choose
 
-Kind = Literal["kinetic", "potential", "constraint", "force"]
+Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
 DRAWN = {"link": "links", "spring": "springs"}
 """What joins two bodies in a drawing, and its entry there."""
 POINTS = ("at_0", "at_1", "at_2", "at_3")
@@ -39,6 +39,7 @@ class Effect(ABC):
     | "constraint" | ``function(q, params)``, `timed` ``function(t, q, params)`` | values that are kept zero, (k,) or () for each element |
     | "kinetic" | ``function(q, v, params)`` | energy added to ``sum m v^2 / 2``, () |
     | "force" | ``function(t, q, v, params)`` | tuple of forces, shaped like q |
+    | "control" | ``function(q, u, params)`` | tuple of forces of the controls u, shaped like q |
 
     q and v are tuples with one entry per role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). Of a rigid
     body these are its centre's, or those of the point that is given with its name. The ground is a body, too. params
@@ -266,6 +267,10 @@ class Effect(ABC):
             return OnGround(len(names), size, at if attached else None)
         own = [places[name] for name in names]
         return InRigidBodies(Rows.of(own), at) if attached else OnBodies(Rows.of(own, size))
+
+    def components(self, bodies: Bodies) -> tuple[str, ...]:
+        """Names of the controls of an effect that is one."""
+        return ()
 
     def curvature(self, bodies: Bodies):
         """Largest second derivative of the energy of each element, () or (n,), where its start does not show it, else None."""

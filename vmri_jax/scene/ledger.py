@@ -28,8 +28,9 @@ HOMES = {
     "constraint": "constraint g",
     "slow_constraint": "constraint g_s",
     "force": "force F",
+    "control": "control u",
 }
-RULES = {"slow_potential": "slow", "fast_potential": "fast"}
+RULES = {"slow_potential": "slow", "fast_potential": "fast", "control": "force"}
 """What a scheme calls its rules of these parts."""
 STEPS = 20
 """Macro steps of a program that is timed."""
@@ -114,7 +115,7 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
     for part, nanoseconds in zip(sorting.placed, times, strict=True):
         rule = getattr(one, RULES.get(part.home, part.home))
         multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
-        count = stages * evaluations(rule, one.num_micro)
+        count = 0 if part.home == "control" else stages * evaluations(rule, one.num_micro)
         own = None if nanoseconds is None else nanoseconds * count / 1e3
         rows.append(Row(part.effect.name, HOMES[part.home], rule.grid, part.reason, 0, multipliers, count, own))
     return Ledger(tuple(rows), whole)

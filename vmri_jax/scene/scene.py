@@ -14,7 +14,7 @@ from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.names import Names, Place, unknown
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
-from vmri_jax.scene.assembly import build
+from vmri_jax.scene.assembly import actuation, build
 from vmri_jax.scene.body import AnyBody
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joints import Joint, along_run
@@ -23,7 +23,7 @@ from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
 from vmri_jax.scene.rigid import RigidBody, Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
-from vmri_jax.scene.terms import MASS
+from vmri_jax.scene.terms import MASS, Actuation
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
@@ -157,6 +157,11 @@ class Scene:
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """(q_s, q_f, v_s, v_f) at the start."""
         return self.sorting.start
+
+    @cached_property
+    def actuation(self) -> Actuation | None:
+        """Forces of the controls, see `Controlled`; None where nothing is controlled."""
+        return actuation(self.sorting)
 
     def system(self) -> System:
         """The system: ``T - V - W`` with constraints and forces, each None where no effect calls for it."""

@@ -26,7 +26,7 @@ from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
 NAMED = 3
 """Most bodies that a reason names."""
 
-Home = Literal["kinetic", "slow_potential", "fast_potential", "constraint", "slow_constraint", "force"]
+Home = Literal["kinetic", "slow_potential", "fast_potential", "constraint", "slow_constraint", "force", "control"]
 
 
 class Reason(NamedTuple):
@@ -149,6 +149,8 @@ def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, li
         return "kinetic", Reason("depends on velocities")
     if effect.kind == "force":
         return "force", Reason("not derived from a potential")
+    if effect.kind == "control":
+        return "control", Reason("set by an optimisation, zero in a run")
     if effect.kind == "constraint" and len(slow) == size:
         return "slow_constraint", Reason("between slow bodies")
     if effect.kind == "constraint":

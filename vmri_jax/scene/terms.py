@@ -6,12 +6,13 @@ Everything here is compared by value: scenes of the same structure give equal fu
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from itertools import pairwise
+from itertools import chain, pairwise
 from operator import add
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from vmri_jax.scene.body import GROUND_COORDINATES
 from vmri_jax.scene.layout import Rows
@@ -144,6 +145,12 @@ class EffectTerm:
         forces = self.function(t, self._positions(q_s, q_f, own), self._velocities(v_s, v_f, own), own)
         return totals([role.put(force, own, *sizes) for role, force in zip(self.roles, forces, strict=True)])
 
+    def controlled(self, q_s, q_f, u, params):
+        """Force on all slow and on all fast coordinates of controls u."""
+        own, sizes = self.params_of(params), (q_s.shape[0], q_f.shape[0])
+        forces = self.function(self._positions(q_s, q_f, own), u, own)
+        return totals([role.put(force, own, *sizes) for role, force in zip(self.roles, forces, strict=True)])
+
     def _positions(self, q_s, q_f, params):
         return tuple(role.positions(q_s, q_f, params) for role in self.roles)
 
@@ -268,6 +275,29 @@ class TotalForce(_OfTerms):
 
     def __call__(self, t, q_s, q_f, v_s, v_f, params):
         return totals([term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms])
+
+
+@dataclass(frozen=True)
+class Actuation(_OfTerms):
+    """Forces of the controls of a scene, ``(q_s, q_f, u, params) -> (F_s, F_f)``, see `vmri_jax.control.minimize`.
+
+    Args:
+        terms: one of each effect.
+        names: of the controls of each effect.
+    """
+
+    names: tuple[tuple[str, ...], ...]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of all controls, in the order of u."""
+        return tuple(chain(*self.names))
+
+    def __call__(self, q_s, q_f, u, params):
+        ends = np.cumsum([len(names) for names in self.names])[:-1]
+        return totals(
+            [term.controlled(q_s, q_f, own, params) for term, own in zip(self.terms, jnp.split(u, ends), strict=True)]
+        )
 
 
 FUNCTIONS = {

@@ -1,0 +1,139 @@
+"""What is asked of an optimisation: checks of its arguments, and where it starts."""
+
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.control.optimum import Optimum
+from vmri_jax.control.search import Point, Search
+from vmri_jax.control.transcription import Transcription
+from vmri_jax.mechanics.arrays import real_array, whole_number
+from vmri_jax.mechanics.state import start_of
+from vmri_jax.running.simulate import prepare
+from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.plan import plan
+
+
+def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, ...]]:
+    """Forces of the controls, and the names of these."""
+    found = getattr(problem, "actuation", None)
+    if actuate is None:
+        if found is None:
+            raise ValueError(
+                'minimize: nothing is controlled; give a scene with Controlled effects, e.g. Controlled("hub", "torque"), or actuate= '
+                "and num_controls=."
+            )
+        if num_controls not in (None, len(found.labels)):
+            raise ValueError(f"minimize: num_controls is {num_controls}; the scene has {len(found.labels)} controls.")
+        return found, found.labels
+    if found is not None:
+        raise ValueError("minimize: actuate is given, and the scene has Controlled effects; leave one of them out.")
+    whole_number("minimize: num_controls", num_controls)
+    return actuate, tuple(f"u {i}" for i in range(num_controls)) if num_controls > 1 else ("u",)
+
+
+def transcribed(
+    problem, actuate, num_controls, cost, scheme, macro_dt, num_steps, final_cost, goal, limits, bounds, grid, newton
+) -> Transcription:
+    whole_number("minimize: num_steps", num_steps)
+    if grid not in ("macro", "micro"):
+        raise ValueError(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
+    system, state = start_of("minimize", problem, None)
+    params = {} if system.params is None else system.params
+    if not isinstance(params, Mapping):
+        raise TypeError(
+            f"minimize: system.params is {type(params).__name__}; the controls need it to be a dict, or None."
+        )
+    prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, newton=newton)  # the checks of a run
+    if newton is None and plan(system, scheme, state).has_fallback:
+        newton = Newton("nested")
+    u = np.zeros(num_controls)
+    forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
+    expected = (state.q_s.shape, state.q_f.shape)
+    if not isinstance(forces, tuple) or tuple(getattr(f, "shape", None) for f in forces) != expected:
+        raise ValueError(
+            f"minimize: actuate returns {forces}; it must return forces on the slow and on the fast variables, of shapes "
+            f"{expected[0]} and {expected[1]}."
+        )
+    for name, function, given in (("cost", cost, (state, u)), ("final_cost", final_cost, (state,))):
+        shape = () if function is None else jax.eval_shape(lambda f=function, g=given: f(*g)).shape
+        if shape != ():
+            raise ValueError(f"minimize: {name} has shape {shape}; it must be a number.")
+    for name, function, given in (("goal", goal, (state,)), ("limits", limits, (state, u))):
+        if function is not None and len(jax.eval_shape(lambda f=function, g=given: f(*g)).shape) != 1:
+            raise ValueError(f"minimize: {name} must return a vector, (n,).")
+    return Transcription(
+        system.replace(params=params),
+        state,
+        scheme,
+        newton or Newton(),
+        float(macro_dt),
+        actuate,
+        cost,
+        final_cost or (lambda state: jnp.zeros(())),
+        goal or (lambda state: jnp.zeros(0)),
+        limits,
+        _bounds(bounds, num_controls),
+        scheme.num_micro if grid == "micro" else 1,
+    )
+
+
+def _bounds(given, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest controls, (m,) each."""
+    if given is None:
+        return np.full(num_controls, -np.inf), np.full(num_controls, np.inf)
+    if not isinstance(given, tuple) or len(given) != 2:
+        raise ValueError(f"minimize: bounds is {given!r}; give (least, largest), each a number or ({num_controls},).")
+    both = [np.asarray(real_array("minimize: bounds", -np.inf if side is None else side)) for side in given]
+    both[1] = np.full((), np.inf) if given[1] is None else both[1]
+    if any(side.shape not in ((), (num_controls,)) for side in both):
+        shapes = " and ".join(str(side.shape) for side in both)
+        raise ValueError(f"minimize: bounds have shapes {shapes}; each is a number or ({num_controls},).")
+    lower, upper = (np.broadcast_to(side, (num_controls,)) for side in both)
+    if not np.all(lower < upper):
+        raise ValueError(f"minimize: bounds are {lower} and {upper}; the least controls must be below the largest.")
+    return lower, upper
+
+
+def started(search: Search, start, num_steps: int, num_controls: int, grid: str) -> Point:
+    """Nodes and controls to start from; what these miss is not computed."""
+    setup, nodes = search.setup, None
+    shape = (num_steps, setup.parts, num_controls)
+    if isinstance(start, Optimum):
+        nodes, controls = _resampled(setup, start, num_steps)
+    elif start is None:
+        controls = np.zeros(shape)
+    else:
+        controls = np.asarray(real_array("minimize: start", start))
+        expected = shape if grid == "micro" else (shape[0], shape[2])
+        if controls.shape != expected:
+            raise ValueError(f"minimize: start has shape {controls.shape}; the controls have {expected}.")
+        controls = controls.reshape(shape)
+    u = jnp.asarray(np.clip(controls, *setup.bounds))
+    if nodes is None:
+        nodes, _ = search.rolled(u)
+        if not np.isfinite(nodes).all():
+            raise ValueError(
+                "minimize: the motion with the controls to start from fails; give others, start=..., or a smaller macro_dt."
+            )
+    return Point(nodes, u, np.zeros(0), np.zeros(0))
+
+
+def _resampled(setup: Transcription, start: Optimum, num_steps: int):
+    """Nodes and controls of another optimum at the times of this one."""
+    run, m = start.trajectory, start.controls.shape[-1]
+    known = np.concatenate([np.asarray(x) for x in (run.q_s, run.q_f, run.p_s, run.p_f)], axis=1)
+    duration, asked = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
+    if abs(duration - asked) > 1e-9 * asked:
+        raise ValueError(f"minimize: start is an Optimum over {duration:g}; this one is over {asked:g}.")
+    if m != len(setup.bounds[0]) or known.shape[1] != setup.z_start.size:
+        raise ValueError("minimize: start is an Optimum of another system or other controls; give one of this.")
+    t = float(setup.start.t) + setup.macro_dt * np.arange(1, num_steps + 1)
+    nodes = np.stack([np.interp(t, np.asarray(run.t), column) for column in known.T], axis=1)
+    from_times, times = start.t.ravel(), setup.times(num_steps)
+    half = [(duration / from_times.size) / 2, setup.macro_dt / setup.parts / 2]
+    columns = start.controls.reshape(-1, m).T
+    controls = [np.interp(times.ravel() + half[1], from_times + half[0], column) for column in columns]
+    return jnp.asarray(nodes), np.stack(controls, axis=1).reshape(*times.shape, m)

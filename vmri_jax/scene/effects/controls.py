@@ -1,0 +1,181 @@
+"""What an optimisation may set: forces and torques on bodies and in joints, see `vmri_jax.control.minimize`."""
+
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.names import AXES
+from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
+from vmri_jax.scene.declare import effect_class, names, vector
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.joint_effects import InJoint
+from vmri_jax.scene.effects.joints import FREEDOMS, Joint
+from vmri_jax.scene.rigid import split
+
+Load = Literal["force", "torque"]
+
+
+@dataclass(frozen=True)
+class LoadOf:
+    """The generalised force of controls u on a body; compared by value.
+
+    A force acts on directors by the weights X of its point, ``f_i = X_i F``, a torque by ``f_i = M x d_i / 2``.
+    """
+
+    load: Load
+    axes: Literal["space", "body"]
+
+    def __call__(self, q, u, params):
+        (q,) = q
+        u = u * params["along"] / jnp.linalg.norm(params["along"]) if "along" in params else u
+        if "point" not in params:
+            return (u,)
+        _, d = split(q)
+        if self.axes == "body":
+            u = u @ d
+        if self.load == "torque":
+            return (jnp.concatenate([jnp.zeros(3), (jnp.cross(u, d) / 2).ravel()]),)
+        return (jnp.concatenate([u, (params["point"][: len(d), None] * u).ravel()]),)
+
+
+@effect_class
+class Controlled(Effect):
+    """A force or a torque that `vmri_jax.control.minimize` sets; in a run it is zero, and costs nothing.
+
+        Scene([hub, ...], [Controlled("hub", "torque"), Controlled(("hub", [0.5, 0, 0]), "force", along=[0, 1, 0])])
+
+    Args:
+        body: a body, a point in a rigid body, or a joint. In a joint the torque is that about its axis, the force that along it;
+            b gets it and a its opposite.
+        load: "force" or "torque", the latter on a rigid body or in a joint.
+        along: (d,) the direction of a single control, of any length; without it there is a control for each axis.
+        axes: whether components are along the axes of space, or along those of the rigid body.
+
+    Raises:
+        ValueError: (of the scene) a body that is not there or not rigid, a joint that leaves no such freedom, a vector of
+            another dimension.
+    """
+
+    body: Any = names()
+    load: Load = "force"
+    _: KW_ONLY
+    along: Any = vector(default=None)
+    axes: Literal["space", "body"] = "space"
+
+    kind = "control"
+    whole = True
+
+    def __post_init__(self):
+        if not self.name:
+            known = is_entry(self.body)
+            object.__setattr__(self, "name", f"{label_of(entry(self.body))} {self.load}" if known else str(self.load))
+        super().__post_init__()
+        for argument, allowed in (("load", ("force", "torque")), ("axes", ("space", "body"))):
+            if getattr(self, argument) not in allowed:
+                raise ValueError(
+                    f"{self.name}: {argument} is {getattr(self, argument)!r}; it must be {' or '.join(map(repr, allowed))}."
+                )
+
+    def bound(self, effects):
+        """The same, or what acts in the joint of this name."""
+        joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
+        if not isinstance(self.body, str) or self.body not in joints:
+            return self
+        if self.along is not None:
+            raise ValueError(f"{self.name}: along is {self.along!r}; a joint has an axis of its own. Leave it out.")
+        freedom: Any = "turn" if self.load == "torque" else "slide"
+        return ControlledJoint(joints[self.body], of=freedom, name=self.name)
+
+    @property
+    def function(self) -> Callable:
+        return LoadOf(self.load, self.axes)
+
+    def elements(self, bodies):
+        if not is_entry(self.body):
+            raise ValueError(
+                f"{self.name}: body is {self.body!r}; give one body or joint, and each its own Controlled."
+            )
+        return ((str(entry(self.body)),),)
+
+    def parameters(self, bodies):
+        name, params = entry(self.body), {}
+        body = body_of(bodies, name)
+        if self.along is not None:
+            params["along"] = self.declared["along"].array(f"{self.name}: along", self.along, [body.point()])
+        if body.rigid:
+            at = jnp.asarray(name.at) if isinstance(name, Attachment) else jnp.zeros(3)
+            params["point"] = jnp.asarray(body.weights(at))
+        return params
+
+    def check_bodies(self, bodies):
+        super().check_bodies(bodies)
+        name = entry(self.body)
+        body = body_of(bodies, name)
+        if self.along is not None:
+            self.require(np.any(np.asarray(self.along)), "along", self.along, "it must have a direction")
+        directors = body.size // 3 - 1 if body.rigid else 0
+        if isinstance(name, Attachment) and not body.rigid:
+            raise ValueError(
+                f"{self.name}: {name} is a point; only rigid bodies have points in them. Give the name alone."
+            )
+        if (self.load == "torque" or self.axes == "body") and directors < 3:
+            what = "a torque" if self.load == "torque" else "axes of its own"
+            has = f"{directors} of three directors" if body.rigid else "no directors"
+            raise ValueError(f"{self.name}: {name} has {has}; {what} needs a rigid body with three.")
+
+    def components(self, bodies) -> tuple[str, ...]:
+        """Names of the controls."""
+        body = body_of(bodies, entry(self.body))
+        size = body.size if not body.rigid else 3
+        if self.along is not None:
+            return (self.name,)
+        axes = [""] if size == 1 else [f" {axis}" for axis in (AXES if size <= 3 else range(size))][:size]
+        return tuple(f"{self.name}{axis}" for axis in axes)
+
+    def drawing(self, bodies):
+        return {}
+
+
+@dataclass(frozen=True)
+class ControlAlong:
+    """``u dx/dq`` along the freedom x of a joint; compared by value."""
+
+    freedom: Callable
+
+    def __call__(self, q, u, params):
+        x, pull = jax.vjp(lambda q: self.freedom(q, params), q)
+        return pull(u.reshape(x.shape))[0]
+
+
+@effect_class
+class ControlledJoint(InJoint):
+    """What `Controlled` is in a joint.
+
+    Args:
+        joint, of: as of `InJoint`.
+    """
+
+    kind = "control"
+
+    @property
+    def function(self) -> Callable:
+        return ControlAlong(FREEDOMS[self.freedom])
+
+    def check_bodies(self, bodies):
+        super().check_bodies(bodies)
+        count = len(self.elements(bodies))
+        if count > 1:
+            raise ValueError(
+                f"{self.name}: {self.joint.name} joins {count} pairs of bodies; give each pair its own joint."
+            )
+
+    def components(self, bodies) -> tuple[str, ...]:
+        """Name of the control."""
+        return (self.name,)
+
+
+Control = Controlled | ControlledJoint
