@@ -69,15 +69,25 @@ def transcribed(
         state,
         scheme,
         newton or Newton(),
-        float(macro_dt),
+        np.asarray(float(macro_dt)),
         actuate,
         cost,
-        final_cost or (lambda state: jnp.zeros(())),
-        goal or (lambda state: jnp.zeros(0)),
+        final_cost or free,
+        goal or unaimed,
         limits,
         _bounds(bounds, num_controls),
         scheme.num_micro if grid == "micro" else 1,
     )
+
+
+def free(state):
+    """The final cost where there is none."""
+    return jnp.zeros(())
+
+
+def unaimed(state):
+    """The goal where there is none."""
+    return jnp.zeros(0)
 
 
 def _bounds(given, num_controls: int) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,24 +27,40 @@ class Point(NamedTuple):
     goal: Float[Numbers, "e"]
 
 
+linearised = eqx.filter_jit(Transcription.linearised)
+limited = eqx.filter_jit(Transcription.limited)
+steps = eqx.filter_jit(Transcription.steps)
+by_sweep = jax.jit(riccati.solve)
+
+
+@eqx.filter_jit
+def measured(setup: Transcription, point: Point):
+    """Cost, sum of all misses, sizes of nodes and controls, and the most that a limit is passed by."""
+    over = setup.over(point.z, point.u)
+    missed = sum(jnp.sum(jnp.abs(x)) for x in (point.gaps, point.goal, jnp.maximum(over, 0.0)))
+    sizes = (jnp.maximum(jnp.max(jnp.abs(a)), 1e-12) for a in (point.z, point.u))
+    return setup.total(point.z, point.u), missed, *sizes, jnp.max(over, initial=0.0)
+
+
+@eqx.filter_jit
+def slope(setup: Transcription, point: Point, dz, du):
+    """Change of the cost along an update."""
+    return jax.jvp(setup.total, (point.z, point.u), (dz, du))[1]
+
+
 class Search:
-    """Updates of nodes and controls, and the search along them, with the programs that both need."""
+    """Updates of nodes and controls, and the search along them."""
 
     def __init__(self, setup: Transcription):
         self.setup = setup
-        self.rolled = jax.jit(setup.along)
-        self._linearised, self._limited = jax.jit(setup.linearised), jax.jit(setup.limited)
-        self._by_sweep = jax.jit(riccati.solve)
-        self._with_gaps = jax.jit(lambda z, u: Point(z, u, *setup.misses(z, u)))
-        self._measured, self._slope = jax.jit(self._measures), jax.jit(self._slope_of_cost)
 
     def update(self, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
         """The solution of the linear-quadratic problem at a point, the largest multiplier of what is asked of it, and the problem."""
-        stages, final = self._linearised(point.z, point.u)
+        stages, final = linearised(self.setup, point.z, point.u)
         if self.setup.bounded:
-            change, steepest = bounded.solve(stages, final, self._limited(point.z, point.u))
+            change, steepest = bounded.solve(stages, final, limited(self.setup, point.z, point.u))
             return change, steepest, stages, final
-        change = self._by_sweep(stages, final)
+        change = by_sweep(stages, final)
         return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
 
     def along(self, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict[str, float]]:
@@ -54,14 +71,16 @@ class Search:
         motion of the updated controls, which has no gaps, and suits bodies that turn far.
         """
         dz, du = change.dz, jnp.reshape(change.du, point.u.shape)
-        cost, missed, size_z, size_u, _ = self._measured(point)
-        before, expected = float(cost + rho * missed), float(self._slope(point, dz, du) - rho * missed)
+        cost, missed, size_z, size_u, _ = measured(self.setup, point)
+        before, expected = float(cost + rho * missed), float(slope(self.setup, point, dz, du) - rho * missed)
         part, found = 1.0, None
         while found is None and part >= SHORTEST:
             z, u = point.z + part * dz, point.u + part * du
             allowed = before + ENOUGH * part * min(expected, 0.0) + 1e-12 * (1 + abs(before))
-            trials = [self._with_gaps(z, u), self.motion(u)]
-            merits = [float(cost + rho * missed) for cost, missed, *_ in map(self._measured, trials)]
+            trials = [self.with_gaps(z, u), self.motion(u)]
+            merits = [
+                float(cost + rho * missed) for cost, missed, *_ in (measured(self.setup, trial) for trial in trials)
+            ]
             best = int(np.nanargmin([*merits, np.inf]))
             if best < len(trials) and merits[best] <= allowed:
                 found = trials[best]
@@ -69,7 +88,7 @@ class Search:
                 part /= 2
         if found is None:
             part, found = 0.0, point
-        cost, _, size_z, size_u, over = self._measured(found)
+        cost, _, size_z, size_u, over = measured(self.setup, found)
         update = max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u)
         told = {
             "cost": cost,
@@ -81,17 +100,19 @@ class Search:
         }
         return found, {name: float(value) for name, value in told.items()}
 
+    def with_gaps(self, z, u) -> Point:
+        """Nodes and controls with what they miss: NaN where a step fails."""
+        ends, _ = steps(self.setup, z, u, jnp.asarray(False))
+        return Point(z, u, ends - z, self._goal(z))
+
+    def rolled(self, u):
+        """Nodes of the motion with controls u, NaN from a step on that fails, and the `Status` of the steps."""
+        return steps(self.setup, jnp.zeros((len(u), self.setup.z_start.size)), u, jnp.asarray(True))
+
     def motion(self, u) -> Point:
-        """The motion of controls: NaN from a step on that fails."""
+        """The motion of controls, without gaps."""
         z, _ = self.rolled(u)
-        return Point(z, u, jnp.zeros_like(z), self.setup.goal(self.setup.state(z[-1], len(u))))
+        return Point(z, u, jnp.zeros_like(z), self._goal(z))
 
-    def _measures(self, point: Point):
-        """Cost, sum of all misses, sizes of nodes and controls, and the most that a limit is passed by."""
-        over = self.setup.over(point.z, point.u)
-        missed = sum(jnp.sum(jnp.abs(x)) for x in (point.gaps, point.goal, jnp.maximum(over, 0.0)))
-        sizes = (jnp.maximum(jnp.max(jnp.abs(a)), 1e-12) for a in (point.z, point.u))
-        return self.setup.total(point.z, point.u), missed, *sizes, jnp.max(over, initial=0.0)
-
-    def _slope_of_cost(self, point: Point, dz, du):
-        return jax.jvp(self.setup.total, (point.z, point.u), (dz, du))[1]
+    def _goal(self, z):
+        return self.setup.goal(self.setup.state(z[-1], len(z)))

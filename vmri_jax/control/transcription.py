@@ -9,17 +9,19 @@ M. Cannon, S. Leyendecker, IFAC-PapersOnLine 53 (2020), on two grids.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from vmri_jax.control.bounded import Limits
 from vmri_jax.control.riccati import Final, Stages
 from vmri_jax.diagnostics.linear import phase_splits, phase_vector
+from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
@@ -35,8 +37,7 @@ BETWEEN = 1e-6
 """Times that are nearer to the border of two parts, over the length of a part, are between them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Transcription:
+class Transcription(eqx.Module):
     """An optimal control problem on a macro grid.
 
     Attributes:
@@ -55,14 +56,14 @@ class Transcription:
     start: State
     scheme: Scheme | Composition
     newton: Newton
-    macro_dt: float
-    actuate: Callable
-    cost: Callable
-    final_cost: Callable
-    goal: Callable
-    limits: Callable | None
+    macro_dt: Float[Numbers, ""]
+    actuate: Callable = eqx.field(static=True)
+    cost: Callable = eqx.field(static=True)
+    final_cost: Callable = eqx.field(static=True)
+    goal: Callable = eqx.field(static=True)
+    limits: Callable | None = eqx.field(static=True)
     bounds: tuple[np.ndarray, np.ndarray]
-    parts: int
+    parts: int = eqx.field(static=True)
 
     @property
     def bounded(self) -> bool:
@@ -76,8 +77,8 @@ class Transcription:
 
     def times(self, count: int) -> np.ndarray:
         """(count, parts) times from which on controls are held."""
-        start = float(self.start.t) + self.macro_dt * np.arange(count)
-        return start[:, None] + np.arange(self.parts) * (self.macro_dt / self.parts)
+        start = float(self.start.t) + float(self.macro_dt) * np.arange(count)
+        return start[:, None] + np.arange(self.parts) * (float(self.macro_dt) / self.parts)
 
     def driven(self, u) -> System:
         """The system with the forces of controls u (N, parts, m), from the start on."""
@@ -105,15 +106,20 @@ class Transcription:
         end, info = macro_step(system, self.scheme, state, self.macro_dt, self.newton)
         return phase_vector(end), info.status
 
-    def along(self, u):
-        """Nodes of the motion with controls u after the first one, NaN from a failure on, and the `Status` of its steps."""
+    def steps(self, z, u, follow):
+        """The ends of all steps, (N, n), and their `Status`: from the nodes z, or where `follow` is true each from the end of the
+        one before, NaN from a failure on.
 
-        def step(z, at):
-            z, status = self.step(z, *at)
-            z = jnp.where(status.result <= Result.CONVERGED_AT_ROUNDOFF, z, jnp.nan)
-            return z, (z, status)
+        Both by one program, since a step takes long to compile.
+        """
 
-        return jax.lax.scan(step, self.z_start, (u, jnp.arange(len(u))))[1]
+        def step(end, at):
+            node, u, k = at
+            end, status = self.step(jnp.where(follow, end, node), u, k)
+            end = jnp.where(status.result <= Result.CONVERGED_AT_ROUNDOFF, end, jnp.nan)
+            return end, (end, status)
+
+        return jax.lax.scan(step, self.z_start, (self.before(z), u, jnp.arange(len(u))))[1]
 
     def stage_cost(self, z, u, z_next, k):
         """``H`` times the mean of the cost at both ends of the interval, over the parts."""
@@ -124,13 +130,6 @@ class Transcription:
         """The cost of nodes z (N, n) after the first one, and controls u (N, parts, m)."""
         stages = jax.vmap(self.stage_cost)(self.before(z), u, z, jnp.arange(len(u)))
         return jnp.sum(stages) + self.final_cost(self.state(z[-1], len(u)))
-
-    def misses(self, z, u):
-        """Gaps between the ends of steps and the nodes, (N, n), and the goal, (e,). Infinite where a step fails."""
-        ends, status = jax.vmap(self.step)(self.before(z), u, jnp.arange(len(u)))
-        solved = status.result <= Result.CONVERGED_AT_ROUNDOFF
-        gaps = jnp.where(solved[:, None], ends - z, jnp.inf)
-        return gaps, self.goal(self.state(z[-1], len(u)))
 
     def over(self, z, u):
         """Values of the limits at nodes z (N, n) after the first one, (N, parts c)."""

@@ -1,0 +1,136 @@
+"""Controls of scenes: their generalised forces, that runs do not see them, and what is refused."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.scene import (
+    Ball,
+    Body,
+    Box,
+    Controlled,
+    Prismatic,
+    Revolute,
+    RigidBody,
+    Rod,
+    Scene,
+    angular_momentum,
+)
+
+HUB = RigidBody("hub", 3.0, Box((1.0, 0.8, 0.6)), [0.0, 0.0, 0.0], [0.0, 0.3, 0.0], pace="slow")
+WHEEL = RigidBody("wheel", 2.0, Ball(0.2), [1.0, 0.0, 0.0], pace="fast")
+POINT = Body("point", 1.0, [0.0, 2.0], pace="fast")
+
+
+def rates_of_momenta(scene: Scene, u):
+    """Resultant force and moment about the origin of controls on each rigid body."""
+    actuate = scene.actuation
+    q_s, q_f, *_ = scene.start
+    assert actuate is not None
+    forces = dict(zip("sf", actuate(q_s, q_f, jnp.asarray(u), scene.system().params), strict=True))
+    positions = {"s": q_s, "f": q_f}
+    found = {}
+    for name, place in scene.places.items():
+        if scene.by_name[name].rigid:
+            at = slice(place.start, place.start + place.size)
+            q, f = positions[place.part][at], forces[place.part][at]
+            found[name] = np.asarray(f[:3]), angular_momentum(q, f)
+    return found
+
+
+def test_a_torque_turns_and_does_not_push():
+    for axes, expected in (("space", [1.0, 2.0, 3.0]), ("body", HUB.rotation @ [1.0, 2.0, 3.0])):
+        force, moment = rates_of_momenta(Scene([HUB], [Controlled("hub", "torque", axes=axes)]), [1.0, 2.0, 3.0])["hub"]
+        np.testing.assert_allclose(force, 0.0, atol=1e-14)
+        np.testing.assert_allclose(moment, expected, atol=1e-14)
+
+
+def test_a_force_at_a_point_of_a_body():
+    scene = Scene([HUB], [Controlled(("hub", [0.5, 0.1, 0.0]), "force", along=[0.0, 2.0, 0.0], axes="body")])
+    force, moment = rates_of_momenta(scene, [3.0])["hub"]
+    arm, along = HUB.rotation @ [0.5, 0.1, 0.0], HUB.rotation @ [0.0, 1.0, 0.0]
+    np.testing.assert_allclose(force, 3.0 * along, atol=1e-14)
+    np.testing.assert_allclose(moment, 3.0 * np.cross(arm, along), atol=1e-14)
+
+
+def test_a_torque_in_a_joint_has_its_opposite():
+    bearing = Revolute(("hub", "wheel"), [1.0, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="bearing")
+    found = rates_of_momenta(Scene([HUB, WHEEL], [bearing, Controlled("bearing", "torque")], project=True), [2.5])
+    np.testing.assert_allclose(found["wheel"][1], [2.5, 0.0, 0.0], atol=1e-13)
+    np.testing.assert_allclose(found["hub"][1], [-2.5, 0.0, 0.0], atol=1e-13)
+    np.testing.assert_allclose(found["hub"][0], 0.0, atol=1e-13)
+
+
+def test_a_force_in_a_slide():
+    slide = Prismatic(("ground", "wheel"), [1.0, 0.0, 0.0], axis=[0.0, 1.0, 0.0], name="slide")
+    force, _ = rates_of_momenta(Scene([WHEEL], [slide, Controlled("slide", "force")]), [2.0])["wheel"]
+    np.testing.assert_allclose(force, [0.0, 2.0, 0.0], atol=1e-13)
+
+
+def test_names_and_order():
+    scene = Scene(
+        [HUB, POINT], [Controlled("hub", "torque"), Controlled("point", "force"), Controlled("hub", along=[1, 0, 0])]
+    )
+    assert scene.actuation is not None
+    assert scene.actuation.labels == (
+        "hub torque x",
+        "hub torque y",
+        "hub torque z",
+        "point force x",
+        "point force y",
+        "hub force",
+    )
+
+
+def test_a_run_does_not_see_them():
+    plain, controlled = Scene([HUB, POINT]), Scene([HUB, POINT], [Controlled("hub", "torque")])
+    assert controlled.system().force is None
+    assert plain.actuation is None
+    runs = [vm.simulate(scene, vm.fully_explicit(2), macro_dt=0.1, num_steps=3) for scene in (plain, controlled)]
+    np.testing.assert_array_equal(*(run.q_s for run in runs))
+    row = next(row for row in controlled.explain(vm.fully_explicit(2), measure=False).rows if row.kind == "control u")
+    assert row.evaluations == 0
+
+
+@pytest.mark.parametrize(
+    ("bodies", "effects", "message"),
+    [
+        ([HUB], [Controlled("hab", "torque")], "hab torque: there is no body 'hab'"),
+        ([POINT], [Controlled("point", "torque")], "point has no directors; a torque needs a rigid body with three"),
+        ([POINT], [Controlled(("point", [1.0, 0.0]), "force")], "point"),
+        ([HUB], [Controlled("hub", "torque", along=[1.0, 0.0])], r"along has shape \(2,\)"),
+        ([HUB], [Controlled("hub", "torque", along=[0.0, 0.0, 0.0])], "it must have a direction"),
+        (
+            [RigidBody("rod", 1.0, Rod(1.0), [0.0, 0.0, 0.0])],
+            [Controlled("rod", "torque")],
+            "rod has 1 of three directors",
+        ),
+        (
+            [HUB, WHEEL],
+            [
+                Revolute(("hub", "wheel"), [1.0, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="bearing"),
+                Controlled("bearing", "force"),
+            ],
+            "of is 'slide'; bearing leaves turn free",
+        ),
+        (
+            [HUB, WHEEL],
+            [
+                Revolute(("hub", "wheel"), [1.0, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="bearing"),
+                Controlled("bearing", "torque", along=[1.0, 0.0, 0.0]),
+            ],
+            "a joint has an axis of its own",
+        ),
+        ([HUB, POINT], [Controlled(["hub", "point"], "force")], "give one body or joint"),
+    ],
+)
+def test_bad_input(bodies, effects, message):
+    with pytest.raises(ValueError, match=message):
+        Scene(bodies, effects, project=True)
+
+
+@pytest.mark.parametrize(("argument", "given"), [("load", "push"), ("axes", "wheel")])
+def test_bad_words(argument, given):
+    with pytest.raises(ValueError, match=f"{argument} is '{given}'; it must be"):
+        Controlled("hub", **{argument: given})
