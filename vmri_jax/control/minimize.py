@@ -130,6 +130,7 @@ def minimize(
         controls,
         held,
         labels,
+        setup.bounds,
         trajectory,
         last["cost"],
         np.asarray(nu),

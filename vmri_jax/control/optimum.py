@@ -17,6 +17,7 @@ class Optimum:
         controls: (N, m), or (N, num_micro, m) for controls on the micro grid.
         t: (N,) or (N, num_micro) times from which on they are held.
         labels: m names of the controls.
+        bounds: the least and the largest controls that were allowed, (m,) each.
         trajectory: the motion, all macro nodes saved.
         cost: its cost.
         multipliers: (e,) change of the cost with the goal.
@@ -33,6 +34,7 @@ class Optimum:
     controls: Float[np.ndarray, "N ..."]
     t: Float[np.ndarray, "N ..."]
     labels: tuple[str, ...]
+    bounds: tuple[np.ndarray, np.ndarray]
     trajectory: Trajectory
     cost: float
     multipliers: Float[np.ndarray, "e"]

@@ -4,6 +4,7 @@ Every function returns a matplotlib `Figure` made without pyplot: no window open
 notebook shows it when it is the value of a cell. Colours follow Okabe and Ito, told apart by the colour-blind.
 """
 
+from vmri_jax.plots.controls import plot_control
 from vmri_jax.plots.ensembles import plot_ensemble
 from vmri_jax.plots.fits import plot_fit
 from vmri_jax.plots.runs import plot_oscillatory_energies, plot_trajectory
@@ -30,6 +31,7 @@ __all__ = [
     "log_ticks",
     "new_figure",
     "panel_grid",
+    "plot_control",
     "plot_convergence",
     "plot_cost",
     "plot_ensemble",

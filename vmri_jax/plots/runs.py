@@ -64,7 +64,7 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
     with new_figure(7.2, 0.4 + 1.85 * count, title, theme) as figure:
         axes = figure.subplots(count, sharex=True)
         for panel, (values, labels, what) in zip(axes, positions, strict=False):
-            _coordinates(panel, t, values, labels, theme)
+            coordinates(panel, t, values, labels, theme)
             panel.set_ylabel(what)
         if driven:
             _energy_balance(axes[len(positions)], axes[len(positions) + 1], trajectory, theme)
@@ -95,13 +95,13 @@ def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Th
     with new_figure(7.2, 3.4, title, theme) as figure:
         axes = figure.subplots()
         axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
-        _coordinates(axes, t, energies, [f"$I_{{{i + 1}}}$" for i in range(energies.shape[1])], theme)
+        coordinates(axes, t, energies, [f"$I_{{{i + 1}}}$" for i in range(energies.shape[1])], theme)
         axes.set(xlabel="time $t$", ylabel="oscillatory energy", xlim=(t[0], t[-1]))
         axes.set_ylim(bottom=0)
     return figure
 
 
-def _coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> None:
+def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> None:
     """One line per coordinate with its name beside the panel; of very many every so manieth is named."""
     n = values.shape[1]
     colors: Any = theme.curves

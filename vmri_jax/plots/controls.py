@@ -1,0 +1,60 @@
+"""Figures of optimal control: the controls, the motion that they make, and how they were found."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vmri_jax.plots.runs import coordinates
+from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, legend_beside, new_figure
+
+if TYPE_CHECKING:
+    from vmri_jax.control.optimum import Optimum
+
+
+def plot_control(optimum: "Optimum", *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+    """Controls with their bounds, slow and fast positions against time, and what the iterations left.
+
+    Args:
+        optimum: of `vmri_jax.control.minimize`.
+        title: over the figure.
+        theme: colours.
+    """
+    run, names = optimum.trajectory, optimum.trajectory.names
+    t = np.asarray(run.t)
+    panels = [
+        (np.asarray(run.q_s), names.slow_coordinates, r"slow positions $q_s$"),
+        (np.asarray(run.q_f), names.fast_coordinates, r"fast positions $q_f$"),
+    ]
+    panels = [panel for panel in panels if panel[0].shape[1]]
+    with new_figure(7.2, 0.6 + 1.85 * (2 + len(panels)), title, theme) as figure:
+        above, *middle, below = figure.subplots(2 + len(panels))
+        edges = np.append(optimum.t.ravel(), t[-1])
+        controls = optimum.controls.reshape(len(edges) - 1, -1)
+        for number, (column, label) in enumerate(zip(controls.T, optimum.labels, strict=True)):
+            color = theme.curves[number % len(theme.curves)]
+            above.stairs(column, edges, baseline=None, color=color, linewidth=1.4, label=label)
+            for bound in (side[number] for side in optimum.bounds if np.isfinite(side[number])):
+                above.axhline(bound, color=color, linewidth=0.8, linestyle=":")
+        above.set(ylabel="controls $u$", xlim=(t[0], t[-1]))
+        legend_beside(above)
+        for axes, (values, labels, what) in zip(middle, panels, strict=True):
+            coordinates(axes, t, values, labels, theme)
+            axes.set(ylabel=what, xlim=(t[0], t[-1]))
+        (middle or [above])[-1].set_xlabel("time $t$")
+        for name, color in zip(("update", "gap", "miss", "over"), theme.curves, strict=False):
+            values = np.array([told[name] for told in optimum.history])
+            if np.any(values > 0):
+                at = 1 + np.arange(len(values))
+                below.semilogy(at, np.where(values > 0, values, np.nan), ".-", color=color, label=MEANING[name])
+        below.set(
+            xlabel="iteration",
+            ylabel="left",
+            xticks=1 + np.arange(0, len(optimum.history), 1 + len(optimum.history) // 12),
+        )
+        legend_beside(below)
+        figure.align_ylabels()
+    return figure
+
+
+MEANING = {"update": "update", "gap": "gaps of steps", "miss": "goal", "over": "limits"}
+"""What the history of an optimisation calls them, and the figure."""
