@@ -5,7 +5,7 @@ ENVIRONMENT ?= .venv
 OLDER ?= python3.11
 NEWER ?= python3.13
 
-.PHONY: reproduce test smoke notebooks bench lint lock clean
+.PHONY: reproduce test smoke notebooks docs bench lint lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
@@ -18,6 +18,10 @@ smoke:  ## a few minutes: every kind of step, with another environment, make smo
 
 notebooks: .venv/installed  ## run the notebooks and store their outputs
 	$(BIN)/python -m tests.notebooks
+
+docs: .venv/installed  ## the site, docs/_build/html/index.html
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[docs]'
+	$(BIN)/python -m sphinx -b html -q --fail-on-warning --keep-going docs docs/_build/html
 
 bench: .venv/installed  ## the quick measurements: time, memory, against C; out/benchmarks
 	$(BIN)/python -m benchmarks all

@@ -1,13 +1,17 @@
-"""The programs in the README run as printed, and its numbers hold."""
+"""The programs in the README and in the pages of `docs` run as printed, their numbers hold, and their links lead somewhere."""
 
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import vmri_jax as vm
 
-TEXT = (Path(__file__).parent.parent / "README.md").read_text()
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TEXT = "\n".join(path.read_text() for path in PAGES)
 PROGRAMS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
@@ -57,3 +61,35 @@ def test_optimal_control():
     exec(next(program for program in PROGRAMS if "vm.control.minimize(" in program), scope)
     assert scope["found"].converged
     assert abs(scope["found"].cost - 6) < 1e-3
+
+
+def test_a_scheme_of_ones_own(capsys):
+    program = "".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs/how_to/schemes.md").read_text(), re.DOTALL))
+    exec(program, {})
+    assert "order 2.0" in capsys.readouterr().out
+
+
+def test_an_effect_of_ones_own(capsys):
+    exec(next(program for program in PROGRAMS if "def magnet" in program), {})
+    assert re.search(r"the ball is at 0\.\d\d", capsys.readouterr().out)
+
+
+MADE = ("gallery/", "tutorials/0")
+"""Pages that `make docs` writes."""
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links(path):
+    for target in re.findall(r"\]\(([^)#\s]+)", path.read_text()):
+        if not target.startswith("http") and not any(part in target for part in MADE) and "_static" not in target:
+            assert (path.parent / target).exists(), target
+
+
+def test_every_public_name_is_documented():
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        from extensions import public  # pyright: ignore[reportMissingImports]
+    finally:
+        sys.path.pop(0)
+    assert public.undocumented() == []
+    assert len(public.names("vmri_jax.scene")) > 50

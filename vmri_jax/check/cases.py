@@ -15,6 +15,7 @@ from vmri_jax.check.measures import (
     Energy,
     constraints,
     difference,
+    drift_meter,
     energy,
     energy_scale,
     long_run,
@@ -104,12 +105,8 @@ class Resolved:
 
     def _shadow(self) -> str:
         """What the drift meter sees in the first steps, if it applies and the scheme resolves the motion."""
-        try:
-            start = run(self.problem, self.scheme, self.macro_dt, SHADOW)
-            meter = diagnostics.shadow_energy(self.problem, self.scheme, start)
-        except ValueError:  # forces, constraints that depend on time, a run that failed
-            return ""
-        return f"; first {SHADOW} steps: {meter}"
+        meter = drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW)
+        return "" if meter is None else f"; first {SHADOW} steps: {meter}"
 
     def _energy(self, steps: int) -> tuple[Trajectory, Energy]:
         trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)

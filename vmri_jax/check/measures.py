@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from vmri_jax import diagnostics
+from vmri_jax.diagnostics.shadow import ShadowEnergy
 from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.running.simulate import simulate
 from vmri_jax.running.trajectory import Trajectory
@@ -94,6 +95,14 @@ def energy_scale(problem: Problem, trajectory: Trajectory) -> float:
     kinetic = jax.vmap(partial(diagnostics.energy, still))
     phase = (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)
     return max(float(np.nanmax(kinetic(*phase))), float(abs(trajectory.energy[0])), 1e-300)
+
+
+def drift_meter(problem: Problem, scheme, macro_dt, num_steps: int) -> ShadowEnergy | None:
+    """The shadow energy of the first steps; None where there is none: forces, constraints that depend on time, a run that failed."""
+    try:
+        return diagnostics.shadow_energy(problem, scheme, run(problem, scheme, macro_dt, num_steps))
+    except ValueError:
+        return None
 
 
 def constraints(trajectory: Trajectory) -> tuple[float, float]:

@@ -1,0 +1,72 @@
+"""The reference: a page for every public name, and one for every room of the package that lists them."""
+
+import inspect
+from importlib import import_module
+from pathlib import Path
+
+ROOMS = {
+    "vmri_jax": "Problems, schemes and runs",
+    "vmri_jax.scene": "Scenes: bodies and effects",
+    "vmri_jax.schemes.quadrature": "Quadrature rules",
+    "vmri_jax.systems": "Systems of the reference study",
+    "vmri_jax.diagnostics": "Diagnostics",
+    "vmri_jax.stability": "Stability",
+    "vmri_jax.study": "What accuracy costs",
+    "vmri_jax.check": "Checks of a system",
+    "vmri_jax.fitting": "Parameters from measurements",
+    "vmri_jax.control": "Optimal control",
+    "vmri_jax.ensembles": "Ensembles",
+    "vmri_jax.plots": "Figures",
+    "vmri_jax.animation": "Animations",
+}
+
+
+def names(room: str) -> list[str]:
+    """The public names of a room: classes and functions."""
+    module = import_module(room)
+    own = [name for name, thing in vars(module).items() if name[0] != "_" and getattr(thing, "__module__", "") == room]
+    found = getattr(module, "__all__", own)
+    return [
+        name for name in found if inspect.isclass(getattr(module, name)) or inspect.isroutine(getattr(module, name))
+    ]
+
+
+def undocumented() -> list[str]:
+    """Public names without a docstring of their own."""
+    things = [(f"{room}.{name}", getattr(import_module(room), name)) for room in ROOMS for name in names(room)]
+    return [name for name, thing in things if not (thing.__doc__ or "").strip()]
+
+
+def write(folder: Path) -> None:
+    """All pages.
+
+    Args:
+        folder: where they go.
+    """
+    (folder / "api").mkdir(parents=True, exist_ok=True)
+    for room, title in ROOMS.items():
+        module, listed, pages = import_module(room), [], []
+        for name in names(room):
+            thing = getattr(module, name)
+            first = (inspect.getdoc(thing) or "").split("\n")[0].replace("|", r"\|")
+            listed.append(f"   * - :doc:`{name} <api/{room}.{name}>`\n     - {first}")
+            pages.append(f"   api/{room}.{name}")
+            kind = "autoclass" if inspect.isclass(thing) else "autofunction"
+            members = "   :members:\n   :exclude-members: set\n" if inspect.isclass(thing) else ""
+            _keep(
+                folder / "api" / f"{room}.{name}.rst",
+                f"{_titled(name)}.. currentmodule:: {room}\n\n.. {kind}:: {name}\n{members}",
+            )
+        table = ".. list-table::\n   :widths: 1 3\n\n" + "\n".join(listed)
+        hidden = ".. toctree::\n   :hidden:\n\n" + "\n".join(pages)
+        _keep(folder / f"{room}.rst", f"{_titled(title)}``{room}``\n\n{table}\n\n{hidden}\n")
+
+
+def _titled(text: str) -> str:
+    return f"{text}\n{'=' * len(text)}\n\n"
+
+
+def _keep(path: Path, text: str) -> None:
+    """Writes only what has changed, so that Sphinx builds no page twice."""
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)
