@@ -197,5 +197,6 @@ def _draw(curves: dict[tuple[str, int], np.ndarray]):
         for marker, ((scheme, num_micro), (error, seconds)) in zip(plots.MARKERS, curves.items(), strict=False):
             axes.loglog(seconds, error, marker=marker, markersize=4, label=f"{scheme}, num_micro = {num_micro}")
         axes.set(title="a slew from rest to rest", xlabel="s, without compiling", ylabel="relative error of J")
+        plots.log_ticks(axes.xaxis, np.concatenate([seconds for _, seconds in curves.values()]))
         axes.legend(fontsize=8)
     return figure

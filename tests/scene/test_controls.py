@@ -18,7 +18,8 @@ from vmri_jax.scene import (
     angular_momentum,
 )
 
-HUB = RigidBody("hub", 3.0, Box((1.0, 0.8, 0.6)), [0.0, 0.0, 0.0], [0.0, 0.3, 0.0], pace="slow")
+HUB = RigidBody("hub", 3.0, Box((1.0, 0.8, 0.6)), [0.0, 0.0, 0.0], pace="slow")
+TURNED = RigidBody("hub", 3.0, Box((1.0, 0.8, 0.6)), [0.0, 0.0, 0.0], [0.3, 0.2, -0.5], pace="slow")
 WHEEL = RigidBody("wheel", 2.0, Ball(0.2), [1.0, 0.0, 0.0], pace="fast")
 POINT = Body("point", 1.0, [0.0, 2.0], pace="fast")
 
@@ -40,16 +41,18 @@ def rates_of_momenta(scene: Scene, u):
 
 
 def test_a_torque_turns_and_does_not_push():
-    for axes, expected in (("space", [1.0, 2.0, 3.0]), ("body", HUB.rotation @ [1.0, 2.0, 3.0])):
-        force, moment = rates_of_momenta(Scene([HUB], [Controlled("hub", "torque", axes=axes)]), [1.0, 2.0, 3.0])["hub"]
+    u = [1.0, 2.0, 3.0]
+    in_space, in_body = Controlled("hub", "torque"), Controlled("hub", "torque", axes="body")
+    for control, expected in ((in_space, u), (in_body, TURNED.rotation @ u)):
+        force, moment = rates_of_momenta(Scene([TURNED], [control]), u)["hub"]
         np.testing.assert_allclose(force, 0.0, atol=1e-14)
         np.testing.assert_allclose(moment, expected, atol=1e-14)
 
 
 def test_a_force_at_a_point_of_a_body():
-    scene = Scene([HUB], [Controlled(("hub", [0.5, 0.1, 0.0]), "force", along=[0.0, 2.0, 0.0], axes="body")])
+    scene = Scene([TURNED], [Controlled(("hub", [0.5, 0.1, 0.0]), "force", along=[0.0, 2.0, 0.0], axes="body")])
     force, moment = rates_of_momenta(scene, [3.0])["hub"]
-    arm, along = HUB.rotation @ [0.5, 0.1, 0.0], HUB.rotation @ [0.0, 1.0, 0.0]
+    arm, along = TURNED.rotation @ [0.5, 0.1, 0.0], TURNED.rotation @ [0.0, 1.0, 0.0]
     np.testing.assert_allclose(force, 3.0 * along, atol=1e-14)
     np.testing.assert_allclose(moment, 3.0 * np.cross(arm, along), atol=1e-14)
 

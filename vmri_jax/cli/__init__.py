@@ -11,6 +11,8 @@ import typer
 from vmri_jax.cli import lists, run, scenes, stability, study
 from vmri_jax.cli.animate import animate
 from vmri_jax.cli.check import check
+from vmri_jax.cli.common import MANY, RIGHT, RUN
+from vmri_jax.cli.new import new
 from vmri_jax.cli.sweep import sweep
 from vmri_jax.configure import cache_folder, configure
 
@@ -20,11 +22,12 @@ app = typer.Typer(
     pretty_exceptions_show_locals=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for part in (lists, run, stability, study, scenes):
+app.command(rich_help_panel=RUN)(new)
+for part in (run, stability, scenes, study, lists):
     app.add_typer(part.app)
-app.command()(check)
-app.command()(animate)
-app.command()(sweep)
+app.command(rich_help_panel=RUN)(animate)
+app.command(rich_help_panel=RIGHT)(check)
+app.command(rich_help_panel=MANY)(sweep)
 
 
 def main() -> None:

@@ -25,6 +25,13 @@ class BadInput(typer.BadParameter):
         return self.message
 
 
+RUN = "Run and see:  vmri simulate fpu --macro-dt 0.05 --steps 400 --out run.npz"
+RIGHT = "Is it right:  vmri check my_system.py:problem"
+COSTS = "What it costs:  vmri tune fpu --error 1e-4 --t-end 2"
+MANY = "Many runs, and what there is:  vmri sweep --example"
+"""The groups of commands, each with an example: what `vmri` shows."""
+
+
 @contextmanager
 def refusals() -> Iterator[None]:
     """Errors of what is called within become panels.

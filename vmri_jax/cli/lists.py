@@ -4,13 +4,13 @@ import numpy as np
 import typer
 
 from vmri_jax.catalogue import SCHEMES, SYSTEMS
-from vmri_jax.cli.common import console, plain_table
+from vmri_jax.cli.common import MANY, console, plain_table
 from vmri_jax.schemes.composition import COMPOSITIONS
 
 app = typer.Typer()
 
 
-@app.command()
+@app.command(rich_help_panel=MANY)
 def systems() -> None:
     """List the built-in systems."""
     table = plain_table("name", "system", "slow", "fast", "constraints", "parameters")
@@ -30,7 +30,7 @@ def systems() -> None:
     console.print("\nYour own: [bold]vmri simulate my_file.py:my_problem[/bold], a vmri_jax.Problem in that file.")
 
 
-@app.command()
+@app.command(rich_help_panel=MANY)
 def schemes() -> None:
     """List the built-in schemes."""
     table = plain_table("name", "order", "options", "what")

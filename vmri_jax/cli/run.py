@@ -16,7 +16,7 @@ from rich.markup import escape
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_failure, refusals
+from vmri_jax.cli.common import PICTURES, RUN, check_target_file, console, plain_table, print_failure, refusals
 from vmri_jax.running.arguments import NOTHING_FAST
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.simulate import simulate as run_at_once
@@ -34,11 +34,12 @@ app = typer.Typer()
 
 
 @app.command(
+    rich_help_panel=RUN,
     epilog="Examples:\n\n"
     "vmri simulate fpu --macro-dt 0.1 --steps 2000 --out run.npz --plot run.png\n\n"
     "vmri simulate fpu --macro-dt 0.1 --steps 10000000 --out run.zarr\n\n"
     "vmri simulate tsp --scheme fully-explicit --alpha 0.5 --num-micro 5 --micro-dt 0.002 --steps 1000\n\n"
-    "vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400"
+    "vmri simulate my_file.py:my_problem --scheme galerkin --degree 2 --macro-dt 0.05 --steps 400",
 )
 def simulate(
     system: options.System,

@@ -7,13 +7,15 @@ from rich.markup import escape
 
 from vmri_jax.catalogue import find_scene, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import console, refusals, status
+from vmri_jax.cli.common import RIGHT, console, refusals, status
 from vmri_jax.running.arguments import NOTHING_FAST
 
 app = typer.Typer()
 
 
-@app.command(epilog="Example:\n\nvmri explain my_file.py:my_scene --scheme explicit-slow --num-micro 20")
+@app.command(
+    rich_help_panel=RIGHT, epilog="Example:\n\nvmri explain my_file.py:my_scene --scheme explicit-slow --num-micro 20"
+)
 def explain(
     scene: Annotated[str, typer.Argument(help="my_file.py:my_scene, or my_file.py alone.")],
     scheme: options.Scheme = "fully-implicit",

@@ -10,7 +10,16 @@ from rich.markup import escape
 from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
-from vmri_jax.cli.common import PICTURES, check_target_file, console, plain_table, print_written, refusals, status
+from vmri_jax.cli.common import (
+    PICTURES,
+    RIGHT,
+    check_target_file,
+    console,
+    plain_table,
+    print_written,
+    refusals,
+    status,
+)
 from vmri_jax.stability import advise as advise_on
 from vmri_jax.stability import linear_model, plot_stability, stability_map
 from vmri_jax.stability.map import windows_text
@@ -19,9 +28,10 @@ app = typer.Typer()
 
 
 @app.command(
+    rich_help_panel=RIGHT,
     epilog="Examples:\n\n"
     "vmri advise fpu --scheme explicit-slow --num-micro 30 --macro-dt 0.0628\n\n"
-    "vmri advise my_file.py:my_problem --macro-dt 0.02"
+    "vmri advise my_file.py:my_problem --macro-dt 0.02",
 )
 def advise(
     system: options.System,
@@ -52,8 +62,9 @@ def advise(
 
 
 @app.command(
+    rich_help_panel=RIGHT,
     epilog="Examples:\n\nvmri stability --scheme explicit-slow --num-micro 2 --num-micro 5 --num-micro 10 --out map.png\n\n"
-    "vmri stability tsp --scheme fully-explicit --scheme mollified-impulse"
+    "vmri stability tsp --scheme fully-explicit --scheme mollified-impulse",
 )
 def stability(
     system: Annotated[

@@ -12,6 +12,7 @@ from rich.markup import escape
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import options
 from vmri_jax.cli.common import (
+    COSTS,
     BadInput,
     check_target_file,
     console,
@@ -34,7 +35,8 @@ SHOWN = 5
 
 
 @app.command(
-    epilog="Examples:\n\nvmri tune fpu --error 1e-4 --t-end 10\n\nvmri tune my_file.py:my_problem --error 1e-3 --t-end 2"
+    rich_help_panel=COSTS,
+    epilog="Examples:\n\nvmri tune fpu --error 1e-4 --t-end 10\n\nvmri tune my_file.py:my_problem --error 1e-3 --t-end 2",
 )
 def tune(
     system: options.System,
@@ -72,7 +74,10 @@ def tune(
     console.print(f"\n[bold]{escape(found.setting.command(system))}[/bold]", soft_wrap=True)
 
 
-@app.command(epilog="Examples:\n\nvmri cost tsp --out out/tsp\n\nvmri cost my_file.py:my_problem --t-end 5")
+@app.command(
+    rich_help_panel=COSTS,
+    epilog="Examples:\n\nvmri cost tsp --out out/tsp\n\nvmri cost my_file.py:my_problem --t-end 5",
+)
 def cost(
     system: options.System,
     t_end: Annotated[
