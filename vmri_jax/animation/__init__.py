@@ -6,6 +6,7 @@ from vmri_jax.animation.drawing import Block, Body, Drawing, Joint, Plane, Spher
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
+from vmri_jax.animation.vtk import write_vtk
 
 __all__ = [
     "Block",
@@ -21,4 +22,5 @@ __all__ = [
     "plot_strip",
     "write_gif",
     "write_html",
+    "write_vtk",
 ]

@@ -17,12 +17,15 @@ from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
+from vmri_jax.animation.vtk import write_vtk
 from vmri_jax.catalogue import SYSTEMS, find_problem
 from vmri_jax.cli.common import PICTURES, check_target_file, console, refusals
 from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.store import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
 
+MOST_FILES = 500
+"""Nodes in files for ParaView, one file each."""
 MOST_NODES = 100_000
 """Read from a store; of longer runs every k-th node is."""
 
@@ -30,7 +33,10 @@ MOST_NODES = 100_000
 def animate(
     run: Annotated[Path, typer.Argument(help="A saved trajectory, run.npz or run.zarr.")],
     out: Annotated[
-        Path | None, typer.Option(help="Write it here: .html, a strip .png/.svg/.pdf, or .gif. [dim]run.html[/dim]")
+        Path | None,
+        typer.Option(
+            help="Write it here: .html, a strip .png/.svg/.pdf, .gif, or .pvd for ParaView. [dim]run.html[/dim]"
+        ),
     ] = None,
     system: Annotated[
         str | None, typer.Option(help="What was simulated: fpu, tsp, sam, or my_file.py:my_problem.")
@@ -52,7 +58,7 @@ def animate(
     """
     with refusals():
         out = run.with_suffix(".html") if out is None else out
-        check_target_file("--out", out, (".html", *PICTURES, ".gif"))
+        check_target_file("--out", out, (".html", *PICTURES, ".gif", ".pvd"))
         shown = _seen_from(_motion(run, system, drawing).between(start, end), view)
         name = title or (SYSTEMS[system].title if system in SYSTEMS else run.stem)
         _write(shown, out, name, frames, seconds, plots.DARK if dark else plots.LIGHT)
@@ -113,6 +119,8 @@ def _write(shown: Motion, out: Path, title: str, frames: int, seconds: float, th
     suffix = out.suffix.lower()
     if suffix == ".html":
         write_html(shown, out, title)
+    elif suffix == ".pvd":
+        write_vtk(shown.thinned(MOST_FILES), out)
     elif suffix == ".gif":
         with progress_shown() as tell:
             write_gif(shown, out, seconds, theme, lambda done, total: tell("drawing", done, total))

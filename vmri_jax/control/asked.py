@@ -37,6 +37,7 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
 def transcribed(
     problem, actuate, num_controls, cost, scheme, macro_dt, num_steps, final_cost, goal, limits, bounds, grid, newton
 ) -> Transcription:
+    """The problem as it is transcribed; arguments as of `vmri_jax.control.minimize`."""
     whole_number("minimize: num_steps", num_steps)
     if grid not in ("macro", "micro"):
         raise ValueError(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")

@@ -40,12 +40,16 @@ class Limits(NamedTuple):
     upper: Float[Numbers, "N m"]
 
 
+class Unsolved(RuntimeError):
+    """PIQP finds no solution, although the relaxed problem has one."""
+
+
 def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float]:
     """The solution, and its largest multiplier.
 
     Raises:
         ImportError: without the package piqp.
-        RuntimeError: the solver fails.
+        Unsolved: the solver fails.
     """
     stages, final, limits = jax.tree.map(np.asarray, (stages, final, limits))
     found = _solved(stages, final, limits, None)
@@ -53,7 +57,10 @@ def solve(stages: Stages, final: Final, limits: Limits) -> tuple[Solution, float
         slopes = [np.abs(part).max(initial=0.0) for part in (stages.gradient, final.s)]
         found = _solved(stages, final, limits, RELAXED * max(1.0, *slopes))
     if found is None:
-        raise RuntimeError("the interior-point method finds no solution of a linear-quadratic problem")
+        raise Unsolved(
+            "minimize: PIQP solves neither the linear-quadratic problem of an iteration nor its relaxation. Look at the sizes of cost, "
+            "goal and limits: they should be of one order."
+        )
     return found
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.control import bounded
 from vmri_jax.control.asked import actuation_of, started, transcribed
 from vmri_jax.control.optimum import Optimum
 from vmri_jax.control.search import Search
@@ -84,6 +85,7 @@ def minimize(
 
     Raises:
         ImportError: bounds or limits without the package piqp.
+        RuntimeError: PIQP solves none of the linear-quadratic problems.
         ValueError, TypeError: bad arguments, functions of other shapes.
     """
     whole_number("minimize: max_iterations", max_iterations)
@@ -111,7 +113,12 @@ def minimize(
     rho, history, nu = 1.0, [], np.zeros(0)
     with progress_shown() if progress else nullcontext(silent) as tell:
         for count in range(1, max_iterations + 1):
-            change, steepest, stages, final = search.update(point)
+            try:
+                change, steepest, stages, final = search.update(point)
+            except bounded.Unsolved:
+                if not history:
+                    raise
+                break
             nu, rho = change.nu, max(rho, 2 * steepest)
             point, told = search.along(point._replace(gaps=stages.c, goal=final.g), change, rho)
             history.append(told)

@@ -6,7 +6,6 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from vmri_jax.mechanics.names import AXES
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
@@ -116,7 +115,7 @@ class Controlled(Effect):
         name = entry(self.body)
         body = body_of(bodies, name)
         if self.along is not None:
-            self.require(np.any(np.asarray(self.along)), "along", self.along, "it must have a direction")
+            self.require(jnp.any(jnp.asarray(self.along) != 0), "along", self.along, "it must have a direction")
         directors = body.size // 3 - 1 if body.rigid else 0
         if isinstance(name, Attachment) and not body.rigid:
             raise ValueError(

@@ -1,0 +1,92 @@
+"""Files for ParaView and others that read VTK: bodies as points, links and springs as lines, solids as polygons."""
+
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.motion import Motion
+from vmri_jax.running.files import check_place
+
+KINDS = ("body", "link", "spring", "solid")
+"""What the number `kind` of a cell says."""
+CELLS = {3: "triangle", 4: "quad"}
+"""Polygons of so many corners; others are cut into triangles."""
+
+
+def write_vtk(motion: Motion, path: str | Path) -> None:
+    """Write ``run.pvd``, which lists the times, and for each node of the run a file ``run/0000.vtu``.
+
+    Cells have their `kind` (0 body, 1 link, 2 spring, 3 solid) and whether they are `fast`; points have their `velocity`.
+
+    Args:
+        motion: from `vmri_jax.animation.motion`; ``motion.thinned(200)`` has fewer nodes.
+        path: of the ``.pvd`` file.
+
+    Raises:
+        ImportError: without the package meshio.
+        OSError: files cannot be written.
+    """
+    meshio = _meshio()
+    path = Path(path)
+    check_place(path)
+    folder = path.with_suffix("")
+    folder.mkdir(exist_ok=True)
+    cells, data = _cells(motion.drawing)
+    fixed = motion.drawing.place([joint.point for joint in motion.drawing.joints if joint.point is not None])
+    entries = []
+    for k, t in enumerate(motion.t):
+        points, velocities = (
+            np.concatenate([bodies[k], still, *motion.drawing.corners(bodies[k])])
+            for bodies, still in ((motion.points, fixed), (motion.velocities, 0.0 * fixed))
+        )
+        file = folder / f"{k:04d}.vtu"
+        meshio.Mesh(points, cells, point_data={"velocity": velocities}, cell_data=data).write(file)
+        entries.append(f'    <DataSet timestep="{float(t)!r}" file={quoteattr(f"{folder.name}/{file.name}")}/>')
+    listed = "\n".join(entries)
+    path.write_text(
+        f'<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n{listed}\n  </Collection>\n</VTKFile>\n',
+        encoding="utf-8",
+    )
+
+
+def _cells(drawing: Drawing):
+    """Cells as meshio takes them, and the data of each block. Points are bodies, fixed ends of joints, corners of solids."""
+    index = {body.name: i for i, body in enumerate(drawing.bodies)}
+    at = len(drawing.bodies)
+    found: dict[str, list[tuple[list[int], str, bool]]] = {}
+    for body in drawing.bodies:
+        if body.shown == "ball":
+            found.setdefault("vertex", []).append(([index[body.name]], "body", body.pace == "fast"))
+    for joint in drawing.joints:
+        ends = [index[name] for name in joint.bodies]
+        if joint.point is not None:
+            ends, at = [*ends, at], at + 1
+        found.setdefault("line", []).append((ends, joint.kind, drawing.pace(joint) == "fast"))
+    for solid in drawing.solids:
+        fast = drawing.bodies[index[solid.points[0]]].pace == "fast"
+        for face in solid.faces:
+            numbers = [at + i for i in face]
+            pieces = (
+                [numbers]
+                if len(face) in CELLS
+                else [[numbers[0], *numbers[i : i + 2]] for i in range(1, len(face) - 1)]
+            )
+            for piece in pieces:
+                found.setdefault(CELLS[len(piece)], []).append((piece, "solid", fast))
+        at += len(solid.corners)
+    cells = [(kind, np.array([numbers for numbers, *_ in items])) for kind, items in found.items()]
+    data = {
+        "kind": [np.array([KINDS.index(kind) for _, kind, _ in items]) for items in found.values()],
+        "fast": [np.array([int(fast) for *_, fast in items]) for items in found.values()],
+    }
+    return cells, data
+
+
+def _meshio():
+    try:
+        import meshio
+    except ImportError:
+        raise ImportError("VTK files need the package meshio; install it with: pip install 'vmri_jax[vtk]'") from None
+    return meshio
