@@ -51,7 +51,7 @@ def write_vtk(motion: Motion, path: str | Path) -> None:
     )
 
 
-def _cells(drawing: Drawing):
+def _cells(drawing: Drawing) -> tuple[list, dict]:
     """Cells as meshio takes them, and the data of each block. Points are bodies, fixed ends of joints, corners of solids."""
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
     at = len(drawing.bodies)
