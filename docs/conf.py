@@ -32,7 +32,7 @@ exclude_patterns = [
     "gallery_sources",
     *(f"gallery/*.{kind}" for kind in ("ipynb", "py", "md5", "zip", "json")),
 ]
-myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_inline"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # the tests run the notebooks, and compare what they show
 suppress_warnings = [
@@ -53,6 +53,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = "vmri_jax"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_context = {"default_mode": "auto"}
 html_theme_options = {
     "show_toc_level": 2,
     "navigation_with_keys": False,
@@ -71,7 +72,10 @@ def setup(app):
         text = path.read_text(encoding="utf-8").replace("(scenes/README.md)", "(../gallery/index.rst)")
         (HERE / "tutorials" / path.name).write_text(text, encoding="utf-8")
     public.write(HERE / "reference")
-    film = HERE / "_static" / "satellite.gif"
-    if not film.exists():
-        gallery.play(ROOT / "notebooks" / "scenes" / "satellite.py", film, ROOT)
+    films = [HERE / "_static" / f"satellite_{theme}.gif" for theme in ("light", "dark")]
+    if not all(film.exists() for film in films):
+        part = ["--view=-60,25", "--to", "6", "--out"]
+        light, dark = (str(film) for film in films)
+        scene = ROOT / "notebooks" / "scenes" / "rigid_satellite.py"
+        gallery.play(scene, ROOT, [*part, light], ["--dark", *part, dark])
     app.connect("autodoc-process-docstring", docstrings.as_rest, priority=1)  # before napoleon

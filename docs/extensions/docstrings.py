@@ -23,11 +23,15 @@ def fields(lines: list[str]) -> list[str]:
             listed = True
         listed = listed and before and bool(line.strip())
         if not line.strip().startswith("|"):
-            line = "".join(
-                part if k % 2 else part.replace("|", r"\|") for k, part in enumerate(re.split(r"(`+[^`]*`+)", line))
-            )
+            line = with_bars(line)
         found.append(f"    {line}" if listed else line)
     return found
+
+
+def with_bars(line: str) -> str:
+    """The line with ``|`` outside of code escaped: there it would be a substitution."""
+    parts = re.split(r"(`+[^`]*`+)", line)
+    return "".join(part if k % 2 else part.replace("|", r"\|") for k, part in enumerate(parts))
 
 
 def tables(lines: list[str]) -> list[str]:

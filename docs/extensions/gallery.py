@@ -40,7 +40,7 @@ def settings(scenes: Path, docs: Path) -> dict:
         page = docs / "_static" / "scenes" / f"{source.stem}.html"
         if not page.exists() or page.stat().st_mtime < (scenes / source.name).stat().st_mtime:
             page.parent.mkdir(parents=True, exist_ok=True)
-            play(scenes / source.name, page, docs.parent)
+            play(scenes / source.name, docs.parent, ["--out", str(page)])
         frame = (
             f'<iframe class="motion" loading="lazy" title="{source.stem}" src="../_static/scenes/{page.name}"></iframe>'
         )
@@ -76,14 +76,20 @@ def with_title(path: Path) -> str:
     return f'"""\n{title}\n{"=" * len(title)}\n\n{text}\n\n.. code-block:: sh\n\n{shown}\n"""\n{body}'
 
 
-def play(path: Path, page: Path, root: Path) -> None:
-    """Runs a scene by the command in its docstring, and writes the page that shows its motion."""
+def play(path: Path, root: Path, *shown: list[str]) -> None:
+    """Runs a scene by the command in its docstring, and shows its motion.
+
+    Args:
+        path: of the scene file.
+        root: of the repository.
+        shown: arguments of `vmri animate`, of each picture of it.
+    """
     simulate = shlex.split(docstring(path)[1][0])[1:]
     vmri = [sys.executable, "-m", "vmri_jax.cli"]
     with tempfile.TemporaryDirectory() as folder:
         run = f"{folder}/run.npz"
         simulate[simulate.index("--out") + 1] = run
-        for command in (simulate, ["animate", run, "--out", str(page)]):
+        for command in (simulate, *(["animate", run, *arguments] for arguments in shown)):
             subprocess.run([*vmri, *command], cwd=root, check=True, capture_output=True)
 
 

@@ -4,6 +4,8 @@ import inspect
 from importlib import import_module
 from pathlib import Path
 
+from extensions.docstrings import with_bars
+
 ROOMS = {
     "vmri_jax": "Problems, schemes and runs",
     "vmri_jax.scene": "Scenes: bodies and effects",
@@ -48,7 +50,7 @@ def write(folder: Path) -> None:
         module, listed, pages = import_module(room), [], []
         for name in names(room):
             thing = getattr(module, name)
-            first = (inspect.getdoc(thing) or "").split("\n")[0].replace("|", r"\|")
+            first = with_bars((inspect.getdoc(thing) or "").split("\n")[0])
             listed.append(f"   * - :doc:`{name} <api/{room}.{name}>`\n     - {first}")
             pages.append(f"   api/{room}.{name}")
             kind = "autoclass" if inspect.isclass(thing) else "autofunction"
