@@ -69,6 +69,12 @@ def test_a_scheme_of_ones_own(capsys):
     assert "order 2.0" in capsys.readouterr().out
 
 
+def test_the_problem_that_others_solve_too(capsys):
+    exec(next(program for program in PROGRAMS if "trolley" not in program and "25.0 * q_s[0]" in program), {})
+    printed = capsys.readouterr().out.strip()
+    assert f"`{printed}`" in (ROOT / "docs/coming_from/index.md").read_text()
+
+
 def test_an_effect_of_ones_own(capsys):
     exec(next(program for program in PROGRAMS if "def magnet" in program), {})
     assert re.search(r"the ball is at 0\.\d\d", capsys.readouterr().out)
