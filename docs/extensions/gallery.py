@@ -9,6 +9,8 @@ from pathlib import Path
 
 from sphinx_gallery.scrapers import figure_rst
 
+from extensions.files import keep
+
 HEAD = """Scenes
 ======
 
@@ -26,10 +28,10 @@ def settings(scenes: Path, docs: Path) -> dict:
     """
     sources = docs / "gallery_sources"
     sources.mkdir(exist_ok=True)
-    _keep(sources / "GALLERY_HEADER.rst", HEAD)
+    keep(sources / "GALLERY_HEADER.rst", HEAD)
     for path in sorted(scenes.glob("*.py")):
         if path.name != "gallery.py":
-            _keep(sources / path.name, with_title(path))
+            keep(sources / path.name, with_title(path))
 
     def picture(block, block_vars, gallery_conf) -> str:
         source = Path(block_vars["src_file"])
@@ -91,9 +93,3 @@ def play(path: Path, root: Path, *shown: list[str]) -> None:
         simulate[simulate.index("--out") + 1] = run
         for command in (simulate, *(["animate", run, *arguments] for arguments in shown)):
             subprocess.run([*vmri, *command], cwd=root, check=True, capture_output=True)
-
-
-def _keep(path: Path, text: str) -> None:
-    """Writes only what has changed, so that nothing is built twice."""
-    if not path.exists() or path.read_text() != text:
-        path.write_text(text)

@@ -5,6 +5,7 @@ from importlib import import_module
 from pathlib import Path
 
 from extensions.docstrings import with_bars
+from extensions.files import keep
 
 ROOMS = {
     "vmri_jax": "Problems, schemes and runs",
@@ -55,20 +56,14 @@ def write(folder: Path) -> None:
             pages.append(f"   api/{room}.{name}")
             kind = "autoclass" if inspect.isclass(thing) else "autofunction"
             members = "   :members:\n   :exclude-members: set\n" if inspect.isclass(thing) else ""
-            _keep(
+            keep(
                 folder / "api" / f"{room}.{name}.rst",
                 f"{_titled(name)}.. currentmodule:: {room}\n\n.. {kind}:: {name}\n{members}",
             )
         table = ".. list-table::\n   :widths: 1 3\n\n" + "\n".join(listed)
         hidden = ".. toctree::\n   :hidden:\n\n" + "\n".join(pages)
-        _keep(folder / f"{room}.rst", f"{_titled(title)}``{room}``\n\n{table}\n\n{hidden}\n")
+        keep(folder / f"{room}.rst", f"{_titled(title)}``{room}``\n\n{table}\n\n{hidden}\n")
 
 
 def _titled(text: str) -> str:
     return f"{text}\n{'=' * len(text)}\n\n"
-
-
-def _keep(path: Path, text: str) -> None:
-    """Writes only what has changed, so that Sphinx builds no page twice."""
-    if not path.exists() or path.read_text() != text:
-        path.write_text(text)
