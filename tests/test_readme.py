@@ -75,6 +75,11 @@ def test_the_problem_that_others_solve_too(capsys):
     assert f"`{printed}`" in (ROOT / "docs/coming_from/index.md").read_text()
 
 
+def test_a_mechanism(capsys):
+    exec(next(program for program in PROGRAMS if "crank pin" in program), {})
+    assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/scenes.md").read_text()
+
+
 def test_an_effect_of_ones_own(capsys):
     exec(next(program for program in PROGRAMS if "def magnet" in program), {})
     assert re.search(r"the ball is at 0\.\d\d", capsys.readouterr().out)

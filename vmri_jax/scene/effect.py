@@ -188,7 +188,7 @@ class Effect(ABC):
                 raise ValueError(f"{self.name}: {element} is about the ground alone, which does not move; name a body.")
             for name in element:
                 if name not in bodies and name != GROUND:
-                    raise ValueError(f"{self.name}: {unknown('body', str(name), bodies)}")
+                    raise ValueError(f"{self.name}: {unknown('body', str(name), [*bodies, GROUND])}")
                 if element.count(name) > 1:
                     raise ValueError(
                         f"{self.name}: {name} occurs twice in {element}; an element is between different bodies."

@@ -134,12 +134,18 @@ def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
     state = initial_state(system, *sorting.start, project=True)
     if macro_dt is None:
         fastest = float(frequencies(system, state)[0])
-        macro_dt = scheme.num_micro * 0.1 / fastest if fastest > 0 else 0.01
+        macro_dt = scheme.num_micro * 0.1 / (fastest or _turning(sorting) or 10.0)
     step = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
     q_s, q_f, v_s, v_f = sorting.start
     own = [_first_derivatives(build(sorting, [part]), q_s.size, v_s, v_f) for part in sorting.placed]
     q = jnp.concatenate([q_s, q_f])
     return 1e6 * float(np.median(step)) / STEPS, [1e9 * seconds_each(derivatives, q) for derivatives in own]
+
+
+def _turning(sorting: Sorting) -> float:
+    """The rate at which the velocities of the start change positions by their own size: that of a body that spins."""
+    q_s, q_f, v_s, v_f = (np.abs(x).max(initial=0.0) for x in sorting.start)
+    return float(max(v_s, v_f) / max(q_s, q_f, 1e-300))
 
 
 def _first_derivatives(system: System, n_s: int, v_s, v_f):
