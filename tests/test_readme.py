@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import vmri_jax as vm
@@ -73,6 +74,17 @@ def test_the_problem_that_others_solve_too(capsys):
     exec(next(program for program in PROGRAMS if "trolley" not in program and "25.0 * q_s[0]" in program), {})
     printed = capsys.readouterr().out.strip()
     assert f"`{printed}`" in (ROOT / "docs/coming_from/index.md").read_text()
+
+
+def test_derivatives(capsys):
+    program = "".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs/how_to/derivatives.md").read_text(), re.DOTALL))
+    scope = {}
+    exec(program, scope)
+    first, *others = capsys.readouterr().out.splitlines()
+    assert others == ["(8,)", "True"]
+    squared, params = scope["squared"], scope["params"]
+    up, down = (squared({**params, "coupling": 0.1 + d}, np.array([0.5])) for d in (1e-5, -1e-5))
+    assert float(first.split()[3].rstrip(",")) == pytest.approx(float(up - down) / 2e-5, rel=1e-5)
 
 
 def test_a_mechanism(capsys):

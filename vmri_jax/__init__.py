@@ -64,6 +64,11 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'vmri_jax' has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    """All names, those of `LATER` too."""
+    return sorted({*globals(), *LATER})
+
+
 __all__ = [
     "CompiledAgainWarning",
     "Composition",

@@ -67,6 +67,7 @@ EFFECTS = [
     sc.QuadraticDrag(0.1),
     sc.HarmonicDrive("b", [1.0, 0.0, 0.0], 3.0),
     sc.Drive("b", history, {"f": 1.0}),
+    sc.Controlled("b", "force"),
     sc.ConstantForce(["b", "c"], [1.0, 0.0, 0.0]),
     sc.FollowerForce(("b", "c"), 1.0),
     sc.PlaneContact(point=[0, 0, 0], normal=[0, 0, 1], stiffness=1e3, smoothing=0.01),
@@ -98,6 +99,7 @@ RIGID_EFFECTS = [
     sc.JointLimit("pin", -1.0, 1.0, stiffness=1e3, smoothing=0.01),
     sc.JointDamper("pin", 0.1),
     sc.JointDrive("pin", torque, {"f": 1.0}),
+    sc.Controlled("pin", "torque", name="controlled pin"),
     sc.JointMotion("pin", torque, {"f": 1.0}),
 ]
 """Joints, and what acts in them."""

@@ -137,6 +137,19 @@ def _run_and_nodes(run, engine: Engine, save_every: int, arrays):
 def _stepped_back(run, engine: Engine, save_every: int, kept, cotangent: Trajectory):
     """Cotangents of (leaves, start, macro_dt)."""
     (leaves, _, macro_dt), nodes = only_once(kept)
+    at_nodes = tuple(getattr(cotangent, name) for name in NODES)
+    at_micro = (cotangent.q_f_micro, cotangent.t_micro) if engine.save_micro else None
+    by_real, by_state, by_dt = _back(engine, save_every, leaves, macro_dt, nodes, at_nodes, at_micro)
+    by_leaves = [by_real[i] if i in by_real else _no_cotangent(leaf) for i, leaf in enumerate(leaves)]
+    return ((by_leaves, tuple(vars(by_state).values()), by_dt),)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_nodes, at_micro):
+    """All steps back: cotangents of the real ones among the leaves by their number, of the start, and of the step.
+
+    A program of its own, so that gradients that are not compiled as a whole do not compile it each time.
+    """
     real = {i: jnp.asarray(leaf) for i, leaf in enumerate(leaves) if _is_real(leaf)}
 
     def complete(real: dict) -> list:
@@ -174,12 +187,11 @@ def _stepped_back(run, engine: Engine, save_every: int, kept, cotangent: Traject
         (state, _), *carry = jax.lax.fori_loop(0, save_every, one, carry)
         return tuple(carry), _distance(state, at.start)
 
-    at_nodes = tuple(getattr(cotangent, name) for name in NODES)
     times = back.scheme.micro_times
     by_micro = jnp.zeros((engine.num_saves, len(times), nodes.q_f.shape[1]))
     by_dt = jnp.zeros(())
-    if engine.save_micro:
-        by_micro, t_micro = cotangent.q_f_micro, cotangent.t_micro
+    if at_micro is not None:
+        by_micro, t_micro = at_micro
         at_nodes = (at_nodes[0].at[1:].add(t_micro.sum(1)), *at_nodes[1:])
         by_dt -= jnp.sum(t_micro * (1 - times))
     before, after = (jax.tree.map(lambda a, part=part: a[part], nodes) for part in (slice(-1), slice(1, None)))
@@ -189,8 +201,7 @@ def _stepped_back(run, engine: Engine, save_every: int, kept, cotangent: Traject
     (by_real, by_state, by_dt), gaps = jax.lax.scan(interval, (*carry[0], by_dt), xs, reverse=True)
     _say_gap(jnp.max(gaps), jnp.argmax(gaps), engine.num_saves)
     by_real, by_state = _plus((by_real, by_state), jax.vjp(node, real, first)[1](tuple(a[0] for a in at_nodes)))
-    by_leaves = [by_real[i] if i in by_real else _no_cotangent(leaf) for i, leaf in enumerate(leaves)]
-    return ((by_leaves, tuple(vars(by_state).values()), by_dt),)
+    return by_real, by_state, by_dt
 
 
 reversible.defvjp(_run_and_nodes, _stepped_back)
