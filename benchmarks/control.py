@@ -136,11 +136,11 @@ SCHEMES = {"explicit slow": vm.explicit_slow, "implicit": vm.fully_implicit}
 def sizes(name: str) -> Size:
     """ "quick" or "full"."""
     if name == "quick":
-        return Size({("explicit slow", 5): (30, 60), ("explicit slow", 1): (300,)}, 600, None)
+        return Size({("explicit slow", 5): (30, 60), ("explicit slow", 1): (60, 300)}, 600, None)
     coarse = (30, 60, 120, 240)
     return Size(
         {
-            ("explicit slow", 1): (300, 600),
+            ("explicit slow", 1): (60, 120, 300, 600),
             ("explicit slow", 5): (60, 120, 240),
             ("explicit slow", 10): coarse,
             ("explicit slow", 20): coarse,

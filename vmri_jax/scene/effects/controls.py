@@ -175,6 +175,3 @@ class ControlledJoint(InJoint):
     def components(self, bodies) -> tuple[str, ...]:
         """Name of the control."""
         return (self.name,)
-
-
-Control = Controlled | ControlledJoint
