@@ -70,6 +70,11 @@ def test_a_scheme_of_ones_own(capsys):
     assert "order 2.0" in capsys.readouterr().out
 
 
+def test_a_stepper_of_ones_own(capsys):
+    exec(next(program for program in PROGRAMS if "class Rotation" in program), {"__name__": "rotation"})
+    assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/steppers.md").read_text()
+
+
 def test_the_problem_that_others_solve_too(capsys):
     exec(next(program for program in PROGRAMS if "trolley" not in program and "25.0 * q_s[0]" in program), {})
     printed = capsys.readouterr().out.strip()

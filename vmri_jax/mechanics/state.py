@@ -88,7 +88,10 @@ def _tell_of_velocities(taken: float) -> None:
         f"initial_state: {taken:.2%} of the velocities (in the norm of the kinetic energy) do not fit the constraints"
     )
     if taken > REFUSED:
-        raise ValueError(f"{message}. Correct the velocities, or pass project=True for the nearest that fit.")
+        raise ValueError(
+            f"{message}. Correct the velocities, or pass project=True for the nearest that fit; of a scene, "
+            "with_rates({joint: rate}) finds all that belong to the rate of a joint."
+        )
     if taken > NOTICED:
         warnings.warn(f"{message}; the nearest that fit are taken. Pass project=True if that is meant.", stacklevel=3)
 

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -135,6 +135,14 @@ class AnyBody(ABC):
             at: (3,) from the centre of mass, in the axes of the body; None for the centre itself.
         """
 
+    @abstractmethod
+    def with_rates(self, rates: np.ndarray) -> "AnyBody":
+        """The same body with other velocities.
+
+        Args:
+            rates: (n,) of its coordinates.
+        """
+
     def _check_names(self) -> None:
         kind = type(self).__name__
         if not isinstance(self.name, str) or not self.name:
@@ -241,6 +249,9 @@ class Body(AnyBody):
             raise ValueError(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
         return Point(self.name, self.position, self.mass, self.block)
 
+    def with_rates(self, rates: np.ndarray) -> "Body":
+        return replace(self, velocity=rates)
+
 
 class Ground(AnyBody):
     """The body that does not move: its axes are those of space."""
@@ -256,6 +267,9 @@ class Ground(AnyBody):
         if at is None:
             raise ValueError('the ground has no centre; give a point of it, ("ground", [x, y, z]).')
         return Point(GROUND, at)
+
+    def with_rates(self, rates: np.ndarray) -> "Ground":
+        return self
 
 
 Bodies = Mapping[str, AnyBody]

@@ -9,7 +9,7 @@ Source: P. Betsch, S. Leyendecker, The discrete null space method for the energy
 mechanical systems, part II: multibody dynamics, Int. J. Numer. Meth. Engng 67 (2006).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -187,9 +187,17 @@ class RigidBody(AnyBody):
     @property
     def motions(self) -> np.ndarray:
         """(n, 6) velocities by those of the centre and the angular velocity; (6, 5) of a rod."""
-        turns = [-_cross_matrix(np.asarray(self.directors[i])) for i in self.wide]
-        whole = np.block([[np.eye(3), np.zeros((3, 3))], *([np.zeros((3, 3)), turn] for turn in turns)])
+        turns = self._turns()
+        whole = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((len(turns), 3)), turns]])
         return whole if len(self.wide) > 1 else np.linalg.svd(whole)[0][:, :5]
+
+    def _turns(self) -> np.ndarray:
+        """Rates of the directors by the angular velocity, ``d_i' = -d_i x spin``."""
+        return np.concatenate([-_cross_matrix(np.asarray(self.directors[i])) for i in self.wide])
+
+    def with_rates(self, rates: np.ndarray) -> "RigidBody":
+        """The same body with other velocities; a rod gets no spin about itself."""
+        return replace(self, velocity=rates[:3], spin=np.linalg.lstsq(self._turns(), rates[3:], rcond=None)[0])
 
     def components(self, vector):
         """(3,) components along the principal axes of a vector in the axes of the body.

@@ -1,7 +1,7 @@
 """Scenes: bodies and the effects between them, turned into an ordinary `System`."""
 
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -24,6 +24,7 @@ from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_r
 from vmri_jax.scene.rigid import RigidBody, Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import MASS, Actuation
+from vmri_jax.scene.velocities import with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
@@ -248,6 +249,23 @@ class Scene:
         items[name] = replace(items[name], **changes)
         changed = list(items.values())
         return replace(self, bodies=changed[: len(self.bodies)], effects=changed[len(self.bodies) :])
+
+    def with_rates(self, rates: Mapping[str, Any]) -> "Scene":
+        """The scene with velocities that have these rates in joints, and keep all constraints, at the start.
+
+            scene.with_rates({"bearing": 100.0})  # rad/s; all that hangs on the crank moves with it
+
+        What the rates leave open stays as near to the velocities that the bodies have, in the norm of the kinetic energy.
+
+        Args:
+            rates: by the name of a `Revolute`, `Prismatic` or `Cylindrical`: rad/s or m/s, of the second body against the first; one
+                number, or one for each pair of the joint. Of a joint that does both, ``{"turn": 1.0, "slide": 0.1}``.
+
+        Raises:
+            TypeError: no mapping, or numbers of the scene that are traced.
+            ValueError: no joint of this name, one that leaves no such freedom, rates that cannot be together.
+        """
+        return replace(self, bodies=with_rates(self.sorting, self.effects, self.system(), rates))
 
     def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
         """What every body and effect adds to a macro step of a scheme: where it lives, unknowns, evaluations, and its cost.

@@ -1,0 +1,132 @@
+"""Velocities of all bodies from the rates of a few joints."""
+
+import jax
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.scene import (
+    Box,
+    Cylindrical,
+    JointMotion,
+    Prismatic,
+    Revolute,
+    RigidBody,
+    Rod,
+    Scene,
+    Spherical,
+    rotation,
+)
+
+R, L, ANGLE = 0.1, 0.3, 0.7
+"""Of the crank, of the rod, and the angle of the crank, m, m, rad."""
+Z = np.array([0.0, 0.0, 1.0])
+
+
+def slider_crank() -> Scene:
+    """At rest, at an angle where everything moves."""
+    pin = R * np.array([np.cos(ANGLE), np.sin(ANGLE), 0.0])
+    tilt = -np.arcsin(R * np.sin(ANGLE) / L)
+    wrist = pin + L * np.array([np.cos(tilt), np.sin(tilt), 0.0])
+    return Scene(
+        [
+            RigidBody("crank", 1.0, Box((R, 0.02, 0.02)), pin / 2, ANGLE * Z),
+            RigidBody("rod", 0.5, Rod(L), (pin + wrist) / 2, _along(wrist - pin)),
+            RigidBody("piston", 0.8, Box((0.06, 0.06, 0.06)), wrist),
+        ],
+        [
+            Revolute(("ground", "crank"), at=[0.0, 0.0, 0.0], axis=Z, name="bearing"),
+            Spherical(("crank", "rod"), at=pin, name="crank pin"),
+            Spherical(("rod", "piston"), at=wrist, name="wrist pin"),
+            Prismatic(("ground", "piston"), at=wrist, axis=[1.0, 0.0, 0.0], name="cylinder"),
+        ],
+    )
+
+
+def _along(direction) -> np.ndarray:
+    """A rotation whose third axis, that of a rod, is along a vector in the plane."""
+    n = direction / np.linalg.norm(direction)
+    return np.column_stack([Z, np.cross(n, Z), n])
+
+
+def test_a_crank_takes_its_rod_and_piston_with_it():
+    speed = 100.0
+    scene = slider_crank().with_rates({"bearing": speed})
+    crank, rod, piston = scene.bodies
+    across = R * np.sin(ANGLE)
+    lean = np.arcsin(across / L)
+    turning = -speed * R * np.cos(ANGLE) / (L * np.cos(lean))  # of the rod
+    pushed = -speed * (across + R * np.cos(ANGLE) * np.tan(lean))  # of the piston
+    np.testing.assert_allclose(crank.spin, speed * Z, atol=1e-10)
+    np.testing.assert_allclose(rod.spin, turning * Z, atol=1e-10)
+    np.testing.assert_allclose(piston.velocity, [pushed, 0.0, 0.0], atol=1e-11)
+    run = vm.simulate(scene, vm.fully_implicit(num_micro=1), macro_dt=1e-4, num_steps=20)
+    moved = scene.joint_motion(run, "bearing")
+    assert moved[1] == pytest.approx(speed * 1e-4, rel=1e-2)
+    assert scene.joint_motion(run, "cylinder")[1] == pytest.approx(pushed * 1e-4, rel=1e-2)
+
+
+def test_rates_of_the_piston_give_those_of_the_crank():
+    there = slider_crank().with_rates({"bearing": 3.0})
+    back = slider_crank().with_rates({"cylinder": there.bodies[2].velocity[0]})
+    np.testing.assert_allclose(back.bodies[0].spin, 3.0 * Z, atol=1e-12)
+    np.testing.assert_allclose(there.with_rates({"bearing": 0.0}).bodies[0].spin, 0.0, atol=1e-12)
+
+
+def test_what_rates_leave_open_stays_as_it_is():
+    hub = RigidBody("hub", 5.0, Box((1.0, 1.0, 1.0)), [0.0, 0.0, 0.0], velocity=[0.3, 0.0, 0.0])
+    arm = RigidBody("arm", 1.0, Box((1.0, 0.1, 0.1)), [1.0, 0.0, 0.0])
+    free = Scene([hub, arm], [Cylindrical(("hub", "arm"), at=[0.5, 0.0, 0.0], axis=[1.0, 0.0, 0.0], name="guide")])
+    moved = free.with_rates({"guide": {"turn": 2.0, "slide": 0.6}})
+    a, b = moved.bodies
+    np.testing.assert_allclose(b.spin - a.spin, [2.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(b.velocity - a.velocity, [0.6, 0.0, 0.0], atol=1e-12)
+    total = 5.0 * a.velocity + b.velocity  # a change of rates inside takes no momentum from outside
+    np.testing.assert_allclose(total, [1.5, 0.0, 0.0], atol=1e-12)
+
+
+def test_motions_that_are_given_count():
+    def steady(t, params):
+        return params["speed"] * t
+
+    base = slider_crank()
+    driven = Scene(base.bodies, [*base.effects, JointMotion("bearing", steady, {"speed": 7.0})])
+    np.testing.assert_allclose(driven.with_rates({}).bodies[0].spin, 7.0 * Z, atol=1e-12)
+    with pytest.raises(ValueError, match="no velocities have these rates of bearing and keep the constraints"):
+        driven.with_rates({"bearing": 8.0})
+
+
+def test_every_pair_of_a_joint_has_a_rate():
+    links = [RigidBody(f"link {k}", 1.0, Box((1.0, 0.1, 0.1)), [k + 0.5, 0.0, 0.0]) for k in range(2)]
+    pairs = Revolute([("ground", "link 0"), ("link 0", "link 1")], [[0, 0, 0], [1, 0, 0]], axis=Z, name="hinges")
+    chain = Scene(links, [pairs]).with_rates({"hinges": [1.0, -3.0]})
+    np.testing.assert_allclose([body.spin for body in chain.bodies], [Z, -2.0 * Z], atol=1e-12)
+    np.testing.assert_allclose(rotation(chain.start[0][:12]), np.eye(3), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("rates", "error", "message"),
+    [
+        (3.0, TypeError, 'rates is 3.0; give rates by the names of joints, {"bearing": 100.0}'),
+        ({"bering": 1.0}, ValueError, "there is no joint 'bering'.*bearing"),
+        ({"crank pin": 1.0}, ValueError, "crank pin leaves neither an angle nor a way"),
+        ({"bearing": {"slide": 1.0}}, ValueError, "of is 'slide'; bearing leaves turn free"),
+        ({"bearing": [1.0, 2.0]}, ValueError, r"the rate of bearing has shape \(2,\); give one number"),
+        ({"bearing": np.nan}, ValueError, "the rate of bearing is nan; it must be finite"),
+        ({"bearing": "fast"}, TypeError, "the rate of bearing"),
+        ({"bearing": 1.0, "cylinder": 1.0}, ValueError, "no velocities have these rates of bearing, cylinder"),
+    ],
+)
+def test_bad_rates_are_refused(rates, error, message):
+    with pytest.raises(error, match=message):
+        slider_crank().with_rates(rates)
+
+
+def test_traced_scenes_are_refused():
+    def speed(mass):
+        body = RigidBody("bar", mass, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], pace="slow")
+        hinge = Revolute(("ground", "bar"), at=[0.0, 0.0, 0.0], axis=Z, name="hinge")
+        return Scene([body], [hinge]).with_rates({"hinge": 1.0}).bodies[0].spin[2]
+
+    with pytest.raises(TypeError, match="traced; find its velocities outside of jit"):
+        jax.grad(speed)(1.0)

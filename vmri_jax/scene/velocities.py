@@ -1,0 +1,106 @@
+"""Velocities of all bodies that fit the joints, from the rates of a few of them."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.projection import legendre
+from vmri_jax.mechanics.system import System
+from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, AnyBody, Bodies
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.joints import FREEDOMS, Joint, freedom_of
+from vmri_jax.scene.sorting import Sorting
+
+REACHED = 1e-8
+"""Part of the rates by which they may be missed."""
+
+
+def with_rates(sorting: Sorting, effects: Sequence[Effect], system: System, wanted: Mapping[str, Any]) -> list[AnyBody]:
+    """The bodies with velocities that have these rates in their joints, see `Scene.with_rates`.
+
+    With all constraints and rates as rows ``C v = b``, v is the nearest to the given velocities v_0 in the norm of the
+    kinetic energy: with ``M = R R^T``, ``R^T (v - v_0)`` is the shortest solution of ``C R^-T x = b - C v_0``.
+
+    Args:
+        sorting: bodies at their places.
+        effects: of the scene, joints among them.
+        system: of the scene.
+        wanted: rates by the name of the joint.
+    """
+    q_s, q_f, v_s, v_f = sorting.start
+    q, v, n_s = jnp.concatenate([q_s, q_f]), np.concatenate([v_s, v_f]), q_s.size
+    if not is_concrete((q, v, system)):
+        raise TypeError(
+            "Scene.with_rates: numbers of the scene are traced; find its velocities outside of jit and grad."
+        )
+    columns = {name: place.start + (n_s if place.part == "f" else 0) for name, place in sorting.places.items()}
+
+    def constraints(t, q):
+        return system.constraints(t, q[:n_s], q[n_s:])
+
+    def momentum(v):
+        return jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
+
+    t = jnp.zeros(())
+    rows = [np.asarray(jax.jacfwd(constraints, 1)(t, q))]
+    values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
+    for joint, freedom, given in _rates(effects, sorting.bodies, wanted):
+        jacobian = jax.jacfwd(lambda q, joint=joint, of=freedom: _freedoms(joint, of, sorting.bodies, columns, q))(q)
+        rows.append(np.asarray(jacobian))
+        values.append(given)
+    c, b = np.concatenate(rows), np.concatenate(values)
+    root = np.linalg.cholesky(np.asarray(jax.jacfwd(momentum)(jnp.asarray(v))))  # M = R R^T
+    size = np.abs([b, c @ v]).max()
+    v = v + np.linalg.solve(root.T, np.linalg.lstsq(np.linalg.solve(root, c.T).T, b - c @ v, rcond=None)[0])
+    missed = np.abs(c @ v - b).max()
+    if missed > REACHED * size:
+        raise ValueError(
+            f"Scene.with_rates: no velocities have these rates of {', '.join(wanted)} and keep the constraints: they are missed by "
+            f"{missed:.3g}. Give fewer rates: those of a joint follow from others, or it cannot move here."
+        )
+    return [body.with_rates(v[columns[name] : columns[name] + body.size]) for name, body in sorting.bodies.items()]
+
+
+def _rates(effects: Sequence[Effect], bodies: Bodies, wanted: Mapping[str, Any]):
+    """Joints, which freedom of each, and its rates (n,), one for each pair of bodies."""
+    if not isinstance(wanted, Mapping):
+        raise TypeError(
+            f'Scene.with_rates: rates is {wanted!r}; give rates by the names of joints, {{"bearing": 100.0}}.'
+        )
+    joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
+    for name, given in wanted.items():
+        if name not in joints:
+            raise ValueError(f"Scene.with_rates: {unknown('joint', name, joints)}")
+        joint = joints[name]
+        for of, values in given.items() if isinstance(given, Mapping) else [("auto", given)]:
+            try:
+                freedom = freedom_of(joint, of)
+            except ValueError as error:
+                raise ValueError(
+                    f'Scene.with_rates: {error} Give {{"turn": ...}} or {{"slide": ...}} of them.'
+                ) from None
+            what, count = f"Scene.with_rates: the rate of {name}", len(joint.elements(bodies))
+            values = real_array(what, values)
+            if values.shape not in ((), (count,)):
+                raise ValueError(f"{what} has shape {values.shape}; give one number, or one for each pair, ({count},).")
+            if not is_concrete(values) or not np.isfinite(values).all():
+                raise ValueError(f"{what} is {values}; it must be finite.")
+            yield joint, freedom, np.broadcast_to(values, (count,))
+
+
+def _freedoms(joint: Joint, of: str, bodies: Bodies, columns: Mapping[str, int], q):
+    """How far each pair of a joint has turned or moved, (n,)."""
+    params, found = joint.parameters(bodies), []
+    for i, element in enumerate(joint.elements(bodies)):
+        _, own = joint.one(i, bodies, params)
+        parts = [
+            GROUND_COORDINATES if name == GROUND else q[columns[name] : columns[name] + bodies[name].size]
+            for name in element
+        ]
+        found.append(FREEDOMS[of](tuple(map(jnp.asarray, parts)), own))
+    return jnp.stack(found)
