@@ -1,6 +1,7 @@
 """Run the scenes of this folder by the commands in their docstrings; write README.md with what they kept and a picture each.
 
-python notebooks/scenes/gallery.py
+python notebooks/scenes/gallery.py          # table and pictures
+python notebooks/scenes/gallery.py films    # films_light.gif and films_dark.gif beside this folder
 """
 
 import ast
@@ -16,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 
 import vmri_jax as vm
 from vmri_jax.catalogue import find_scene
@@ -27,6 +28,10 @@ HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
 WIDTH = 1200
 """Of a picture, in points."""
+FILMS = {"rigid_satellite": 8.0, "engine": 0.126, "simple_atomic_model": 20.0}
+"""Scenes that are shown side by side in one film, and until when."""
+SECONDS, HEIGHT, GAP, COLOURS = 4.0, 340, 24, 64
+"""How long the film takes; height of its pictures and space between them, in points; how many colours it has."""
 SYMMETRIC = 1e-9
 """Rates of Lagrangian and constraints below this are zero."""
 
@@ -192,7 +197,44 @@ def shrink(path: Path) -> None:
     picture.quantize(128).save(path, optimize=True)
 
 
-def main() -> None:
+def write_films() -> None:
+    """Some scenes side by side, in light and in dark colours."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, until in FILMS.items():
+            simulate, animate = docstring(HERE / f"{name}.py")[1]
+            run = f"{folder}/{option(simulate, '--out')}"
+            vmri(*simulate[:-1], run, cache=Path(folder))
+            view = [word for word in animate if word.startswith("--view")]
+            for colours in ("light", "dark"):
+                out = ["--out", f"{folder}/{name}_{colours}.gif", "--to", str(until), "--seconds", str(SECONDS)]
+                vmri("animate", run, *out, *view, *["--dark"] * (colours == "dark"), cache=Path(folder))
+        for colours in ("light", "dark"):
+            films = [f"{folder}/{name}_{colours}.gif" for name in FILMS]
+            write_side_by_side(films, HERE.parent / f"films_{colours}.gif")
+
+
+def write_side_by_side(films: list[str], path: Path) -> None:
+    """One film of several that are equally long."""
+    rows = []
+    for frames in zip(*(ImageSequence.all_frames(Image.open(film)) for film in films), strict=True):
+        pictures = [frame.convert("RGB") for frame in frames]
+        pictures = [picture.resize((picture.width * HEIGHT // picture.height, HEIGHT)) for picture in pictures]
+        width = sum(picture.width + GAP for picture in pictures) - GAP
+        row = Image.new("RGB", (width, HEIGHT), pictures[0].getpixel((0, 0)))
+        left = 0
+        for picture in pictures:
+            row.paste(picture, (left, 0))
+            left += picture.width + GAP
+        rows.append(row)
+    palette = rows[len(rows) // 2].quantize(COLOURS)
+    first, *others = (row.quantize(palette=palette, dither=Image.Dither.NONE) for row in rows)
+    first.save(path, save_all=True, append_images=others, duration=1000 * SECONDS / len(rows), loop=0, optimize=True)
+
+
+def main(films: bool) -> None:
+    if films:
+        write_films()
+        return
     jax.config.update("jax_enable_x64", True)
     with tempfile.TemporaryDirectory() as folder:
         rows = [row(path, Path(folder)) for path in scenes()]
@@ -201,4 +243,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main("films" in sys.argv[1:])

@@ -245,3 +245,17 @@ def test_points_that_cannot_be():
             Scene([hub, rod, ball], [Spring(between, 1.0)])
     with pytest.raises(ValueError, match=r"hub \(1, 0, 0\) has no mass of its own"):
         Scene([hub, ball], [NBodyGravity(1.0, (("hub", [1.0, 0, 0]), "ball"))])
+
+
+def test_coordinates_are_called_by_centre_and_directors():
+    hub = RigidBody("hub", 2.0, MOMENTS, [0.0, 0.0, 1.0], pace="slow")
+    scene = Scene([hub, RigidBody("bar", 1.0, Rod(1.0), [1.0, 0.0, 0.0], pace="fast")])
+    names = scene.names
+    directors = [f"hub d{i} {axis}" for i in (1, 2, 3) for axis in "xyz"]
+    assert names.slow_coordinates == ["hub x", "hub y", "hub z", *directors]
+    assert names.fast_coordinates == ["bar x", "bar y", "bar z", "bar d1 x", "bar d1 y", "bar d1 z"]
+    assert [names.positions(part) for part in ("s", "f")] == [[0, 1, 2], [0, 1, 2]]
+    run = vm.simulate(scene, ONE, macro_dt=0.1, num_steps=2)
+    panel = run.plot().axes[0]
+    np.testing.assert_array_equal(panel.lines[2].get_ydata(), run.position("hub")[:, 2])
+    assert len(panel.lines) == 3

@@ -33,6 +33,7 @@ class Names:
         slow, fast: bodies, or single coordinates, in the order of q_s and q_f, with their numbers of coordinates.
         constraint, slow_constraint: constraints in the order of the values of these functions, with their numbers of rows.
         numbered: bodies whose coordinates are general ones: they are called "name[0]", "name[1]", not "name x", "name y".
+        rigid: bodies whose coordinates are a centre and directors: "name x", "name y", "name z", "name d1 x" and so on.
 
     Raises:
         TypeError: no mapping from names to whole numbers.
@@ -44,6 +45,7 @@ class Names:
     constraint: Mapping[str, int] = field(default_factory=dict)
     slow_constraint: Mapping[str, int] = field(default_factory=dict)
     numbered: Sequence[str] = ()
+    rigid: Sequence[str] = ()
 
     def __post_init__(self):
         for what in ("slow", "fast", "constraint", "slow_constraint"):
@@ -75,6 +77,14 @@ class Names:
     def fast_coordinates(self) -> list[str]:
         """A name for each entry of q_f."""
         return self._coordinates(self.fast)
+
+    def positions(self, part: Part) -> list[int]:
+        """Which entries of q_s or q_f are positions: all but the directors of rigid bodies."""
+        found = []
+        for name, place in self.bodies.items():
+            if place.part == part:
+                found += range(place.start, place.start + (len(AXES) if name in self.rigid else place.size))
+        return found
 
     @property
     def rows(self) -> dict[str, list[int]]:
@@ -135,7 +145,10 @@ class Names:
     def _coordinates(self, sizes: Mapping[str, int]) -> list[str]:
         names = []
         for name, size in sizes.items():
-            if name in self.numbered or size > len(AXES):
+            if name in self.rigid:
+                parts = [name, *(f"{name} d{i}" for i in range(1, size // len(AXES)))]
+                names += [f"{part} {axis}" for part in parts for axis in AXES]
+            elif name in self.numbered or size > len(AXES):
                 names += [f"{name}[{i}]" for i in range(size)]
             elif size == 1:
                 names.append(name)

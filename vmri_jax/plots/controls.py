@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vmri_jax.plots.runs import coordinates
+from vmri_jax.plots.runs import coordinates, position_panels
 from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, legend_beside, new_figure
 
 if TYPE_CHECKING:
@@ -19,13 +19,7 @@ def plot_control(optimum: "Optimum", *, title: str = "", theme: Theme = LIGHT) -
         title: over the figure.
         theme: colours.
     """
-    run, names = optimum.trajectory, optimum.trajectory.names
-    t = np.asarray(run.t)
-    panels = [
-        (np.asarray(run.q_s), names.slow_coordinates, r"slow positions $q_s$"),
-        (np.asarray(run.q_f), names.fast_coordinates, r"fast positions $q_f$"),
-    ]
-    panels = [panel for panel in panels if panel[0].shape[1]]
+    t, panels = np.asarray(optimum.trajectory.t), position_panels(optimum.trajectory)
     with new_figure(7.2, 0.6 + 1.85 * (2 + len(panels)), title, theme) as figure:
         above, *middle, below = figure.subplots(2 + len(panels))
         edges = np.append(optimum.t.ravel(), t[-1])

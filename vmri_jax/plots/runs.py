@@ -38,6 +38,8 @@ class Run(Protocol):
 def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Slow and fast positions, energy and, where there are constraints, their residual, against time.
 
+    Of rigid bodies it shows the centres of mass.
+
     The energy of a system that keeps it is shown as an error. Of one with forces or moving constraints the figure shows its
     change, their work, and what is left of the balance.
 
@@ -51,14 +53,10 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
     """
     if np.ndim(trajectory.t) != 1:
         raise ValueError("plot: this is a batch of runs; take one of them, run.lane(i).")
-    t, names = np.asarray(trajectory.t), trajectory.names
+    t = np.asarray(trajectory.t)
     residual = np.asarray(trajectory.constraint_residual)
     constrained = bool(np.nanmax(residual) > 0)
-    positions = [
-        (np.asarray(trajectory.q_s), names.slow_coordinates, r"slow positions $q_s$"),
-        (np.asarray(trajectory.q_f), names.fast_coordinates, r"fast positions $q_f$"),
-    ]
-    positions = [panel for panel in positions if panel[0].shape[1]]
+    positions = position_panels(trajectory)
     driven = trajectory.keeps_energy is False
     count = len(positions) + (2 if driven else 1) + constrained
     with new_figure(7.2, 0.4 + 1.85 * count, title, theme) as figure:
@@ -99,6 +97,24 @@ def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Th
         axes.set(xlabel="time $t$", ylabel="oscillatory energy", xlim=(t[0], t[-1]))
         axes.set_ylim(bottom=0)
     return figure
+
+
+def position_panels(run: Run) -> list[tuple[np.ndarray, list[str], str]]:
+    """Slow and fast positions with their names and what they are called; of rigid bodies the centres, without directors.
+
+    Args:
+        run: one run.
+    """
+    names = run.names
+    panels = (
+        (run.q_s, names.positions("s"), names.slow_coordinates, r"slow positions $q_s$"),
+        (run.q_f, names.positions("f"), names.fast_coordinates, r"fast positions $q_f$"),
+    )
+    return [
+        (np.asarray(values)[:, shown], [labels[i] for i in shown], what)
+        for values, shown, labels, what in panels
+        if shown
+    ]
 
 
 def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> None:

@@ -36,8 +36,10 @@ def names_of(sorting: Sorting) -> Names:
     for part in sorting.placed:
         if part.home in ("constraint", "slow_constraint"):
             sizes[part.home] |= _rows(sorting, part)
-    blocks = [name for name, body in sorting.bodies.items() if body.block]
-    return Names(sizes["s"], sizes["f"], sizes["constraint"], sizes["slow_constraint"], blocks)
+    blocks, rigid = (
+        [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
+    )
+    return Names(sizes["s"], sizes["f"], sizes["constraint"], sizes["slow_constraint"], blocks, rigid)
 
 
 def _rows(sorting: Sorting, part: Placed) -> dict[str, int]:
