@@ -97,6 +97,22 @@ def test_a_mechanism(capsys):
     assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/scenes.md").read_text()
 
 
+def test_molecules(capsys):
+    page = (ROOT / "docs/how_to/molecules.md").read_text()
+    first, rigid, steps, many = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    scope = {}
+    exec(first + rigid, scope)
+    free, held = capsys.readouterr().out.splitlines()
+    assert f"`{free}`" in page
+    assert held.startswith("energy kept to 0.1")
+    assert abs(scope["length"] - scope["BOND"]).max() < 1e-15
+    exec(steps.replace("50 / macro_dt", "2 / macro_dt"), scope)
+    assert "macro_dt = 0.0149 is close to an instability" in capsys.readouterr().out
+    exec(many.replace("t_end=100.0", "t_end=1.0"), scope)
+    assert scope["phi"].shape == (20, 11)
+    assert bool(scope["runs"].success.all())
+
+
 def test_an_effect_of_ones_own(capsys):
     exec(next(program for program in PROGRAMS if "def magnet" in program), {})
     assert re.search(r"the ball is at 0\.\d\d", capsys.readouterr().out)

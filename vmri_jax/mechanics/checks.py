@@ -85,19 +85,19 @@ def check_system(system: System, q_s, q_f) -> None:
     }
     for name, (function, args) in scalars.items():
         if function is not None:
-            shape = _shape(name, function, *args, system.params)
+            shape = shape_of(f"System: {name}", function, *args, system.params)
             if getattr(shape, "shape", None) != ():
                 raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a scalar, shape ().")
             _check_float64(name, shape)
     for name, args in (("constraint", (q_s, q_f)), ("slow_constraint", (q_s,))):
         function, args = with_time(getattr(system, name), jnp.zeros(()), *args, system.params)
         if function is not None:
-            shape = _shape(name, function, *args)
+            shape = shape_of(f"System: {name}", function, *args)
             if len(getattr(shape, "shape", ())) != 1:
                 raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a vector, shape (n_g,).")
             _check_float64(name, shape)
     if system.force is not None:
-        shape = _shape("force", system.force, jnp.zeros(()), q_s, q_f, q_s, q_f, system.params)
+        shape = shape_of("System: force", system.force, jnp.zeros(()), q_s, q_f, q_s, q_f, system.params)
         if not isinstance(shape, tuple) or [getattr(s, "shape", None) for s in shape] != [(n_s,), (n_f,)]:
             raise ValueError(
                 f"System: force returns {_describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
@@ -106,8 +106,17 @@ def check_system(system: System, q_s, q_f) -> None:
             _check_float64("force", part)
 
 
-def _shape(name: str, function, *args):
-    """What a function returns; it must have two derivatives in forward mode, by everything but the params."""
+def shape_of(what: str, function, *args):
+    """What a user's function returns, without its numbers; it must have two derivatives in forward mode, by everything but the params.
+
+    Args:
+        what: its name, for messages.
+        function: of floats or trees of them, and of params.
+        args: of the function, params the last.
+
+    Raises:
+        ValueError: it cannot be traced, differentiated, or evaluated.
+    """
 
     def along(*args):
         *moving, params = args
@@ -122,17 +131,17 @@ def _shape(name: str, function, *args):
         return jax.eval_shape(along, *args)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
-            f"System: {name} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
+            f"{what} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
             "numpy and math, jnp.where(condition, a, b) instead of if, and no float(...) or int(...)."
         ) from None
     except Exception as error:
         if "custom_vjp" in str(error) or "custom_lin" in str(error):
             raise ValueError(
-                f"System: {name} has no derivative in forward mode{_line_of(error)}: implicit steps take second derivatives, "
+                f"{what} has no derivative in forward mode{_line_of(error)}: implicit steps take second derivatives, "
                 "which a jax.custom_vjp does not give. Use jax.custom_jvp, which gives both modes."
             ) from error
         raise ValueError(
-            f"System: {name} could not be evaluated on arguments of shapes "
+            f"{what} could not be evaluated on arguments of shapes "
             f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and the params{_line_of(error)}: "
             f"{type(error).__name__}: {error}"
         ) from error

@@ -12,8 +12,8 @@ from vmri_jax.steppers.newton import Newton
 WHOLE = 1e-9
 """Part by which a number of steps may miss a whole number."""
 NOTHING_FAST = (
-    "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1, or make what vibrates fast, "
-    'Body(..., pace="fast").'
+    "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1; or say which potential is slow, "
+    'Torsion(..., rate="slow"), or which bodies are fast, Body(..., pace="fast").'
 )
 
 

@@ -5,14 +5,14 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.angles import Angle, Bending, Torsion
 from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
 from vmri_jax.scene.effects.controls import Controlled
-from vmri_jax.scene.effects.custom import Constraint, Force, Kinetic, Potential
+from vmri_jax.scene.effects.custom import Constraint, CustomEffect, Force, Kinetic, Potential
 from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag, RayleighDamping
 from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, HarmonicDrive
 from vmri_jax.scene.effects.fields import Gravity, MagneticField
 from vmri_jax.scene.effects.joint_effects import JointDamper, JointDrive, JointLimit, JointMotion, JointSpring
 from vmri_jax.scene.effects.joints import Cylindrical, Fixed, Joint, Prismatic, Revolute, Spherical, Universal
 from vmri_jax.scene.effects.links import Anchor, Guide, MovingPivot, RigidLink
-from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity
+from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity, within_bonds
 from vmri_jax.scene.effects.springs import MovingAnchor, NonlinearSpring, Spring, SpringAnchor
 from vmri_jax.scene.rigid import RigidBody, angular_momentum, angular_velocity, quaternion, rotation
 from vmri_jax.scene.scene import Scene
@@ -29,6 +29,7 @@ __all__ = [
     "Constraint",
     "Controlled",
     "Coulomb",
+    "CustomEffect",
     "Cylinder",
     "Cylindrical",
     "Dashpot",
@@ -74,4 +75,5 @@ __all__ = [
     "angular_velocity",
     "quaternion",
     "rotation",
+    "within_bonds",
 ]

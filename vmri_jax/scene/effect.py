@@ -168,8 +168,11 @@ class Effect(ABC):
         """Parameters of element i among those of all."""
         return params if len(self.elements(bodies)) == 1 else choose(params, (i,), self.split)
 
-    def check(self, bodies: Bodies) -> None:
+    def check(self, bodies: Bodies, moved: bool = False) -> None:
         """Refuse what is wrong with this effect between these bodies.
+
+        Args:
+            moved: the bodies will be moved onto the constraints, so that what these keep may start otherwise.
 
         Raises:
             TypeError: parameters that are no real numbers.
@@ -179,6 +182,8 @@ class Effect(ABC):
         """
         self.check_bodies(bodies)
         self.check_parameters(bodies)
+        if self.kind == "constraint" and not moved:
+            self.check_start(bodies)
 
     def check_bodies(self, bodies: Bodies) -> None:
         """Refuse bodies that are not there, or that do not fit."""
@@ -209,7 +214,7 @@ class Effect(ABC):
             self._check_sizes([element[0] for element in elements], bodies)
 
     def check_parameters(self, bodies: Bodies) -> None:
-        """Refuse bodies at one place, parameters of another shape or sign, that are not finite, or that are not what a constraint keeps."""
+        """Refuse bodies at one place, parameters of another shape or sign, or that are not finite."""
         if self.apart:
             self.require_apart(bodies)
         params = self.parameters(bodies)
@@ -222,8 +227,6 @@ class Effect(ABC):
             if given is None:
                 continue
             parameter.check_sign(f"{self.name}: {name}", given)
-            if parameter.measured and self.kind == "constraint":
-                self._check_start(name, bodies, params)
 
     def by_size(self, select: Sequence[int], bodies: Bodies) -> list[list[int]]:
         """Some of the elements, those between bodies of the same sizes and kinds together: each of these is a term.
@@ -335,16 +338,18 @@ class Effect(ABC):
             described = ", ".join(f"{name} {size}" for name, size in sizes.items())
             raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must be of the same.")
 
-    def _check_start(self, name: str, bodies: Bodies, params: dict[str, Any]) -> None:
+    def check_start(self, bodies: Bodies) -> None:
         """Refuse a value that a constraint keeps and that is not the one at the start."""
-        start = self.at_start(bodies, params)
-        if not is_concrete((params[name], start)):
-            return
-        values = np.broadcast_arrays(np.atleast_1d(params[name]), start)
-        for element, given, found in zip(self.elements(bodies), *values, strict=True):
-            right = abs(given - found) <= START * given
-            expected = f"it starts as {found:.12g}; give that, or move a body"
-            self.require(right, f"{name} of {'-'.join(map(label_of, element))}", f"{given:g}", expected)
+        for name in (name for name, parameter in self.declared.items() if parameter.measured):
+            params = self.parameters(bodies)
+            start = self.at_start(bodies, params)
+            if getattr(self, name) is None or not is_concrete((params[name], start)):
+                continue
+            values = np.broadcast_arrays(np.atleast_1d(params[name]), start)
+            for element, given, found in zip(self.elements(bodies), *values, strict=True):
+                right = abs(given - found) <= START * given
+                expected = f"it starts as {found:.12g}; give that, move a body, or let the scene do it, project=True"
+                self.require(right, f"{name} of {'-'.join(map(label_of, element))}", f"{given:g}", expected)
 
 
 def lasting(value):

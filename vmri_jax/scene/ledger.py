@@ -8,12 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.table import Table
 
 from vmri_jax.diagnostics import frequencies
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.state import initial_state
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.simulate import Simulation, prepare
 from vmri_jax.running.timing import interleaved, seconds_each
 from vmri_jax.scene.assembly import build
@@ -73,9 +73,9 @@ class Ledger:
         """Plain data: "rows", "unknowns", "microseconds"."""
         return asdict(self) | {"rows": [asdict(row) for row in self.rows], "unknowns": self.unknowns}
 
-    def table(self) -> Table:
-        """What each adds, a table for `rich.print`; `reasons` says why it is there."""
-        table = Table("name", "part of", "grid", box=None, pad_edge=False)
+    def table(self) -> PrintedTable:
+        """What each adds; `reasons` says why it is there."""
+        table = PrintedTable("name", "part of", "grid", box=None, pad_edge=False)
         for column in ("unknowns", "evaluations", *(["time"] if self.microseconds is not None else [])):
             table.add_column(column, justify="right")
         for row in self.rows:
@@ -86,9 +86,12 @@ class Ledger:
         table.add_row("a macro step", "", "", str(self.unknowns), "", *step, style="italic")
         return table
 
-    def reasons(self) -> Table:
-        """Why each is slow or fast, and on its grid, a table for `rich.print`."""
-        table = Table("name", "why", box=None, pad_edge=False)
+    def __str__(self) -> str:
+        return str(self.table())
+
+    def reasons(self) -> PrintedTable:
+        """Why each is slow or fast, and on its grid."""
+        table = PrintedTable("name", "why", box=None, pad_edge=False)
         for row in self.rows:
             table.add_row(f"[bold]{row.name}[/bold]", row.why)
         return table

@@ -69,19 +69,21 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     return {effect.name: _rates(effect, bodies, found[effect.name], mass, size or 1.0) for effect in effects}
 
 
-def border(rates: Sequence[np.ndarray]) -> float | None:
+def border(rates: Sequence[np.ndarray], slow: float = 0.0, fast: float = np.inf) -> float | None:
     """The middle of the widest gap between rates, None where there is none.
 
     Args:
         rates: of all effects, rad/s.
+        slow, fast: the border is above the one and below the other, rates of effects that are declared slow and fast.
     """
     found = np.sort([rate for some in rates for rate in some if rate > 0])
     if not found.size:
         return None
     found = np.maximum(found, found[-1] / SPAN)
-    gaps = [(high / low, np.sqrt(high * low)) for low, high in pairwise(found)]
+    gaps = [(high / low, np.sqrt(high * low)) for low, high in pairwise(found) if slow <= low and high <= fast]
     widest, middle = max(gaps, default=(1.0, 0.0))
-    return float(middle) if widest >= SEPARATION else None
+    declared = slow > 0 or fast < np.inf
+    return float(middle) if widest >= SEPARATION or (declared and widest > 1) else None
 
 
 def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndarray, size: float) -> Rates:
@@ -103,6 +105,11 @@ def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndar
             frequency[i] = np.sqrt(largest)
         frequency[i] = max(frequency[i], np.linalg.norm(_scaled(root, element.gyroscopic), 2))
         rate[i] = max(frequency[i], np.sqrt(np.abs(np.linalg.solve(own, element.force)).max() / size))
+    same: dict[frozenset, list[int]] = {}
+    for i, names in enumerate(effect.elements(bodies)):
+        same.setdefault(frozenset(names), []).append(i)
+    for some in same.values():  # terms of one sum, as of a torsion: they belong together
+        frequency[some], rate[some] = frequency[some].max(), rate[some].max()
     return Rates(frequency, rate)
 
 

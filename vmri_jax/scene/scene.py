@@ -91,7 +91,7 @@ class Scene:
             )
         potentials = [effect.name for effect in self.effects if effect.kind == "potential"]
         for effect in self.everything:
-            effect.check(self.by_name)
+            effect.check(self.by_name, self.project)
             for name in effect.refers_to:
                 if name not in potentials:
                     raise ValueError(f"{effect.name}: {unknown('potential', name, potentials)}")

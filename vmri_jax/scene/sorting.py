@@ -15,6 +15,7 @@ from itertools import chain
 from typing import Literal, NamedTuple
 
 import jax
+import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.names import Place
@@ -80,7 +81,15 @@ def sort(bodies: Bodies, effects: Sequence[Effect]) -> Sorting:
     """
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     measured = _measure(bodies, energies)
-    limit = border([rates.rate for rates in measured.values()])
+    declared = {
+        rate: [measured[effect.name].rate for effect in energies if effect.rate == rate and effect.name in measured]
+        for rate in ("slow", "fast")
+    }
+    limit = border(
+        [rates.rate for rates in measured.values()],
+        max((rates.max() for rates in declared["slow"]), default=0.0),
+        min((rates.min() for rates in declared["fast"]), default=np.inf),
+    )
     paces = _paces(bodies, energies, measured, limit)
     placed = []
     for effect in effects:

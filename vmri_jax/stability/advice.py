@@ -89,7 +89,7 @@ class Advice(ResultTable):
     def verdict(self) -> str:
         """One sentence."""
         if self.safe_macro_dt == self.macro_dt:
-            return f"macro_dt = {self.macro_dt:.6g} is stable at this state."
+            return f"macro_dt = {self.macro_dt:.6g} is stable for small motions about this state."
         state = "unstable" if self.growth else "close to an instability"
         if np.isnan(self.safe_macro_dt):
             return f"macro_dt = {self.macro_dt:.6g} is {state}, and no safe step was found; take another scheme."
@@ -145,7 +145,8 @@ def advise(
     * labels: the fastest vibration is one of the slow variables;
     * stages, motion (notes): a composition with steps backwards; a state that is unstable by itself.
 
-    One compilation and some hundred eigenvalue problems. Far from the state frequencies differ: ask again there.
+    One compilation and some hundred eigenvalue problems. Motions are small here. Large ones, as of a hot molecule, change
+    frequencies along their way and meet resonances that no state shows: ask at several states of a run, and look at the energy of a long one.
 
     Args:
         system, scheme, state, macro_dt: of the run; without a state it is judged at the start of the problem or scene.

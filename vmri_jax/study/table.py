@@ -12,6 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from vmri_jax.running.printed import PrintedTable
+
 
 @dataclass(frozen=True)
 class Column:
@@ -60,6 +62,9 @@ class ResultTable:
     def __rich__(self) -> Table:
         return self.table()
 
+    def __str__(self) -> str:
+        return str(self.table())
+
     def markdown(self) -> str:
         """The same table in Markdown."""
         return markdown_table(self.columns, self.shown())
@@ -81,7 +86,7 @@ class ResultTable:
 def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = "", ruled: bool = False) -> Table:
     """Rows as a `rich.table.Table`, with lines between them if it is `ruled`."""
     columns, cells = _filled(columns, rows)
-    table = Table(header_style="bold", caption=caption or None, show_lines=ruled)
+    table = PrintedTable(header_style="bold", caption=caption or None, show_lines=ruled)
     if not ruled:
         table.box, table.pad_edge = None, False
     for column in columns:

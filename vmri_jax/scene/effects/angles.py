@@ -95,17 +95,17 @@ class Torsion(_AmongPoints):
 
     Args:
         between: names (a, b, c, d) of points in space, or a list of such.
-        stiffness: k, N m, positive; one number, or one for each.
+        stiffness: k, N m; one number, or one for each. Negative ones make phi_0 a maximum, as in the OPLS series.
         angle: phi_0, rad, of a minimum; likewise.
         multiplicity: m, number of minima in a turn; likewise.
 
     Raises:
-        ValueError: (of the scene) a stiffness that is not positive, a multiplicity that is not a positive integer, points
+        ValueError: (of the scene) a multiplicity that is not a positive integer, points
             that coincide or lie on a line.
     """
 
     between: Any = names(4)
-    stiffness: Any = positive()
+    stiffness: Any = number()
     angle: Any = number(default=0.0)
     multiplicity: Any = positive(default=1)
 

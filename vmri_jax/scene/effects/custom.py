@@ -11,6 +11,9 @@ from collections.abc import Callable
 from dataclasses import field
 from typing import Any, Literal
 
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.checks import shape_of
 from vmri_jax.scene.body import end_of, entry, is_entry
 from vmri_jax.scene.declare import effect_class
 from vmri_jax.scene.effect import DRAWN, Effect, real_tree
@@ -51,7 +54,13 @@ class CustomEffect(Effect):
             raise ValueError(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")
 
     def elements(self, bodies):
-        return (tuple(map(entry, (self.bodies,) if is_entry(self.bodies) else self.bodies)),)
+        given = (self.bodies,) if is_entry(self.bodies) else tuple(self.bodies)
+        if not given or not all(map(is_entry, given)):
+            raise ValueError(
+                f"{self.name}: bodies is {self.bodies!r}; give names of the bodies that the function takes, and each such tuple an effect "
+                "of its own, with its own name=..."
+            )
+        return (tuple(map(entry, given)),)
 
     def parameters(self, bodies):
         params, points = real_tree(f"{self.name}: params", self.params), self.points(bodies)
@@ -60,6 +69,14 @@ class CustomEffect(Effect):
                 f"{self.name}: params is {self.params!r}; with points in rigid bodies it must be a dictionary."
             )
         return params | points if points else params
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        params, t = self.parameters(bodies), jnp.zeros(())
+        q, _ = self.one(0, bodies, params)
+        q = tuple(map(jnp.asarray, q))
+        known = {"potential": (q,), "constraint": (t, q) if self.timed else (q,), "kinetic": (q, q), "force": (t, q, q)}
+        shape_of(f"{self.name}: function", self.function, *known[self.kind], params)
 
     def check_bodies(self, bodies):
         super().check_bodies(bodies)

@@ -37,7 +37,7 @@ class RigidLink(_Rigid, BetweenPoints):
 
     Raises:
         ValueError: (of the scene) ends at one point at the start, a length that is not positive or not the distance at
-            the start, links that together are redundant.
+            the start (unless the scene projects), links that together are redundant.
     """
 
     default_name = "links"
@@ -104,8 +104,8 @@ class Guide(ToPath):
     def law(line, params):
         return line
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
+    def check_start(self, bodies):
+        super().check_start(bodies)
         away = self.at_start(bodies, self.parameters(bodies))
         size = jnp.max(jnp.abs(jnp.stack([end_of(bodies, name).position for (name,) in self.elements(bodies)])))
         what = "the distance of the body from its point at t = 0"

@@ -1,11 +1,14 @@
 """Forces between all pairs of points: Newton's gravity, Coulomb, Lennard-Jones."""
 
+from collections.abc import Iterable
+from dataclasses import field
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.names import unknown
 from vmri_jax.scene.declare import array, effect_class, names, number, positive, squeeze
 from vmri_jax.scene.effect import Effect, real_tree
 from vmri_jax.scene.effects.points import distance
@@ -44,13 +47,64 @@ class NBodyGravity(Effect):
 
 
 @effect_class
-class Coulomb(Effect):
+class _Nonbonded(Effect):
+    """Forces between pairs of points, some of them left out."""
+
+    exclude: Any = field(default=(), kw_only=True)
+
+    kind = "potential"
+    dimensions = (1, 2, 3)
+    apart = True
+
+    def elements(self, bodies):
+        pairs = super().elements(bodies)
+        known, left_out = {name for pair in pairs for name in pair}, set()
+        for pair in self.exclude:
+            if isinstance(pair, str) or len(pair) != 2:
+                raise ValueError(
+                    f"{self.name}: {pair!r} is in exclude; give pairs of names, as from within_bonds(bonds, 3)."
+                )
+            for name in pair:
+                if name not in bodies:
+                    raise ValueError(f"{self.name}: exclude: {unknown('body', name, sorted(known))}")
+            left_out.add(frozenset(pair))
+        kept = tuple(pair for pair in pairs if frozenset(pair) not in left_out)
+        if not kept:
+            raise ValueError(f"{self.name}: exclude leaves no pair; leave the effect out.")
+        return kept
+
+
+def within_bonds(bonds: Iterable[tuple[str, str]], number: int = 3) -> list[tuple[str, str]]:
+    """Pairs of bodies with at most so many bonds between them, for `exclude` of `LennardJones` and `Coulomb`.
+
+    1 are neighbours, 2 the ends of an angle, 3 those of a torsion.
+
+    Args:
+        bonds: pairs of names.
+        number: of bonds from one to the other.
+    """
+    near: dict[str, set[str]] = {}
+    for a, b in bonds:
+        near.setdefault(a, set()).add(b)
+        near.setdefault(b, set()).add(a)
+    found = set()
+    for start in near:
+        reached = {start}
+        for _ in range(number):
+            reached = reached.union(*(near[name] for name in reached))
+        found |= {(min(start, name), max(start, name)) for name in reached - {start}}
+    return sorted(found)
+
+
+@effect_class
+class Coulomb(_Nonbonded):
     """Coulomb's law between charges, ``V = C sum_{a<b} Q_a Q_b / |q_b - q_a|``.
 
     Args:
         charges: Q by name of the body, a dictionary.
         constant: C, in the units of the scene: 8.99e9 N m^2/C^2 in SI units.
         between: a list of pairs; all pairs of the charges by default.
+        exclude: pairs that are left out, see `within_bonds`.
 
     Raises:
         ValueError: (of the scene) a pair without a charge, bodies that start at one point.
@@ -60,10 +114,7 @@ class Coulomb(Effect):
     constant: Any = array(default=8.9875517862e9)
     between: Any = names(2, pairs=True, default=None)
 
-    kind = "potential"
     default_name = "coulomb"
-    dimensions = (1, 2, 3)
-    apart = True
     derived = ("charge_a", "charge_b")
 
     @staticmethod
@@ -85,13 +136,14 @@ class Coulomb(Effect):
 
 
 @effect_class
-class LennardJones(Effect):
+class LennardJones(_Nonbonded):
     """Lennard-Jones forces, ``V = 4 eps sum_{a<b} ((s/r)^12 - (s/r)^6)``; the minimum -eps is at ``r = 2^(1/6) s``.
 
     Args:
         depth: eps, J, positive; one number, or one for each pair.
         distance: s, m, positive; likewise.
-        between: names of bodies, every pair of which interacts; or a list of pairs. All bodies by default.
+        between: names of bodies, every pair of which interacts; or a list of pairs. All bodies by default, bonded ones too.
+        exclude: pairs that are left out, see `within_bonds`.
 
     Raises:
         ValueError: (of the scene) numbers that are not positive, bodies that start at one point.
@@ -101,10 +153,7 @@ class LennardJones(Effect):
     distance: Any = positive()
     between: Any = names(2, pairs=True, default=None)
 
-    kind = "potential"
     default_name = "lennard_jones"
-    dimensions = (1, 2, 3)
-    apart = True
 
     @staticmethod
     def function(q, params):
