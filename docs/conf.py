@@ -72,10 +72,4 @@ def setup(app):
         text = path.read_text(encoding="utf-8").replace("(scenes/README.md)", "(../gallery/index.rst)")
         (HERE / "tutorials" / path.name).write_text(text, encoding="utf-8")
     public.write(HERE / "reference")
-    films = [HERE / "_static" / f"satellite_{theme}.gif" for theme in ("light", "dark")]
-    if not all(film.exists() for film in films):
-        part = ["--view=-60,25", "--to", "6", "--out"]
-        light, dark = (str(film) for film in films)
-        scene = ROOT / "notebooks" / "scenes" / "rigid_satellite.py"
-        gallery.play(scene, ROOT, [*part, light], ["--dark", *part, dark])
     app.connect("autodoc-process-docstring", docstrings.as_rest, priority=1)  # before napoleon

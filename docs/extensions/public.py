@@ -6,6 +6,8 @@ from pathlib import Path
 
 from extensions.docstrings import with_bars
 from extensions.files import keep
+from vmri_jax.running.quantities import Quantities
+from vmri_jax.study import ResultTable
 
 ROOMS = {
     "vmri_jax": "Problems, schemes and runs",
@@ -22,6 +24,10 @@ ROOMS = {
     "vmri_jax.plots": "Figures",
     "vmri_jax.animation": "Animations",
 }
+
+
+SHARED = (Quantities, ResultTable)
+"""Bases whose members stand on the pages of their subclasses."""
 
 
 def names(room: str) -> list[str]:
@@ -56,6 +62,8 @@ def write(folder: Path) -> None:
             pages.append(f"   api/{room}.{name}")
             kind = "autoclass" if inspect.isclass(thing) else "autofunction"
             members = "   :members:\n   :exclude-members: set\n" if inspect.isclass(thing) else ""
+            if inspect.isclass(thing) and issubclass(thing, SHARED):
+                members += "   :inherited-members: Module\n"
             keep(
                 folder / "api" / f"{room}.{name}.rst",
                 f"{_titled(name)}.. currentmodule:: {room}\n\n.. {kind}:: {name}\n{members}",

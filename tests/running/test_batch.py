@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.stability.systems import swinging
 from tests.support import PROBLEMS, largest_difference
 from vmri_jax import (
@@ -238,3 +239,14 @@ def test_a_lane_off_the_constraints_has_failed(tsp):
     assert run.failed_at.tolist() == [-1, 0]
     assert np.isnan(run.q_f[1]).all()
     assert run.constraint_residual[0].max() < 1e-10
+
+
+def test_tracers_are_refused(fpu):
+    def end(omega):
+        states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
+        params = {"omega": jnp.stack([omega, omega])}
+        run = vm.simulate_batch(fpu, vm.explicit_slow(5), states, macro_dt=0.01, num_steps=10, params=params)
+        return run.q_s[-1, -1, 0]
+
+    with pytest.raises(ValueError, match=r"simulate_batch: arguments are tracers; .*jax\.vmap of simulate"):
+        jax.grad(end)(50.0)

@@ -192,6 +192,14 @@ def test_files_carry_names(swing, tmp_path):
     assert np.array_equal(data["q_f"].sel(fast="bob y"), swing.q_f[:, 1])
 
 
+def test_a_run_as_parquet(swing, tmp_path):
+    path = tmp_path / "run.parquet"
+    swing.to_parquet(path)
+    frame = pandas.read_parquet(path)
+    assert list(frame.columns) == list(swing.columns())
+    np.testing.assert_array_equal(frame["bob x"], swing.position("bob")[:, 0])
+
+
 def test_a_streamed_run_is_the_same(swing, tmp_path):
     stored = vm.stream(
         pendulum(), vm.fully_implicit(10), out=tmp_path / "run.zarr", macro_dt=0.05, num_steps=40, save_micro=True

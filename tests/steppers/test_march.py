@@ -12,8 +12,10 @@ from tests.stability.systems import swinging
 from tests.support import compiled_step, largest_difference
 from tests.user_systems import FULL_MASS, cart, double_pendulum, two_oscillators
 from vmri_jax import (
+    ConstantMass,
     Method,
     Newton,
+    Problem,
     Result,
     Scheme,
     System,
@@ -101,6 +103,25 @@ def skew(q_f, params):
 
 def link(q_s, q_f, params):
     return jnp.stack([jnp.sum((q_f[:2] - q_s) ** 2) - 2.0])
+
+
+@pytest.mark.parametrize("scheme", [fully_explicit(1), fully_explicit(5), explicit_slow(5)])
+def test_a_heavy_slow_body_at_rest_at_the_origin(scheme):
+    """It has neither position nor motion to be relative to: round-off of the hook on its rope is all there is."""
+
+    def weight(q_s, q_f, params):
+        return 9.81 * q_f[1]
+
+    def rope(q_s, q_f, params):
+        return jnp.array([((q_f[0] - q_s[0]) ** 2 + q_f[1] ** 2 - 25.0) / 2])
+
+    system = System(ConstantMass([500.0], [1.0, 1.0]), weight, None, rope)
+    crane = Problem(system, q_s=[0.0], q_f=[3.0, -4.0])
+    run = simulate(crane, scheme, macro_dt=4e-4, num_steps=20)
+    assert int(run.info.method.max()) <= Method.NESTED
+    assert int(run.info.iterations.max()) <= 20  # without it: a hundred, and the fallback
+    momentum = 500.0 * run.v_s[:, 0] + run.v_f[:, 0]
+    np.testing.assert_allclose(momentum, 0.0, atol=1e-12)
 
 
 @pytest.mark.full

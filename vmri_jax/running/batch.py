@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from vmri_jax.mechanics.arrays import real_array, whole_number
+from vmri_jax.mechanics.arrays import is_concrete, real_array, whole_number
 from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
@@ -61,6 +61,10 @@ def simulate_batch(
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
     """
+    if not is_concrete((states, macro_dt, micro_dt, params)):
+        raise ValueError(
+            "simulate_batch: arguments are tracers; call it outside of jax.jit, vmap and grad, or take jax.vmap of simulate."
+        )
     lanes = _check_states(states)
     first = jax.tree.map(lambda a: np.asarray(a)[0], states)
     problem = opened(system)

@@ -106,6 +106,21 @@ class Exports(Quantities):
         columns = self.columns()
         return pandas.DataFrame(columns).set_index("t")
 
+    def to_parquet(self, path) -> None:
+        """Write `columns` to a .parquet file, with time as the first one (needs the extra ``vmri_jax[parquet]``).
+
+        Args:
+            path: of the file; one that is there is replaced.
+
+        Raises:
+            ValueError: this is a batch.
+            ImportError: pyarrow is not installed.
+            OSError: the file cannot be written.
+        """
+        pyarrow, parquet = (extra(name, "to_parquet", "parquet") for name in ("pyarrow", "pyarrow.parquet"))
+        with replaced(Path(path)) as file:
+            parquet.write_table(pyarrow.table(self.columns()), file)
+
     def to_xarray(self):
         """The run as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``), with a dimension of lanes in a batch.
 

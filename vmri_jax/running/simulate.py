@@ -171,6 +171,7 @@ class Simulation:
         macro_dt: an array of shape ().
         names: of bodies and constraints, None if there are none.
         room: saved intervals that the program has room for.
+        may_fall_back: whether what the first method does not solve is computed with the fallback, else it fails.
     """
 
     system: System
@@ -185,6 +186,7 @@ class Simulation:
     names: Names | None
     leaves: list = field(repr=False)
     structure: Any = field(repr=False)
+    may_fall_back: bool = True
 
     def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = False) -> Trajectory:
         """The run, or the same from another start, with another step size, other parameters, another number of steps.
@@ -193,10 +195,19 @@ class Simulation:
             state, macro_dt, params: of the same shapes as before; None for those of the run.
             num_steps: a multiple of the number of saved intervals, which stays; None for that of the run.
             throw: raise `SimulationError` if a step fails; else the status is in the trajectory.
+
+        Raises:
+            ValueError: arrays of other shapes; a function of the system that uses traced numbers which are not in params.
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
         origin = self.origin if params is None else self.origin._replace(params=params)
-        trajectory = know(from_arrays(self._program(False)(*arguments), self.num_saves), origin)
+        arrays = self._program(False)(*arguments)
+        if not is_concrete(arrays):
+            raise ValueError(
+                "simulate: a function of the system uses a number that jax.grad, vmap or jvp traces, and that is not among its arguments. "
+                "Hand it over in the params: System(..., params={'k': k}), and params['k'] in the function."
+            )
+        trajectory = know(from_arrays(arrays, self.num_saves), origin)
         if int(trajectory.failed_at) < 0:
             return trajectory
         if self._fallback_helps(trajectory):
@@ -320,7 +331,8 @@ class Simulation:
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
         """Whether a step failed that another method may solve: none does where equations are explicit or linear."""
-        return int(piece.failed_at) >= 0 and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
+        failed = self.may_fall_back and int(piece.failed_at) >= 0
+        return failed and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
 
     def in_parts(self) -> Trajectory:
         """The whole run with a progress bar; Ctrl-C raises `Interrupted` with what was computed."""

@@ -289,7 +289,7 @@ class Collocation(Solver):
             dx, dmu = saddles.solve(-missing, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
             left = map(expected, moved, last.moved)
-            result = newton.status(accepted.over(left, slow_and_fast(x)), iterations)
+            result = newton.status(accepted.over(left, slow_and_fast(x), iterations), iterations)
             return Increments(x, mu, moved, iterations, result)
 
         def step(at: Evaluated) -> Evaluated:

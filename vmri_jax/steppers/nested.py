@@ -36,8 +36,8 @@ from vmri_jax.steppers.secant import SIZE, Pairs
 from vmri_jax.steppers.slow_equations import SlowEquations, Tied
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
-NOISE = 3e2
-"""Secant pairs shorter than so many units of round-off of the positions are not kept."""
+NOISE = 100.0
+"""Secant pairs shorter than so many times the round-off of the slow positions are not kept."""
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
 EASY = 2
@@ -197,14 +197,14 @@ class _Passes:
         is_hard = (self.own.passes[1] > EASY) | (last.passes >= EASY)
         d = jax.lax.cond(is_hard, lambda: known.corrected(last.d, size), lambda: last.d)
         now = self._moved_by(d, last)
-        noise = NOISE * jnp.finfo(float).eps * (max_abs(self.equations.q_s) + max_abs(last.slow))
+        noise = NOISE * (self.accepted.slow[1] + jnp.finfo(float).eps * max_abs(last.slow))
         pairs = jax.lax.cond(is_hard, lambda: known.add(d, now.d - last.d, noise, size), lambda: known)
         return now._replace(missed=pairs)
 
     def _with_forces(self, last: Pass) -> Pass:
         assert not isinstance(last.missed, Pairs)
         part = jnp.where(last.passes == 1, last.missed**2, last.missed)  # the fast unknowns take three passes anyway
-        is_hard = part * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0)) > 1
+        is_hard = part * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
         wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part
         x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
         d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
@@ -225,7 +225,7 @@ class _Passes:
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(left.p_f)
         motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
         changes = max_abs(d[: self.r * self.n_s]), still_moves
-        result = self.newton.status(self.accepted.over(changes, (max_abs(slow), motion)), passes)
+        result = self.newton.status(self.accepted.over(changes, (max_abs(slow), motion), passes), passes)
         residual = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves), max_abs(g)
         passes = jnp.asarray(passes)
         return Pass(slow, slow_multiplier, fast, left, d, tied, missed, impulse, residual, passes, result)

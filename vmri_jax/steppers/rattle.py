@@ -90,13 +90,12 @@ class Rattle(Solver):
         x = jnp.concatenate(straight) - move(mu)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
         schur = self.sparsity.inverse(jax.vmap(push)(columns))
-        accepted = Accepted.of(equations, newton).sizes(tuple(map(max_abs, straight)))
-        per_slow, per_fast = (1 / size for size in accepted)
+        accepted, motions = Accepted.of(equations, newton), tuple(map(max_abs, straight))
 
         def at(x, mu, g, iterations) -> Correction:
             dmu = schur.times(g)
             dx = move(dmu)
-            change = jnp.maximum(per_slow * max_abs(dx[:n_s]), per_fast * max_abs(dx[n_s:]))
+            change = accepted.over((max_abs(dx[:n_s]), max_abs(dx[n_s:])), motions, iterations)
             return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
 
         def corrected(last: Correction) -> Correction:

@@ -79,11 +79,20 @@ class Search:
         menu: families to choose from.
         reference: what runs are compared with; its number of nodes is that of the runs.
         newton: how implicit equations are solved.
+        fallback: as of `Program`.
     """
 
-    def __init__(self, problem, t_end: float, menu: Sequence[Family], reference: ReferenceSolution, newton=None):
+    def __init__(
+        self,
+        problem,
+        t_end: float,
+        menu: Sequence[Family],
+        reference: ReferenceSolution,
+        newton: Newton | None = None,
+        fallback: bool = True,
+    ):
         self.problem, self.t_end, self.menu, self.reference = problem, t_end, menu, reference
-        self.newton = newton
+        self.newton, self.fallback = newton, fallback
         self.frequency = float(diagnostics.frequencies(problem)[0])
         self.programs: dict[tuple[str, int], Program] = {}
         self.settings: dict[tuple[str, int, int], Setting] = {}
@@ -93,7 +102,8 @@ class Search:
         key = (family.name, num_micro)
         program = self.programs.pop(key, None)
         if program is None:
-            program = Program(self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton)
+            given = self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton
+            program = Program(*given, self.fallback)
         self.programs[key] = program  # the last one now
         if len(self.programs) > PROGRAMS:
             self.programs.pop(next(iter(self.programs)))
@@ -311,9 +321,12 @@ def recommend(
             f"step come no closer, as where a motion is chaotic. Give a smaller t_end, an error of at least "
             f"{MARGIN * reference.error_q:.1e}, or a better reference."
         )
-    search = Search(problem, t_end, families() if menu is None else menu, reference, newton)
-    found = search.cheapest(error, progress, exhaustive)
-    if not found:
+    for fallback in (False, True):  # runs that need it are seldom the cheapest, and it takes long to compile
+        search = Search(problem, t_end, families() if menu is None else menu, reference, newton, fallback)
+        found = search.cheapest(error, progress, exhaustive)
+        if found:
+            break
+    else:
         best = min(search.settings.values(), key=lambda s: np.nan_to_num(s.row.error_q, nan=np.inf))
         raise NothingReached(
             f"recommend: no setting reached {error:g} in {len(search.settings)} runs; the best error was "

@@ -1,6 +1,7 @@
 """One problem under one scheme, compiled once for every number of steps: what studies run and time."""
 
 import time
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +28,7 @@ class Program:
         t_end: simulated time.
         num_saves: saved nodes, equally spaced; numbers of steps must be multiples of it.
         newton: how implicit equations are solved.
+        fallback: whether "auto" may take its second method where the first one fails, which takes long to compile.
 
     Attributes:
         compile_seconds: time of compiling, NaN before the first call.
@@ -39,9 +41,10 @@ class Program:
         t_end: float,
         num_saves: int = 1,
         newton: Newton | None = None,
+        fallback: bool = True,
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
-        self.newton, self.state = newton or Newton(), problem.state()
+        self.newton, self.state, self.fallback = newton or Newton(), problem.state(), fallback
         check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, None, 1)
         self.compile_seconds = float("nan")
 
@@ -51,7 +54,7 @@ class Program:
         steps = {"macro_dt": self.t_end / self.num_saves, "num_steps": self.num_saves}
         run = prepare(self.problem.system, self.scheme, self.state, **steps, newton=self.newton)
         self.compile_seconds = time.perf_counter() - start
-        return run
+        return replace(run, may_fall_back=self.fallback)
 
     def _steps(self, num_steps: int) -> dict:
         if num_steps < 1 or num_steps % self.num_saves:
