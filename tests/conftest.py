@@ -37,8 +37,9 @@ def pytest_configure(config):
     from vmri_jax import configure
 
     configure()
-    # Tests make functions of one piece of code again for each case.
+    # Tests make functions of one piece of code again for each case, and runs that lose their energy.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
+    config.addinivalue_line("filterwarnings", "ignore::vmri_jax.LostEnergyWarning")
 
 
 def pytest_collection_modifyitems(config, items):

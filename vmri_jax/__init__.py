@@ -12,6 +12,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.lost_energy import LostEnergyWarning
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.running.simulate import Simulation, prepare, simulate
 from vmri_jax.running.store import StoredTrajectory, stream
@@ -74,6 +75,7 @@ __all__ = [
     "Composition",
     "ConstantMass",
     "Interrupted",
+    "LostEnergyWarning",
     "Method",
     "Names",
     "Newton",

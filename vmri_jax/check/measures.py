@@ -1,5 +1,6 @@
 """What the cases measure: energy band and drift, constraints, iterations, conditioning, reversal."""
 
+import warnings
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from vmri_jax import diagnostics
 from vmri_jax.diagnostics.shadow import ShadowEnergy
 from vmri_jax.mechanics.state import Problem, State
+from vmri_jax.running.lost_energy import LostEnergyWarning
 from vmri_jax.running.simulate import simulate
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
@@ -22,7 +24,9 @@ SAVED = 10_000
 def run(problem: Problem, scheme, macro_dt, num_steps: int, state: State | None = None, **options: Any) -> Trajectory:
     """`vmri_jax.running.simulate`, by default from the problem's start; a failure is in the trajectory and not raised."""
     start = problem.state() if state is None else state
-    return simulate(problem.system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LostEnergyWarning)  # the cases measure it
+        return simulate(problem.system, scheme, start, macro_dt=macro_dt, num_steps=num_steps, throw=False, **options)
 
 
 def long_run(problem: Problem, scheme, macro_dt, num_steps: int, **options) -> Trajectory:

@@ -139,15 +139,30 @@ class Fit:
         errors = self.sigma * np.sqrt(np.diagonal(np.asarray(covariances), axis1=1, axis2=2))
         return Bootstrap(self.labels, self.values, np.asarray(found), errors)
 
-    def __str__(self) -> str:
-        bounds = self.intervals()
-        width = max(map(len, self.labels))
-        lines = [
-            f"{label:{width}}  {x:.6g} +- {s:.2g}   95 %: {low:.6g} .. {high:.6g}"
-            for x, (label, s), (low, high) in zip(
-                self.values, self.standard_errors.items(), bounds.values(), strict=True
+    @property
+    def doubts(self) -> list[str]:
+        """What speaks against the fit, in sentences; then its intervals say little, and are not printed."""
+        found = []
+        if not self.converged:
+            found.append(
+                "The search did not end by its tolerance: raise max_steps, start closer, or cut the motion into segments."
             )
-        ]
+        if self.probability < UNLIKELY:
+            more = [] if len(self.squares) > 1 else ["starts=8"]
+            more += [] if self.shooting.segments > 1 else ["segments=10, which cuts the motion into parts"]
+            beside = (
+                f"the search may have ended beside the best parameters (try {' or '.join(more)}), or " if more else ""
+            )
+            found.append(f"Sigma does not explain the misses: {beside}the model or sigma is not right.")
+        return found
+
+    def __str__(self) -> str:
+        width = max(map(len, self.labels))
+        lines = [f"{label:{width}}  {x:.6g}" for label, x in zip(self.labels, self.values, strict=True)]
+        if not self.doubts:
+            known = zip(self.standard_errors.values(), self.intervals().values(), strict=True)
+            intervals = [f" +- {s:.2g}   95 %: {low:.6g} .. {high:.6g}" for s, (low, high) in known]
+            lines = [line + interval for line, interval in zip(lines, intervals, strict=True)]
         how = (
             f"chance of worse {self.probability:.2g}"
             if self.shooting.knows_sigma
@@ -155,15 +170,7 @@ class Fit:
         )
         squares = float(np.sum(self.residuals**2))
         lines.append(f"chi^2 {squares:.4g} for {self.freedom} degrees of freedom ({how}), {self.iterations} iterations")
-        if not self.converged:
-            lines.append(
-                "The search did not end by its tolerance: raise max_steps, start closer, or cut the motion into segments."
-            )
-        if self.probability < UNLIKELY:
-            lines.append(
-                "Sigma does not explain the misses: the search may have ended beside the best parameters (try starts=8, or another "
-                "start), or the model or sigma is not right."
-            )
+        lines += self.doubts
         if self.shooting.segments > 1:
             lines.append(f"{self.shooting.segments} segments, largest gap {self.gap:.1e} of the motion")
         return "\n".join(lines + [f"The data does not determine {what}." for what in self.undetermined])

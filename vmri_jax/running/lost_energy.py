@@ -5,6 +5,11 @@ import numpy as np
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.running.trajectory import Trajectory
 
+
+class LostEnergyWarning(UserWarning):
+    """The energy of a system that keeps it has changed by half of the largest kinetic energy of a run."""
+
+
 LOST = 0.5
 """Part of the largest kinetic energy: a change of the energy above it is said."""
 LOOKED_AT = 1000

@@ -21,7 +21,7 @@ from vmri_jax.running.adjoints import check_adjoint
 from vmri_jax.running.arguments import NOTHING_FAST, check_run, check_vectors
 from vmri_jax.running.engine import Engine, engine, room_for
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.lost_energy import lost_energy
+from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import progress_shown
@@ -77,7 +77,7 @@ def simulate(
         adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
             "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
 
-    A run of a system that keeps its energy is told about by a warning if the energy has changed by half of the largest kinetic energy.
+    A run of a system that keeps its energy is told about by a `LostEnergyWarning` if the energy has changed by half of the largest kinetic energy.
 
     Returns:
         The `Trajectory`, with ``num_steps / save_every + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
@@ -103,7 +103,7 @@ def simulate(
         raise simulation_error(trajectory, run.macro_dt, save_every)
     lost = lost_energy(trajectory) if int(trajectory.failed_at) < 0 else ""
     if lost:
-        warnings.warn(f"simulate: {lost}", stacklevel=2)
+        warnings.warn(f"simulate: {lost}", LostEnergyWarning, stacklevel=2)
     return trajectory
 
 

@@ -36,7 +36,7 @@ from vmri_jax.steppers.secant import SIZE, Pairs
 from vmri_jax.steppers.slow_equations import SlowEquations, Tied
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
-NOISE = 100.0
+NOISE = 75.0
 """Secant pairs shorter than so many times the round-off of the slow positions are not kept."""
 MORE = 1
 """A matrix is renewed after a step with more than so many passes above the fewest with it."""
