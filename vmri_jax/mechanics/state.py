@@ -19,6 +19,8 @@ from vmri_jax.mechanics.system import System
 
 NOTICED, REFUSED = 1e-6, 1e-2
 """Parts of the velocities against the constraints that are said, and that are refused."""
+MOST = 0.85
+"""A part that is said where projecting it away is asked for."""
 
 
 class State(eqx.Module):
@@ -77,21 +79,22 @@ def initial_state(
                 "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
                 "singular at the initial positions, or a function returned NaN there."
             )
-        if not project:
-            _tell_of_velocities(float(taken))
+        _tell_of_velocities(float(taken), project)
     return state
 
 
-def _tell_of_velocities(taken: float) -> None:
+def _tell_of_velocities(taken: float, project: bool) -> None:
     """Say which part of the velocities does not fit the constraints, at rest or moving, and refuse a large one."""
     message = (
         f"initial_state: {taken:.2%} of the velocities (in the norm of the kinetic energy) do not fit the constraints"
     )
+    scenes = "of a scene, with_rates({joint: rate}) finds all that belong to the rate of a joint"
+    if project and taken > MOST:
+        warnings.warn(f"{message}, and project=True has taken them away; {scenes}.", stacklevel=3)
+    if project:
+        return
     if taken > REFUSED:
-        raise ValueError(
-            f"{message}. Correct the velocities, or pass project=True for the nearest that fit; of a scene, "
-            "with_rates({joint: rate}) finds all that belong to the rate of a joint."
-        )
+        raise ValueError(f"{message}. Correct the velocities, or pass project=True for the nearest that fit; {scenes}.")
     if taken > NOTICED:
         warnings.warn(f"{message}; the nearest that fit are taken. Pass project=True if that is meant.", stacklevel=3)
 
