@@ -89,6 +89,10 @@ class Ledger:
     def __str__(self) -> str:
         return str(self.table())
 
+    def _repr_mimebundle_(self, include=(), exclude=(), **kwargs) -> dict[str, str]:
+        """What notebooks show: the table."""
+        return self.table()._repr_mimebundle_(include, exclude, **kwargs)
+
     def reasons(self) -> PrintedTable:
         """Why each is slow or fast, and on its grid."""
         table = PrintedTable("name", "why", box=None, pad_edge=False)

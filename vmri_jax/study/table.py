@@ -65,6 +65,10 @@ class ResultTable:
     def __str__(self) -> str:
         return str(self.table())
 
+    def _repr_mimebundle_(self, include=(), exclude=(), **kwargs) -> dict[str, str]:
+        """What notebooks show: the table."""
+        return self.table()._repr_mimebundle_(include, exclude, **kwargs)
+
     def markdown(self) -> str:
         """The same table in Markdown."""
         return markdown_table(self.columns, self.shown())
