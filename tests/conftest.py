@@ -37,9 +37,10 @@ def pytest_configure(config):
     from vmri_jax import configure
 
     configure()
-    # Tests make functions of one piece of code again for each case, and runs that lose their energy.
+    # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random velocities.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.LostEnergyWarning")
+    config.addinivalue_line("filterwarnings", "ignore:.*project=True has taken them away")
 
 
 def pytest_collection_modifyitems(config, items):

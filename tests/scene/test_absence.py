@@ -13,7 +13,7 @@ from vmri_jax.scene.ledger import operations, prepare_steps, temporary_bytes
 def test_every_effect_is_in_the_list():
     listed = {type(effect) for effect in (*EFFECTS, *RIGID_EFFECTS, *BASE.effects)}
     offered = {value for value in vars(sc).values() if isinstance(value, type) and issubclass(value, sc.Effect)}
-    assert offered - listed == {sc.Effect, sc.Joint}
+    assert offered - listed == {sc.Effect, sc.Joint, sc.CustomEffect}
 
 
 CASES = [(BASE, effect) for effect in EFFECTS] + [(RIGID, effect) for effect in RIGID_EFFECTS]

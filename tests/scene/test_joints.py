@@ -30,10 +30,6 @@ from vmri_jax.scene.body import Pace
 from vmri_jax.scene.effects.joints import slide, turn
 from vmri_jax.scene.rigid import angular_velocity, rotation
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*project=True has taken"
-)  # velocities are random, or of one body alone
-
 MOMENTS = [1.0, 2.0, 2.5]
 ONE = vm.fully_implicit(num_micro=1)
 X, Y, Z = np.eye(3)

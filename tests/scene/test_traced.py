@@ -21,10 +21,6 @@ from vmri_jax.scene import (
     SpringAnchor,
 )
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*project=True has taken"
-)  # velocities are random, or of one body alone
-
 
 def bouncing(x) -> Scene:
     """A number in masses, places, radii and stiffnesses."""

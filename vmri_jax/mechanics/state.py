@@ -85,9 +85,7 @@ def initial_state(
 
 def _tell_of_velocities(taken: float, project: bool) -> None:
     """Say which part of the velocities does not fit the constraints, at rest or moving, and refuse a large one."""
-    message = (
-        f"initial_state: {taken:.2%} of the velocities (in the norm of the kinetic energy) do not fit the constraints"
-    )
+    message = f"initial_state: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit the constraints"
     scenes = "of a scene, with_rates({joint: rate}) finds all that belong to the rate of a joint"
     if project and taken > MOST:
         warnings.warn(f"{message}, and project=True has taken them away; {scenes}.", stacklevel=3)
