@@ -13,6 +13,7 @@ import pytest
 
 from vmri_jax import (
     ConstantMass,
+    Rheonomic,
     Scheme,
     SimulationError,
     State,
@@ -196,7 +197,6 @@ def numpy_potential(q_f, params):
             {"fast_potential": numpy_potential},
             "fast_potential cannot be traced, line .* of test_bad_input.py .*instead of numpy and math",
         ),
-        ({"fast_potential": lambda q_f: 0.0}, "fast_potential could not be evaluated .*positional argument"),
         ({"slow_potential": lambda q_s, q_f, params: None}, "slow_potential returns NoneType; it must return a scalar"),
         ({"slow_potential": vector_potential}, r"slow_potential returns shape \(3,\); it must return a scalar"),
         ({"fast_potential": vector_fast_potential}, r"fast_potential returns shape \(3,\); it must return a scalar"),
@@ -212,6 +212,53 @@ def test_user_functions_of_the_wrong_shape(fpu, changes, message):
         initial_state(system, fpu.q_s, fpu.q_f, fpu.v_s, fpu.v_f)
     with pytest.raises(ValueError, match=message):
         simulate(system, fully_implicit(2), fpu.state(), macro_dt=0.1, num_steps=1)
+
+
+TIME = "Energies and masses that depend on time are out of scope. Take instead a force .* or a constraint that moves"
+VELOCITY = (
+    "Constraints on velocities .* are out of scope. Take instead the positions that they hold.* or a strong damper"
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fast_potential": lambda q_f: 0.0}, r"\(q_f\); it is called with \(q_f, params\)\. Give it all of these"),
+        (
+            {"slow_potential": lambda q_f, q_s, params: 0.0},
+            r"called with \(q_s, q_f, params\)\. Give it .* in this order",
+        ),
+        ({"force": lambda q_s, q_f, v_s, v_f, t, params: (v_s, v_f)}, "force is .* Give it .* in this order"),
+        ({"slow_potential": lambda t, q_s, q_f, params: 0.0}, f"slow_potential is .* {TIME}"),
+        ({"fast_potential": lambda t, params: 0.0}, f"fast_potential is .* {TIME}"),
+        ({"kinetic": lambda t, q_s, q_f, v_s, v_f, params: 0.0}, f"kinetic is .* {TIME}"),
+        ({"constraint": lambda q_s, q_f, v_s, v_f, params: q_f}, f"constraint is .* {VELOCITY}"),
+        (
+            {"slow_constraint": lambda t, q_s, params: q_s},
+            "slow_constraint is .* one that moves with time is Rheonomic",
+        ),
+        ({"constraint": Rheonomic(lambda q_s, q_f, params: q_f)}, r"called with \(t, q_s, q_f, params\)\. Give it all"),
+    ],
+)
+def test_user_functions_of_other_arguments(fpu, changes, message):
+    with pytest.raises(TypeError, match=message):
+        fpu.system.replace(**changes)
+
+
+def test_functions_may_take_more_where_it_has_a_default(fpu):
+    fpu.system.replace(fast_potential=lambda q_f, params, stiffness=2.0: stiffness * jnp.sum(q_f**2))
+    fpu.system.replace(slow_potential=lambda *arguments: jnp.sum(arguments[0]))
+
+
+def ring(q_s, q_f, params):
+    return jnp.array([q_s @ q_s - 1.0])
+
+
+@pytest.mark.parametrize("num_fast", [0, 1])
+def test_constraints_of_slow_coordinates_alone(num_fast):
+    system = System(ConstantMass([1.0, 1.0], [1.0] * num_fast), constraint=ring)
+    with pytest.raises(ValueError, match=r"\[0\] of constraint do not depend on the fast .*System\(slow_constraint="):
+        initial_state(system, [1.0, 0.0], [0.0] * num_fast, [0.0, 0.0], [0.0] * num_fast)
 
 
 @pytest.mark.parametrize(

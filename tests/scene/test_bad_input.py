@@ -11,7 +11,10 @@ from vmri_jax.scene import (
     Anchor,
     Angle,
     Body,
+    Constraint,
     Coulomb,
+    Drive,
+    Force,
     Gravity,
     Guide,
     HarmonicDrive,
@@ -268,3 +271,24 @@ def test_numbers_that_are_none():
         Body("a", "heavy", [1.0])
     with pytest.raises(ValueError, match="springs: between is None; give 2 names of bodies"):
         Scene([A, B], [Spring(None, 1.0)])
+
+
+def edge(q, v, params):
+    """A skate: no velocity across its blade."""
+    return v[0][0] * jnp.sin(q[0][2]) - v[0][1] * jnp.cos(q[0][2])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Constraint(edge, "bob"), "edge.*called with .q, params.*velocities .*out of scope.* Force.function"),
+        (lambda: Constraint(edge, "bob", timed=True), "called with .t, q, params.*Give it all of these arguments"),
+        (lambda: Potential(edge, "bob"), "called with .q, params.*depend on time are out of scope"),
+        (lambda: Force(edge, "bob"), r"called with \(t, q, v, params\)\. Give it all of these arguments"),
+        (lambda: Drive("bob", lambda t: 0.0), r"drive: history is .*called with \(t, params\)"),
+        (lambda: Guide("bob", 3.0), r"guides: path is 3.0; give a function of \(t, params\)"),
+    ],
+)
+def test_functions_of_other_arguments(make, message):
+    with pytest.raises(TypeError, match=message):
+        make()

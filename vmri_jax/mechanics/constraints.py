@@ -136,7 +136,6 @@ def check_constraints(
         return
     values, slow, fast, alone = _values_and_jacobians(system, state.t, state.q_s, state.q_f)
     _check_values(values, what, tolerance, advice)
-    _check_counts(fast, alone)
     if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
@@ -144,8 +143,10 @@ def check_constraints(
     if slow_only.size:
         raise ValueError(
             f"System: row(s) {slow_only.tolist()} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
-            "Pass them as slow_constraint(q_s, params), which is held at the macro nodes."
+            "Give them as System(slow_constraint=...), a function of (q_s, params), which is held at the macro nodes; or make the "
+            "variables that they hold fast."
         )
+    _check_counts(fast, alone)
     if rank_of(alone).dependent or rank_of(fast).dependent:
         # At a singular configuration (a linkage folded flat) rows are dependent at that place alone: runs pass it.
         _, _, fast, alone = _values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f))
@@ -182,7 +183,10 @@ def _check_counts(fast, alone) -> None:
             f"System: slow_constraint returns {n_gs} values for {n_s} slow variables; at most {n_s} can be satisfied."
         )
     if n_g > n_f:
-        raise ValueError(f"System: constraint returns {n_g} values for {n_f} fast variables. {MICRO_GRID} Remove rows.")
+        raise ValueError(
+            f"System: constraint returns {n_g} values for {n_f} fast variables; at most {n_f} can be satisfied. {MICRO_GRID} "
+            "Remove rows, or make the variables that they hold fast."
+        )
 
 
 def _check_rank(name: str, jacobian, of: str) -> None:

@@ -1,6 +1,7 @@
 """The user's functions: Python code that runs once for all programs that they are part of."""
 
 import dataclasses
+import inspect
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -10,6 +11,21 @@ import jax
 
 AGAIN = 5
 """So many functions of one piece of code, each compiled anew, are worth a warning."""
+
+
+NO_TIME = (
+    "Energies and masses that depend on time are out of scope. Take instead a force that depends on time, {force}, or a constraint that "
+    "moves with time, {moving}."
+)
+"""What a function of energy that takes the time is told; {force} and {moving} say how these are given."""
+NO_VELOCITY = (
+    "Constraints hold positions; one that moves with time is {moving}. Constraints on velocities (rolling without slip, skates) are out "
+    "of scope. Take instead the positions that they hold, where there are such (x - radius * angle of a wheel that rolls along a line), or a "
+    "strong damper on the velocity that is forbidden, {force}."
+)
+"""What a constraint that takes the time or velocities is told."""
+NOT_FOR_ALL = ("t", "v_s", "v_f")
+"""Names of arguments that only some functions get."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +77,41 @@ _made: Counter = Counter()
 def traced_once(function: Callable) -> TracedOnce:
     """`function` as `TracedOnce`, if it is not one already."""
     return function if isinstance(function, TracedOnce) else TracedOnce(function)
+
+
+def check_arguments(what: str, function: Callable, arguments: str, instead: str = "") -> None:
+    """Refuse a function of the user that takes other arguments than it is called with, or the same in another order.
+
+    Args:
+        what: the function's place, for messages: "System: constraint".
+        function: of the user; where Python knows no signature of it, nothing is checked.
+        arguments: names of the arguments that it is called with, in order: "q_s, q_f, params".
+        instead: what to do where it takes the time, velocities, or more arguments.
+
+    Raises:
+        TypeError: with both lists of arguments.
+    """
+    try:
+        signature = inspect.signature(function)
+    except (ValueError, TypeError):
+        return
+    expected = arguments.split(", ")
+    places = [p for p in signature.parameters.values() if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    required = [p.name for p in places if p.default is p.empty]
+    not_there = [name for name in required if name in NOT_FOR_ALL and name not in expected]
+    moved = [p.name for p, name in zip(places, expected, strict=False) if p.name != name and p.name in expected]
+    try:
+        signature.bind(*expected)
+        if not not_there and not moved:
+            return
+    except TypeError:
+        pass
+    if not_there or len(required) > len(expected):
+        advice = instead or "What varies besides them belongs into the params."
+    else:
+        advice = "Give it all of these arguments in this order, whether it uses them or not."
+    name = getattr(function, "__name__", type(function).__name__)
+    raise TypeError(f"{what} is {name}{signature}; it is called with ({arguments}). {advice}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,8 +8,30 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.functions import Rheonomic, TracedOnce, traced_once, with_time
+from vmri_jax.mechanics.functions import (
+    NO_TIME,
+    NO_VELOCITY,
+    Rheonomic,
+    TracedOnce,
+    check_arguments,
+    traced_once,
+    with_time,
+)
 from vmri_jax.mechanics.masses import ConstantMass
+
+ARGUMENTS = {
+    "kinetic": "q_s, q_f, v_s, v_f, params",
+    "slow_potential": "q_s, q_f, params",
+    "fast_potential": "q_f, params",
+    "constraint": "q_s, q_f, params",
+    "slow_constraint": "q_s, params",
+    "force": "t, q_s, q_f, v_s, v_f, params",
+}
+"""Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
+_INSTEAD = {
+    "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
+    "moving": "Rheonomic(function), whose function gets t first",
+}
 
 
 class KineticFunction(eqx.Module):
@@ -73,7 +95,7 @@ class System(eqx.Module):
                     f"System: kinetic is {kinetic!r}; give ConstantMass(slow, fast) or a function "
                     "kinetic(q_s, q_f, v_s, v_f, params)."
                 )
-            _check_hash("kinetic", kinetic)
+            _check_function("kinetic", kinetic)
             kinetic = KineticFunction(traced_once(kinetic))
         self.kinetic = kinetic
         self.params = params
@@ -136,11 +158,12 @@ def _checked(name: str, function):
     """A function of the system as it is kept, or None."""
     if function is None:
         return None
-    _check_hash(name, function)
     if isinstance(function, Rheonomic) and name in ("constraint", "slow_constraint"):
+        _check_function(name, function.function, "t, ")
         return Rheonomic(traced_once(function.function))
     if not callable(function):
         raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
+    _check_function(name, function)
     return traced_once(function)
 
 
@@ -151,7 +174,8 @@ def _constrain(function, t, *arguments):
     return function(*arguments)
 
 
-def _check_hash(name: str, function) -> None:
+def _check_function(name: str, function, before: str = "") -> None:
+    """Refuse a function without a hash, or that takes other arguments than those of its place, with `before` before them."""
     try:
         hash(function)
     except TypeError:
@@ -159,3 +183,5 @@ def _check_hash(name: str, function) -> None:
             f"System: {name} is {function!r}, which has no hash: programs are compiled once per function. Give a plain "
             "function, with what varies in params."
         ) from None
+    instead = "" if name == "force" else NO_VELOCITY if "constraint" in name else NO_TIME
+    check_arguments(f"System: {name}", function, before + ARGUMENTS[name], instead.format(**_INSTEAD))

@@ -161,8 +161,15 @@ def array(*, default: Any = MISSING, sign: Sign = "") -> Any:
     return field(default=default, metadata={"parameter": Parameter("array", sign)})
 
 
+def of_time() -> Any:
+    """A function of the user, ``f(t, params)``."""
+    return field(metadata={"of_time": True})
+
+
 @dataclass_transform(
-    frozen_default=True, eq_default=False, field_specifiers=(names, number, positive, vector, common, array, field)
+    frozen_default=True,
+    eq_default=False,
+    field_specifiers=(names, number, positive, vector, common, array, of_time, field),
 )
 def effect_class(cls: type[Class]) -> type[Class]:
     """A frozen dataclass whose fields may be declared by `names`, `positive` and the like."""

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import Place, unknown
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, body_of, end_of, label_of, moving
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
@@ -83,6 +84,12 @@ class Effect(ABC):
             object.__setattr__(self, argument.name, lasting(getattr(self, argument.name)))
         if not self.name:
             object.__setattr__(self, "name", self.default_name)
+        for argument in fields(self):
+            if "of_time" in argument.metadata:
+                what, function = f"{self.name}: {argument.name}", getattr(self, argument.name)
+                if not callable(function):
+                    raise TypeError(f"{what} is {function!r}; give a function of (t, params).")
+                check_arguments(what, function, "t, params")
         if self.rate not in ("slow", "fast", "auto"):
             raise ValueError(f"{self.name}: rate is {self.rate!r}; it must be 'slow', 'fast' or 'auto'.")
 

@@ -14,9 +14,17 @@ from typing import Any, Literal
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.checks import shape_of
+from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, check_arguments
 from vmri_jax.scene.body import end_of, entry, is_entry
 from vmri_jax.scene.declare import effect_class
 from vmri_jax.scene.effect import DRAWN, Effect, real_tree
+
+ARGUMENTS = {"potential": "q, params", "constraint": "q, params", "kinetic": "q, v, params", "force": "t, q, v, params"}
+"""Arguments of the functions; a constraint that is timed gets t before them."""
+_INSTEAD = {
+    "force": "Force(function, bodies), function(t, q, v, params)",
+    "moving": "Constraint(..., timed=True), whose function gets t first",
+}
 
 
 @effect_class
@@ -32,7 +40,7 @@ class CustomEffect(Effect):
         drawn_as: "link" or "spring", between each of its bodies and the next one; None for nothing to see.
 
     Raises:
-        TypeError: a function that cannot be called.
+        TypeError: a function that cannot be called, or that takes other arguments.
         ValueError: another drawing; (of the scene) one of a single body, or of blocks of general coordinates.
     """
 
@@ -49,6 +57,9 @@ class CustomEffect(Effect):
             raise TypeError(f"{type(self).__name__}: function is {self.function!r}; give a function of (q, ...).")
         if not self.name:
             object.__setattr__(self, "name", getattr(self.function, "__name__", type(self).__name__.lower()))
+        instead = {"constraint": NO_VELOCITY, "force": ""}.get(self.kind, NO_TIME).format(**_INSTEAD)
+        arguments = f"t, {ARGUMENTS[self.kind]}" if self.timed else ARGUMENTS[self.kind]
+        check_arguments(f"{type(self).__name__}: function", self.function, arguments, instead)
         super().__post_init__()
         if self.drawn_as not in (None, *DRAWN):
             raise ValueError(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")

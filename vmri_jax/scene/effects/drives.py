@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.scene.declare import effect_class, names, number, positive, vector
+from vmri_jax.scene.declare import effect_class, names, number, of_time, positive, vector
 from vmri_jax.scene.effect import Effect, real_tree
 from vmri_jax.scene.effects.points import BetweenPoints
 
@@ -83,7 +83,7 @@ class Drive(Effect):
     """
 
     bodies: Any = names()
-    history: Callable
+    history: Callable = of_time()
     params: Any = field(default_factory=dict)
 
     kind = "force"

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.names import unknown
-from vmri_jax.scene.declare import effect_class, number, positive
+from vmri_jax.scene.declare import effect_class, number, of_time, positive
 from vmri_jax.scene.effect import Effect, real_tree
 from vmri_jax.scene.effects.joints import FREEDOMS, M_PRIME, Freedom, Joint, M, dot, freedom_of, slide, triads
 from vmri_jax.scene.effects.springs import elastic_energy
@@ -200,7 +200,7 @@ class JointDrive(InJoint):
         params: what `history` gets as params; traced.
     """
 
-    history: Callable
+    history: Callable = of_time()
     params: Any = field(default_factory=dict)
 
     kind = "force"
@@ -243,7 +243,7 @@ class JointMotion(InJoint):
         ValueError: (of the scene) a path that does not start at zero.
     """
 
-    path: Callable
+    path: Callable = of_time()
     params: Any = field(default_factory=dict)
 
     kind = "constraint"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.scene.body import end_of, label_of
-from vmri_jax.scene.declare import effect_class, names, vector
+from vmri_jax.scene.declare import effect_class, names, of_time, vector
 from vmri_jax.scene.effect import Effect, real_tree
 
 
@@ -108,7 +108,7 @@ class AlongPath:
 class ToPath(ToPoint):
     """To a point that moves along a path."""
 
-    path: Callable
+    path: Callable = of_time()
     params: Any = field(default_factory=dict, kw_only=True)
 
     dimensions = (1, 2, 3)
@@ -125,8 +125,6 @@ class ToPath(ToPoint):
         return self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
 
     def check_bodies(self, bodies):
-        if not callable(self.path):
-            raise TypeError(f"{self.name}: path is {self.path!r}; give a function of (t, params).")
         super().check_bodies(bodies)
         shape = jax.eval_shape(lambda: jnp.asarray(self.point_at_start({}))).shape
         for (name,) in self.elements(bodies):
