@@ -28,6 +28,30 @@ def test_example_runs(tmp_path):
     assert (tmp_path / "run.csv").read_text().startswith("t,trolley,hook x,hook y,load x,load y,v trolley,")
 
 
+def test_the_nutshell_shows_the_same_program():
+    """The page has to hold it as text, for readers of the file: copy the first two programs of README.md there."""
+    readme, nutshell = (
+        re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
+        for page in ("README.md", "docs/nutshell.md")
+    )
+    assert nutshell[:2] == readme[:2]
+    printed = re.search(r"It prints (`.*`) and (`.*`)\.", (ROOT / "README.md").read_text())
+    assert printed is not None
+    assert printed.group() in (ROOT / "docs/nutshell.md").read_text()
+
+
+def test_systems_of_functions(capsys):
+    """A crane that hoists, then a bob in polar coordinates: they print what the page says."""
+    page = (ROOT / "docs/how_to/systems.md").read_text()
+    crane, bob = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    scope = {}
+    exec(crane, scope)
+    assert f"```text\n{capsys.readouterr().out}```" in page
+    assert scope["run"].reaction_forces("rail")["trolley"].shape == (801, 2)
+    exec(bob, scope)
+    assert f"`{capsys.readouterr().out.strip()}`" in page
+
+
 def test_scenes_run():
     """Points and springs, then rigid bodies and a hinge, one after the other as they stand there."""
     scope = {}

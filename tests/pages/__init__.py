@@ -1,0 +1,1 @@
+"""Pages and what they print; a part of `make test-tools`."""
