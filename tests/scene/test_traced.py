@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vmri_jax as vm
 from tests.scene.effect_scenes import BASE, EFFECTS
 from vmri_jax.mechanics.invariants import potentials
 from vmri_jax.scene import (
@@ -98,3 +99,23 @@ def test_traced_numbers_decide_nothing(what):
 
     with pytest.raises(ValueError, match="whether light is slow or fast depends on numbers that are traced"):
         jax.grad(momentum)(1.0)
+
+
+def test_names_hold_in_a_trace():
+    """A scene made of traced numbers is simulated, and its run asked by name; what needs numbers says so."""
+    refused = []
+
+    def end(stiffness):
+        pulled = Body("pulled", 2.0, [1.0, 0.0], pace="slow")
+        scene = Scene([pulled], [SpringAnchor("pulled", [0.0, 0.0], stiffness, length=0.5)])
+        run = vm.simulate(scene, vm.fully_explicit(1), macro_dt=0.1, num_steps=3)
+        if isinstance(stiffness, jax.core.Tracer):  # pyright: ignore[reportAttributeAccessIssue]
+            with pytest.raises(ValueError, match=r"work: the run is traced by JAX.*run.of\(problem\).work"):
+                run.work()
+            refused.append(True)
+        return run.position("pulled")[-1, 0] + run.velocity("pulled")[-1, 0]
+
+    slope = (end(3.01) - end(2.99)) / 0.02
+    assert jax.grad(end)(3.0) == pytest.approx(float(slope), rel=1e-8)  # measured 2e-9
+    assert np.allclose(jax.vmap(end)(jnp.array([2.99, 3.01])), [end(2.99), end(3.01)], rtol=1e-14, atol=0)
+    assert refused

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.integrate import cumulative_simpson, cumulative_trapezoid
 
 from vmri_jax.mechanics import invariants
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.motion import motion, powers, reaction_force
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.projection import legendre
@@ -129,7 +130,7 @@ class Quantities(ABC):
         Raises:
             ValueError: the run does not know its system, or did not keep the micro nodes.
         """
-        run = self.whole()
+        run = _known("multipliers", self.whole())
         values = np.asarray(at_nodes(_multipliers, run.origin, _states(run, micro)))
         return {name: _shaped(run, values[..., rows], micro) for name, rows in run.names.rows.items()}
 
@@ -143,7 +144,7 @@ class Quantities(ABC):
         Raises:
             ValueError: no constraint of this name, and as of `multipliers`.
         """
-        run = self.whole()
+        run = _known("reaction_forces", self.whole())
         names = run.names
         if constraint not in names.rows:
             raise ValueError(f"reaction_forces: {unknown('constraint', constraint, names.rows)}")
@@ -167,7 +168,7 @@ class Quantities(ABC):
         Raises:
             ValueError: the run does not know its system, or it is a batch.
         """
-        run = self.whole()
+        run = _known("work", self.whole())
         if np.ndim(run.t) != 1:
             raise ValueError("work: the run is a batch; take one lane of it, run.lane(i).")
         micro = why_not(run.t, run.t_micro) == "" and bool(np.isfinite(run.energy[1]))
@@ -191,6 +192,16 @@ class Quantities(ABC):
         from vmri_jax.plots import plot_trajectory  # matplotlib takes half a second
 
         return plot_trajectory(self.whole(), title)
+
+
+def _known(what: str, run: "Trajectory") -> "Trajectory":
+    """The run, unless its numbers are tracers of a transformation."""
+    if not is_concrete(run.energy):
+        raise ValueError(
+            f"{what}: the run is traced by JAX, inside of jit, grad or vmap. Return the run and ask outside, "
+            f"run.of(problem).{what}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can be traced."
+        )
+    return run
 
 
 def _of_body(names: Names, body: str, slow, fast):

@@ -59,7 +59,8 @@ def simulate(
 
     Compiled once per system structure and scheme structure, and for every eighth or so of the number of saved nodes: step sizes,
     parameters, rule weights, initial states and `save_every` may vary without compiling again. Works under ``jax.vmap`` over state,
-    params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised.
+    params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised, and names
+    work inside of the function that is transformed: ``run.position("load")``.
     Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "nested".
 
     Args:
@@ -93,7 +94,7 @@ def simulate(
     run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     if not run.is_concrete:
         check_system(run.system, run.state.q_s, run.state.q_f)
-        return traced_run(run, adjoint)
+        return know(traced_run(run, adjoint), run.origin)
     run.check()
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     trajectory = run.in_parts() if progress else run()

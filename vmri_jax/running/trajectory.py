@@ -45,8 +45,8 @@ class Trajectory(Exports, eqx.Module):
     """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has an axis of lanes before.
 
     ``len(run)`` is k; ``run[i]`` is the `State` at a node, ``run[-1]`` that at the end; ``run[a:b]`` and ``run[a:b:n]`` are the
-    `Trajectory` of these nodes. Velocities, multipliers, reaction forces and work are `Quantities` of it. Transformations of JAX
-    keep the arrays alone; then ``run.of(problem)`` says again what the run is of.
+    `Trajectory` of these nodes. Velocities, multipliers, reaction forces and work are `Quantities` of it. A run that is returned from a
+    transformation of JAX has kept the arrays alone; then ``run.of(problem)`` says again what the run is of.
 
     Attributes:
         q_s, q_f, p_s, p_f: positions and momenta; NaN after a failure.
