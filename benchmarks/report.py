@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -10,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import Ratio, Tell, machine
 from vmri_jax import plots
+from vmri_jax.running.printed import OutputConsole
+from vmri_jax.running.progress import SECONDS
 
-console = Console(width=None if sys.stdout.isatty() else 160)
+console = OutputConsole()
 
 
 @dataclass(frozen=True)
@@ -135,9 +137,24 @@ def legend_below(figure: Figure, names: Sequence[str] = ()) -> None:
 
 @contextmanager
 def progress(title: str) -> Iterator[Tell]:
-    """A line that shows what is being measured; yields the function that is told each part before it starts."""
-    with console.status(title) as status:
-        yield lambda at: status.update(f"{title}: {at}")
+    """Show what is being measured; yields the function that is told each part before it starts.
+
+    In a terminal it is one line that changes; in a pipe or a file lines on the error stream, the first one at once.
+    """
+    if console.is_terminal:
+        with console.status(title) as status:
+            yield lambda at: status.update(f"{title}: {at}")
+        return
+    begin, last = time.monotonic(), -math.inf
+
+    def tell(part: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= SECONDS:
+            last = now
+            print(f"{now - begin:5.0f} s  {title}: {part}", file=sys.stderr, flush=True)
+
+    yield tell
 
 
 def _cell(value) -> str:

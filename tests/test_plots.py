@@ -65,6 +65,14 @@ def labels(axes):
     return [text.get_text() for text in axes.get_legend().get_texts()]
 
 
+def names_below(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def look(line):
+    return line.get_color(), line.get_marker(), line.get_linestyle()
+
+
 def y_data(line):
     return np.asarray(line.get_ydata(), dtype=float)
 
@@ -134,7 +142,7 @@ def test_oscillatory_energies_and_their_sum():
 def test_convergence_names_the_orders_and_draws_guides_only_where_asked():
     figure = plots.plot_convergence(study(), orders=(2,))
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["positions", "momenta"]
-    assert labels(figure.axes[0]) == ["order 1   order 1.00", "order 2   order 2.00"]
+    assert names_below(figure) == ["order 1   order 1.00 (q), 1.00 (p)", "order 2   order 2.00 (q), 2.00 (p)"]
     assert [len(axes.patches) for axes in figure.axes] == [1, 1]
     corners = np.asarray(figure.axes[0].patches[0].get_path().vertices, dtype=float)
     slope = np.log(corners[2, 1] / corners[1, 1]) / np.log(corners[1, 0] / corners[0, 0])
@@ -144,7 +152,40 @@ def test_convergence_names_the_orders_and_draws_guides_only_where_asked():
 def test_convergence_says_when_a_scheme_failed():
     rows = [dataclasses.replace(row, error_q=np.nan, error_p=np.nan) for row in study((1,)).rows]
     figure = plots.plot_convergence(dataclasses.replace(study(), rows=tuple(rows)), orders=(1,))
-    assert labels(figure.axes[0]) == ["order 1   failed"]
+    assert names_below(figure) == ["order 1   failed"]
+
+
+@pytest.mark.parametrize("theme", [plots.LIGHT, plots.DARK])
+def test_thirty_curves_look_different(theme):
+    for axes in plots.plot_convergence(study(range(1, 31)), theme=theme).axes:
+        assert len({look(line) for line in axes.lines}) == 30
+    looks = [plots.curve_look(i, theme) for i in range(30)]
+    assert len({(look["color"], look["linestyle"]) for look in looks}) == 30  # markers may hide each other
+
+
+def test_the_legend_of_many_curves_is_inside_the_figure_and_leaves_the_panels_their_height():
+    few, many = plots.plot_convergence(study()), plots.plot_convergence(study(range(1, 16)))
+    heights = []
+    for figure, count in ((few, 2), (many, 15)):
+        figure.draw_without_rendering()
+        legend = figure.legends[0]
+        assert len(legend.get_texts()) == count
+        box, page = legend.get_window_extent(), figure.bbox
+        assert page.x0 <= box.x0 <= box.x1 <= page.x1
+        assert page.y0 <= box.y0
+        panels = [axes.get_tightbbox() for axes in figure.axes]
+        assert all(panel is not None and panel.y0 >= box.y1 for panel in panels)
+        heights.append(figure.axes[0].get_window_extent().height)
+    assert heights[1] == pytest.approx(heights[0], rel=0.1)  # measured: 0.015 more
+
+
+def test_residuals_are_not_drawn_below_roundoff():
+    residual = np.full((21, 2), 1e-15)
+    residual[3], residual[7] = 0.0, 1e-33
+    axes = plots.plot_trajectory(dataclasses.replace(run(), constraint_residual=residual)).axes[-1]
+    for line in axes.lines:
+        assert np.flatnonzero(y_data(line) == 1e-17).tolist() == [3, 7]
+    assert 1e-18 < axes.get_ylim()[0] <= 1e-17
 
 
 def test_cost_circles_the_minimum_and_marks_the_paper():
@@ -152,7 +193,7 @@ def test_cost_circles_the_minimum_and_marks_the_paper():
     lines = figure.axes[0].lines
     circled = [np.asarray(line.get_xydata()).tolist() for line in lines if line.get_markersize() == 11]
     assert circled == [[[10.0, 3.0]], [[100.0, 3.0]]]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["dense", "arrowhead", "minimum in the paper"]
+    assert names_below(figure) == ["dense", "arrowhead", "minimum in the paper"]
     assert np.asarray(lines[-1].get_xdata()).tolist() == [60, 60]
 
 

@@ -93,6 +93,17 @@ def test_claim(at_most, at_least, holds, target):
     assert claim.target == target
 
 
+def test_progress_is_told_in_lines_where_the_output_is_no_terminal(capsys, monkeypatch):
+    clock = iter((0.0, 0.5, 1.0, 5.0))
+    monkeypatch.setattr(report.time, "monotonic", lambda: next(clock))
+    with report.progress("cost") as tell:
+        for part in ("FPU, num_micro 1", "FPU, num_micro 4", "FPU, num_micro 8"):
+            tell(part)
+    out, lines = capsys.readouterr()
+    assert out == ""
+    assert lines.splitlines() == ["    0 s  cost: FPU, num_micro 1", "    5 s  cost: FPU, num_micro 8"]
+
+
 def test_report_is_written_and_shown(tmp_path, monkeypatch):
     console = Console(width=100, record=True, quiet=False, file=open(os.devnull, "w"))  # noqa: SIM115
     monkeypatch.setattr(report, "console", console)

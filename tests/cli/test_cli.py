@@ -1,5 +1,6 @@
 """The command line: what it prints, what it writes, and how it refuses."""
 
+import dataclasses
 import errno
 import importlib
 import os
@@ -12,8 +13,11 @@ import pytest
 from typer.testing import CliRunner
 
 import vmri_jax as vm
+from tests.animation.support import swinging
 from vmri_jax import cli
 from vmri_jax.catalogue import SCHEMES, find_problem, find_scheme
+from vmri_jax.cli.run import _energy_balance
+from vmri_jax.running.quantities import Work
 from vmri_jax.running.simulate import Simulation
 from vmri_jax.study import families, reference_solution
 
@@ -111,6 +115,13 @@ def test_constraints_are_reported(vmri):
     code, text = vmri("simulate", "tsp", *arguments)
     assert code == 0
     assert "constraint residual" in text
+
+
+def test_the_energy_of_a_driven_run_says_when_it_was_what(monkeypatch):
+    run = dataclasses.replace(swinging(), energy=np.linspace(0.0, 0.000345, 41))
+    zero = np.zeros(41)
+    monkeypatch.setattr(vm.Trajectory, "work", lambda self: Work(zero, zero, np.asarray(self.energy), 0.0))
+    assert _energy_balance(run)["energy"] == "0 at the start, 0.000345 at the end"
 
 
 def test_micro_dt_gives_the_macro_step(vmri):

@@ -15,6 +15,8 @@ from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.shapes import Stage
 
 FRAMES_PER_SECOND = 20
+MOST_COLUMNS = 6
+"""Pictures side by side; with more, names and times are too small to read."""
 WIDTH = 9.0
 """Of a strip, in inches."""
 TITLE = 0.3
@@ -25,6 +27,8 @@ def plot_strip(
     motion: Motion, times: int | Sequence[float] = 5, title: str = "", theme: plots.Theme = plots.LIGHT
 ) -> plots.NotebookFigure:
     """Several moments side by side, from one point of view; wide scenes one below the other.
+
+    Rows have equal numbers of pictures, or differ by one; the shorter rows are centred.
 
     Below them are curves: the slow motion along the whole run, with the moments as dots, and a close-up of the fast one.
 
@@ -42,9 +46,8 @@ def plot_strip(
         raise ValueError(f"plot_strip: times is {times!r}; give at least one.")
     stage = Stage.of(motion, theme)
     aspect = stage.aspect
-    columns = len(moments) if aspect < 1.3 else 3 if aspect < 3.5 else 1
-    columns = min(columns, len(moments), 6)
-    rows = -(-len(moments) // columns)
+    sizes = rows_of(len(moments), MOST_COLUMNS if aspect < 1.3 else 3 if aspect < 3.5 else 1)
+    rows, columns = len(sizes), max(sizes)
     trail = 0.5 * (motion.t[-1] - motion.t[0]) / max(len(moments), 4)
     curves = Curves(motion, theme)
     with plots.style(theme):
@@ -53,14 +56,25 @@ def plot_strip(
         height = rows * width / aspect + head + curves.height
         figure = plots.NotebookFigure(figsize=(WIDTH, height))
         figure.set_layout_engine("none")
-        for k, time in enumerate(moments):
-            row, column = divmod(k, columns)
+        cells = [(row, (columns - size) / 2 + column) for row, size in enumerate(sizes) for column in range(size)]
+        for k, (time, (row, column)) in enumerate(zip(moments, cells, strict=True)):
             bottom = (curves.height + (rows - 1 - row) * width / aspect) / height
             place = (column / columns, bottom, 1 / columns, width / aspect / height)
             stage.draw(figure, place, time, trail, names=k == 0)
         curves.draw(figure, moments)
         _write_head(figure, title, stage)
     return figure
+
+
+def rows_of(count: int, columns: int) -> list[int]:
+    """How many pictures each row has, of at most so many columns: as equal as can be, the longer rows first.
+
+    Args:
+        count: number of pictures.
+        columns: most pictures in a row.
+    """
+    rows = -(-count // columns)
+    return [count // rows + (row < count % rows) for row in range(rows)]
 
 
 def _write_head(figure: Figure, title: str, stage: Stage) -> None:

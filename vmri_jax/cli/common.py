@@ -12,7 +12,9 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-console = Console()
+from vmri_jax.running.printed import OutputConsole
+
+console = OutputConsole()
 
 PICTURES = (".png", ".svg", ".pdf")
 """Endings of files that a figure is written to."""

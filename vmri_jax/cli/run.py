@@ -212,7 +212,8 @@ def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]
     uncertainty = sum(work.uncertainty for work in works)
     work = {"forces": forces, "moving constraints": constraints}
     found = {f"work of {name}": f"{value:.6g}" for name, value in work.items() if value != 0}
-    energy = {"energy": f"{float(trajectory[0:1].energy[0]):.6g} to {float(trajectory[-1:].energy[0]):.6g}"}
+    start, end = (float(trajectory[nodes].energy[0]) for nodes in (slice(0, 1), slice(-1, None)))
+    energy = {"energy": f"{start:.6g} at the start, {end:.6g} at the end"}
     resolved = f"; the saved nodes resolve the work to {uncertainty:.1e}"
     return energy | found | {"energy balance": f"{left:.1e} left at the end{resolved}"}
 

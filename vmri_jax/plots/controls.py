@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vmri_jax.plots.runs import coordinates, position_panels
-from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, legend_beside, new_figure
+from vmri_jax.plots.theme import LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
 
 if TYPE_CHECKING:
     from vmri_jax.control.optimum import Optimum
@@ -39,7 +39,7 @@ def plot_control(optimum: "Optimum", *, title: str = "", theme: Theme = LIGHT) -
             values = np.array([told[name] for told in optimum.history])
             if np.any(values > 0):
                 at = 1 + np.arange(len(values))
-                below.semilogy(at, np.where(values > 0, values, np.nan), ".-", color=color, label=MEANING[name])
+                below.semilogy(at, np.maximum(values, ROUNDOFF_FLOOR), ".-", color=color, label=MEANING[name])
         below.set(
             xlabel="iteration",
             ylabel="left",

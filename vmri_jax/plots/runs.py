@@ -10,7 +10,7 @@ from matplotlib.axis import Axis
 
 from vmri_jax.mechanics.invariants import oscillatory_energies
 from vmri_jax.mechanics.names import Names
-from vmri_jax.plots.theme import DARK, LIGHT, NotebookFigure, Theme, legend_beside, new_figure
+from vmri_jax.plots.theme import DARK, LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
 
 MOST_NAMED = 12
 """Of more curves than this in one panel so many are named."""
@@ -69,7 +69,7 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
         else:
             _energy_error(axes[len(positions)], trajectory, theme)
         if constrained:
-            shown = np.where(residual > 0, residual, np.nan)
+            shown = np.maximum(residual, ROUNDOFF_FLOOR)  # NaN stays
             axes[-1].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
             axes[-1].semilogy(t, shown[:, 1], "--", linewidth=_thin(t), label="velocity $|G v|$")
             axes[-1].set_ylabel("constraint residual")

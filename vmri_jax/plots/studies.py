@@ -10,10 +10,10 @@ from matplotlib.ticker import EngFormatter, FixedLocator, NullLocator
 
 from vmri_jax.plots.theme import (
     LIGHT,
-    MARKERS,
     NotebookFigure,
     Theme,
-    legend_beside,
+    curve_look,
+    legend_below,
     log_ticks,
     new_figure,
     panel_grid,
@@ -35,6 +35,8 @@ def plot_convergence(
 ) -> NotebookFigure:
     """Errors of positions and of momenta against the macro step, with guide triangles of the given slopes.
 
+    The legend says the observed orders of both.
+
     Args:
         study: e.g. of `vmri_jax.study.convergence_study`.
         orders: slopes to draw for comparison.
@@ -47,17 +49,24 @@ def plot_convergence(
             steps = []
             for i, scheme in enumerate(study.schemes):
                 macro_dt, errors = study.errors(scheme, quantity)
-                order = study.order(scheme, quantity)
-                label = f"{scheme}   order {order:.2f}" if np.isfinite(order) else f"{scheme}   failed"
-                axes.loglog(macro_dt, errors, label=label, **_look(i, theme))
+                axes.loglog(macro_dt, errors, label=f"{scheme}   {_orders(study, scheme)}", **curve_look(i, theme))
                 steps += list(macro_dt)
             for order in orders:
                 _guide_triangle(axes, study, quantity, order, theme)
             axes.set(title=name, xlabel="macro step $H$")
             axes.set(ylabel=rf"largest error $|{quantity} - {quantity}_{{\mathrm{{ref}}}}|$")
             log_ticks(axes.xaxis, steps)
-            axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=1, handlelength=2.4)
+        legend_below(figure)
     return figure
+
+
+def _orders(study: ConvergenceErrors, scheme: str) -> str:
+    """The observed orders of positions and of momenta in words."""
+    orders = {quantity: study.order(scheme, quantity) for quantity in ("q", "p")}
+    if not np.isfinite([*orders.values()]).any():
+        return "failed"
+    seen = (f"{order:.2f} ({q})" if np.isfinite(order) else f"failed ({q})" for q, order in orders.items())
+    return "order " + ", ".join(seen)
 
 
 WORK = {
@@ -105,8 +114,7 @@ def plot_work_precision(
         for i, scheme in enumerate(study.schemes):
             curve = sorted(study.curve(scheme), key=lambda row: row.num_steps)
             x, y = [getattr(row, work) or np.nan for row in curve], [row.error_q for row in curve]
-            look = _look(i, theme) | {"marker": MARKERS[i // len(theme.curves) % len(MARKERS)]}
-            axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **look)
+            axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **curve_look(i, theme))
         axes.set(xlabel=WORK[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
         axes.set_ylim(top=30 * max(errors, default=1.0))
         if study.reference.error_q > axes.get_ylim()[0]:
@@ -116,17 +124,8 @@ def plot_work_precision(
         log_ticks(axes.xaxis, [getattr(row, work) for scheme in study.schemes for row in study.curve(scheme)])
         if work == "seconds":
             axes.xaxis.set_major_formatter(EngFormatter("s"))
-        legend_beside(axes)
+        legend_below(figure)
     return figure
-
-
-def _look(i: int, theme: Theme) -> dict[str, Any]:
-    """Colour and marker of curve i."""
-    return {
-        "color": theme.curves[i % len(theme.curves)],
-        "marker": MARKERS[i % len(MARKERS)],
-        "markerfacecolor": theme.paper,
-    }
 
 
 class CostCurves(Protocol):
@@ -155,17 +154,14 @@ def plot_cost(
     height = 0.6 + 2.7 * math.ceil(len(studies) / columns)
     with new_figure(max(5.2, 0.6 + 3.0 * columns), height, title, theme) as figure:
         grid = panel_grid(figure, len(studies), columns)
-        handles: dict = {}
         for axes, (name, study) in zip(grid, studies.items(), strict=True):
             _cost_panel(axes, study, (paper_minima or {}).get(name), theme)
             axes.set(title=name)
-            shown = zip(*axes.get_legend_handles_labels(), strict=True)
-            handles.update({label: handle for handle, label in shown})
         for axes in grid[-columns:]:
             axes.set(xlabel="micro steps per macro step")
         for axes in grid[::columns]:
             axes.set(ylabel="µs per micro step")
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(4, len(handles)))
+        legend_below(figure)
     return figure
 
 
@@ -174,11 +170,11 @@ def _cost_panel(axes: Axes, study: CostCurves, paper_minimum: int | None, theme:
     curves = [study.curve(label, method) for label, method in study.curves]
     for i, ((label, method), (num_micro, cost)) in enumerate(zip(study.curves, curves, strict=True)):
         name = method if one_label else f"{label}, {method}"
-        color = theme.curves[i % len(theme.curves)]
-        axes.loglog(num_micro, cost, marker=MARKERS[i], markersize=4, color=color, label=name)
+        look = curve_look(i, theme)
+        axes.loglog(num_micro, cost, markersize=4, label=name, **look)
         if np.isfinite(cost).any():
             best = np.nanargmin(cost)
-            axes.plot(num_micro[best], cost[best], "o", markersize=11, markerfacecolor="none", color=color)
+            axes.plot(num_micro[best], cost[best], "o", markersize=11, markerfacecolor="none", color=look["color"])
     if paper_minimum is not None:
         axes.axvline(paper_minimum, color=theme.ink, linestyle=":", linewidth=1.1, label="minimum in the paper")
     ticks = np.unique(np.concatenate([num_micro for num_micro, _ in curves]))

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -32,6 +33,10 @@ DARK = Theme(
     "#15191d", "#e3e6e8", "#384048", "#8b969f", ("#62b5e8", "#f08a4b", "#3cc79b", "#dd92c4", "#e3b341", "#9ad0f0")
 )
 MARKERS = ("o", "s", "^", "D", "v", "P")
+LINES = ("-", "--", ":", "-.", (0, (7, 1.5, 1, 1.5, 1, 1.5)))
+"""Styles of lines: one for each turn of the cycle of colours, so that 30 curves differ."""
+ROUNDOFF_FLOOR = 1e-17
+"""Least value on a logarithmic axis of residuals, which zeros are drawn at: below it is round-off of numbers of order one."""
 DPI = 150
 """Of figures that are saved by their own method."""
 
@@ -132,6 +137,48 @@ def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
     """
     with style(theme):
         figure.savefig(path)
+
+
+def curve_look(i: int, theme: Theme) -> dict[str, Any]:
+    """Colour, marker and line style of curve i, as keywords of ``plot``; no two of the first 30 curves look alike.
+
+    Args:
+        i: number of the curve.
+        theme: colours.
+    """
+    turn, color = divmod(i, len(theme.curves))
+    return {
+        "color": theme.curves[color],
+        "marker": MARKERS[(color + turn) % len(MARKERS)],
+        "markerfacecolor": theme.paper,
+        "linestyle": LINES[turn % len(LINES)],
+    }
+
+
+def legend_below(figure: Figure, size: float = 9.0) -> None:
+    """Names of all curves under the panels, each once, in as many columns as there is room for.
+
+    The figure grows by the height of the legend, so that the panels keep theirs.
+
+    Args:
+        figure: with its panels drawn.
+        size: of the letters, in points.
+    """
+    curves: dict[str, Any] = {}
+    for axes in figure.axes:
+        handles, labels = axes.get_legend_handles_labels()
+        curves = dict(zip(labels, handles, strict=True)) | curves
+    if not curves:
+        return
+    width, height = figure.get_size_inches()
+    column = (
+        size / 72 * (4 + 0.56 * max(map(len, curves)))
+    )  # the line before the name, and the mean width of its letters
+    columns = max(1, min(len(curves), int(width / column)))
+    rows = math.ceil(len(curves) / columns)
+    figure.set_size_inches(width, height + 0.1 + 1.35 * size / 72 * rows)
+    look = {"fontsize": size, "handlelength": 2.6, "labelspacing": 0.3, "columnspacing": 1.5}
+    figure.legend(curves.values(), curves.keys(), loc="outside lower left", ncols=columns, **look)
 
 
 def legend_beside(axes: Axes, title: str | None = None, size: float = 9.0) -> None:

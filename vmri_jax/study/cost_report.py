@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -242,25 +241,22 @@ def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
     """Time against num_micro of the families that were varied, at each error, one panel per error."""
     answers = [answer for answer in report.answers if answer.all]
     names = list(dict.fromkeys(s.family.name for answer in answers for s in answer.all[: 2 * SHOWN]))
-    looks = dict(zip(names, product("-:", theme.curves), strict=False))  # dotted once the colours are used up
+    looks = {name: plots.curve_look(i, theme) for i, name in enumerate(names)}
     with plots.new_figure(7.2, 3.2, "", theme) as figure:
         panels = figure.subplots(1, max(1, len(answers)), sharey=True, squeeze=False)[0]
-        drawn = {}
         for axes, answer in zip(panels, answers, strict=False):
             for name in names:
                 settings = sorted((s for s in answer.all if s.family.name == name), key=lambda s: s.num_micro)
                 if len(settings) >= 3:
                     x, y = [s.num_micro for s in settings], [s.row.seconds for s in settings]
-                    line, color = looks[name]
-                    drawn[name] = axes.loglog(x, y, "o" + line, color=color, markersize=3.5, linewidth=1.2)[0]
+                    axes.loglog(x, y, label=name, markersize=3.5, linewidth=1.2, **looks[name])
             axes.set(title=f"error {answer.error:.0e}", xlabel="num_micro")
             plots.log_ticks(axes.xaxis, [s.num_micro for shown in answers for s in shown.all])
             axes.xaxis.set_major_formatter("{x:g}")
             plots.log_ticks(axes.yaxis, [s.row.seconds for shown in answers for s in shown.all])
         panels[0].set_ylabel("computing time")
         panels[0].yaxis.set_major_formatter(EngFormatter("s"))
-        if drawn:
-            figure.legend(drawn.values(), drawn, loc="outside lower center", ncols=3, frameon=False)
+        plots.legend_below(figure)
     return figure
 
 

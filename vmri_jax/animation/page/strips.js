@@ -9,8 +9,11 @@ function shown(x) {
   return `${digits.replace("-", "−")} × 10${raised}`;
 }
 
+// Round-off of numbers of order one: no logarithmic curve goes below.
+const FLOOR = 1e-17;
+
 class Strip {
-  // curves: [name, values at the nodes, colour]; logarithmic: zeros are left out.
+  // curves: [name, values at the nodes, colour]; logarithmic: zeros are drawn at FLOOR.
   constructor(canvas, text, title, motion, curves, logarithmic) {
     Object.assign(this, { canvas, text, title, motion, curves, logarithmic, still: document.createElement("canvas") });
     this.largest = curves.map(([, values]) => values.reduce((most, x) => Math.max(most, Math.abs(x)), 0));
@@ -38,7 +41,7 @@ class Strip {
 
   // From a value to its height in pixels.
   range() {
-    const size = (x) => (this.logarithmic ? (x > 0 ? Math.log10(x) : NaN) : x);
+    const size = (x) => (this.logarithmic ? Math.log10(Math.max(x, FLOOR)) : x);
     let low = this.logarithmic ? Infinity : 0, high = this.logarithmic ? -Infinity : 0;
     for (const [, values] of this.curves) {
       for (const x of values) {
