@@ -84,8 +84,8 @@ def test_a_fit(tmp_path):
 def test_optimal_control():
     scope = {}
     exec(next(program for program in PROGRAMS if "vm.control.minimize(" in program), scope)
-    assert scope["found"].converged
-    assert abs(scope["found"].cost - 6) < 1e-3
+    assert scope["optimum"].converged
+    assert abs(scope["optimum"].cost - 6) < 1e-3
 
 
 def test_a_scheme_of_ones_own(capsys):

@@ -1,6 +1,6 @@
 """An engine with a valve: crank, rod and piston turn slowly by a given motion, the valve on its stiff spring follows a cam fast.
 
-Teaches: a slow mechanism that drives a fast part; a motion that is given; a cam as a potential of one's own; springs with mass.
+Teaches: a slow mechanism that drives a fast part; a body whose motion is given; a cam as a potential of your own; springs with mass.
 
     vmri simulate notebooks/scenes/engine.py:scene --scheme explicit-slow --num-micro 10 --macro-dt 0.00025 --steps 800 --save-micro --out engine.npz
     vmri animate engine.npz --out engine.png --frames 3 --to 0.04 --view=-70,15

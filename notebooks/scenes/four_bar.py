@@ -1,6 +1,6 @@
 """A chain of closed loops: cranks on hinges, joined by rods; the N-loop four-bar linkage, a benchmark of IFToMM.
 
-Teaches: closed loops of hinges in a plane have rows too many, which the scene leaves out and names.
+Teaches: in closed loops of hinges in a plane some constraints follow from the others; the scene leaves them out and names them.
 
 Source: F. Gonzalez, A. Luaces, U. Lugris, M. Gonzalez, Non-intrusive parallelization of multibody system dynamic simulations,
 Comput. Mech. 44 (2009), case A02 of the IFToMM library of benchmarks.

@@ -37,19 +37,19 @@ SYMMETRIC = 1e-9
 
 HEAD = f"""# Scenes
 
-Each file is a scene as a user writes one. `vmri simulate` runs it, `vmri animate` shows it, `vmri explain` says where
-every effect lives and what it costs. Without `--out`, `vmri animate` writes a page to play in a browser. Table and
+Each file is a scene as a user writes one. `vmri simulate` runs it, `vmri animate` shows it, `vmri explain` says in which term and
+on which grid each effect is, and its time. Without `--out`, `vmri animate` writes a page to play in a browser. Table and
 pictures: `python notebooks/scenes/{Path(__file__).name}`.
 
 Pictures: bodies at some times, with trails; below them a slow coordinate along the run, and a fast one during the time that is
 shaded.
 
-- *seconds*: of one core, from the start of Python to the end, compilation included.
-- *energy*: largest change, of the largest kinetic energy; with forces, of energy less their work at the saved nodes; not
-  where constraints depend on time, which do work.
+- *seconds*: processor time on one core, from the start of Python to the end, compilation included.
+- *energy*: largest change of the energy, divided by the largest kinetic energy. Where forces act, their work at the saved nodes is
+  subtracted from the change. Empty where constraints depend on time, because these do work.
 - *constraints*: largest residual of positions.
-- *momentum maps*: how many linear and angular momenta belong to symmetries of the scene, and their largest change, of the
-  sum of the sizes of all terms.
+- *momentum maps*: how many linear and angular momenta belong to symmetries of the scene, and their largest change, divided by
+  the sum of the sizes of all terms.
 
 | scene | slow, fast, constraints | scheme | H, micro steps, steps | seconds | energy | constraints | momentum maps |
 |---|---|---|---|---|---|---|---|

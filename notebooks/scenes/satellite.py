@@ -1,6 +1,6 @@
 """A satellite with two flexible booms in orbit: gravity gradient and orbit are slow, the booms vibrate fast.
 
-Teaches: one scene from the orbit to the vibration; momentum maps of the whole stay exact.
+Teaches: one scene from the orbit to the vibration; the momenta of the whole scene are kept to round-off.
 
     vmri simulate notebooks/scenes/satellite.py:scene --scheme explicit-slow --num-micro 10 --macro-dt 0.02 --steps 1000 --save-micro --out satellite.npz
     vmri animate satellite.npz --out satellite.png --frames 3 --to 4.2 --view=-90,50

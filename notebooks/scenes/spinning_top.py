@@ -1,6 +1,6 @@
 """A heavy top that precesses and nods: a disc on a ball joint.
 
-Teaches: a rigid body by its directors; the ground as a body; a joint is an effect; what spins is fast.
+Teaches: a rigid body by its directors; the ground as a body; a joint as an effect; a body that spins is fast.
 
     vmri simulate notebooks/scenes/spinning_top.py:scene --scheme fully-implicit --num-micro 5 --macro-dt 0.0125 --steps 320 --save-micro --out spinning_top.npz
     vmri animate spinning_top.npz --out spinning_top.png --frames 3 --to 3

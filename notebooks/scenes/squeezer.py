@@ -1,6 +1,6 @@
 """Andrews' squeezer: seven bodies in three loops, driven by a motor; the standard test of solvers of mechanisms.
 
-Teaches: a mechanism from its published data; a fast one, of which nothing is slow.
+Teaches: a mechanism from its published data; a scene without a fast part.
 
 Source: E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, VII.7, after W. Schiehlen, Multibody Systems Handbook,
 1990. In the plane z = 0; units are those of the source, m, kg, s.

@@ -1,6 +1,6 @@
 """A heavy bob on a rod (slow), from it a hook on a rod and a load on a stiff spring (fast).
 
-Teaches: the scene finds from masses and stiffness who is slow and who is fast; rods at both paces are kept to round-off.
+Teaches: the scene finds from masses and stiffness which bodies are slow and which are fast; rods of both are kept to round-off.
 
     vmri simulate notebooks/scenes/triple_spherical_pendulum.py:scene --num-micro 5 --macro-dt 0.02 --steps 1000 --save-micro --out triple_spherical_pendulum.npz
     vmri animate triple_spherical_pendulum.npz --out triple_spherical_pendulum.png --frames 3

@@ -1,6 +1,6 @@
 """Two pendulums that stand upside down, because their pivots vibrate fast: Kapitza's pendulum, single and double.
 
-Teaches: a body whose motion is given, `Guide`, is a constraint that depends on time; it does work, and takes it back.
+Teaches: a body whose motion is given, `Guide`, is a constraint that depends on time, and does work on the pendulum.
 
     vmri simulate notebooks/scenes/upright_pendulum.py:scene --scheme fully-explicit --num-micro 10 --macro-dt 0.01 --steps 1000 --save-micro --out upright_pendulum.npz
     vmri animate upright_pendulum.npz --out upright_pendulum.png --frames 3 --to 1.25
