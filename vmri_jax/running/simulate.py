@@ -14,6 +14,7 @@ from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_flags, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
+from vmri_jax.mechanics.jumps import in_words, jump_ahead
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
@@ -414,4 +415,14 @@ def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> Simul
         float(trajectory.info.residual[interval]),
         trajectory,
     )
-    return error.advised(float(macro_dt), swapped_at_start(trajectory))
+    return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, macro_dt, save_every))
+
+
+def _jump(trajectory: Trajectory, macro_dt, save_every: int) -> str:
+    """The sentence about a force that jumps in the failing step or the one after it; empty where none does."""
+    system, interval = trajectory.origin.system, int(trajectory.failed_at) // save_every
+    if system is None or np.ndim(trajectory.t) != 1:
+        return ""
+    last = trajectory[interval]
+    steps = int(trajectory.failed_at) - interval * save_every + 2
+    return in_words(jump_ahead(system, last, steps * float(macro_dt)), trajectory.names)

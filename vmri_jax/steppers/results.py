@@ -107,16 +107,17 @@ class SimulationError(RuntimeError):
             "throw=False returns it instead of raising."
         )
 
-    def advised(self, macro_dt: float, labels: str = "") -> "SimulationError":
+    def advised(self, macro_dt: float, labels: str = "", jump: str = "") -> "SimulationError":
         """The same with notes on a cause and on what to ask next.
 
         Args:
             macro_dt: of the run.
             labels: what is wrong with what is slow and what is fast.
+            jump: which force jumps where the run failed.
         """
         self.labels = labels
-        if labels:
-            self.add_note(labels)
+        for cause in filter(None, (jump, labels)):
+            self.add_note(cause)
         self.add_note(
             f"vmri_jax.stability.advise(problem, scheme, macro_dt={macro_dt:g}), or vmri advise on the command line, says whether this "
             "step is stable, which one near it is, and whether slow and fast variables are swapped."

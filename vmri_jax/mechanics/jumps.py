@@ -1,0 +1,137 @@
+"""Forces that jump, as dry friction does: a step that crosses a jump has no solution, or one that no iteration reaches.
+
+The forces ``F + dL/dq`` are followed from a state along two lines: straight ahead, and to the reversed velocities,
+
+    t + s,  q + s v,  v + s a,    0 <= s <= duration          t,  q,  v - s v,    0 <= s <= 2
+
+The part of a line with the largest change of a force is cut into pieces again and again: the change of a smooth force shrinks with its
+part, the change of a force that jumps stays.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.invariants import potentials
+from vmri_jax.mechanics.motion import motion
+from vmri_jax.mechanics.names import Names
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+
+PIECES = 65  # of a part; odd, since a force like v / |v| is not finite at the middle of the second line, where v = 0
+ROUNDS = 3  # times a part is cut: a change within 65^-3 of a line is a jump; with more rounds, steep forces are none
+KEPT = 0.5  # part of the change over the first piece that a jump keeps; above it, jumps of forces that vary are missed
+OVER_OTHERS = 10.0  # factor by which a jump exceeds all other changes in the last part: those by round-off are alike
+COORDINATES = 8  # forces that are followed, those with the most uneven changes; more of them take longer
+AT_ZERO = 1e-4  # part of the largest velocity on a line that counts as zero where a force jumps
+
+
+class Jump(NamedTuple):
+    """A force that jumps.
+
+    coordinate: its number, slow ones first.
+    before, behind: the force on either side of the jump, in the direction of the motion.
+    reverses: whether the velocity of the coordinate passes zero there.
+    """
+
+    coordinate: int
+    before: float
+    behind: float
+    reverses: bool
+
+
+def jump_ahead(system: System, state: State, duration: float) -> Jump | None:
+    """A force that jumps ahead of a state; None if none does.
+
+    Args:
+        system: its potentials, kinetic energy and forces.
+        state: where the lines start.
+        duration: time that the line straight ahead takes, and in which velocities may reach zero.
+    """
+    now = _motion(system, state)
+    v, a = (np.append(*x) for x in ((now.v_s, now.v_f), (now.a_s, now.a_f)))
+    every = np.ones(len(v), dtype=bool)
+    reached = np.abs(v) <= np.abs(a) * duration
+    for (dt, dq, dv), end, may_jump in (((1.0, v, a), duration, every), ((0.0, 0 * v, -v), 2.0, reached)):
+        found = _jump_on_line(system, state, (dt, dq, dv), end, may_jump)
+        if found is not None:
+            return found
+    return None
+
+
+def in_words(jump: Jump | None, names: Names) -> str:
+    """Which force jumps, and what to take instead; empty if none does.
+
+    Args:
+        jump: ahead of a state.
+        names: of the coordinates.
+    """
+    if jump is None:
+        return ""
+    label = [*names.slow_coordinates, *names.fast_coordinates][jump.coordinate]
+    sides = f"The likely cause: the force on {label} jumps from {jump.before:.4g} to {jump.behind:.4g} just ahead"
+    if jump.reverses:
+        return (
+            f"{sides}, where the velocity of {label} passes zero, as dry friction does. A step across a jump has no solution that the "
+            "iteration could reach, and sticking is out of scope. Take f tanh(v / eps) instead of f sign(v), with eps well below the "
+            "velocities of interest and a step below 2 m eps / f: what sticks then creeps, slower than eps."
+        )
+    return (
+        f"{sides}. A step across a jump has no solution that the iteration could reach. Take a smooth function instead of sign, "
+        "where, abs or round in forces and potentials, tanh(x / eps) for sign(x), and a step that resolves eps."
+    )
+
+
+def _jump_on_line(system: System, state: State, line: tuple, end: float, may_jump: np.ndarray) -> Jump | None:
+    """The first force that jumps on a line (rates of t, q and v), among those of the coordinates that may."""
+    s = np.linspace(0.0, end, PIECES + 1)
+    forces, velocities = _along(system, state, line, s)
+    changes = _changes(forces)
+    uneven = np.where(may_jump, changes.max(axis=0), 0.0) / np.maximum(changes.mean(axis=0), np.finfo(float).tiny)
+    for i in np.argsort(-uneven)[:COORDINATES]:
+        first, part, values, speeds = changes[:, i].max(), s, forces, velocities
+        if not (may_jump[i] and first > 0):
+            continue
+        for _ in range(ROUNDS - 1):
+            k = int(_changes(values)[:, i].argmax())
+            part = np.linspace(part[k], part[k + 1], PIECES + 1)
+            values, speeds = _along(system, state, line, part)
+        last = _changes(values)[:, i]
+        k = int(last.argmax())
+        if last[k] > max(KEPT * first, OVER_OTHERS * np.delete(last, k).max()):
+            reverses = abs(speeds[k, i]) <= AT_ZERO * abs(velocities[:, i]).max()
+            return Jump(int(i), float(values[k, i]), float(values[k + 1, i]), bool(reverses))
+    return None
+
+
+def _changes(forces: np.ndarray) -> np.ndarray:
+    """(pieces, n) what each force changes by over each piece; zero next to values that are not finite."""
+    return np.nan_to_num(np.abs(np.diff(forces, axis=0)), nan=0.0, posinf=0.0)
+
+
+def _along(system: System, state: State, line: tuple, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Forces and velocities (k, n) on a line."""
+    forces, velocities = _on_line(system, state, line, s)
+    return np.asarray(forces), np.asarray(velocities)
+
+
+_motion = jax.jit(motion)
+
+
+@jax.jit
+def _on_line(system, state, line, s):
+    now, (dt, dq, dv) = motion(system, state), line
+    q, v, n_s = jnp.append(state.q_s, state.q_f), jnp.append(now.v_s, now.v_f), state.q_s.size
+
+    def lagrangian(q, v):
+        q_s, q_f = q[:n_s], q[n_s:]
+        return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params) - sum(potentials(system, q_s, q_f))
+
+    def force(s):
+        here, velocity = q + s * dq, v + s * dv
+        outside = system.forces(state.t + s * dt, here[:n_s], here[n_s:], velocity[:n_s], velocity[n_s:])
+        return jax.grad(lagrangian)(here, velocity) + jnp.concatenate(outside), velocity
+
+    return jax.vmap(force)(s)
