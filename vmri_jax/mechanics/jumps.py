@@ -24,6 +24,9 @@ PIECES = 65  # of a part; odd, since a force like v / |v| is not finite at the m
 ROUNDS = 3  # times a part is cut: a change within 65^-3 of a line is a jump; with more rounds, steep forces are none
 KEPT = 0.5  # part of the change over the first piece that a jump keeps; above it, jumps of forces that vary are missed
 OVER_OTHERS = 10.0  # factor by which a jump exceeds all other changes in the last part: those by round-off are alike
+ROUND_OFF = (
+    1e-6  # part of a force up to which its jump may be round-off of positions; above it, small frictions are missed
+)
 COORDINATES = 8  # forces that are followed, those with the most uneven changes; more of them take longer
 AT_ZERO = 1e-4  # part of the largest velocity on a line that counts as zero where a force jumps
 
@@ -100,7 +103,8 @@ def _jump_on_line(system: System, state: State, line: tuple, end: float, may_jum
             values, speeds = _along(system, state, line, part)
         last = _changes(values)[:, i]
         k = int(last.argmax())
-        if last[k] > max(KEPT * first, OVER_OTHERS * np.delete(last, k).max()):
+        size = np.abs(values[k : k + 2, i]).max()
+        if last[k] > max(KEPT * first, OVER_OTHERS * np.delete(last, k).max(), ROUND_OFF * size):
             reverses = abs(speeds[k, i]) <= AT_ZERO * abs(velocities[:, i]).max()
             return Jump(int(i), float(values[k, i]), float(values[k + 1, i]), bool(reverses))
     return None
@@ -108,7 +112,9 @@ def _jump_on_line(system: System, state: State, line: tuple, end: float, may_jum
 
 def _changes(forces: np.ndarray) -> np.ndarray:
     """(pieces, n) what each force changes by over each piece; zero next to values that are not finite."""
-    return np.nan_to_num(np.abs(np.diff(forces, axis=0)), nan=0.0, posinf=0.0)
+    with np.errstate(invalid="ignore", over="ignore"):  # of infinities
+        changes = np.abs(np.diff(forces, axis=0))
+    return np.where(np.isfinite(changes), changes, 0.0)
 
 
 def _along(system: System, state: State, line: tuple, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
