@@ -81,7 +81,8 @@ def test_a_fit(tmp_path):
     assert (tmp_path / "fit.png").stat().st_size > 10_000
 
 
-def test_optimal_control():
+def test_optimal_control(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     scope = {}
     exec(next(program for program in PROGRAMS if "vm.control.minimize(" in program), scope)
     assert scope["optimum"].converged
