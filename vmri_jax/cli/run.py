@@ -17,7 +17,7 @@ from vmri_jax import plots
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
 from vmri_jax.cli.common import PICTURES, RUN, check_target_file, console, plain_table, print_failure, refusals
-from vmri_jax.running.arguments import NOTHING_FAST
+from vmri_jax.running.arguments import nothing_fast
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.simulate import simulate as run_at_once
 from vmri_jax.running.store import StoredTrajectory, stream
@@ -109,7 +109,7 @@ def simulate(
     _print_named(
         {
             "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
-            "": NOTHING_FAST if problem.q_f.size == 0 and chosen.num_micro > 1 else "",
+            "": nothing_fast(chosen, problem.q_f.size),
             "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
             "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
             **_summary(trajectory, problem.system.is_constrained),

@@ -8,7 +8,7 @@ from rich.markup import escape
 from vmri_jax.catalogue import find_scene, find_scheme
 from vmri_jax.cli import options
 from vmri_jax.cli.common import RIGHT, console, refusals, status
-from vmri_jax.running.arguments import NOTHING_FAST
+from vmri_jax.running.arguments import nothing_fast
 
 app = typer.Typer()
 
@@ -41,5 +41,6 @@ def explain(
     console.print(ledger.table())
     console.print()
     console.print(ledger.reasons())
-    if chosen.num_micro > 1 and all(row.grid == "macro" for row in ledger.rows if row.kind == "body"):
-        console.print(f"\n[yellow]{escape(NOTHING_FAST)}[/yellow]")
+    useless = nothing_fast(chosen, sum(row.kind == "body" and row.grid != "macro" for row in ledger.rows))
+    if useless:
+        console.print(f"\n[yellow]{escape(useless)}[/yellow]")

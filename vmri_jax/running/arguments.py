@@ -5,16 +5,12 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, real_array, require_x64, whole_number
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params
 from vmri_jax.mechanics.state import State
-from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 
 WHOLE = 1e-9
 """Part by which a number of steps may miss a whole number."""
-NOTHING_FAST = (
-    "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1; or say which potential is slow, "
-    'Torsion(..., rate="slow"), or which bodies are fast, Body(..., pace="fast").'
-)
 
 
 def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro=False):
@@ -39,6 +35,21 @@ def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_en
     if is_concrete(vars(state)):
         check_vectors(state)
     return dt, *counts
+
+
+def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
+    """What to do about several micro steps for a scene without fast bodies; empty where there is nothing to say.
+
+    Args:
+        scheme: of a composition, the micro steps of a stage count.
+        num_fast: number of fast coordinates, or of fast bodies.
+    """
+    if num_fast or stage_scheme(scheme).num_micro == 1:
+        return ""
+    return (
+        "no body of the scene is fast, so that all micro steps but one resolve nothing. Take num_micro=1; or say which potential is slow, "
+        'Torsion(..., rate="slow"), or which bodies are fast, Body(..., pace="fast").'
+    )
 
 
 def steps_until(t_end, t, macro_dt) -> int:

@@ -1,8 +1,14 @@
 """Whether a run that went through has lost its energy, as an unstable step does that does not overflow."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.mechanics.invariants import energy_parts
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.origin import at_nodes
 from vmri_jax.running.trajectory import Trajectory
 
 
@@ -15,14 +21,20 @@ LOST = 0.5
 LOOKED_AT = 1000
 """Nodes at which the kinetic energy is computed."""
 ROUNDOFF = 1e-9
-"""Part of the energy below which changes are not looked at."""
+"""Part of the terms T, V and W below which changes of their sum are round-off; a larger one hides losses of systems whose terms cancel."""
+DIGITS = 10 * np.finfo(float).eps
+"""Part of the largest position that a step may move positions by round-off alone; a larger one hides slower motions."""
 
 
-def lost_energy(run: Trajectory) -> str:
+def lost_energy(run: Trajectory, macro_dt: float) -> str:
     """What is wrong with the energy of a run of a system that keeps it; empty where nothing is.
+
+    A system at rest moves by round-off: n steps H change velocities by up to ``sqrt(n) DIGITS |q| / H``, in random directions. A kinetic
+    energy below that of such velocities, and a change below round-off of the terms that make up the energy, say nothing.
 
     Args:
         run: one run, without a failure, that knows its system; of constant masses, else nothing is said.
+        macro_dt: step H.
     """
     system = run.origin.system
     if system is None or not system.keeps_energy or not isinstance(system.kinetic, ConstantMass):
@@ -36,11 +48,13 @@ def lost_energy(run: Trajectory) -> str:
     slow = _kinetic(system.kinetic.slow_mass, np.asarray(run.p_s)[nodes])
     fast = _kinetic(system.kinetic.fast_mass, np.asarray(run.p_f)[nodes])
     kinetic = (slow + fast).max()
-    if not change[worst] > LOST * kinetic:
+    if not change[worst] > max(LOST * kinetic, _kinetic_of_roundoff(run, macro_dt)):
+        return ""
+    if not change[worst] > ROUNDOFF * np.max(at_nodes(_size_of_terms, run.origin, _states(run, nodes))):
         return ""
     return (
-        f"the energy, which the system keeps, has changed by {change[worst]:.3g} at t = {run.t[worst]:.4g}, and the largest kinetic "
-        f"energy is {kinetic:.3g}: this is no motion of the system. Take smaller steps, or ask vmri_jax.stability.advise(problem, "
+        f"the computed motion is wrong: the energy, which the system keeps, has changed by {change[worst]:.3g} at t = {run.t[worst]:.4g}, "
+        f"and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, or ask vmri_jax.stability.advise(problem, "
         "scheme, macro_dt=...) which are stable."
     )
 
@@ -50,3 +64,20 @@ def _kinetic(mass, p: np.ndarray) -> np.ndarray:
     if isinstance(mass, Diagonal):
         return (p**2 / np.asarray(mass.masses)).sum(axis=1) / 2
     return np.einsum("ki,ik->k", p, np.linalg.solve(np.asarray(mass.matrix), p.T)) / 2
+
+
+def _kinetic_of_roundoff(run: Trajectory, macro_dt: float) -> float:
+    """Kinetic energy of velocities that round-off of the positions makes in the steps of a run."""
+    mass, steps = run.origin.known_system.kinetic, float(run.t[-1] - run.t[0]) / macro_dt
+    position = max(np.abs(q).max(initial=0.0) for q in (np.asarray(run.q_s), np.asarray(run.q_f)))
+    total = sum(float(jnp.trace(part.matrix)) for part in (mass.slow_mass, mass.fast_mass))
+    return total * steps * (DIGITS * position / macro_dt) ** 2 / 2
+
+
+def _states(run: Trajectory, nodes: np.ndarray) -> State:
+    return jax.tree.map(lambda a: np.asarray(a)[nodes], run.states)
+
+
+def _size_of_terms(system: System, state: State):
+    """``|T| + |V| + |W|``."""
+    return sum(jnp.abs(part) for part in energy_parts(system, state.q_s, state.q_f, state.p_s, state.p_f).values())

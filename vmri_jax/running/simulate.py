@@ -19,7 +19,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.adjoints import check_adjoint
-from vmri_jax.running.arguments import NOTHING_FAST, check_run, check_vectors
+from vmri_jax.running.arguments import check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Engine, engine, room_for
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
@@ -103,7 +103,7 @@ def simulate(
         check_constraints(run.system, run.state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, save_every)
-    lost = lost_energy(trajectory) if int(trajectory.failed_at) < 0 else ""
+    lost = lost_energy(trajectory, float(run.macro_dt)) if int(trajectory.failed_at) < 0 else ""
     if lost:
         warnings.warn(f"simulate: {lost}", LostEnergyWarning, stacklevel=2)
     return trajectory
@@ -361,8 +361,9 @@ def simulation(
     macro_dt, num_steps, save_every = check_run(
         system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro
     )
-    if given is not problem and state.q_f.size == 0 and scheme.num_micro > 1:
-        warnings.warn(f"simulate: {NOTHING_FAST}", stacklevel=3)
+    useless = nothing_fast(scheme, state.q_f.size) if given is not problem else ""
+    if useless:
+        warnings.warn(f"simulate: {useless}", stacklevel=3)
     newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
     leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))
