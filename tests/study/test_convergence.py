@@ -174,3 +174,23 @@ def test_cases_side_by_side(tmp_path):
         convergence_study(PROBLEM, schemes, STEPS, 1.0, num_saves=5, params=params, reference=study.references["soft"])
     with pytest.raises(ValueError, match="params is empty"):
         convergence_study(PROBLEM, schemes, STEPS, 1.0, num_saves=5, params={})
+
+
+def driven(t, q_s, q_f, v_s, v_f, params):
+    """Work that is much larger than the error of any step here."""
+    return 5.0 + jnp.sin(4.0 * t) - 0.5 * v_s, 0.0 * v_f
+
+
+def test_the_energy_of_a_driven_system_has_an_error_too():
+    """It is not its change, which is the work that is done."""
+    problem = dataclasses.replace(PROBLEM, system=PROBLEM.system.replace(force=driven))
+    reference = reference_solution(problem, 1.0, num_saves=5, num_steps=100, degree=2)
+    study = convergence_study(
+        problem, {"implicit": vm.fully_implicit(2)}, (0.02, 0.01), 1.0, num_saves=5, reference=reference
+    )
+    coarse, fine = (row.energy_error for row in study.rows)
+    run = vm.simulate(problem, vm.fully_implicit(2), macro_dt=0.01, num_steps=100, save_every=20)
+    assert abs(run.energy - run.energy[0]).max() > 3.0  # measured 6.3
+    assert coarse / fine == pytest.approx(4, rel=0.05)  # measured 4.04
+    assert fine < 2e-3  # measured 3.8e-4
+    assert all(row.energy_band <= 2 * row.energy_error for row in study.rows)

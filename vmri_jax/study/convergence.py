@@ -7,6 +7,7 @@ The error of a run is the largest difference over all saved nodes and all coordi
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -39,8 +40,9 @@ class ConvergenceRow:
 
     case: label of the parameters, "" if there is one set only.
     error_q, error_p: of positions and momenta.
-    energy_error, energy_drift, energy_band: largest change of the energy since the start; change over the run of the
-        straight line fitted to it; largest distance from that line.
+    energy_error, energy_drift, energy_band: largest error of the energy; change over the run of the straight line fitted to this
+        error; largest distance from that line. The error is the change since the start where the system keeps its energy; where forces or
+        moving constraints do work, it is the difference from the energy of the reference.
     momentum_error: largest change of a momentum map since the start.
     constraint_residual: largest constraint value, of positions or velocities.
     iterations, method, result: most Newton iterations of a step, costliest `Method`, `Result`.
@@ -98,6 +100,8 @@ def _of_finest(name: str, form: str = ".1e") -> Callable[[SchemeSummary], str]:
 @dataclass(frozen=True)
 class ConvergenceStudy(ResultTable):
     """Rows of a convergence study, schemes one after the other, then cases, and macro steps as given.
+
+    The column "energy" of its table is the error of the energy, see `ConvergenceRow`, at the smallest step.
 
     references: reference solutions by case.
     """
@@ -251,6 +255,7 @@ def convergence_study(
         lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][1]:g}", done, total),
     )
     found = dict(zip(labels, runs, strict=True))
+    energies = {case: _energies(changed, references[case]) for case, changed in cases.items()}
     rows = [
         _row(
             label,
@@ -261,6 +266,7 @@ def convergence_study(
             momentum_maps,
             found[label, num_steps][k],
             references[case],
+            energies[case],
         )
         for label, scheme in schemes.items()
         for k, (case, changed) in enumerate(cases.items())
@@ -338,10 +344,19 @@ def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
     return num_steps
 
 
-def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, reference) -> ConvergenceRow:
+def _energies(problem: Problem, reference: ReferenceSolution) -> np.ndarray | None:
+    """(num_saves + 1,) energies of a reference; None where the system keeps its energy, so that the start tells it."""
+    if problem.system.keeps_energy:
+        return None
+    phase = [part for both in (reference.q, reference.p) for part in np.split(both, [problem.q_s.size], axis=1)]
+    return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, problem.system)))(*phase))
+
+
+def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, reference, energies) -> ConvergenceRow:
     error_q, error_p = reference.errors(trajectory)
     energy = np.asarray(trajectory.energy)
-    drift, band = _drift_and_band(np.asarray(trajectory.t), energy)
+    off = energy - (energy[0] if energies is None else energies)
+    drift, band = _drift_and_band(np.asarray(trajectory.t), off)
     phase = trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f
     maps = [np.asarray(jax.vmap(lambda *z, xi=xi: diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
     return ConvergenceRow(
@@ -352,7 +367,7 @@ def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, refer
         macro_dt=macro_dt,
         error_q=error_q,
         error_p=error_p,
-        energy_error=float(np.abs(energy - energy[0]).max()),
+        energy_error=float(np.abs(off).max()),
         energy_drift=drift,
         energy_band=band,
         momentum_error=float(max((np.abs(m - m[0]).max() for m in maps), default=0.0)),
@@ -364,7 +379,7 @@ def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, refer
 
 
 def _drift_and_band(t: np.ndarray, energy: np.ndarray) -> tuple[float, float]:
-    """Change over the run of the line fitted to the energy, and the largest distance from it."""
+    """Change over the run of the line fitted to an error of the energy, and the largest distance from it."""
     if not np.isfinite(energy).all():
         return float("nan"), float("nan")
     line = np.polynomial.Polynomial.fit(t, energy, 1)
