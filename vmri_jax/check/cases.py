@@ -201,11 +201,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
     problem = problem_of("cases_for", problem)
     own, system = resolved(problem), problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
-    implicit = "its constraints are solved for in every step" if system.is_constrained else ""
-    masses = "" if system.has_constant_mass else "its masses are not constant"
-    work = _does_work(system)
-    one_way = work or _turns_one_way(problem)
-    explicit = work or masses or implicit
+    one_way = _turns_one_way(problem)
 
     def precision(full: bool) -> Outcome:
         return single_precision(problem, own.macro_dt)
@@ -222,12 +218,12 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         ("advice", step, "no error, no warning", own.advice),
         ("rank of the constraints", step, "rows independent at the start and on the way", own.rank, unconstrained),
         ("constraints for long", step, "position constraint below 1e-10", own.constraints, unconstrained),
-        ("energy for long", step, ENERGY_CRITERION, own.energy, work),
+        ("energy for long", step, ENERGY_CRITERION, own.energy, _does_work(system)),
         ("loose Newton tolerance", f"{step}, 1e-4 to 1e-12", "error shrinks with the tolerance", own.tolerance),
         ("tiny steps", f"{step} and smaller", "scaled condition flat", own.tiny_steps),
         ("reversibility", step, "back at the start to 1e-6", own.reversal, one_way),
-        ("explicit limit", f"fully_explicit, {one}", EXPLICIT_CRITERION, own.explicit_limit, explicit),
-        ("reductions", one, "known methods to 1e-10", own.reductions, work or masses),
+        ("explicit limit", f"fully_explicit, {one}", EXPLICIT_CRITERION, own.explicit_limit, _has_no_limit(system)),
+        ("reductions", one, "known methods to 1e-10", own.reductions, _is_not_reduced(system)),
         ("float32", "64-bit mode off, and float32 data", "refused with the one-line fix", precision),
         ("one bad lane in a batch", step, LANE_CRITERION, lane),
         ("derivatives", step, "gradients and Hessians are those of the functions, to 1e-4", differences),
@@ -240,16 +236,42 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
 
 
 def _does_work(system: System) -> str:
-    """Why energy and reversal say nothing about the scheme; empty for a closed system."""
+    """Why no energy is kept; empty for a closed system."""
     if system.is_rheonomic:
-        return "its constraints move with time: they do work, and the way back is another motion"
+        return "its constraints move with time and do work: no energy is kept"
     if system.force is not None:
-        return "it has forces besides its potentials: they may do work, and the way back is another motion"
+        return "it has forces besides its potentials, which may do work: no energy is kept"
+    return ""
+
+
+def _has_no_limit(system: System) -> str:
+    """Why ``omega h = 2`` is not where an explicit scheme becomes unstable; empty where it is."""
+    if system.is_constrained:
+        return "every step solves for the multipliers of its constraints, explicit schemes too"
+    if not system.has_constant_mass:
+        return "its kinetic energy is a function, not that of constant masses: every step solves equations"
+    if system.force is not None:
+        return "it has forces besides its potentials: every step solves equations, and damping changes the limit"
+    return ""
+
+
+def _is_not_reduced(system: System) -> str:
+    """Why the known methods, as written here, are others; empty where the scheme reduces to them."""
+    if not system.has_constant_mass:
+        return "its kinetic energy is a function, and the known methods are written here for constant masses"
+    if system.is_rheonomic:
+        return "its constraints move with time, and the known methods are written here for constraints at rest"
+    if system.force is not None:
+        return "it has forces besides its potentials, and the known methods are written here for potentials alone"
     return ""
 
 
 def _turns_one_way(problem: Problem) -> str:
-    """Why turned momenta do not lead back; empty if the kinetic energy is even in the velocities."""
+    """Why turned momenta do not lead back; empty for potentials, and a kinetic energy that is even in the velocities."""
+    if problem.system.is_rheonomic:
+        return "its constraints move with time: the way back is another motion"
+    if problem.system.force is not None:
+        return "it has forces besides its potentials, as friction and drives: the way back is another motion"
     random, system = np.random.default_rng(0), problem.system
     v_s, v_f = (random.uniform(-1, 1, q.shape) for q in (problem.q_s, problem.q_f))
     there, back = (float(system.kinetic(problem.q_s, problem.q_f, v_s * x, v_f * x, system.params)) for x in (1, -1))
