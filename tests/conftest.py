@@ -9,6 +9,8 @@ import jax
 import pytest
 from hypothesis import settings
 
+from tests.durations import Durations
+
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=50)
 settings.load_profile("repeatable")
 
@@ -20,6 +22,9 @@ LONGEST = ("verification", "steppers")
 
 def pytest_addoption(parser):
     parser.addoption("--full", action="store_true", help="also the tests that take long")
+    parser.addoption(
+        "--budget", action="store_true", help="fail if a test or a file takes more processor time than tests/durations.py allows"
+    )
     parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
     parser.addoption(
         "--kernels", choices=["plain", "cpu"], help="which small dense algebra; default: the package's own"
@@ -34,9 +39,14 @@ def pytest_configure(config):
                 "--kernels: vmri_jax is imported already; import it in fixtures of conftest.py only"
             )
         os.environ["VMRI_KERNELS"] = kernels  # read where the package is imported, also in processes of tests
-    from vmri_jax import configure
+    programs = config.cache.mkdir("programs")
+    os.environ["XDG_CACHE_HOME"] = str(programs)  # processes of tests that call `vmri` or workers of ensembles
+    from vmri_jax.configure import SECONDS_WORTH_KEEPING, cache_folder, configure
 
-    configure()
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_folder())  # all other processes of tests
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(SECONDS_WORTH_KEEPING)
+    configure(cache=cache_folder())
+    config.pluginmanager.register(Durations(config.getoption("--budget")), "durations")
     # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random velocities.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.LostEnergyWarning")

@@ -25,6 +25,9 @@ FAST_LOOPS = (
 further back to the store it could be replaced by (short chains 1.4 times); vector registers are filled (long chains 1.3); and
 sums over many lanes stay in the kernel, where a library would do them (batches of high order 2.6). XLA ignores names of passes
 that it does not know."""
+SECONDS_WORTH_KEEPING = 0.2
+"""Time to compile from which a program is kept in the cache on disk: reading a file takes some milliseconds. A larger value leaves
+more programs to be compiled by every process, a smaller one fills the folder with programs that are compiled as fast as read."""
 LATER = "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made."
 
 
@@ -60,7 +63,7 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
         jax.config.update("jax_cpu_enable_async_dispatch", False)
     if cache is not None:
         jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS_WORTH_KEEPING)
 
 
 def loops_are_fast() -> bool:
