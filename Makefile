@@ -1,17 +1,24 @@
 # Two commands do all: `make reproduce` and `make test`. Both build .venv from the lock of versions first.
+# OPTIONS are handed on to pytest, as in `make test OPTIONS=--full`.
 PYTHON ?= python3
 BIN := .venv/bin
 ENVIRONMENT ?= .venv
 OLDER ?= python3.11
 NEWER ?= python3.13
 
-.PHONY: reproduce test smoke notebooks docs bench lint lock clean
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+TOOLS := tests/benchmarks tests/pages tests/ensembles/test_workers.py
+
+.PHONY: reproduce test test-tools smoke notebooks docs bench lint lock clean
 
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
 
-test: .venv/installed  ## the whole test suite
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --ignore tests/smoke
+test: .venv/installed  ## the library
+	$(PYTEST) $(addprefix --ignore=,tests/smoke $(TOOLS)) $(OPTIONS)
+
+test-tools: .venv/installed  ## benchmarks, notebooks, programs and commands of the pages, ensembles on workers
+	$(PYTEST) $(TOOLS) $(OPTIONS)
 
 smoke:  ## a few minutes: every kind of step, with another environment, make smoke ENVIRONMENT=/path/to/venv
 	$(ENVIRONMENT)/bin/python -m pytest -n 2 tests/smoke

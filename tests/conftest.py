@@ -23,7 +23,9 @@ LONGEST = ("verification", "steppers")
 def pytest_addoption(parser):
     parser.addoption("--full", action="store_true", help="also the tests that take long")
     parser.addoption(
-        "--budget", action="store_true", help="fail if a test or a file takes more processor time than tests/durations.py allows"
+        "--budget",
+        action="store_true",
+        help="fail if a test or a file takes more processor time than tests/durations.py allows",
     )
     parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
     parser.addoption(

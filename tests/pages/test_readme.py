@@ -10,7 +10,7 @@ import pytest
 
 import vmri_jax as vm
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TEXT = "\n".join(path.read_text() for path in PAGES)
 PROGRAMS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
