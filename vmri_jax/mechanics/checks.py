@@ -89,7 +89,12 @@ def check_system(system: System, q_s, q_f) -> None:
             if getattr(shape, "shape", None) != ():
                 raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a scalar, shape ().")
             _check_float64(name, shape)
-    for name, args in (("constraint", (q_s, q_f)), ("slow_constraint", (q_s,))):
+    if system.implied is not None and not system.is_constrained:
+        raise ValueError(
+            "System: implied is given, but neither constraint nor slow_constraint: its rows are watched, not solved for, and must "
+            "follow from rows that are. Give it as constraint."
+        )
+    for name, args in (("constraint", (q_s, q_f)), ("slow_constraint", (q_s,)), ("implied", (q_s, q_f))):
         function, args = with_time(getattr(system, name), jnp.zeros(()), *args, system.params)
         if function is not None:
             shape = shape_of(f"System: {name}", function, *args)

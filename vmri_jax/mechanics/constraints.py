@@ -136,6 +136,8 @@ def check_constraints(
         return
     values, slow, fast, alone = _values_and_jacobians(system, state.t, state.q_s, state.q_f)
     _check_values(values, what, tolerance, advice)
+    if system.implied is not None:
+        _check_implied(np.asarray(_implied_values(system, state.t, state.q_s, state.q_f)), what)
     if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
@@ -173,6 +175,21 @@ def _check_values(values, what: str, tolerance: float, advice: str) -> None:
         raise ValueError(
             f"{what} violate the constraints by {worst:.3e} (row {np.abs(values).argmax()} of {values.size}, tolerance "
             f"{tolerance:.0e}); {advice}"
+        )
+
+
+@jax.jit
+def _implied_values(system, t, q_s, q_f):
+    return system.g_implied(t, q_s, q_f)
+
+
+def _check_implied(values, what: str) -> None:
+    opened = np.flatnonzero(~(np.abs(values) <= CONSTRAINT_TOLERANCE))
+    if opened.size:
+        raise ValueError(
+            f"System: implied does not follow from the constraints: {what} keep these, and row(s) {opened.tolist()} of implied are "
+            f"{values[opened]} there (tolerance {CONSTRAINT_TOLERANCE:.0e}). Take parameters for which they follow, or hold them "
+            "as constraint."
         )
 
 

@@ -51,10 +51,16 @@ def constraint_residual(system: System, state: State):
     """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,).
 
     Args:
-        system: its constraints; without any both are zero.
+        system: its constraints, and the rows that they imply; without any both are zero.
         state: time, positions and momenta.
     """
-    return jax.vmap(max_abs)(jnp.stack(all_constraints(system, state)))
+    levels = all_constraints(system, state)
+    if system.implied is not None:
+        at = state.t, state.q_s, state.q_f
+        v = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+        implied = system.g_implied(*at), system.implied_rates(*at, *v)
+        levels = [jnp.concatenate(rows) for rows in zip(levels, implied, strict=True)]
+    return jax.vmap(max_abs)(jnp.stack(levels))
 
 
 def all_constraints(system: System, state: State):
@@ -72,7 +78,7 @@ def velocity(system: System, q_s, q_f, p_s, p_f):
         q_s, q_f: (n_s,) and (n_f,) positions, at which masses that depend on them are taken.
         p_s, p_f: (n_s,) and (n_f,) momenta.
     """
-    free = system.replace(constraint=None, slow_constraint=None)
+    free = system.replace(constraint=None, slow_constraint=None, implied=None)
     return project_momentum(free, State(jnp.zeros(()), q_s, q_f, p_s, p_f))[2:]
 
 

@@ -26,6 +26,7 @@ ARGUMENTS = {
     "constraint": "q_s, q_f, params",
     "slow_constraint": "q_s, params",
     "force": "t, q_s, q_f, v_s, v_f, params",
+    "implied": "q_s, q_f, params",
 }
 """Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
 _INSTEAD = {
@@ -56,6 +57,9 @@ class System(eqx.Module):
         force: ``F(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)``, not derived from a potential.
         params: any pytree of arrays, handed to every function; traced, so that sweeps and gradients over it
             never recompile.
+        implied: ``g_i(q_s, q_f, params) -> (n_i,)``, rows that follow from the constraints and would be too many among them,
+            scaled to order one; or a `Rheonomic` function. They are not solved for, and get no multipliers. A run watches them
+            at its saved nodes: they count in `constraint_residual`, and where one is not zero the run ends as `NOT_IMPLIED`.
 
     Functions are compared by identity: define them at module level (not inside a loop) and pass what varies
     through `params`, and everything is compiled once. They are kept as `TracedOnce`, so that ``system.force`` is called
@@ -69,6 +73,7 @@ class System(eqx.Module):
     slow_constraint: TracedOnce | Rheonomic | None = eqx.field(static=True, default=None)
     force: TracedOnce | None = eqx.field(static=True, default=None)
     params: Any = None
+    implied: TracedOnce | Rheonomic | None = eqx.field(static=True, default=None)
 
     def __init__(
         self,
@@ -79,6 +84,7 @@ class System(eqx.Module):
         slow_constraint=None,
         force=None,
         params=None,
+        implied=None,
     ):
         functions = {
             "slow_potential": slow_potential,
@@ -86,6 +92,7 @@ class System(eqx.Module):
             "constraint": constraint,
             "slow_constraint": slow_constraint,
             "force": force,
+            "implied": implied,
         }
         for name, function in functions.items():
             setattr(self, name, _checked(name, function))
@@ -111,6 +118,10 @@ class System(eqx.Module):
     def g_slow(self, t, q_s):
         """Values of `slow_constraint`, shape (n_gs,); n_gs = 0 where there is none."""
         return _constrain(self.slow_constraint, t, q_s, self.params)
+
+    def g_implied(self, t, q_s, q_f):
+        """Values of `implied`, shape (n_i,); n_i = 0 where there is none."""
+        return _constrain(self.implied, t, q_s, q_f, self.params)
 
     @property
     def has_constant_mass(self) -> bool:
@@ -148,6 +159,12 @@ class System(eqx.Module):
             return jax.jvp(self.constraints, (t, q_s, q_f), (jnp.ones_like(t), v_s, v_f))[1]
         return jax.jvp(partial(self.constraints, t), (q_s, q_f), (v_s, v_f))[1]
 
+    def implied_rates(self, t, q_s, q_f, v_s, v_f):
+        """Rates of the values of `implied`, shape (n_i,)."""
+        if isinstance(self.implied, Rheonomic):
+            return jax.jvp(self.g_implied, (t, q_s, q_f), (jnp.ones_like(t), v_s, v_f))[1]
+        return jax.jvp(partial(self.g_implied, t), (q_s, q_f), (v_s, v_f))[1]
+
     def num_constraints(self, q_s, q_f) -> tuple[int, int]:
         """``(n_g, n_gs)`` for configurations of these shapes."""
         t = jnp.zeros(())
@@ -158,7 +175,7 @@ def _checked(name: str, function):
     """A function of the system as it is kept, or None."""
     if function is None:
         return None
-    if isinstance(function, Rheonomic) and name in ("constraint", "slow_constraint"):
+    if isinstance(function, Rheonomic) and name in ("constraint", "slow_constraint", "implied"):
         _check_function(name, function.function, "t, ")
         return Rheonomic(traced_once(function.function))
     if not callable(function):
@@ -183,5 +200,6 @@ def _check_function(name: str, function, before: str = "") -> None:
             f"System: {name} is {function!r}, which has no hash: programs are compiled once per function. Give a plain "
             "function, with what varies in params."
         ) from None
-    instead = "" if name == "force" else NO_VELOCITY if "constraint" in name else NO_TIME
+    holonomic = name in ("constraint", "slow_constraint", "implied")
+    instead = "" if name == "force" else NO_VELOCITY if holonomic else NO_TIME
     check_arguments(f"System: {name}", function, before + ARGUMENTS[name], instead.format(**_INSTEAD))

@@ -19,6 +19,7 @@ from vmri_jax.running.trajectory import Trajectory, from_arrays
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import Result
 
 WORKING_SET = 4096
 """Fast and slow variables at all nodes of a macro step that the lanes of a chunk may have together, 32 kB."""
@@ -96,7 +97,8 @@ def simulate_batch(
         "macro_dt": None if dt.ndim == 0 else dt * (scheme.num_micro if micro_dt is not None else 1),
     }
     trajectory = _in_chunks(run, run.engine, batch, width, devices)
-    failed = np.flatnonzero(np.asarray(trajectory.failed_at) >= 0)
+    unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
+    failed = np.flatnonzero(unsolved)
     if failed.size and run.plan.has_fallback:
         exact = replace(
             run.engine, structure=jax.tree.structure((replace(run.newton, method="arrowhead"), scheme, system))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
+from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
@@ -188,15 +189,20 @@ def _step_of(stepper: Plan, t_start, macro_dt, save_micro: bool):
 def _node(system: System, tolerance, at: _At):
     """What is saved of a node, the first seven fields of a `Trajectory`; and the status after a look at it.
 
-    A potential may be NaN where its gradient is not (a logarithm beyond its pole), and a lane of a batch may start off its
-    constraints: such nodes are no result either.
+    A potential may be NaN where its gradient is not (a logarithm beyond its pole), a lane of a batch may start off its
+    constraints, and rows that were left out may not follow from them: such nodes are no result either.
     """
     state = at.state
     phase = state.q_s, state.q_f, state.p_s, state.p_f
     energy, residual = invariants.energy(system, *phase), invariants.constraint_residual(system, state)
-    finite, kept = jnp.isfinite(energy), residual[0] <= jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
+    allowed = jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
+    finite, kept = jnp.isfinite(energy), residual[0] <= allowed
     breaks = (at.failed_at < 0) & ~(finite & kept)
-    cause = jnp.where(finite, Result.CONSTRAINT_VIOLATED, Result.NON_FINITE)
+    violated = Result.CONSTRAINT_VIOLATED
+    if system.implied is not None:  # the residual has rows that are not solved for, too
+        solved = max_abs(system.constraints(state.t, state.q_s, state.q_f))
+        violated = jnp.where(solved <= allowed, Result.NOT_IMPLIED, violated)
+    cause = jnp.where(finite, violated, Result.NON_FINITE)
     result = jnp.where(breaks, cause, at.result)
     failed_at = jnp.where(breaks, jnp.maximum(at.step - 1, 0), at.failed_at)
     values = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))

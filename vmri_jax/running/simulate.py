@@ -332,8 +332,8 @@ class Simulation:
         return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
-        """Whether a step failed that another method may solve: none does where equations are explicit or linear."""
-        failed = self.may_fall_back and int(piece.failed_at) >= 0
+        """Whether a step failed that another method may solve: not where equations are explicit or linear, or solved, as of `NOT_IMPLIED`."""
+        failed = self.may_fall_back and int(piece.failed_at) >= 0 and int(piece.result) != Result.NOT_IMPLIED
         return failed and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
 
     def in_parts(self) -> Trajectory:

@@ -51,7 +51,7 @@ class Trajectory(Exports, eqx.Module):
     Attributes:
         q_s, q_f, p_s, p_f: positions and momenta; NaN after a failure.
         energy: Hamiltonian.
-        constraint_residual: largest |g| and largest |G v|.
+        constraint_residual: largest |g| and largest |G v|, of the rows that were left out as implied, too.
         info: what the solver did since the node before.
         t_micro, q_f_micro: the micro nodes of the macro step that ends at each saved node (its start excluded); None unless
             asked for.

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
 from vmri_jax.scene.layout import join
 from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import FUNCTIONS, MASS, Actuation, SomeRows
+from vmri_jax.scene.terms import FUNCTIONS, IMPLIED, MASS, Actuation, DroppedRows, SomeRows
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
@@ -24,14 +26,18 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         if part.effect.kind == "potential":
             potentials[name] = (*potentials.get(name, ()), *made)
         terms.setdefault(part.home, []).extend([SomeRows(made, part.dropped)] if part.dropped else made)
+        if part.dropped:
+            terms.setdefault("implied", []).append(DroppedRows(made, part.dropped))
     functions: dict[str, Any] = {home: FUNCTIONS[home](tuple(terms[home])) for home in FUNCTIONS if terms.get(home)}
-    for home in ("constraint", "slow_constraint"):
+    for home in ("constraint", "slow_constraint", "implied"):
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])
     params: dict[str, Any] = {part.effect.name: part.effect.parameters(bodies) for part in placed}
     slow, fast = (join(bodies, places, part, "masses") for part in ("s", "f"))
     if "kinetic" in functions:
         params[MASS] = {"slow": slow, "fast": fast}
+    if "implied" in functions:
+        params[IMPLIED] = np.concatenate([part.sizes for part in placed])
     kinetic = functions.pop("kinetic", None) or ConstantMass(slow, fast)
     return System(kinetic, **functions, params=params)
 

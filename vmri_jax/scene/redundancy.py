@@ -1,30 +1,61 @@
-"""Constraints that are too many, found at the start and named."""
+"""Constraints that are too many, found and named; those that are left out must follow from the others along the motion.
 
-from collections.abc import Sequence
+A row whose gradient depends on those of the other rows at the start need not depend on them elsewhere: the third distance of three
+atoms in line, or a linkage that lies flat. The rows g_k that stay are independent at the start, so that ``g_k = 0`` is a smooth
+surface there. The others follow from them if and only if they vanish on that surface around the start, which is looked at where
+random motions along it lead.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import chain
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import qr
 
-from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.constraints import RANK, rank_of
-from vmri_jax.scene.body import moving
-from vmri_jax.scene.labels import label
 from vmri_jax.scene.rigid import Rigidity
-from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import EffectTerm
+from vmri_jax.scene.rows import HOMES, ConstraintRows
+from vmri_jax.scene.sorting import Sorting
 
-HOMES = ("slow_constraint", "constraint")
 NAMED = 8
 """Most rows that a message names."""
+MOTIONS = 3
+"""Random motions from the start along which dropped rows are looked at: along a single one a row may open by little by chance."""
+NEARBY = 0.1
+"""Length of a motion as a part of the least singular value of the rows that stay, which bounds where they stay independent.
+
+A row that opens with the second power of the motion opens by some 1e-3. A longer motion may reach another branch of a mechanism.
+"""
+CONTRACTION = 0.1
+"""Largest ratio of two corrections of Newton's iteration back from the end of a motion; a larger one may lead to another branch."""
+SHORTER, TIMES = 4.0, 10
+"""By how much a motion is shortened where corrections shrink more slowly, and how often at most: a molecule in a box is far smaller
+than the extent of the scene."""
+ITERATIONS = 12
+"""Most corrections of Newton's iteration; six reach round-off from nearby."""
+REACHED = 1e-12
+"""Largest value of the rows that stay, in parts of their sizes, with which they count as kept."""
+FOLLOWS = RANK
+"""Largest value of a dropped row, in parts of its size, that counts as zero; rows are dropped that depend on others but for RANK."""
+BEND = "Bend what lies in line or flat at the start by a little, leave other rows out of the scene, or hold the shape by other constraints"
+
+
+class Opening(NamedTuple):
+    """How far dropped rows leave zero.
+
+    rows: their numbers, among all rows.
+    values: largest values of these, in parts of their sizes.
+    motion: how far coordinates were moved, in parts of their scales; 0 of rows that are not kept at the start itself.
+    """
+
+    rows: list[int]
+    values: list[float]
+    motion: float
 
 
 def check_constraints(sorting: Sorting) -> None:
-    """Refuse constraints that are redundant, or that the fast bodies cannot keep, naming them.
+    """Refuse constraints that are redundant, dropped ones that do not follow from the others, and those that the fast bodies cannot keep.
 
     Args:
         sorting: bodies at their places, effects at their homes.
@@ -32,18 +63,20 @@ def check_constraints(sorting: Sorting) -> None:
     Raises:
         ValueError: with the names of the constraints that are too many.
     """
-    held = _held(sorting)
-    if not held:
+    rows = ConstraintRows.of(sorting)
+    if rows is None:
         return
-    n_s = _slow_size(sorting)
-    macro, micro = ([row for p in held if p.home == home for row in kept_rows(sorting, p)] for home in HOMES)
-    _refuse(macro + micro, 0, 'leave one of them out, or let the scene choose, redundant="drop"')
+    opening = find_opening(rows)
+    if opening is not None:
+        raise ValueError(f'Scene: redundant="drop" would change the motion: {_told(rows, opening)}.')
+    macro, micro = (rows.numbers(home) for home in HOMES)
+    _refuse(rows, macro + micro, 0, lambda: _cure(sorting))
     if micro:
-        _refuse(micro, n_s, _advice(sorting, micro, n_s))
+        _refuse(rows, micro, rows.num_slow, lambda: _advice(sorting, rows, micro))
 
 
 def without_redundant(sorting: Sorting) -> Sorting:
-    """The same with as many rows of its constraints left out as depend on others.
+    """The same with as many rows of its constraints left out as depend on others at the start.
 
     Those that stay are chosen by a QR decomposition with pivoting of the rows, scaled by the masses and to length one. What
     keeps bodies rigid stays.
@@ -51,29 +84,22 @@ def without_redundant(sorting: Sorting) -> Sorting:
     Args:
         sorting: bodies at their places, effects at their homes.
     """
-    held = _held(sorting)
-    found = [(part, kept_rows(sorting, part)) for part in held]
-    rows = [row for _, own in found for row in own]
-    if not rows:
+    rows = ConstraintRows.of(sorting)
+    if rows is None:
         return sorting
-    counts = {part: len(own) for part, own in found}
-    own = np.repeat([isinstance(part.effect, Rigidity) for part in held], list(counts.values()))
-    mass = np.concatenate(_of_all(sorting, "masses"))
-    scaled = np.array([row for _, row in rows]) / np.sqrt(mass)
-    scaled /= np.linalg.norm(scaled, axis=1, keepdims=True)
-    rigid = np.linalg.qr(scaled[own].T)[0]
-    others = np.flatnonzero(~own)
+    scaled = rows.jacobian / np.sqrt(rows.masses)
+    lengths = np.linalg.norm(scaled, axis=1, keepdims=True)
+    scaled /= np.where(lengths > 0, lengths, 1.0)
+    of_bodies = np.array([isinstance(row.effect, Rigidity) for row in rows.rows])
+    rigid = np.linalg.qr(scaled[of_bodies].T)[0]
+    others = np.flatnonzero(~of_bodies)
     free = scaled[others] - scaled[others] @ rigid @ rigid.T
     triangle, order = qr(free.T, mode="r", pivoting=True)  # pyright: ignore[reportAssignmentType]
     rank = np.count_nonzero(np.abs(np.diagonal(triangle)) > RANK)
-    dropped = set(others[order[rank:]].tolist())
-    placed, at = [], 0
-    for part in sorting.placed:
-        if part in held:
-            count = counts[part]
-            part = part._replace(dropped=tuple(k for k in range(count) if at + k in dropped))
-            at += count
-        placed.append(part)
+    placed = list(sorting.placed)
+    for i in sorted(others[order[rank:]].tolist()):
+        row, part = rows.rows[i], placed[rows.rows[i].part]
+        placed[row.part] = part._replace(dropped=(*part.dropped, row.number), sizes=(*part.sizes, float(rows.sizes[i])))
     return replace(sorting, placed=tuple(placed))
 
 
@@ -83,37 +109,107 @@ def dropped_rows(sorting: Sorting) -> list[str]:
     Args:
         sorting: from `without_redundant`.
     """
-    return [_all_rows(sorting, part)[k][0] for part in sorting.placed for k in part.dropped]
+    rows = ConstraintRows.of(sorting)
+    return [] if rows is None else [row.name for row in rows.rows if not row.kept]
 
 
-def _held(sorting: Sorting) -> list[Placed]:
-    """The constraints, none where their numbers are traced."""
-    held = [part for part in sorting.placed if part.home in HOMES]
-    numbers = (
-        [body.coordinates for body in sorting.bodies.values()],
-        [p.effect.parameters(sorting.bodies) for p in held],
+def find_opening(rows: ConstraintRows) -> Opening | None:
+    """The dropped rows that do not follow from those that stay, and by how much they leave zero; None if all follow.
+
+    In coordinates x over their scales, ``dg_k(x_0) z = 0`` are motions z along the rows g_k that stay, and Newton's iteration leads
+    from ``x_0 + s z`` back onto ``g_k = 0``.
+
+    Args:
+        rows: some of them dropped.
+    """
+    kept, dropped = rows.numbers(), [i for i, row in enumerate(rows.rows) if not row.kept]
+    if not dropped:
+        return None
+    unit = (rows.jacobian * rows.scales / rows.sizes[:, None])[kept]
+    basis, triangle = np.linalg.qr(unit.T)
+    step = NEARBY * float(np.linalg.svd(triangle, compute_uv=False)[-1])
+    start = _where_kept(rows, kept, 0.0, np.zeros(rows.start.size), np.inf)
+    if start is None:
+        return None  # positions off the constraints, which the making of the state refuses
+    worst, length = np.abs(start.values[dropped]), 0.0
+    if worst.max() <= FOLLOWS:
+        random = np.random.default_rng(0)
+        for _ in range(MOTIONS):
+            time, motion = random.normal() * rows.timed, random.normal(size=rows.start.size)
+            motion -= basis @ (basis.T @ motion)
+            for _ in range(TIMES):
+                end = _where_kept(rows, kept, step * time, start.x + step * motion, CONTRACTION)
+                if end is not None:
+                    worst, length = np.maximum(worst, np.abs(end.values[dropped])), max(length, step)
+                    break
+                step /= SHORTER
+    opened = np.flatnonzero(worst > FOLLOWS)
+    if not opened.size:
+        return None
+    return Opening([dropped[i] for i in opened], worst[opened].tolist(), length)
+
+
+class _Place(NamedTuple):
+    """Positions x, in parts of their scales from the start, and the values of all rows there, in parts of their sizes."""
+
+    x: np.ndarray
+    values: np.ndarray
+
+
+def _where_kept(rows: ConstraintRows, kept: list[int], t: float, x: np.ndarray, contraction: float) -> _Place | None:
+    """Where Newton's iteration from x reaches the rows that stay; None if its corrections do not shrink by this factor each."""
+    before = np.inf
+    for _ in range(ITERATIONS):
+        values, jacobian = rows.at(t, rows.start + rows.scales * x)
+        values = values / rows.sizes
+        if np.abs(values[kept]).max() <= REACHED:
+            return _Place(x, values)
+        scaled = jacobian[kept] * rows.scales / rows.sizes[kept, None]
+        correction = np.linalg.lstsq(scaled, values[kept], rcond=None)[0]
+        size = np.linalg.norm(correction)
+        if not size <= contraction * before:
+            return None
+        x, before = x - correction, size
+    return None
+
+
+def _cure(sorting: Sorting) -> str:
+    """What to do about rows that depend on others: leave them out, unless they do not follow from these."""
+    rows = ConstraintRows.of(without_redundant(sorting))
+    opening = None if rows is None else find_opening(rows)
+    if rows is None or opening is None:
+        return 'leave one of them out, or let the scene choose, redundant="drop"'
+    return f"nor can any be left out: {_told(rows, opening)}"
+
+
+def _told(rows: ConstraintRows, opening: Opening) -> str:
+    """That dropped rows do not vanish where the others do, and what to do."""
+    names = rows.names(opening.rows)
+    off = _listed([f"{name} by {value:.1e}" for name, value in zip(names, opening.values, strict=True)])
+    if not opening.motion:
+        return (
+            f"{_listed(names)} contradicts the other constraints. Where these are kept, it is off by parts of its size: {off}. "
+            "Correct its numbers, or leave it out"
+        )
+    return (
+        f"{_listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by some "
+        f"{opening.motion:.1g} of the extent of the scene and the other constraints are kept, it is off by parts of its size: {off}. {BEND}"
     )
-    return held if is_concrete(numbers) else []
 
 
-def _slow_size(sorting: Sorting) -> int:
-    return sum(place.size for place in sorting.places.values() if place.part == "s")
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
 
 
-def _of_all(sorting: Sorting, what: str) -> list[np.ndarray]:
-    """Numbers of all bodies, slow ones first."""
-    names = sorted(sorting.bodies, key=lambda name: sorting.places[name].part == "f")
-    return [np.asarray(getattr(sorting.bodies[name], what)) for name in names]
-
-
-def _advice(sorting: Sorting, micro, n_s: int) -> str:
+def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
     """What to do about constraints that the fast bodies cannot keep."""
     fast = [name for name, place in sorting.places.items() if place.part == "f"]
-    involved = rank_of(np.array([row[n_s:] for _, row in micro])).dependent
+    jacobian = rows.jacobian[micro]
+    involved = jacobian[rank_of(jacobian[:, rows.num_slow :]).dependent]
     touched = {
         name
         for name, place in sorting.places.items()
-        if place.part == "s" and any(micro[i][1][place.start : place.start + place.size].any() for i in involved)
+        if place.part == "s" and involved[:, place.start : place.start + place.size].any()
     }
     more = f"make {' or '.join(sorted(touched))} fast too" if touched else "make more of their bodies fast"
     return (
@@ -122,43 +218,15 @@ def _advice(sorting: Sorting, micro, n_s: int) -> str:
     )
 
 
-def kept_rows(sorting: Sorting, part: Placed) -> list[tuple[str, np.ndarray]]:
-    """Those of `_all_rows` that are not left out."""
-    return [row for k, row in enumerate(_all_rows(sorting, part)) if k not in part.dropped]
-
-
-def _all_rows(sorting: Sorting, part: Placed) -> list[tuple[str, np.ndarray]]:
-    """Rows of the Jacobian of some constraints in the order of their terms, slow coordinates first, each with its name."""
-    bodies, effect, rows, n_s = sorting.bodies, part.effect, [], _slow_size(sorting)
-    columns = {name: p.start + np.arange(p.size) + (n_s if p.part == "f" else 0) for name, p in sorting.places.items()}
-    elements, params = effect.elements(bodies), effect.parameters(bodies)
-    for i in chain(*effect.by_size(part.elements, bodies)):
-        term, own = effect.alone(i, bodies, params)
-        names = moving(elements[i])
-        jacobian = np.asarray(_jacobian(term, jnp.concatenate([bodies[name].coordinates for name in names]), own))
-        what = label(effect, elements[i])
-        for j, entries in enumerate(jacobian):
-            row = np.zeros(sum(body.size for body in bodies.values()))
-            row[np.concatenate([columns[name] for name in names])] = entries
-            rows.append((what if len(jacobian) == 1 else f"{what} [{j}]", row))
-    return rows
-
-
-@partial(jax.jit, static_argnames="term")
-def _jacobian(term: EffectTerm, q, params):
-    return jax.jacfwd(lambda q: jnp.reshape(term.value(q, None, params, jnp.zeros(())), (-1,)))(q)
-
-
-def _refuse(rows: Sequence[tuple[str, np.ndarray]], first: int, advice: str) -> None:
-    """Raise if named rows, from a column on, are dependent, naming those that take part."""
-    names, jacobian = [name for name, _ in rows], np.array([row[first:] for _, row in rows])
+def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callable[[], str]) -> None:
+    """Raise if rows, from a column on, are dependent, naming those that take part."""
+    names, jacobian = rows.names(numbers), rows.jacobian[numbers][:, first:]
     involved = rank_of(jacobian).dependent
     if involved:
         own = [names[i] for i in involved if not names[i].startswith(Rigidity.default_name + " ")] or [
             names[i] for i in involved
         ]
-        shown = ", ".join(own[:NAMED]) + (f" and {len(own) - NAMED} more" if len(own) > NAMED else "")
         raise ValueError(
-            f"Scene: over-constrained at the start: {shown} are {'among ' * (len(own) < len(involved))}{len(involved)} constraints of rank "
-            f"{rank_of(jacobian[involved]).rank}; {advice}."
+            f"Scene: over-constrained at the start: {_listed(own)} are {'among ' * (len(own) < len(involved))}{len(involved)} constraints of "
+            f"rank {rank_of(jacobian[involved]).rank}; {advice()}."
         )

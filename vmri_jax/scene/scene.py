@@ -23,7 +23,7 @@ from vmri_jax.scene.ledger import Ledger, ledger
 from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_redundant
 from vmri_jax.scene.rigid import RigidBody, Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
-from vmri_jax.scene.terms import MASS, Actuation
+from vmri_jax.scene.terms import RESERVED, Actuation
 from vmri_jax.scene.velocities import with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -85,10 +85,11 @@ class Scene:
                 raise ValueError(
                     f"Scene: the name {name!r} occurs twice; give each body and effect its own, e.g. name=..."
                 )
-        if MASS in [effect.name for effect in self.effects]:
-            raise ValueError(
-                f"Scene: an effect is called {MASS!r}, where the params keep the masses; give it another name."
-            )
+        for name, content in RESERVED.items():
+            if name in [effect.name for effect in self.effects]:
+                raise ValueError(
+                    f"Scene: an effect is called {name!r}, where the params keep {content}; give it another name."
+                )
         potentials = [effect.name for effect in self.effects if effect.kind == "potential"]
         for effect in self.everything:
             effect.check(self.by_name, self.project)

@@ -41,6 +41,7 @@ class Placed(NamedTuple):
     """Some elements of an effect, the argument of `System` that they are part of, and why.
 
     dropped: rows of a constraint that are left out, numbers in the order of its terms.
+    sizes: by how much the values of these change in a large motion, see `vmri_jax.scene.rows`.
     """
 
     effect: Effect
@@ -48,6 +49,7 @@ class Placed(NamedTuple):
     home: Home
     reason: str
     dropped: tuple[int, ...] = ()
+    sizes: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

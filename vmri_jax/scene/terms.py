@@ -19,6 +19,10 @@ from vmri_jax.scene.layout import Rows
 
 MASS = "mass"
 """Where the masses are in params if the kinetic energy is a function."""
+IMPLIED = "implied"
+"""Where the sizes of rows that are left out are in params."""
+RESERVED = {MASS: "the masses", IMPLIED: "the sizes of rows that are left out"}
+"""Names in params that no effect may have, and what stands there."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +182,16 @@ class SomeRows:
 
 
 @dataclass(frozen=True)
+class DroppedRows(SomeRows):
+    """The values that `SomeRows` leaves out."""
+
+    def value(self, q_s, q_f, params, t=None):
+        """These values, by static slices."""
+        values = joined([term.value(q_s, q_f, params, t) for term in self.terms])
+        return joined([values[k : k + 1] for k in self.dropped])
+
+
+@dataclass(frozen=True)
 class TangentDamping:
     """``F = -beta K v``, K the Hessian of the energy of some terms."""
 
@@ -261,6 +275,13 @@ class MacroConstraint(_OfTerms):
         return joined([term.value(q_s, None, params, *t) for term in self.terms])
 
 
+class ImpliedRows(MicroConstraint):
+    """``g_i(q_s, q_f, params)``, or ``g_i(t, q_s, q_f, params)``: the values of rows that are left out, in parts of their sizes."""
+
+    def __call__(self, *arguments):
+        return super().__call__(*arguments) / arguments[-1][IMPLIED]
+
+
 class KineticEnergy(_OfTerms):
     """``T = sum m v^2 / 2`` and the velocity-dependent terms."""
 
@@ -307,5 +328,6 @@ FUNCTIONS = {
     "constraint": MicroConstraint,
     "slow_constraint": MacroConstraint,
     "force": TotalForce,
+    "implied": ImpliedRows,
 }
 """What is made of the terms of a home."""

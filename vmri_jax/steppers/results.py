@@ -14,6 +14,7 @@ class Result(IntEnum):
     SINGULAR = 5
     RANK_DEFICIENT = 6
     CONSTRAINT_VIOLATED = 7
+    NOT_IMPLIED = 8
 
     @property
     def success(self) -> bool:
@@ -60,6 +61,12 @@ _MESSAGES = {
     Result.CONSTRAINT_VIOLATED: (
         "the increments converged, but the constraints are not kept. Likely causes: rows that contradict each other, or rows of "
         "very different size (scale them to order one)."
+    ),
+    Result.NOT_IMPLIED: (
+        "the constraints that are solved for are kept, but rows that were left out as following from them are not (those of a "
+        'scene with redundant="drop", of a System its implied). Likely causes: the rows follow only at the start, where links '
+        "lie in line or a loop lies flat, or only for other parameters. Start elsewhere, take the parameters for which they "
+        "follow, or hold these rows instead of others."
     ),
 }
 

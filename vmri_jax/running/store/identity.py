@@ -79,6 +79,7 @@ def _operations(system: System, start: State) -> dict[str, str]:
         "fast_potential": (system.fast_potential, (q_f, params)),
         "constraint": with_time(system.constraint, start.t, q_s, q_f, params),
         "slow_constraint": with_time(system.slow_constraint, start.t, q_s, params),
+        "implied": with_time(system.implied, start.t, q_s, q_f, params),
         "force": (system.force, (start.t, q_s, q_f, q_s, q_f, params)),
     }
     if isinstance(system.kinetic, KineticFunction):

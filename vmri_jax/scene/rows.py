@@ -1,0 +1,176 @@
+"""The rows of a scene's constraints one by one: their names, their values and their Jacobian at any positions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import chain
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.scene.body import LARGEST_POINT, Bodies, moving
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.labels import label
+from vmri_jax.scene.sorting import Home, Placed, Sorting
+from vmri_jax.scene.terms import EffectTerm
+
+HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
+
+
+class Row(NamedTuple):
+    """A row of a constraint.
+
+    name: of its effect and bodies, with a number where these have several rows.
+    part: number of its entry in `Sorting.placed`.
+    number: of the row in that entry, in the order of its terms.
+    effect, home, kept: of that entry; `kept` is False of a row that is left out.
+    """
+
+    name: str
+    part: int
+    number: int
+    effect: Effect
+    home: Home
+    kept: bool
+
+
+class _Element(NamedTuple):
+    """An element of a constraint as a function of its coordinates.
+
+    columns: where these are among all coordinates, slow ones first.
+    """
+
+    term: EffectTerm
+    params: dict[str, Any]
+    columns: np.ndarray
+
+
+@dataclass(frozen=True)
+class ConstraintRows:
+    """The k rows of all constraints, in the order of `Sorting.placed`, over the n coordinates, slow ones first.
+
+    Attributes:
+        rows: one entry for each of them.
+        elements: their functions.
+        start: (n,) coordinates at the start.
+        masses: (n,).
+        scales: (n,) by how much each coordinate changes in a large motion: the extent of the scene for positions, 1 for
+            directors of rigid bodies, and for general coordinates their value, at least 1.
+        num_slow: number of slow coordinates.
+    """
+
+    rows: tuple[Row, ...]
+    elements: tuple[_Element, ...]
+    start: np.ndarray
+    masses: np.ndarray
+    scales: np.ndarray
+    num_slow: int
+
+    @classmethod
+    def of(cls, sorting: Sorting) -> "ConstraintRows | None":
+        """The rows of the constraints of these effects; None where there are none, or where their numbers are traced."""
+        bodies, held = sorting.bodies, [(i, part) for i, part in enumerate(sorting.placed) if part.home in HOMES]
+        params = {i: part.effect.parameters(bodies) for i, part in held}
+        if not held or not is_concrete(([body.coordinates for body in bodies.values()], params)):
+            return None
+        order = sorted(bodies, key=lambda name: sorting.places[name].part == "f")
+        num_slow = sum(place.size for place in sorting.places.values() if place.part == "s")
+        columns = {
+            name: place.start + np.arange(place.size) + (num_slow if place.part == "f" else 0)
+            for name, place in sorting.places.items()
+        }
+        start, masses = (
+            np.concatenate([np.asarray(getattr(bodies[name], of)) for name in order])
+            for of in ("coordinates", "masses")
+        )
+        rows, elements = [], []
+        for i, part in held:
+            for names, element in _elements(part, bodies, columns, params[i]):
+                elements.append(element)
+                size = _evaluated(element, start, 0.0)[0].size
+                count = sum(row.part == i for row in rows)
+                for j in range(size):
+                    name = names if size == 1 else f"{names} [{j}]"
+                    kept = count + j not in part.dropped
+                    rows.append(Row(name, i, count + j, part.effect, part.home, kept))
+        scales = np.concatenate([_scales(bodies[name], _extent(bodies)) for name in order])
+        return cls(tuple(rows), tuple(elements), start, masses, scales, num_slow)
+
+    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values (k,) and Jacobian (k, n) at a time and at positions (n,)."""
+        values, jacobian, at = np.empty(len(self.rows)), np.zeros((len(self.rows), q.size)), 0
+        for element in self.elements:
+            value, entries = _evaluated(element, q, t)
+            values[at : at + value.size] = value
+            jacobian[at : at + value.size, element.columns] = entries
+            at += value.size
+        return values, jacobian
+
+    @cached_property
+    def jacobian(self) -> np.ndarray:
+        """The Jacobian (k, n) at the start."""
+        return self.at(0.0, self.start)[1]
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """By how much each row changes in a large motion, (k,): the length of its gradient in coordinates over `scales`, 1 where that is zero."""
+        lengths = np.linalg.norm(self.jacobian * self.scales, axis=1)
+        return np.where(lengths > 0, lengths, 1.0)
+
+    @property
+    def timed(self) -> bool:
+        """Whether a row depends on time."""
+        return any(row.effect.timed for row in self.rows)
+
+    def numbers(self, home: Home | None = None) -> list[int]:
+        """Numbers of the rows that are kept, all or those of a home."""
+        return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
+
+    def names(self, numbers: Sequence[int]) -> list[str]:
+        """Names of some rows."""
+        return [self.rows[i].name for i in numbers]
+
+
+def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], params: dict[str, Any]):
+    """Elements of an effect in the order of its terms, each with its name."""
+    effect = part.effect
+    elements = effect.elements(bodies)
+    for i in chain(*effect.by_size(part.elements, bodies)):
+        term, own = effect.alone(i, bodies, params)
+        of_element = np.concatenate([columns[name] for name in moving(elements[i])])
+        yield label(effect, elements[i]), _Element(term, own, of_element)
+
+
+def _evaluated(element: _Element, q: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Values (m,) of an element at positions q (n,) of all bodies, and their derivatives by its own coordinates."""
+    values, jacobian = _value_and_jacobian(element.term, q[element.columns], element.params, t)
+    return np.asarray(values), np.asarray(jacobian)
+
+
+@partial(jax.jit, static_argnames="term")
+def _value_and_jacobian(term: EffectTerm, q, params, t):
+    def values(q):
+        value = jnp.reshape(term.value(q, None, params, t), (-1,))
+        return value, value
+
+    jacobian, value = jax.jacfwd(values, has_aux=True)(q)
+    return value, jacobian
+
+
+def _extent(bodies: Bodies) -> float:
+    """Largest distance of a body from their mean along an axis; of a single place, its largest coordinate, or 1 at the origin."""
+    points = [np.asarray(body.coordinates)[:LARGEST_POINT] for body in bodies.values() if not body.block]
+    points = np.array([np.pad(point, (0, LARGEST_POINT - point.size)) for point in points]).reshape(-1, LARGEST_POINT)
+    if not points.size:
+        return 1.0
+    return float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
+
+
+def _scales(body, extent: float) -> np.ndarray:
+    q = np.asarray(body.coordinates)
+    if body.block:
+        return np.maximum(np.abs(q), 1.0)
+    return np.where(np.arange(q.size) < LARGEST_POINT, extent, 1.0)
