@@ -29,15 +29,16 @@ A row that opens with the second power of the motion opens by some 1e-3. A longe
 """
 CONTRACTION = 0.1
 """Largest ratio of two corrections of Newton's iteration back from the end of a motion; a larger one may lead to another branch."""
-SHORTER, TIMES = 4.0, 10
-"""By how much a motion is shortened where corrections shrink more slowly, and how often at most: a molecule in a box is far smaller
-than the extent of the scene."""
+SHORTER = 4.0
+"""Factor by which a motion is shortened where the corrections do not shrink like that; a larger one may skip good lengths."""
+SHORTENINGS = 10
+"""Most lengths of a motion that are tried: the last one suits a molecule of a millionth of the extent of the scene."""
 ITERATIONS = 12
 """Most corrections of Newton's iteration; six reach round-off from nearby."""
 REACHED = 1e-12
 """Largest value of the rows that stay, in parts of their sizes, with which they count as kept."""
 FOLLOWS = RANK
-"""Largest value of a dropped row, in parts of its size, that counts as zero; rows are dropped that depend on others but for RANK."""
+"""Largest value of a dropped row, in parts of its size, that counts as zero: that of rows which depend on others to RANK, as the choice of dropped rows asks."""
 BEND = "Bend what lies in line or flat at the start by a little, leave other rows out of the scene, or hold the shape by other constraints"
 
 
@@ -127,7 +128,7 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
         return None
     unit = (rows.jacobian * rows.scales / rows.sizes[:, None])[kept]
     basis, triangle = np.linalg.qr(unit.T)
-    step = NEARBY * float(np.linalg.svd(triangle, compute_uv=False)[-1])
+    step = NEARBY * float(np.linalg.svd(triangle, compute_uv=False).min(initial=1.0))
     start = _where_kept(rows, kept, 0.0, np.zeros(rows.start.size), np.inf)
     if start is None:
         return None  # positions off the constraints, which the making of the state refuses
@@ -137,7 +138,7 @@ def find_opening(rows: ConstraintRows) -> Opening | None:
         for _ in range(MOTIONS):
             time, motion = random.normal() * rows.timed, random.normal(size=rows.start.size)
             motion -= basis @ (basis.T @ motion)
-            for _ in range(TIMES):
+            for _ in range(SHORTENINGS):
                 end = _where_kept(rows, kept, step * time, start.x + step * motion, CONTRACTION)
                 if end is not None:
                     worst, length = np.maximum(worst, np.abs(end.values[dropped])), max(length, step)
@@ -162,7 +163,7 @@ def _where_kept(rows: ConstraintRows, kept: list[int], t: float, x: np.ndarray, 
     for _ in range(ITERATIONS):
         values, jacobian = rows.at(t, rows.start + rows.scales * x)
         values = values / rows.sizes
-        if np.abs(values[kept]).max() <= REACHED:
+        if np.abs(values[kept]).max(initial=0.0) <= REACHED:
             return _Place(x, values)
         scaled = jacobian[kept] * rows.scales / rows.sizes[kept, None]
         correction = np.linalg.lstsq(scaled, values[kept], rcond=None)[0]
@@ -223,10 +224,10 @@ def _refuse(rows: ConstraintRows, numbers: list[int], first: int, advice: Callab
     names, jacobian = rows.names(numbers), rows.jacobian[numbers][:, first:]
     involved = rank_of(jacobian).dependent
     if involved:
-        own = [names[i] for i in involved if not names[i].startswith(Rigidity.default_name + " ")] or [
+        of_effects = [names[i] for i in involved if not names[i].startswith(Rigidity.default_name + " ")] or [
             names[i] for i in involved
         ]
         raise ValueError(
-            f"Scene: over-constrained at the start: {_listed(own)} are {'among ' * (len(own) < len(involved))}{len(involved)} constraints of "
+            f"Scene: over-constrained at the start: {_listed(of_effects)} are {'among ' * (len(of_effects) < len(involved))}{len(involved)} constraints of "
             f"rank {rank_of(jacobian[involved]).rank}; {advice()}."
         )

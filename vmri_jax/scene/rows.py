@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.scene.body import LARGEST_POINT, Bodies, moving
+from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.labels import label
 from vmri_jax.scene.sorting import Home, Placed, Sorting
@@ -88,25 +88,25 @@ class ConstraintRows:
         )
         rows, elements = [], []
         for i, part in held:
+            number = 0
             for names, element in _elements(part, bodies, columns, params[i]):
                 elements.append(element)
                 size = _evaluated(element, start, 0.0)[0].size
-                count = sum(row.part == i for row in rows)
                 for j in range(size):
                     name = names if size == 1 else f"{names} [{j}]"
-                    kept = count + j not in part.dropped
-                    rows.append(Row(name, i, count + j, part.effect, part.home, kept))
+                    rows.append(Row(name, i, number, part.effect, part.home, number not in part.dropped))
+                    number += 1
         scales = np.concatenate([_scales(bodies[name], _extent(bodies)) for name in order])
         return cls(tuple(rows), tuple(elements), start, masses, scales, num_slow)
 
     def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values (k,) and Jacobian (k, n) at a time and at positions (n,)."""
-        values, jacobian, at = np.empty(len(self.rows)), np.zeros((len(self.rows), q.size)), 0
+        values, jacobian, first = np.empty(len(self.rows)), np.zeros((len(self.rows), q.size)), 0
         for element in self.elements:
             value, entries = _evaluated(element, q, t)
-            values[at : at + value.size] = value
-            jacobian[at : at + value.size, element.columns] = entries
-            at += value.size
+            values[first : first + value.size] = value
+            jacobian[first : first + value.size, element.columns] = entries
+            first += value.size
         return values, jacobian
 
     @cached_property
@@ -139,9 +139,8 @@ def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], para
     effect = part.effect
     elements = effect.elements(bodies)
     for i in chain(*effect.by_size(part.elements, bodies)):
-        term, own = effect.alone(i, bodies, params)
         of_element = np.concatenate([columns[name] for name in moving(elements[i])])
-        yield label(effect, elements[i]), _Element(term, own, of_element)
+        yield label(effect, elements[i]), _Element(*effect.alone(i, bodies, params), of_element)
 
 
 def _evaluated(element: _Element, q: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +168,8 @@ def _extent(bodies: Bodies) -> float:
     return float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
 
 
-def _scales(body, extent: float) -> np.ndarray:
+def _scales(body: AnyBody, extent: float) -> np.ndarray:
+    """By how much each coordinate of a body changes in a large motion, see `ConstraintRows`."""
     q = np.asarray(body.coordinates)
     if body.block:
         return np.maximum(np.abs(q), 1.0)

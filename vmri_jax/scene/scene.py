@@ -54,7 +54,8 @@ class Scene:
         project: move positions onto the constraints at the start, and take away what of the velocities points against them,
             instead of refusing them.
         redundant: what is done about constraints that depend on others, as in a planar loop of hinges: "refuse" names them,
-            "drop" leaves as many rows of them out as are too many, see `dropped`.
+            "drop" leaves as many rows of them out as are too many, see `dropped`. These must follow from the others along the motion,
+            not only at the start: the scene tries random motions, and runs watch the rows, see `System.implied`.
 
     Raises:
         TypeError: something else among them.
