@@ -55,7 +55,7 @@ def study(orders=(1, 2)):
 
 def cost(costs=(9.0, 3.0, 6.0), solver="dense"):
     rows = [
-        CostRow("FPU", solver, n, 3 * n, 10, 1.0, value, 1.0, 2, "CONVERGED")
+        CostRow("FPU", solver, n, 3 * n, 10, 1.0, value, 1.0, 2, solver.upper(), "CONVERGED")
         for n, value in zip((1, 10, 100), costs, strict=True)
     ]
     return CostStudy(tuple(rows))
@@ -195,6 +195,12 @@ def test_cost_circles_the_minimum_and_marks_the_paper():
     assert circled == [[[10.0, 3.0]], [[100.0, 3.0]]]
     assert names_below(figure) == ["dense", "arrowhead", "minimum in the paper"]
     assert np.asarray(lines[-1].get_xdata()).tolist() == [60, 60]
+
+
+def test_a_cost_study_draws_itself():
+    (axes,) = (figure := (cost() + cost((5.0, 4.0, 3.0), "auto")).plot("Cost")).axes
+    assert names_below(figure) == ["dense", "auto"]
+    np.testing.assert_array_equal(y_data(axes.lines[0]), [9.0, 3.0, 6.0])
 
 
 def test_cost_leaves_failed_runs_out():

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 import vmri_jax as vm
 from vmri_jax import cli
 from vmri_jax.cli.sweep import read_sweep
+from vmri_jax.ensembles.quantities import drawn_by_default
 
 SMALL = """
 system = "fpu"
@@ -39,8 +40,13 @@ def vmri(tmp_path, monkeypatch):
 
 
 def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):
+    with (tmp_path / "sweep.toml").open("r+") as file:
+        text = file.read()
+        file.seek(0)
+        file.write(f'save = ["end", "iterations"]\n{text}')
     code, text = vmri("sweep", "sweep.toml", "--plot", "map.png")
     assert code == 0
+    assert "Figure of iterations: map.png" in text
     assert re.search(r"runs 2 computed now 2 in [\d.]+ s", text)
     assert "chunks 1 of 1 are in the store, 2 runs each" in text
     assert 'vmri_jax.open_ensemble("runs.zarr")' in text
@@ -51,6 +57,37 @@ def test_a_sweep_runs_is_drawn_and_gone_on_with(vmri, tmp_path):
     assert "holds an ensemble of 2 runs, 1 of 1 chunks done" in text
     assert "computed now 0" in vmri("sweep", "--resume")[1]
     assert "computed now 2" in vmri("sweep", "--overwrite")[1]
+
+
+def test_what_cannot_be_drawn_is_refused_before_it_runs(vmri, tmp_path):
+    code, text = vmri("sweep", "sweep.toml", "--plot", "map.png")
+    assert code == 2
+    assert '--plot draws one number per run, and save = ["end"] keeps none.' in text
+    assert 'save = ["end", "energy_error"]' in text
+    assert not (tmp_path / "runs.zarr").exists()
+
+
+OWN = """
+def reach(run):
+    return run.q_s[:, 0].max()
+
+def places(run):
+    return {"first": run.position("centres")[0]}
+"""
+
+
+@pytest.mark.parametrize(
+    ("save", "drawn"),
+    [
+        (["end", "extremes", "quantiles", "constraint_residual"], []),
+        (["energy_error", "end", "iterations"], ["energy_error", "iterations"]),
+        (["nodes"], ["node_energy"]),
+        (["own.py:reach", "own.py:places"], ["reach"]),
+    ],
+)
+def test_what_is_drawn_is_known_from_what_is_saved(vmri, tmp_path, fpu, save, drawn):
+    (tmp_path / "own.py").write_text(OWN)
+    assert drawn_by_default(save, fpu) == drawn
 
 
 def test_workers(vmri, tmp_path):

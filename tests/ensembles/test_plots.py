@@ -30,6 +30,14 @@ def cloud(tmp_path_factory):
     ).open()
 
 
+def test_the_status_is_drawn_only_if_it_is_asked_for(grid):
+    kept = grid[["result", "failed_at", "node_q_s", "node_t"]]
+    with pytest.raises(ValueError, match=r"no quantity is one number per run; there are node_q_s\. Save one"):
+        plots.plot_ensemble(kept)
+    assert plots.plot_ensemble(kept, "result").axes[-1].get_ylabel() == "result"
+    assert plots.plot_ensemble(grid[["result", "node_energy", "node_t"]]).axes[0].get_title(loc="left") == "node_energy"
+
+
 def test_a_map_has_a_panel_for_each_value_of_the_third_axis(grid):
     figure = plots.plot_ensemble(grid, title="map")
     titles = [axes.get_title(loc="left") for axes in figure.axes]

@@ -1,6 +1,7 @@
 """The search for the cheapest setting: what it promises, what it refuses, what it keeps when it fails."""
 
 import dataclasses
+import json
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -81,6 +82,19 @@ def test_the_front_falls(found):
     assert all(a.seconds <= b.seconds and a.error_q > b.error_q for a, b in pairwise(front))
     assert found.runs.cheapest(1e-5).error_q <= 1e-5
     assert found.runs.cheapest(1e-30) is None
+
+
+def test_it_prints_the_best_few_and_keeps_all(found, tmp_path):
+    head, *rows, last = str(found).splitlines()
+    assert head.split()[:2] == ["scheme", "H"]
+    assert len(rows) == min(5, 1 + len(found.others))
+    assert rows[0].startswith(found.setting.row.scheme)
+    assert last.startswith("For an error of 1e-05 take the first: its .scheme, .macro_dt and .num_steps. From another")
+    assert repr(found) == str(found)
+    found.to_csv(tmp_path / "runs.csv")
+    assert len((tmp_path / "runs.csv").read_text().splitlines()) == 1 + len(found.runs.rows)
+    found.to_json(tmp_path / "runs.json")
+    assert json.loads((tmp_path / "runs.json").read_text())["choice"]["num_steps"] == found.num_steps
 
 
 def test_the_command_names_the_setting(found):

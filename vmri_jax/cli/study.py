@@ -30,9 +30,6 @@ from vmri_jax.study.work import duration
 
 app = typer.Typer()
 
-SHOWN = 5
-"""Settings that `vmri tune` lists for the error asked for."""
-
 
 @app.command(
     rich_help_panel=COSTS,
@@ -60,10 +57,8 @@ def tune(
             raise typer.Exit(1) from failure
         _write_runs(found.runs, out)
     console.print("[bold]Errors against time[/bold], the best of all runs\n", found.runs.table())
-    fastest = [setting.row for setting in (found.setting, *found.others)[:SHOWN]]
-    console.print(
-        f"\n[bold]For an error of {error:g}[/bold], the choice first\n", rich_table(found.runs.columns, fastest)
-    )
+    best = rich_table(found.columns, found.shown())
+    console.print(f"\n[bold]For an error of {error:g}[/bold], the choice first\n", best)
     seen = found.verification
     if seen is not None:
         console.print(

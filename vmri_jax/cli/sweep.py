@@ -1,5 +1,6 @@
 """`vmri sweep`: an ensemble that a file describes."""
 
+import json
 import os
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
@@ -13,6 +14,7 @@ import typer
 from rich.markup import escape
 
 from vmri_jax import plots
+from vmri_jax.catalogue import find_problem
 from vmri_jax.cli.common import (
     PICTURES,
     check_target_file,
@@ -24,6 +26,7 @@ from vmri_jax.cli.common import (
 )
 from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, Stopped, ensemble
 from vmri_jax.ensembles.executors import local_workers
+from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.mechanics.names import near
 
 EXAMPLE = Path("sweep.toml")
@@ -41,7 +44,8 @@ def sweep(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in the store.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is in the store.")] = False,
     plot: Annotated[
-        Path | None, typer.Option(help="Draw the last of what is saved over the longest axes: .png, .svg or .pdf.")
+        Path | None,
+        typer.Option(help="Draw the last number per run that is saved over the longest axes: .png, .svg or .pdf."),
     ] = None,
     example: Annotated[bool, typer.Option("--example", help="Write a file with comments that runs, and stop.")] = False,
 ) -> None:
@@ -57,6 +61,7 @@ def sweep(
         if workers is not None and scheduler is not None:
             raise ValueError("--workers and --scheduler are given; choose one of them.")
         given = read_sweep(file)
+        drawn = "" if plot is None else _drawn(given)
         with _client(workers, scheduler) as client:
             try:
                 runs = ensemble(**given, executor=client, resume=resume, overwrite=overwrite, progress=True)
@@ -72,8 +77,23 @@ def sweep(
                 raise typer.Exit(1) from error
         _print_summary(runs)
         if plot is not None:
-            plots.save(plots.plot_ensemble(runs.open(), title=file.stem), plot)
-            print_written("Figure", plot)
+            plots.save(plots.plot_ensemble(runs.open(), drawn, title=file.stem), plot)
+            print_written(f"Figure of {drawn}", plot)
+
+
+def _drawn(given: Mapping[str, Any]) -> str:
+    """What --plot draws of the arrays that are saved, before anything runs.
+
+    Raises:
+        ValueError: nothing that is saved can be drawn over the axes.
+    """
+    drawn = drawn_by_default(given["save"], find_problem(given["system"]))
+    if not drawn:
+        raise ValueError(
+            f"--plot draws one number per run, and save = {json.dumps(given['save'])} keeps none. Add one to the file, e.g. save = "
+            f"{json.dumps([*given['save'], 'energy_error'])}, or a function of your own that returns one, my_file.py:function."
+        )
+    return drawn[-1]
 
 
 def read_sweep(file: Path) -> dict[str, Any]:

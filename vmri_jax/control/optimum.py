@@ -46,7 +46,7 @@ class Optimum:
     problem: Problem
     history: list[dict] = field(repr=False, default_factory=list)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         how = "converged" if self.converged else "not converged: the best that was found"
         over = f", limits by {self.over:.1e}" if self.over > 0 else ""
         return (

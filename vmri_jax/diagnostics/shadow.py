@@ -72,7 +72,7 @@ class ShadowEnergy:
         """How much smaller the band is than that of the energy."""
         return self.energy_band / self.band if self.band else np.inf
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         seen = "it drifts" if self.drifts else "no drift is seen"
         return (
             f"shadow energy: band {self.band:.1e} (energy of the system: {self.energy_band:.1e}), "

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 
 from vmri_jax.catalogue import imported
 from vmri_jax.mechanics.names import near
+from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.export import DIMENSIONS
 from vmri_jax.running.simulate import Simulation
-from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.running.trajectory import RunInfo, Trajectory
 
 LEVELS = (0.05, 0.5, 0.95)
 """Parts of the saved nodes that lie below the quantiles."""
@@ -173,6 +174,30 @@ def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, K
 
     values = jax.eval_shape(shapes)
     return {name: one._replace(value=values[name]) for name, one in found.items()}
+
+
+def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
+    """Arrays that `vmri_jax.plots.plot_ensemble` draws where none is chosen: one number per run, or one per saved node.
+
+    Args:
+        names: of what is kept, as of `quantity`.
+        problem: what runs; nothing is computed of it.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    n_s, n_f = problem.q_s.size, problem.q_f.size
+    quantities, dimensions = [quantity(name) for name in names], {}
+
+    def shapes() -> None:
+        t, q_s, q_f = jnp.zeros(2), jnp.zeros((2, n_s)), jnp.zeros((2, n_f))
+        info = RunInfo(jnp.zeros(1, dtype=int), jnp.zeros(1, dtype=int), jnp.zeros(1))
+        status = jnp.zeros((), dtype=int)
+        run = Trajectory(t, q_s, q_f, q_s, q_f, t, jnp.zeros((2, 2)), info, status, status).of(problem)
+        dimensions.update({name: one.dimensions for name, one in kept(quantities, run).items()})
+
+    jax.eval_shape(shapes)
+    return [name for name, axes in dimensions.items() if axes in ((), ("node",)) and name != "node_t"]
 
 
 def of_lanes(quantities: Sequence[Quantity]) -> Callable[[Trajectory], dict[str, Any]]:

@@ -156,7 +156,7 @@ class Fit:
             found.append(f"Sigma does not explain the misses: {beside}the model or sigma is not right.")
         return found
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         width = max(map(len, self.labels))
         lines = [f"{label:{width}}  {x:.6g}" for label, x in zip(self.labels, self.values, strict=True)]
         if not self.doubts:

@@ -15,6 +15,7 @@ from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, c
 from vmri_jax.mechanics.constraints import check_constraints, check_mass, project_positions
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers, summary
 from vmri_jax.mechanics.system import System
 
 NOTICED, REFUSED = 1e-6, 1e-2
@@ -31,6 +32,12 @@ class State(eqx.Module):
     q_f: Float[Numbers, "n_f"]
     p_s: Float[Numbers, "n_s"]
     p_f: Float[Numbers, "n_f"]
+
+    def __repr__(self) -> str:
+        if not has_values(self) or np.ndim(self.t) or np.ndim(self.q_s) != 1:
+            return eqx.Module.__repr__(self)
+        vectors = {"q_s": self.q_s, "q_f": self.q_f, "p_s": self.p_s, "p_f": self.p_f}
+        return summary(f"State at t = {float(self.t):.6g}", {name: numbers(a) for name, a in vectors.items()})
 
 
 def initial_state(
@@ -137,6 +144,21 @@ class Problem:
             check_type("Problem: names", self.names, Names, "vmri_jax.Names(slow={...}, fast={...})")
             check_system(self.system, self.q_s, self.q_f)
             self.names.of(self.system, self.q_s.size, self.q_f.size)
+
+    def __repr__(self) -> str:
+        names = (self.names or Names()).of_coordinates(np.shape(self.q_s)[-1], np.shape(self.q_f)[-1])
+        constraints = [f"{name} ({size})" for name, size in {**names.constraint, **names.slow_constraint}.items()]
+        return summary(
+            "Problem",
+            {
+                "slow": coordinates(names.slow_coordinates),
+                "fast": coordinates(names.fast_coordinates),
+                **self.system.terms(),
+                "rows of constraints": listed(constraints),
+                "start": f"t = {numbers(self.t)}",
+                **{name: numbers(getattr(self, name)) for name in ("q_s", "q_f", "v_s", "v_f")},
+            },
+        )
 
     def state(self, project: bool | None = None) -> State:
         """The consistent initial `State` (see `initial_state`); None for `project` of the problem."""

@@ -18,6 +18,7 @@ from vmri_jax.mechanics.functions import (
     with_time,
 )
 from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.summary import name_of, numbers, parameters, summary
 
 ARGUMENTS = {
     "kinetic": "q_s, q_f, v_s, v_f, params",
@@ -106,6 +107,29 @@ class System(eqx.Module):
             kinetic = KineticFunction(traced_once(kinetic))
         self.kinetic = kinetic
         self.params = params
+
+    def __repr__(self) -> str:
+        return summary("System", self.terms())
+
+    def terms(self) -> dict[str, str]:
+        """Its terms in words by name, empty where there is none; for summaries."""
+        kinetic = self.kinetic
+        if isinstance(kinetic, ConstantMass):
+            mass = f"masses, slow {numbers(kinetic.slow)}; fast {numbers(kinetic.fast)}"
+        else:
+            mass = f"function {name_of(kinetic)}"
+        functions = {
+            "slow potential V": self.slow_potential,
+            "fast potential W": self.fast_potential,
+            "constraint g": self.constraint,
+            "slow constraint g_s": self.slow_constraint,
+            "force F": self.force,
+        }
+        terms = {name: "" if f is None else f"function {name_of(f)}" for name, f in functions.items()}
+        for name, function in functions.items():
+            if isinstance(function, Rheonomic):
+                terms[name] += ", which depends on time"
+        return {"kinetic energy T": mass, **terms, "params": parameters(self.params)}
 
     def replace(self, **changes) -> "System":
         """The same system with some fields changed, e.g. ``system.replace(params=new)``."""

@@ -40,13 +40,13 @@ def plot_ensemble(
 
     Args:
         data: from `vmri_jax.open_ensemble`, or a selection of it.
-        quantity: what is drawn; the last one that is a single number per run if None.
+        quantity: what is drawn; if None the last one that is a single number per run, else the last one of a number per saved node.
         x, y: names of axes or columns; the two longest axes if both are None and the design has axes.
         title: over the figure.
         theme: colours.
 
     Raises:
-        ValueError: an unknown name, a quantity with several numbers per run, or more panels than can be drawn.
+        ValueError: an unknown name, a quantity with several numbers per run, no quantity to choose, or more panels than can be drawn.
     """
     quantity = _quantity(data, quantity)
     values = data[quantity]
@@ -86,10 +86,17 @@ def _quantity(data: "xarray.Dataset", name: str | None) -> str:
         if name not in data:
             raise ValueError(f"plot_ensemble: there is no {name!r}; there are {', '.join(map(str, data.data_vars))}.")
         return name
-    single = [
-        str(n) for n, array in data.data_vars.items() if not set(array.dims) & set(COORDINATES) and n not in STATUS
-    ]
-    return single[-1] if single else "result"
+    arrays = {str(n): set(map(str, array.dims)) & set(COORDINATES) for n, array in data.data_vars.items()}
+    arrays = {n: several for n, several in arrays.items() if n not in (*STATUS, "node_t")}
+    for several in (set(), {"node"}):
+        names = [n for n, dimensions in arrays.items() if dimensions == several]
+        if names:
+            return names[-1]
+    raise ValueError(
+        f"plot_ensemble: no quantity is one number per run; there are {', '.join(arrays) or 'none besides the status'}. Save one, "
+        "save=('end', 'energy_error'), or choose one number of a quantity: plot_ensemble(data.isel(slow=0), 'q_s'). "
+        "The status of the runs is drawn as 'result'."
+    )
 
 
 def _label(array) -> str:

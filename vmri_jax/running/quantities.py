@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from scipy.integrate import cumulative_simpson, cumulative_trapezoid
@@ -13,6 +14,7 @@ from vmri_jax.mechanics.motion import motion, powers, reaction_force
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.origin import Origin, at_nodes
@@ -38,6 +40,23 @@ class Work(NamedTuple):
     constraints: np.ndarray
     balance: np.ndarray
     uncertainty: float
+
+    def __repr__(self) -> str:
+        if not has_values(self):
+            return f"Work({eqx.tree_pformat(self._asdict(), width=1000)})"
+        nodes = np.flatnonzero(np.isfinite(self.balance))
+        forces, constraints, left = (float(a[nodes[-1]]) if nodes.size else np.nan for a in self[:3])
+        until = "the end" if nodes.size == len(self.balance) else f"node {nodes.size - 1}, after which the run failed"
+        return summary(
+            f"Work from the start to {until}, and the change of the energy",
+            {
+                "change of the energy": f"{forces + constraints + left:.6g}",
+                "work of forces": f"{forces:.6g}",
+                "work of moving constraints": f"{constraints:.6g}",
+                "left of the balance": f"{left:.2g}, the error of the run and of the two works",
+                "resolved by the nodes to": f"{float(self.uncertainty):.2g}",
+            },
+        )
 
 
 class Quantities(ABC):

@@ -26,6 +26,7 @@ from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import progress_shown
+from vmri_jax.running.summaries import summary_of_prepared
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
 from vmri_jax.schemes.composition import Composition
@@ -265,6 +266,9 @@ class Simulation:
     def _program(self, falls_back: bool):
         """The compiled run, see `Engine.whole`."""
         return self.engine_for(falls_back, self.room).whole
+
+    def __repr__(self) -> str:
+        return summary_of_prepared(self)
 
     @property
     def num_saves(self) -> int:

@@ -13,11 +13,13 @@ from jaxtyping import Float, Int
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import HasProblem, Problem, State
+from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import Exports
 from vmri_jax.running.files import replaced
 from vmri_jax.running.origin import Origin
-from vmri_jax.steppers.results import Result
+from vmri_jax.running.summaries import summary_of
+from vmri_jax.steppers.results import Method, Result, Status
 
 FORMAT = "vmri_jax trajectory 2"
 NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
@@ -25,6 +27,8 @@ NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 STATUS = ("result", "failed_at")
 MICRO = ("t_micro", "q_f_micro")
 """Fields that may be None."""
+STATUS_ARRAYS = jax.Array, np.ndarray
+"""What the status of a run comes as."""
 
 
 class RunInfo(NamedTuple):
@@ -39,6 +43,17 @@ class RunInfo(NamedTuple):
     method: Int[Numbers, "k-1"]
     iterations: Int[Numbers, "k-1"]
     residual: Float[Numbers, "k-1"]
+
+    def __repr__(self) -> str:
+        arrays = self._asdict()
+        return f"RunInfo: {self.in_words()}" if has_values(self) else f"RunInfo({eqx.tree_pformat(arrays, width=1000)})"
+
+    def in_words(self) -> str:
+        """The most that the solver did, of arrays that have values."""
+        if not np.size(self.method):
+            return "no step"
+        method, most = Method(int(np.max(self.method))), int(np.max(self.iterations))
+        return f"{method.name}, at most {most} iterations per step, residual at most {np.nanmax(self.residual, initial=0.0):.1e}"
 
 
 class Trajectory(Exports, eqx.Module):
@@ -55,7 +70,7 @@ class Trajectory(Exports, eqx.Module):
         info: what the solver did since the node before.
         t_micro, q_f_micro: the micro nodes of the macro step that ends at each saved node (its start excluded); None unless
             asked for.
-        result: status of the run, a `Result`; the first that was no success.
+        result: status of the run, the number of a `Result`, as which it prints; the first that was no success.
         failed_at: index of the macro step that failed, -1 if none did.
     """
 
@@ -71,6 +86,12 @@ class Trajectory(Exports, eqx.Module):
     failed_at: Int[Numbers, ""]
     t_micro: Float[Numbers, "k-1 num_micro"] = None
     q_f_micro: Float[Numbers, "k-1 num_micro n_f"] = None
+
+    def __repr__(self) -> str:
+        fields = [getattr(self, name) for name in (*NODES, *STATUS)]
+        if not all(map(has_values, (*fields, *self.info))) or not np.size(self.energy) or not np.ndim(self.t):
+            return eqx.Module.__repr__(self)
+        return summary(*summary_of(self))
 
     @property
     def origin(self) -> Origin:
@@ -211,7 +232,11 @@ def know(trajectory: Trajectory, origin: Origin, fields: dict | None = None) -> 
         origin: what it is of.
         fields: its fields, if it has none yet.
     """
-    vars(trajectory).update(fields or {}, _origin=origin)
+    attributes = vars(trajectory)
+    attributes.update(fields or {}, _origin=origin)
+    result = attributes["result"]
+    if isinstance(result, STATUS_ARRAYS) and result.ndim == 0 and is_concrete(result):
+        attributes["result"] = Status(result)  # which prints as a sentence
     return trajectory
 
 

@@ -86,7 +86,7 @@ class Ledger:
         table.add_row("a macro step", "", "", str(self.unknowns), "", *step, style="italic")
         return table
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return str(self.table())
 
     def _repr_mimebundle_(self, include=(), exclude=(), **kwargs) -> dict[str, str]:

@@ -13,6 +13,7 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.names import Names, Place, unknown
 from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.scene.assembly import actuation, build
 from vmri_jax.scene.body import AnyBody
@@ -66,6 +67,14 @@ class Scene:
     effects: Any = ()
     project: bool = False
     redundant: Literal["refuse", "drop"] = "refuse"
+
+    def __repr__(self) -> str:
+        effects = [effect.name for effect in self.effects]
+        return summary(
+            f"Scene of {len(self.bodies)} bodies and {len(effects)} effects",
+            {"bodies": listed([body.name for body in self.bodies]), "effects": listed(effects)}
+            | {"to see more": "scene.explain(scheme), scene.system(), scene.problem()"},
+        )
 
     def __post_init__(self):
         require_x64()

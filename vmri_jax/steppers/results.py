@@ -2,6 +2,8 @@
 
 from enum import IntEnum
 
+import numpy as np
+
 
 class Result(IntEnum):
     """Status of a macro step. `CONVERGED` and `CONVERGED_AT_ROUNDOFF` are successes."""
@@ -69,6 +71,20 @@ _MESSAGES = {
         "follow, or hold these rows instead of others."
     ),
 }
+
+
+class Status(np.int64):
+    """The `Result` of a whole run as a number of NumPy: a run stays a pytree of arrays, and its status prints as a sentence."""
+
+    def __str__(self) -> str:
+        result = Result(int(self))
+        return result.name if result.success else f"{result.name}: {result.message}"
+
+    def __repr__(self) -> str:
+        return repr(Result(int(self)))
+
+    def __format__(self, form: str) -> str:
+        return format(int(self), form) if form else str(self)
 
 
 RUNNING = -1

@@ -7,7 +7,8 @@ families, uphill from where they stand, and tries them with one micro step. Stag
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.work import WorkPrecision, WorkRow, timed_in_turn, work_row
+from vmri_jax.study.table import ResultTable
+from vmri_jax.study.work import WorkPrecision, WorkRow, duration, timed_in_turn, work_row
 
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 PATIENCE = 5.0
@@ -29,6 +31,8 @@ CLOSE = 1.1
 """The number of steps is found within this factor."""
 MARGIN = 10.0
 """A target must lie so many times above the error of the reference."""
+SHOWN = 5
+"""Settings that a recommendation and `vmri tune` print."""
 LUCK = 2.0
 """A setting whose error from another start is so many times larger was lucky; the next one is tried."""
 LONGEST = 5.0
@@ -235,8 +239,10 @@ class Verification:
 
 
 @dataclass(frozen=True)
-class Recommendation:
-    """The cheapest setting found for an error, and how it was found.
+class Recommendation(ResultTable):
+    """The cheapest setting found for an error, and how it was found; it prints as a table of the best few settings.
+
+    Its files, `to_csv` and `to_json`, hold all runs of the search.
 
     scheme, macro_dt, num_steps: what to give to `vmri_jax.running.simulate`.
     setting: the same with its error and time; others: the runners-up, the fastest first.
@@ -249,6 +255,31 @@ class Recommendation:
     others: tuple[Setting, ...]
     verification: Verification | None
     runs: WorkPrecision
+    columns = WorkPrecision.columns
+
+    @property
+    def rows(self) -> tuple[WorkRow, ...]:
+        """All runs of the search."""
+        return self.runs.rows
+
+    def shown(self) -> list[WorkRow]:
+        """The best settings, the choice first."""
+        return [setting.row for setting in (self.setting, *self.others)[:SHOWN]]
+
+    @property
+    def caption(self) -> str:
+        """What to run, and what it gave from another start."""
+        seen = self.verification
+        again = f" From another start its error is {seen.error_q:.1e}, in {duration(seen.seconds)}." if seen else ""
+        return (
+            f"For an error of {self.error:g} take the first: its .scheme, .macro_dt and .num_steps.{again} "
+            f"All {len(self.rows)} runs are in .runs and .to_csv(path)."
+        )
+
+    def content(self) -> dict[str, Any]:
+        """The choice, and all that the JSON file of the runs holds."""
+        chosen = {"error": self.error, "choice": asdict(self.setting.row)}
+        return {**self.runs.content(), **chosen}
 
     @property
     def scheme(self):

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vmri_jax import plots
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.timing import interleaved
@@ -20,6 +21,8 @@ from vmri_jax.study.timing import interleaved
 class CostRow:
     """One program: its size and its times.
 
+    method: what ``Newton(method=...)`` was told.
+    solved_by: name of the `Method` that took the steps, as ``run.info.method`` says it: "auto" chooses one.
     num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
     us_per_micro_step: the same per micro step, in microseconds.
@@ -35,16 +38,18 @@ class CostRow:
     us_per_micro_step: float
     first_call_seconds: float
     iterations: int
+    solved_by: str
     result: str
 
 
 @dataclass(frozen=True)
 class CostStudy(ResultTable):
-    """Rows of one or several cost studies."""
+    """Rows of one or several cost studies; each is a run of ``simulate(..., newton=Newton(method=row.method))``."""
 
     columns = (
         Column("what", lambda row: row.label),
         Column("method", lambda row: row.method),
+        Column("solved by", lambda row: row.solved_by),
         Column("num_micro", lambda row: f"{row.num_micro}", right=True),
         Column("unknowns", lambda row: f"{row.num_unknowns:,}", right=True),
         Column("µs per micro step", lambda row: f"{row.us_per_micro_step:.3g}", right=True),
@@ -66,6 +71,10 @@ class CostStudy(ResultTable):
             raise ValueError(f"curve: no {(label, method)} in this study; it has {self.curves}.")
         return np.array([row.num_micro for row in rows]), np.array([row.us_per_micro_step for row in rows])
 
+    def plot(self, title: str = "", theme: plots.Theme = plots.LIGHT):
+        """Computing time against num_micro, the cheapest point of each curve circled, see `vmri_jax.plots.plot_cost`."""
+        return plots.plot_cost({"": self}, title=title, theme=theme)
+
     def __add__(self, other: "CostStudy") -> "CostStudy":
         return CostStudy(self.rows + other.rows)
 
@@ -77,13 +86,16 @@ def cost_study(
     *,
     micro_dt: float,
     t_end: float,
-    methods: Sequence[str] = ("dense", "arrowhead"),
+    methods: Sequence[str] = ("auto", "dense"),
     repeats: int = 5,
     min_seconds: float = 0.1,
     label: str = "",
     progress: Progress = silent,
 ) -> CostStudy:
-    """Time ``scheme(n)`` for every n in `num_micro` with every linear solver, over the same simulated time.
+    """Time ``scheme(n)`` for every n in `num_micro` with every method of Newton's iteration, over the same simulated time.
+
+    "auto" is what `simulate` takes by itself, and "dense" what the reference paper took; every method is that of
+    ``simulate(..., newton=vm.Newton(method="dense"))`` and of ``vmri simulate --method dense``.
 
     Where `t_end` is not a whole number of macro steps their number is rounded, and times are given per simulated unit
     and per micro step. A timed call is one compiled program, started once; take `t_end` long enough (thousands of micro
@@ -98,7 +110,7 @@ def cost_study(
         num_micro: numbers of micro steps per macro step.
         micro_dt: the constant micro step h.
         t_end: simulated time of every timed run.
-        methods: see `vmri_jax.Newton`.
+        methods: "auto", "nested", "arrowhead", "null_space", "dense", see `vmri_jax.Newton`.
         repeats: timed runs of each program.
         min_seconds: runs shorter than this are called several times and averaged.
         label: name of this scheme or system in the rows.
@@ -145,5 +157,6 @@ def _row(
         us_per_micro_step=1e6 * median / (num_steps * scheme.num_micro),
         first_call_seconds=program.compile_seconds,
         iterations=int(np.max(trajectory.info.iterations)),
+        solved_by=Method(int(np.max(trajectory.info.method))).name,
         result=Result(int(trajectory.result)).name,
     )

@@ -62,8 +62,15 @@ class ResultTable:
     def __rich__(self) -> Table:
         return self.table()
 
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        cls.__repr__ = ResultTable.__repr__  # else `dataclass` writes one that prints every field of every row
+
     def __str__(self) -> str:
         return str(self.table())
+
+    def __repr__(self) -> str:
+        return str(self)
 
     def _repr_mimebundle_(self, include=(), exclude=(), **kwargs) -> dict[str, str]:
         """What notebooks show: the table."""

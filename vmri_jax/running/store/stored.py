@@ -8,10 +8,12 @@ import numpy as np
 
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, State
+from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import Exports
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
+from vmri_jax.running.summaries import named_coordinates
 from vmri_jax.running.trajectory import MICRO, NODES, RunInfo, Trajectory, ends_of, from_named_arrays
 from vmri_jax.steppers.results import Result, SimulationError
 
@@ -56,8 +58,14 @@ class StoredTrajectory(Exports):
         return cls(path)
 
     def __repr__(self) -> str:
-        state = "complete" if self.complete else "failed" if not self.success else "not complete"
-        return f"StoredTrajectory({str(self.path)!r}: {self.step} of {self.num_steps} macro steps, {state})"
+        state = "complete" if self.complete else "not complete" if self.success else f"failed: {self.result.name}"
+        lines = {"status": f"{self.step} of {self.num_steps} macro steps, {state}"}
+        if len(self):
+            ends = [float(self[node].t) for node in (0, -1)]
+            lines["times"] = f"t = {ends[0]:.6g} to {ends[1]:.6g}"
+            lines |= named_coordinates(self.origin.names, self[:1])
+        title = f"StoredTrajectory {self.path}: {len(self)} saved nodes, one every {self.save_every} macro steps"
+        return summary(title, lines)
 
     @property
     def origin(self) -> Origin:

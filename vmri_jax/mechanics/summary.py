@@ -1,0 +1,83 @@
+"""Summaries that `print` and notebooks show: a title, and named lines in words and a few numbers, never whole arrays."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete
+
+MOST_LISTED = 6
+"""Names or numbers that a line lists; of more the first ones and the last one."""
+MOST_PARAMETERS = 12
+"""Entries of `params` that a line lists."""
+
+
+def summary(title: str, lines: Mapping[str, str]) -> str:
+    """A title and a line for each name, indented; names without text are left out.
+
+    Args:
+        title: what it is.
+        lines: texts by name.
+    """
+    shown = {name: text for name, text in lines.items() if text}
+    width = max(map(len, shown), default=0)
+    return "\n".join([title, *(f"  {name:<{width}}  {text}" for name, text in shown.items())])
+
+
+def has_values(tree) -> bool:
+    """Whether a pytree has leaves, and all are numbers or arrays that can be read: no tracers, placeholders or donated arrays."""
+    leaves = jax.tree.leaves(tree)
+    kinds = (np.ndarray, np.generic, jax.Array, int, float)
+    return (
+        bool(leaves)
+        and is_concrete(tree)
+        and all(isinstance(leaf, kinds) for leaf in leaves)
+        and not any(isinstance(leaf, jax.Array) and leaf.is_deleted() for leaf in leaves)
+    )
+
+
+def listed(items: Sequence[str]) -> str:
+    """Items with commas between them, in the middle of many of them dots."""
+    if len(items) > MOST_LISTED:
+        items = [*items[: MOST_LISTED - 1], "...", items[-1]]
+    return ", ".join(items)
+
+
+def numbers(values) -> str:
+    """The numbers of a vector in a line; of a matrix, a tracer or anything else its shape."""
+    if not has_values(values) or np.ndim(values) > 1:
+        return eqx.tree_pformat(values, width=1000)
+    return listed([f"{x:.6g}" for x in np.atleast_1d(np.asarray(values))]) or "none"
+
+
+def coordinates(names: Sequence[str]) -> str:
+    """How many coordinates there are, and their names."""
+    if not names:
+        return "none"
+    return f"{len(names)} coordinate{'s' if len(names) > 1 else ''}: {listed(names)}"
+
+
+def name_of(function) -> str:
+    """What a function of a system is called; its class, where it has no name."""
+    inner = getattr(function, "function", function)  # of `TracedOnce`, `Rheonomic`, `KineticFunction`
+    inner = getattr(inner, "function", inner)
+    return getattr(inner, "__name__", type(inner).__name__)
+
+
+def parameters(params: Any) -> str:
+    """Parameters by name, numbers by value and arrays by shape."""
+    if not isinstance(params, Mapping):
+        return "" if params is None else _short(params)
+    texts = [f"{name} = {_short(value)}" for name, value in params.items()]
+    more = [f"and {len(texts) - MOST_PARAMETERS} more"] if len(texts) > MOST_PARAMETERS else []
+    return ", ".join([*texts[:MOST_PARAMETERS], *more])
+
+
+def _short(value) -> str:
+    leaves = jax.tree.leaves(value)
+    if len(leaves) > 1:
+        return f"{len(leaves)} arrays"
+    return f"{float(value):.6g}" if has_values(value) and np.ndim(value) == 0 else eqx.tree_pformat(value, width=1000)

@@ -1,0 +1,91 @@
+"""What a run is, in a few lines: how many nodes of which times, its coordinates by name, and what it has kept."""
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vmri_jax.mechanics.names import Names
+from vmri_jax.mechanics.summary import coordinates, listed, numbers, summary
+from vmri_jax.steppers.results import Result
+
+if TYPE_CHECKING:
+    from vmri_jax.running.simulate import Simulation
+    from vmri_jax.running.trajectory import Trajectory
+
+
+def summary_of(run: "Trajectory") -> tuple[str, dict[str, str]]:
+    """Title and lines of the summary of a run, or of a batch of runs.
+
+    Args:
+        run: with values, no tracers.
+    """
+    t, energy, residual = (np.asarray(a) for a in (run.t, run.energy, run.constraint_residual))
+    lanes = t.shape[:-1]
+    of = f" of a batch of {' x '.join(map(str, lanes))} runs" if lanes else ""
+    times = f" from t = {np.nanmin(t):.6g} to {np.nanmax(t):.6g}" if np.isfinite(t).any() else ""
+    return f"Trajectory{of}: {t.shape[-1]} saved nodes{times}", {
+        "status": statuses(np.asarray(run.result), np.asarray(run.failed_at)),
+        **named_coordinates(run.origin.names, run),
+        "energy": energy_in_words(energy, run.keeps_energy),
+        "constraints": _constraints(residual.reshape(-1, residual.shape[-1])),
+        "solver": run.info.in_words(),
+        "micro nodes": "" if run.t_micro is None else f"t_micro and q_f_micro, {run.t_micro.shape[-1]} per saved node",
+    }
+
+
+def summary_of_prepared(run: "Simulation") -> str:
+    """What a prepared run will do.
+
+    Args:
+        run: of `vmri_jax.prepare`.
+    """
+    micro = f", of {run.scheme.num_micro} micro steps each" if run.scheme.num_micro > 1 else ""
+    lines = {
+        "macro steps": f"{run.num_steps} of {numbers(run.macro_dt)}{micro}",
+        "saved nodes": f"{run.num_saves + 1}, one every {run.save_every} macro steps",
+    }
+    return summary("Simulation, prepared: run() makes a Trajectory", lines | run.system.terms())
+
+
+def named_coordinates(names: Names | None, run: "Trajectory") -> dict[str, str]:
+    """Lines on the slow and the fast coordinates of a run by name, plain names where none are known."""
+    names = (names or Names()).of_coordinates(run.q_s.shape[-1], run.q_f.shape[-1])
+    return {"slow": coordinates(names.slow_coordinates), "fast": coordinates(names.fast_coordinates)}
+
+
+def statuses(result: np.ndarray, failed_at: np.ndarray) -> str:
+    """The status of a run by name; of a batch how many runs have which, and where the first ones failed."""
+    if not result.ndim:
+        at = "" if failed_at < 0 else f" at macro step {failed_at}; all saved nodes after it are NaN"
+        return f"{Result(int(result)).name}{at}"
+    seen = Counter(Result(int(r)).name for r in result.ravel())
+    failed = [str(i) for i in np.flatnonzero(failed_at.ravel() >= 0)]
+    where = f"; failed: run.lane(i) for i = {listed(failed)}" if failed else ""
+    return ", ".join(f"{count} {name}" for name, count in seen.most_common()) + where
+
+
+def energy_in_words(energy: np.ndarray, kept: bool | None) -> str:
+    """Energy at the start and how it changes; of a batch the largest change in a run.
+
+    Args:
+        energy: (k,), of a batch (..., k); NaN after a failure.
+        kept: whether the system keeps it; None if that is not known.
+    """
+    start = energy[..., :1]
+    change = np.abs(energy - start)
+    largest = float(np.nanmax(change, initial=0.0))
+    if energy.ndim > 1:
+        return f"changed by at most {largest:.2e} in a run"
+    if kept is False:
+        last = energy[np.isfinite(energy)]
+        return f"{start[0]:.6g} at the start, {last[-1] if last.size else np.nan:.6g} at the end; run.work() says why"
+    relative = f", {largest / abs(start[0]):.1e} of it" if abs(start[0]) > 1e-12 else ""
+    return f"{start[0]:.6g} at the start, changed by at most {largest:.2e}{relative}"
+
+
+def _constraints(residual: np.ndarray) -> str:
+    if not np.nanmax(residual, initial=0.0) > 0:
+        return ""
+    position, velocity = np.nanmax(residual, axis=0, initial=0.0)
+    return f"kept to {position:.1e} in positions, {velocity:.1e} in velocities"
