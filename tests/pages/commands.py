@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,24 @@ from typer.testing import CliRunner
 from vmri_jax.cli import app as vmri
 
 ROOT = Path(__file__).parents[2]
+PAGES = ("README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs/**/*.md")
+GALLERY = "notebooks/scenes/README.md"
+SEARCHES = ("vmri tune", "vmri cost")
+"""Commands of two minutes: they have a file of tests for themselves, so that two workers share the commands."""
+FILES = {"crane.py": "README.md", "my_scene.py": "docs/how_to/scenes.md"}
+"""Files that commands name, each the first program of a page."""
+CODES = {"vmri advise fpu": 1}
+"""Exit codes other than 0: a step that is advised against."""
+SMALLER = {"python -m benchmarks hard": "--case 24", "python -m benchmarks fuzz": "--count 1 --out fuzz"}
+"""Options that make minutes to seconds: one case of 28, one system of 2000."""
+NOT_RUN = {
+    "make": "a command of CI, or one of hours; only the target is looked up",
+    ".ci/run": "CI itself",
+    "pip": "installs from the internet, as the first step of CI does",
+    "#!/bin/bash": "a job for a cluster",
+    "python -m benchmarks": "takes minutes to hours on an idle machine; only its options are tested here, small forms in tests/benchmarks",
+}
+"""Beginnings of commands that are not run, and why."""
 BLOCK = re.compile(r"```sh\n(.*?)```\n(?:(?:\n[^\n`]*\n)?\n```text\n(.*?)```)?", re.DOTALL)
 """A block of commands; with the block of text below it, if one line of words at most stands between them."""
 
@@ -99,3 +118,21 @@ def shows(printed: str, line: str) -> bool:
     """Whether a line is among those that were printed; `...` in it stands for anything, spaces for any number of spaces."""
     pattern = re.escape(" ".join(line.split())).replace(r"\.\.\.", ".*")
     return any(re.fullmatch(pattern, " ".join(other.split())) for other in printed.splitlines())
+
+
+def why_not_run(command: str) -> str:
+    """The reason why a command is not run; nothing if it is."""
+    command = command.removeprefix(".venv/bin/")
+    return next((why for start, why in NOT_RUN.items() if command.startswith(start) and command not in SMALLER), "")
+
+
+def runs(block: Block) -> bool:
+    """Whether any command of a block is run."""
+    return not all(map(why_not_run, block.commands))
+
+
+def check(block: Block, run: Callable[[str], str]) -> None:
+    """Runs the commands of a block, and compares the last output with the lines that the page shows."""
+    printed = [run(command) for command in block.commands if not why_not_run(command)]
+    for line in block.lines:
+        assert shows(printed[-1], line), f"{line!r} is not in:\n{printed[-1]}"
