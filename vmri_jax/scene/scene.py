@@ -110,18 +110,22 @@ class Scene:
 
     @classmethod
     def from_mujoco(cls, model: Any, *, qpos: Any = None, qvel: Any = None, ignore: Collection[str] = ()) -> "Scene":
-        """The scene of a model of MuJoCo: bodies, inertias, joints, their springs and dampers, connect, weld, gravity.
+        """The scene of a model of MuJoCo: bodies, inertias, joints, their springs and dampers, connect, weld, gravity and gravcomp.
 
-        All bodies decide their pace by themselves; ``scene.replace("arm", pace="fast")`` changes that.
+        Flags of the model are heard: what they switch off neither acts nor is refused. All bodies decide their pace by
+        themselves; ``scene.replace("arm", pace="fast")`` changes that.
 
         Args:
             model: path of an MJCF or URDF file, or a compiled `mujoco.MjModel`.
-            qpos, qvel: MuJoCo's coordinates and velocities at the start; None for those of the model, at rest.
-            ignore: what is left out although the model has it, by the names in the message that refuses it.
+            qpos, qvel: MuJoCo's coordinates and velocities at the start; None for those of the model, at rest. Loops that
+                qpos leaves open by less than a thousandth of the model's extent are closed by moving the joints.
+            ignore: what is left out of the motion although the model has it, by the names in the message that refuses it.
 
         Raises:
-            ImportError: without the package mujoco.
-            ValueError: a file that MuJoCo cannot read; all that a scene does not express, in one list.
+            ImportError: without the package mujoco, or with one before 4.0.
+            TypeError: a model of another kind, names to ignore that are no list.
+            ValueError: a file that MuJoCo cannot read; all that a scene does not express, in one list; loops that are open at
+                the start; an unknown name to ignore; qpos or qvel of another shape or not finite.
         """
         from vmri_jax.scene.mujoco import bodies_and_effects  # its package is an extra
 

@@ -1,0 +1,233 @@
+"""A compiled model of MuJoCo: what its bodies are called, what is switched off, and what of it no scene expresses."""
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from vmri_jax.mechanics.names import unknown
+from vmri_jax.scene.body import GROUND
+from vmri_jax.scene.mujoco_fields import CONSTRAINTS, PASSIVE, REFUSED, Refusal
+
+SOFTEST_TIME = 0.02
+"""s, the time constant in solref of MuJoCo's equalities by default; one that takes longer to close is meant as a spring."""
+SOFTEST_IMPEDANCE = 0.9
+"""The least impedance in solimp by default; an equality of less is meant to give way."""
+ELEMENTS = {"jnt": "joint", "dof": "joint", "body": "body", "tendon": "tendon", "actuator": "actuator"}
+"""Prefixes of fields with one row for each element, and what their elements are called."""
+NAMED = 8
+"""Most elements that a message names."""
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A compiled model.
+
+    Args:
+        mujoco: the package.
+        model: `mujoco.MjModel`.
+    """
+
+    mujoco: Any
+    model: Any
+
+    def off(self, *flags: str) -> bool:
+        """Whether one of these is set among opt.disableflags; of several flags in one string all must be."""
+        bits, named = int(self.model.opt.disableflags), self.mujoco.mjtDisableBit
+        return any(all(bits & int(getattr(named, f"mjDSBL_{flag}")) for flag in both.split()) for both in flags)
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """(3,) acceleration, m/s^2; zero where it is switched off."""
+        return np.zeros(3) if self.off("GRAVITY") else np.array(self.model.opt.gravity)
+
+    @property
+    def compensated(self) -> list[int]:
+        """Bodies whose weight is compensated."""
+        if self.off(PASSIVE) or not self.gravity.any():
+            return []
+        return [b for b in np.flatnonzero(self.model.body_gravcomp).tolist() if self.root(b)]
+
+    @property
+    def equalities(self) -> list[int]:
+        """The equalities that act."""
+        return [] if self.off(CONSTRAINTS, "EQUALITY") else np.flatnonzero(self.model.eq_active0).tolist()
+
+    def closes(self, i: int) -> bool:
+        """Whether an equality is a connect or a weld, of bodies or of sites."""
+        model, kinds, objects = self.model, self.mujoco.mjtEq, self.mujoco.mjtObj
+        return model.eq_type[i] in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)) and model.eq_objtype[i] in (
+            int(objects.mjOBJ_BODY),
+            int(objects.mjOBJ_SITE),
+        )
+
+    @cached_property
+    def roots(self) -> list[int]:
+        """The first of every group of bodies that are welded together, without those that rest: the world and mocap bodies."""
+        return [b for b in range(1, self.model.nbody) if self.root(b) == b]
+
+    def root(self, body: int) -> int:
+        """The first of the bodies that a body is welded to, itself perhaps; 0 of one that rests."""
+        root = int(self.model.body_weldid[body])
+        return 0 if self.model.body_mocapid[root] >= 0 else root
+
+    def group(self, body: int) -> str:
+        """The name in the scene of the rigid body that a body is part of."""
+        root = self.root(body)
+        return self.name("body", root) if root else GROUND
+
+    def name(self, kind: str, i: int) -> str:
+        """What an element is called in the scene: as in the model, or by its number; "arm joint" where a body is "arm" too."""
+        name = getattr(self.model, kind)(int(i)).name or f"{kind} {int(i)}"
+        return f"{name} {kind}" if name == GROUND or (kind != "body" and name in self._bodies) else name
+
+    @cached_property
+    def _bodies(self) -> set[str]:
+        return {self.model.body(b).name for b in range(self.model.nbody)}
+
+    def refuse(self, ignore: Collection[str]) -> None:
+        """Raise ValueError with all that the model has and a scene does not express, but for what is ignored.
+
+        Args:
+            ignore: names in `REFUSED`.
+        """
+        if isinstance(ignore, str):
+            raise TypeError(f"Scene.from_mujoco: ignore is {ignore!r}; give a list, ignore=[{ignore!r}].")
+        ignorable = [kind for kind, refusal in REFUSED.items() if refusal.ignorable]
+        for kind in ignore:
+            if kind not in REFUSED:
+                raise ValueError(f"Scene.from_mujoco: ignore: {unknown('name', kind, ignorable)}")
+        left = {kind: part for kind, part in self.beyond() if kind not in ignore or not REFUSED[kind].ignorable}
+        if not left:
+            return
+        named = [kind for kind in left if REFUSED[kind].ignorable]
+        advice = [f"leave it out of the motion, ignore={named}"] if named else []
+        advice += [f"for {kind}, {REFUSED[kind].without}" for kind in left if not REFUSED[kind].ignorable]
+        raise ValueError(
+            "Scene.from_mujoco: the model has what a scene of rigid bodies does not express: "
+            f"{'; '.join(f'{kind} ({part})' for kind, part in left.items())}. Change the model, or {'; '.join(advice)}."
+        )
+
+    def beyond(self) -> Iterator[tuple[str, str]]:
+        """What a scene does not express: its name in `REFUSED`, and which elements of the model it is."""
+        looks: dict[str, Callable[[], str]] = {
+            "actuators": self._actuators,
+            "contact": self._contact,
+            "springs and dampers of ball and free joints": self._turning_springs,
+            "couplings": self._couplings,
+            "soft equalities": self._soft_equalities,
+            "sleep": self._sleep,
+            "several joints of one body": self._several_joints,
+            "compensation of gravity by actuators": self._actuated_compensation,
+        }
+        for kind, refusal in REFUSED.items():
+            part = looks[kind]() if kind in looks else self._acting(refusal)
+            if part:
+                yield kind, part
+
+    def _acting(self, refusal: Refusal) -> str:
+        """The elements of the model whose fields are not zero, nor switched off."""
+        parts = []
+        for name, flags in refusal.fields.items():
+            values = np.asarray(getattr(self.model.opt if name.startswith("opt.") else self.model, name.split(".")[-1]))
+            if self.off(*flags) or not values.any():
+                continue
+            if values.ndim == 0:
+                parts.append(f"{name.removeprefix('opt.')} = {values:g}")
+                continue
+            kind = ELEMENTS[name.split("_")[0]]
+            rows = np.flatnonzero(_rows(values))
+            rows = self.model.dof_jntid[rows] if name.startswith("dof_") else rows
+            parts.append(self._listed(kind, rows))
+        return ", ".join(dict.fromkeys(parts))
+
+    def _listed(self, kind: str, rows) -> str:
+        """ "joint a, joint b, ..." without repetitions."""
+        names = list(dict.fromkeys(f"{kind} {getattr(self.model, kind)(int(i)).name or int(i)}" for i in rows))
+        more = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
+        return ", ".join(names[:NAMED] + more)
+
+    def _actuators(self) -> str:
+        """Those of groups that are not disabled; their armature and damping act in any case."""
+        fields = REFUSED["actuators"].fields
+        groups = np.asarray(self.model.actuator_group)
+        # a bit for each of the groups 0 to 30; others cannot be disabled
+        disabled = (
+            (groups >= 0) & (groups < 31) & ((int(self.model.opt.disableactuator) >> groups.clip(0, 30)) & 1 == 1)
+        )
+        acting = np.zeros(len(groups), dtype=bool) if self.off("ACTUATION") else ~disabled
+        for name, flags in fields.items():
+            if name != "nactuator" and not self.off(*flags):
+                acting = acting | _rows(getattr(self.model, name))
+        return self._listed("actuator", np.flatnonzero(acting))
+
+    def _contact(self) -> str:
+        pairs = self.touching()
+        if not len(pairs):
+            return ""
+        model, several = self.model, "s" if len(pairs) > 1 else ""
+        bodies = [model.body(int(model.geom_bodyid[g])).name or f"body {model.geom_bodyid[g]}" for g in pairs[0]]
+        return f"{len(pairs)} pair{several} of geoms, as of {bodies[0]} and {bodies[1]}"
+
+    def touching(self) -> np.ndarray:
+        """(n, 2) pairs of geoms that may collide by MuJoCo's rules: types, parents, exclusions; and those that are named as pairs."""
+        model = self.model
+        if self.off(CONSTRAINTS, "CONTACT"):
+            return np.zeros((0, 2), dtype=int)
+        body = np.asarray(model.geom_bodyid)
+        weld = model.body_weldid[body]
+        group, parent = np.array([self.root(b) for b in body], dtype=int), model.body_weldid[model.body_parentid[weld]]
+        kind, affinity = np.asarray(model.geom_contype), np.asarray(model.geom_conaffinity)
+        meet = (kind[:, None] & affinity) | (affinity[:, None] & kind) != 0
+        if not self.off("FILTERPARENT"):  # parents and children do not collide, unless the parent is the world
+            child = (weld[:, None] == parent) & (weld[:, None] != 0) & (weld != 0)
+            meet &= ~(child | child.T)
+        for first, second in zip(*np.divmod(model.exclude_signature, 1 << 16), strict=True):
+            excluded = (body[:, None] == first) & (body == second)
+            meet &= ~(excluded | excluded.T)
+        for first, second in zip(model.pair_geom1, model.pair_geom2, strict=True):  # has precedence over exclusion
+            meet[first, second] = meet[second, first] = True
+        meet &= group[:, None] != group  # those that are welded together do not move against each other
+        return np.argwhere(np.triu(meet))
+
+    def _turning_springs(self) -> str:
+        """Ball and free joints with a spring or a damper."""
+        model, kinds = self.model, self.mujoco.mjtJoint
+        turning = np.isin(model.jnt_type, [int(kinds.mjJNT_FREE), int(kinds.mjJNT_BALL)])
+        sprung = np.zeros(model.njnt, dtype=bool) if self.off("SPRING") else np.asarray(model.jnt_stiffness) != 0
+        damped = [] if self.off("DAMPER") else model.dof_jntid[np.flatnonzero(model.dof_damping)]
+        sprung[np.asarray(damped, dtype=int)] = True
+        return self._listed("joint", np.flatnonzero(turning & sprung))
+
+    def _couplings(self) -> str:
+        """Equalities that are neither connect nor weld."""
+        return self._listed("equality", [i for i in self.equalities if not self.closes(i)])
+
+    def _soft_equalities(self) -> str:
+        """Connects and welds that are softer than by default; with negative numbers solref is a spring."""
+        model = self.model
+        soft = [
+            i
+            for i in self.equalities
+            if self.closes(i)
+            and (not 0 < model.eq_solref[i, 0] <= SOFTEST_TIME or model.eq_solimp[i, :2].min() < SOFTEST_IMPEDANCE)
+        ]
+        return self._listed("equality", soft)
+
+    def _sleep(self) -> str:
+        asleep = int(self.model.opt.enableflags) & int(self.mujoco.mjtEnableBit.mjENBL_SLEEP)
+        return "the flag sleep" if asleep else ""
+
+    def _several_joints(self) -> str:
+        return self._listed("body", np.flatnonzero(np.asarray(self.model.body_jntnum) > 1))
+
+    def _actuated_compensation(self) -> str:
+        """Joints whose actuators compensate gravity, where it is compensated at all."""
+        return self._acting(REFUSED["compensation of gravity by actuators"]) if self.compensated else ""
+
+
+def _rows(values: Any) -> np.ndarray:
+    """Which rows of a field have an entry that is not zero."""
+    return np.any(values, axis=tuple(range(1, np.ndim(values))))
