@@ -114,6 +114,15 @@ def find_problem(name: str) -> Problem:
         raise ValueError(f"{name} is a scene that makes no system: {type(error).__name__}: {error}") from error
 
 
+def find_scene_or_problem(name: str) -> Scene | Problem:
+    """The scene of a name, before it is made a problem; or the problem, as of `find_problem`.
+
+    Raises:
+        ValueError: as of `find_problem`.
+    """
+    return SYSTEMS[name].factory() if name in SYSTEMS else _find_own(name)
+
+
 def find_scene(name: str) -> Scene:
     """The scene in your own file, ``my_file.py:my_scene``, or ``my_file.py`` as in `find_problem`.
 

@@ -37,6 +37,19 @@ def test_scenes_are_found_in_files(file):
     assert find_problem("fpu").q_s.shape == systems.fermi_pasta_ulam().q_s.shape
 
 
+def test_explain_takes_systems_of_functions():
+    result = CliRunner().invoke(cli.app, ["explain", "tsp", "--no-measure", "--num-micro", "4"])
+    assert result.exit_code == 0, result.output
+    lines = [" ".join(line.split()) for line in result.output.splitlines()]
+    assert "bob 1 body macro 3" in lines
+    assert "bob 3 body micro 12" in lines
+    assert "spring fast potential W micro 4" in lines
+    assert "second_rod constraint g micro 4 4" in lines
+    assert "a macro step 32" in lines
+    head = lines.index("frequency period in fast coordinates kinetic energy in")
+    assert lines[head + 1] == "100 0.06283 100% bob 2 z 50%, bob 3 z 50%"  # sqrt(5000 (1 / 1 + 1 / 1)): the spring
+
+
 def test_explain_prints_the_ledger(file):
     result = CliRunner().invoke(cli.app, ["explain", file, "--no-measure", "--num-micro", "4"], env={"COLUMNS": "160"})
     assert result.exit_code == 0, result.output

@@ -1,14 +1,17 @@
-"""`vmri explain`: what a scene adds to a macro step, body by body and effect by effect."""
+"""`vmri explain`: what a scene or a system adds to a macro step, body by body and term by term; and its vibrations."""
 
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
-from vmri_jax.catalogue import find_scene, find_scheme
+from vmri_jax.catalogue import find_scene_or_problem, find_scheme
 from vmri_jax.cli import options
 from vmri_jax.cli.common import RIGHT, console, refusals, status
+from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.arguments import nothing_fast
+from vmri_jax.scene.ledger import ledger_of_functions
+from vmri_jax.stability.vibrations import vibrations
 
 app = typer.Typer()
 
@@ -17,7 +20,7 @@ app = typer.Typer()
     rich_help_panel=RIGHT, epilog="Example:\n\nvmri explain my_file.py:my_scene --scheme explicit-slow --num-micro 20"
 )
 def explain(
-    scene: Annotated[str, typer.Argument(help="my_file.py:my_scene, or my_file.py alone.")],
+    system: options.System,
     scheme: options.Scheme = "fully-implicit",
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,
@@ -29,18 +32,24 @@ def explain(
     ] = None,
     measure: Annotated[bool, typer.Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
-    """Where every body and effect of a scene lives and why, and what it adds: unknowns, evaluations, time.
+    """Where every body and effect of a scene, or function of a system, lives and why, and what it adds; and all frequencies.
 
-    The time of an effect is that of its first derivatives at all of its nodes, once.
+    What it adds are unknowns, evaluations, and the time of its first derivatives at all of its nodes, once. Frequencies are
+    those of small vibrations about the start.
     """
     with refusals():
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
-        found = find_scene(scene)
+        moving = find_scene_or_problem(system)
         with status("compiling and timing" if measure else "looking"):
-            ledger = found.explain(chosen, macro_dt=macro_dt, measure=measure)
+            if isinstance(moving, Problem):
+                ledger = ledger_of_functions(moving, chosen, macro_dt, measure)
+            else:
+                ledger = moving.explain(chosen, macro_dt=macro_dt, measure=measure)
+            small = vibrations(moving)
     console.print(ledger.table())
     console.print()
     console.print(ledger.reasons())
+    console.print("\n[bold]Small vibrations[/bold] about the start\n", small.table())
     useless = nothing_fast(chosen, sum(row.kind == "body" and row.grid != "macro" for row in ledger.rows))
     if useless:
         console.print(f"\n[yellow]{escape(useless)}[/yellow]")

@@ -1,4 +1,4 @@
-"""The ledger of a scene: what every body and effect adds to a macro step, and what it costs."""
+"""The ledger of a scene or of a system of functions: what every body and effect adds to a macro step, and what it costs."""
 
 import re
 from collections import Counter
@@ -11,7 +11,10 @@ import numpy as np
 
 from vmri_jax.diagnostics import frequencies
 from vmri_jax.mechanics import invariants
-from vmri_jax.mechanics.state import initial_state
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.names import Names
+from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.mechanics.summary import name_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.simulate import Simulation, prepare
@@ -128,6 +131,46 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
     return Ledger(tuple(rows), whole)
 
 
+def ledger_of_functions(
+    problem: Problem, scheme: Scheme | Composition, macro_dt: float | None = None, measure: bool = True
+) -> Ledger:
+    """The ledger of a system of functions: its coordinates by name, and each of its functions.
+
+    Args:
+        problem: the system and where it starts.
+        scheme, macro_dt, measure: as of `Scene.explain`.
+    """
+    system, state, one = problem.system, problem.state(), stage_scheme(scheme)
+    stages = scheme.num_stages if isinstance(scheme, Composition) else 1
+    intervals = {"macro": stages * one.degree, "micro": stages * one.degree * one.num_micro}
+    names = (problem.names or Names()).of_coordinates(state.q_s.size, state.q_f.size)
+    rows = []
+    for name, (part, _, size) in names.bodies.items():
+        pace, grid = ("fast", "micro") if part == "f" else ("slow", "macro")
+        rows.append(Row(name, "body", grid, f"{pace}: it is in q_{part}", intervals[grid] * size, 0, 0))
+    terms = [home for home in HOMES if home != "control" and getattr(system, home) is not None]
+    if system.has_constant_mass:
+        terms.remove("kinetic")
+    for home in terms:
+        alone = _alone(system, home, state)
+        rule = getattr(one, RULES.get(home, home))
+        multipliers = intervals[rule.grid] * sum(alone.num_constraints(state.q_s, state.q_f))
+        count, time = stages * evaluations(rule, one.num_micro), None
+        if measure:
+            derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
+            time = 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
+        why = f"the rule of the scheme for it is on the {rule.grid} grid"
+        rows.append(Row(name_of(getattr(system, home)), HOMES[home], rule.grid, why, 0, multipliers, count, time))
+    return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, 10.0) if measure else None)
+
+
+def _alone(system: System, home: str, state: State) -> System:
+    """The system with one of its functions, and unit masses unless that is the kinetic energy."""
+    masses = ConstantMass(np.ones(state.q_s.size), np.ones(state.q_f.size))
+    others = {name: None for name in HOMES if name not in (home, "kinetic", "control")}
+    return system.replace(**others, **({} if home == "kinetic" else {"kinetic": masses}))
+
+
 def evaluations(rule, num_micro: int) -> int:
     """Nodes of a rule in a macro step, one at the border of two steps counted once."""
     nodes = rule.composite(num_micro).nodes
@@ -139,14 +182,19 @@ def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
     """Microseconds of a macro step, and nanoseconds of one evaluation of the first derivatives of every effect."""
     system = build(sorting, sorting.placed)
     state = initial_state(system, *sorting.start, project=True)
-    if macro_dt is None:
-        fastest = float(frequencies(system, state)[0])
-        macro_dt = scheme.num_micro * 0.1 / (fastest or _turning(sorting) or 10.0)
-    step = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
+    step = _macro_step(system, scheme, state, macro_dt, _turning(sorting) or 10.0)
     q_s, q_f, v_s, v_f = sorting.start
     own = [_first_derivatives(build(sorting, [part]), q_s.size, v_s, v_f) for part in sorting.placed]
     q = jnp.concatenate([q_s, q_f])
-    return 1e6 * float(np.median(step)) / STEPS, [1e9 * seconds_each(derivatives, q) for derivatives in own]
+    return step, [1e9 * seconds_each(derivatives, q) for derivatives in own]
+
+
+def _macro_step(system: System, scheme, state: State, macro_dt: float | None, otherwise: float) -> float:
+    """Microseconds of a macro step; without a step size of one that the fastest vibration, or else this frequency, suggests."""
+    if macro_dt is None:
+        macro_dt = scheme.num_micro * 0.1 / (float(frequencies(system, state).max(initial=0.0)) or otherwise)
+    step = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
+    return 1e6 * float(np.median(step)) / STEPS
 
 
 def _turning(sorting: Sorting) -> float:

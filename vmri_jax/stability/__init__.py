@@ -6,6 +6,7 @@ from vmri_jax.stability.linear import SmallMotions, linear_model, small_motions
 from vmri_jax.stability.map import StabilityMap, Window, stability_map
 from vmri_jax.stability.monodromy import Monodromy, monodromy
 from vmri_jax.stability.multipliers import Multipliers, multipliers
+from vmri_jax.stability.vibrations import Vibration, Vibrations, vibrations
 
 __all__ = [
     "Advice",
@@ -14,6 +15,8 @@ __all__ = [
     "Multipliers",
     "SmallMotions",
     "StabilityMap",
+    "Vibration",
+    "Vibrations",
     "Window",
     "advise",
     "linear_model",
@@ -22,4 +25,5 @@ __all__ = [
     "plot_stability",
     "small_motions",
     "stability_map",
+    "vibrations",
 ]
