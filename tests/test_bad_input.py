@@ -19,11 +19,13 @@ from vmri_jax import (
     State,
     System,
     explicit_slow,
+    fully_explicit,
     fully_implicit,
     galerkin,
     initial_state,
     macro,
     micro,
+    mollified_impulse,
     quadrature,
     simulate,
     simulate_batch,
@@ -147,6 +149,11 @@ def vector_fast_potential(q_f, params):
     return q_f**2
 
 
+def entry_that_is_not_there(q_f, params):
+    """JAX takes the last entry instead, without a word."""
+    return jnp.sin(q_f[3])
+
+
 def scalar_constraint(q_s, q_f, params):
     return jnp.sum(q_f)
 
@@ -198,6 +205,10 @@ def numpy_potential(q_f, params):
             "fast_potential cannot be traced, line .* of test_bad_input.py .*instead of numpy and math",
         ),
         ({"slow_potential": lambda q_s, q_f, params: None}, "slow_potential returns NoneType; it must return a scalar"),
+        (
+            {"fast_potential": entry_that_is_not_there},
+            r"fast_potential takes an entry .* test_bad_input.py .*index 3 is out of",
+        ),
         ({"slow_potential": vector_potential}, r"slow_potential returns shape \(3,\); it must return a scalar"),
         ({"fast_potential": vector_fast_potential}, r"fast_potential returns shape \(3,\); it must return a scalar"),
         ({"constraint": scalar_constraint}, r"constraint returns shape \(\); it must return a vector"),
@@ -280,6 +291,8 @@ def test_bad_masses(slow, message):
 def test_system_fields_of_the_wrong_type():
     with pytest.raises(TypeError, match=r"kinetic is 3.0; give ConstantMass"):
         System(3.0)
+    with pytest.raises(TypeError, match="slow_potential is a ConstantMass; masses come first"):
+        System(vector_fast_potential, ConstantMass([1.0], [1.0]))
     with pytest.raises(TypeError, match="slow_potential is 2; it must be a function or None"):
         System(ConstantMass([1.0], [1.0]), slow_potential=2)
     with pytest.raises(TypeError, match=r"force is Unhashable.*, which has no hash"):
@@ -379,6 +392,13 @@ def test_only_rules_are_placed():
             place("midpoint")  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="rule is 3; give a Rule"):
         galerkin(2, 1, 3)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("alpha", [2.0, -0.5, np.nan])
+def test_parts_of_kicks_are_from_0_to_1(alpha):
+    for make in (explicit_slow, fully_explicit, mollified_impulse):
+        with pytest.raises(ValueError, match=f"alpha is {alpha}; it must be from 0 to 1: it is the part of a kick"):
+            make(2, alpha)
 
 
 def test_bad_number_of_springs():

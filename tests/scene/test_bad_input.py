@@ -18,6 +18,7 @@ from vmri_jax.scene import (
     Gravity,
     Guide,
     HarmonicDrive,
+    Kinetic,
     LinearDamping,
     MagneticField,
     MovingPivot,
@@ -292,3 +293,26 @@ def edge(q, v, params):
 def test_functions_of_other_arguments(make, message):
     with pytest.raises(TypeError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    ("effect", "message"),
+    [
+        (Potential(lambda q, params: q[0] ** 2, "bob", name="pull"), r"pull: function returns shape \(2,\).* a scalar"),
+        (Kinetic(lambda q, v, params: v[0], "bob", name="lift"), r"lift: function returns shape \(2,\).* a scalar"),
+        (Constraint(lambda q, params: None, "bob", name="rail"), r"rail: function returns NoneType.*vector \(k,\)"),
+        (
+            Force(lambda t, q, v, params: -v[0], "bob", name="drag"),
+            r"drag: .* shape \(2,\);.*\(force,\) of a single body",
+        ),
+        (Force(lambda t, q, v, params: (v[0][:1],), "bob", name="drag"), r"a force for each body, of shapes \(2,\)"),
+        (
+            Potential(lambda q, params: q[0][2], "bob", name="weight"),
+            "weight: function takes an entry that is not there",
+        ),
+        (Drive("bob", lambda t, params: jnp.sin(t)), r"drive: history returns shape \(\); bob has dimension 2"),
+    ],
+)
+def test_functions_that_return_something_else(effect, message):
+    with pytest.raises(ValueError, match=message):
+        Scene([A], [effect])

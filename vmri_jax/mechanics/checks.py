@@ -9,7 +9,7 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import check_precision, is_concrete, real_array
 from vmri_jax.mechanics.arrays import require_x64 as require_x64
-from vmri_jax.mechanics.functions import with_time
+from vmri_jax.mechanics.functions import TracedOnce, with_time
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 
@@ -87,7 +87,7 @@ def check_system(system: System, q_s, q_f) -> None:
         if function is not None:
             shape = shape_of(f"System: {name}", function, *args, system.params)
             if getattr(shape, "shape", None) != ():
-                raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a scalar, shape ().")
+                raise ValueError(f"System: {name} returns {describe(shape)}; it must return a scalar, shape ().")
             _check_float64(name, shape)
     if system.implied is not None and not system.is_constrained:
         raise ValueError(
@@ -99,13 +99,13 @@ def check_system(system: System, q_s, q_f) -> None:
         if function is not None:
             shape = shape_of(f"System: {name}", function, *args)
             if len(getattr(shape, "shape", ())) != 1:
-                raise ValueError(f"System: {name} returns {_describe(shape)}; it must return a vector, shape (n_g,).")
+                raise ValueError(f"System: {name} returns {describe(shape)}; it must return a vector, shape (n_g,).")
             _check_float64(name, shape)
     if system.force is not None:
         shape = shape_of("System: force", system.force, jnp.zeros(()), q_s, q_f, q_s, q_f, system.params)
         if not isinstance(shape, tuple) or [getattr(s, "shape", None) for s in shape] != [(n_s,), (n_f,)]:
             raise ValueError(
-                f"System: force returns {_describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
+                f"System: force returns {describe(shape)}; it must return (F_s, F_f) of shapes ({n_s},) and ({n_f},)."
             )
         for part in shape:
             _check_float64("force", part)
@@ -133,7 +133,7 @@ def shape_of(what: str, function, *args):
         return value
 
     try:
-        return jax.eval_shape(along, *args)
+        shape = jax.eval_shape(along, *args)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
             f"{what} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
@@ -147,9 +147,27 @@ def shape_of(what: str, function, *args):
             ) from error
         raise ValueError(
             f"{what} could not be evaluated on arguments of shapes "
-            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and the params{_line_of(error)}: "
-            f"{type(error).__name__}: {error}"
+            f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and {'params=None' if args[-1] is None else 'the params'}"
+            f"{_line_of(error)}: {type(error).__name__}: {error}"
         ) from error
+    _check_indices(what, function, args)
+    return shape
+
+
+def _check_indices(what: str, function, args) -> None:
+    """Refuse a function that takes ``q[3]`` of three entries: JAX takes the last entry instead, NumPy refuses.
+
+    The function is traced once more with arrays of NumPy; other errors are those of operations that NumPy's arrays do not have.
+    """
+    raw = function.function if isinstance(function, TracedOnce) else function
+    moving, params = jax.tree.map(lambda a: np.zeros(np.shape(a)), args[:-1]), args[-1]
+    try:
+        with np.errstate(all="ignore"):
+            jax.eval_shape(lambda: raw(*moving, params))
+    except IndexError as error:
+        raise ValueError(f"{what} takes an entry that is not there{_line_of(error)}: {error}.") from None
+    except Exception:
+        return
 
 
 def _line_of(error: Exception) -> str:
@@ -170,7 +188,8 @@ def _check_float64(name: str, value) -> None:
         )
 
 
-def _describe(value) -> str:
+def describe(value) -> str:
+    """Shapes of what a function returned, in words."""
     if isinstance(value, tuple):
-        return "(" + ", ".join(_describe(v) for v in value) + ")"
+        return "(" + ", ".join(describe(v) for v in value) + ")"
     return f"shape {value.shape}" if hasattr(value, "shape") else type(value).__name__

@@ -202,6 +202,8 @@ def _checked(name: str, function):
     if isinstance(function, Rheonomic) and name in ("constraint", "slow_constraint", "implied"):
         _check_function(name, function.function, "t, ")
         return Rheonomic(traced_once(function.function))
+    if isinstance(function, ConstantMass):
+        raise TypeError(f"System: {name} is a ConstantMass; masses come first, System(ConstantMass(slow, fast), V, W).")
     if not callable(function):
         raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
     _check_function(name, function)

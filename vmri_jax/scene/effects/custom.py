@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.checks import shape_of
+from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, check_arguments
 from vmri_jax.scene.body import end_of, entry, is_entry
 from vmri_jax.scene.declare import effect_class
@@ -87,7 +87,26 @@ class CustomEffect(Effect):
         q, _ = self.one(0, bodies, params)
         q = tuple(map(jnp.asarray, q))
         known = {"potential": (q,), "constraint": (t, q) if self.timed else (q,), "kinetic": (q, q), "force": (t, q, q)}
-        shape_of(f"{self.name}: function", self.function, *known[self.kind], params)
+        value = shape_of(f"{self.name}: function", self.function, *known[self.kind], params)
+        self._check_value(value, [x.shape for x in q])
+
+    def _check_value(self, value: Any, sizes: list[tuple[int, ...]]) -> None:
+        """Refuse an energy that is no scalar, rows that are no vector, forces that are not one for each body."""
+        shape = getattr(value, "shape", None)
+        if self.kind == "force":
+            fits = isinstance(value, tuple | list) and [getattr(x, "shape", None) for x in value] == sizes
+            expected = (
+                f"a tuple with a force for each body, of shapes {', '.join(map(str, sizes))}: (force,) of a single body"
+            )
+        elif self.kind == "constraint":
+            fits, expected = (
+                shape is not None and len(shape) < 2,
+                "a vector (k,) of values that are kept zero, or one value ()",
+            )
+        else:
+            fits, expected = shape == (), "an energy, a scalar of shape ()"
+        if not fits:
+            raise ValueError(f"{self.name}: function returns {describe(value)}; it must return {expected}.")
 
     def check_bodies(self, bodies):
         super().check_bodies(bodies)

@@ -6,6 +6,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from vmri_jax.mechanics.checks import shape_of
+from vmri_jax.scene.body import end_of
 from vmri_jax.scene.declare import effect_class, names, number, of_time, positive, vector
 from vmri_jax.scene.effect import Effect, real_tree
 from vmri_jax.scene.effects.points import BetweenPoints
@@ -95,6 +97,18 @@ class Drive(Effect):
 
     def parameters(self, bodies):
         return real_tree(f"{self.name}: params", self.params)
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        shape = getattr(
+            shape_of(f"{self.name}: history", self.history, jnp.zeros(()), self.parameters(bodies)), "shape", None
+        )
+        for (name,) in self.elements(bodies):
+            size = end_of(bodies, name).size
+            if shape != (size,) and (shape, size) != ((), 1):
+                raise ValueError(
+                    f"{self.name}: history returns shape {shape}; {name} has dimension {size}, return ({size},)."
+                )
 
 
 @effect_class
