@@ -89,7 +89,7 @@ def _batch(problems, made, draws, how) -> list[vm.Trajectory]:
         jax.tree.map(lambda *lanes: np.stack(lanes), *some) for some in (starts, [p.system.params for p in problems])
     )
     dt = np.array([at.macro_dt for at in draws])
-    runs = vm.simulate_batch(problems[0].system, made, states, params=params, macro_dt=dt, **how)
+    runs = vm.simulate_batch(problems[0].system, made, states, params=params, macro_dt=dt, warn=False, **how)
     return [jax.tree.map(lambda a, i=i: a[i], runs) for i in range(len(draws))]
 
 

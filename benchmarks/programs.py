@@ -44,9 +44,9 @@ def unknowns(problem: vm.Problem, num_micro: int) -> int:
 
 
 def program(problem: vm.Problem, scheme: vm.Scheme | vm.Composition, newton: vm.Newton | None = None, **step):
-    """``run(num_steps)``, a prepared run with ``macro_dt`` or ``micro_dt`` that saves the last node only."""
+    """``run(num_steps)``, a prepared run with ``macro_dt`` or ``micro_dt`` that saves the last node only, NaN if it fails."""
     prepared = vm.prepare(problem.system, scheme, problem.state(), **step, num_steps=1, newton=newton)
-    return lambda num_steps, **other: prepared(num_steps=num_steps, **other)
+    return lambda num_steps, **other: prepared(num_steps=num_steps, **other, throw=False)
 
 
 def failed(trajectory: vm.Trajectory) -> bool:

@@ -111,7 +111,7 @@ def prepared(degree: int, steps: int, angles: bool) -> vm.Simulation:
 
 def by_bodies(degree: int, steps: int) -> vm.Trajectory:
     """The run of the scene of rigid bodies."""
-    return prepared(degree, steps, False)(throw=True)
+    return prepared(degree, steps, False)()
 
 
 def of_bodies(run: vm.Trajectory) -> np.ndarray:
@@ -123,7 +123,7 @@ def of_bodies(run: vm.Trajectory) -> np.ndarray:
 
 def by_angles(degree: int, steps: int) -> np.ndarray:
     """The angles at the end, of the system in these angles."""
-    return np.asarray(prepared(degree, steps, True)(throw=True).q_s[-1])
+    return np.asarray(prepared(degree, steps, True)().q_s[-1])
 
 
 # --- in seven angles with six constraints, as the source states it ----------------------------------------------------

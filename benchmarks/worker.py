@@ -135,7 +135,7 @@ class Prepared(Call):
         """The same by `vm.prepare`."""
         problem = case.problem()
         run = vm.prepare(problem.system, case.made_scheme(), problem.state(), macro_dt=case.macro_dt, num_steps=1)
-        return lambda num_steps: run(num_steps=num_steps)
+        return lambda num_steps: run(num_steps=num_steps, throw=False)
 
 
 class Batch(Timed):

@@ -10,7 +10,7 @@ from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
-from vmri_jax.running.batch import simulate_batch
+from vmri_jax.running.batch import FailedLanesWarning, simulate_batch
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.lost_energy import LostEnergyWarning
 from vmri_jax.running.macro_step import macro_step
@@ -74,6 +74,7 @@ __all__ = [
     "CompiledAgainWarning",
     "Composition",
     "ConstantMass",
+    "FailedLanesWarning",
     "Interrupted",
     "LostEnergyWarning",
     "Method",

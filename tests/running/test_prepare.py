@@ -20,6 +20,7 @@ from vmri_jax import (
     prepare,
     simulate,
 )
+from vmri_jax.running import progress
 
 CALLS = Counter()
 STEPS = {"macro_dt": 0.03, "num_steps": 8, "save_every": 2}
@@ -57,29 +58,52 @@ def test_numbers_change_without_compiling_again(fpu):
     assert largest_difference(changed.q_f, run().q_f) > 1e-3
 
 
-def test_the_fallback_takes_over(fpu):
+def test_the_fallback_takes_over_and_says_so(fpu, capsys, monkeypatch):
+    monkeypatch.setattr(progress, "SECONDS", 0.0)
     newton = Newton(max_iterations=8)
     run = prepare(fpu.system, fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=5, newton=newton)
     trajectory = run()
     assert trajectory.success
+    assert "a step that the first method does not solve: the fallback is compiled" in capsys.readouterr().err
     assert np.any(np.asarray(trajectory.info.method) == Method.ARROWHEAD)
     run.timed()()
 
 
-def test_failures_are_in_the_trajectory_or_raised(fpu):
+def test_failures_are_raised_or_in_the_trajectory(fpu):
     run = prepare(fpu.system, fully_explicit(3), fpu.state(), **STEPS)
     bad = State(fpu.state().t, 1e200 * fpu.state().q_s, *(getattr(fpu.state(), name) for name in ("q_f", "p_s", "p_f")))
-    trajectory = run(bad)
+    trajectory = run(bad, throw=False)
     assert trajectory.result == Result.NON_FINITE
     assert trajectory.failed_at == 0
     with pytest.raises(SimulationError, match="macro step 0"):
-        run(bad, throw=True)
+        run(bad)
+
+
+STEPS_TAKEN = Counter()
+
+
+def counted(q_f, params):
+    jax.debug.callback(lambda: STEPS_TAKEN.update(["W"]))
+    return jnp.sum(q_f**2) / 2
+
+
+def test_after_a_failure_no_step_is_taken(fpu):
+    """The first of 40 steps fails: the potential is evaluated for the energy of 41 nodes and in that step, no more."""
+    system, state = fpu.system.replace(fast_potential=counted), fpu.state()
+    run = prepare(system, fully_explicit(1), state, macro_dt=0.01, num_steps=40)
+    jax.effects_barrier()
+    STEPS_TAKEN.clear()
+    trajectory = run(State(state.t, 1e200 * state.q_s, state.q_f, state.p_s, state.p_f), throw=False)
+    jax.effects_barrier()
+    assert trajectory.failed_at == 0
+    assert 41 < STEPS_TAKEN["W"] <= 45  # 42; 82 if all steps were taken
+    assert np.allclose(trajectory.t, 0.01 * np.arange(41), rtol=1e-15, atol=0)
 
 
 def test_a_start_off_the_constraints_has_failed(tsp):
     run = prepare(tsp.system, fully_explicit(2), tsp.state(), macro_dt=0.01, num_steps=2)
     state = tsp.state()
-    trajectory = run(State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f))
+    trajectory = run(State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f), throw=False)
     assert trajectory.result == Result.CONSTRAINT_VIOLATED
     assert np.isnan(trajectory.q_f).all()
     off = State(state.t, state.q_s, 1.01 * state.q_f, state.p_s, state.p_f)

@@ -51,7 +51,7 @@ def bad_lane(
     p_s, p_f = (jnp.asarray(p).at[bad].set(ABSURD) for p in (along.p_s, along.p_f))
     states = State(along.t, along.q_s, along.q_f, p_s, p_f)
     options = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps, "newton": newton}
-    batch = simulate_batch(problem.system, scheme, states, **options)
+    batch = simulate_batch(problem.system, scheme, states, **options, warn=False)
     failed = np.flatnonzero(np.asarray(batch.failed_at) >= 0)
     apart = 0.0
     for lane in sorted({*np.linspace(0, lanes - 1, compared, dtype=int), bad - 1, bad + 1} - {bad}):

@@ -1,7 +1,6 @@
 """Optimal control: the controls that bring a system to a goal at the least cost."""
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -19,7 +18,7 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.origin import Origin, names_of
-from vmri_jax.running.progress import progress_shown, silent
+from vmri_jax.running.progress import Working, progress_shown
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -78,7 +77,8 @@ def minimize(
         grid: controls for every macro interval, or for every micro interval.
         tolerance: of updates, gaps, the goal and limits, relative to the motion and to the controls.
         max_iterations: at most so many linear-quadratic problems.
-        progress: show cost and misses of each iteration.
+        progress: show cost and misses of each iteration as a bar; without it a line tells them now and then, where it takes more
+            than two seconds.
 
     Returns:
         The `Optimum`; where the goal was not reached, the best that was found, which says so.
@@ -111,7 +111,8 @@ def minimize(
     search = Search(setup)
     point = started(search, start, num_steps, len(labels), grid)
     rho, history, nu = 1.0, [], np.zeros(0)
-    with progress_shown() if progress else nullcontext(silent) as tell:
+    with progress_shown() if progress else Working("minimize") as tell:
+        tell("compiling the steps and their derivatives", 0, max_iterations)
         for count in range(1, max_iterations + 1):
             try:
                 change, steepest, stages, final = search.update(point)

@@ -202,6 +202,7 @@ class Work:
             params=lanes.params,
             newton=self.newton,
             chunk=width,
+            warn=False,
         )
         kept = {name: np.asarray(getattr(trajectory, name))[:count] for name in STATUS}
         return kept | {name: np.asarray(value)[:count] for name, value in self._kept(trajectory).items()}

@@ -16,6 +16,7 @@ from vmri_jax.fitting.unknowns import Unknown, Unknowns
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
+from vmri_jax.running.progress import Progress, Working
 from vmri_jax.running.simulate import prepare
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -30,6 +31,8 @@ TOLERANCE = 1e-6
 """Changes of the search variables at which the search ends."""
 BAD = 1e6
 """What a value counts as missed by, in standard deviations, where a run fails."""
+PHASES = 4
+"""Parts of a fit that are told apart where it takes long."""
 
 
 def fit(
@@ -53,7 +56,7 @@ def fit(
         print(found)
 
     It minimises ``sum ((predicted - measured) / sigma)^2`` by the method of Levenberg and Marquardt (`optimistix`), with the
-    Jacobian in forward mode.
+    Jacobian in forward mode. What takes more than two seconds is said on the error stream.
 
     Args:
         problem: whose ``system.params`` is a dict; `parameters` then name entries of it, or "q_s", "q_f", "v_s", "v_f" for
@@ -85,16 +88,18 @@ def fit(
     steps = [m.steps(float(first.t), macro_dt) for m in data]
     if max(s.max() for s in steps) < 1:
         raise ValueError("fit: all times of measurement are that of the start; measure later ones, too.")
-    run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), newton=newton)
-    run(throw=True)
-    if newton is None and run.plan.has_fallback:
-        newton = Newton("nested")
-    shooting = Shooting(model, unknowns, data, steps, scheme, newton or Newton(), float(macro_dt), segments)
-    search = _Search(shooting, max_steps)
-    u = np.zeros((starts, unknowns.size))
-    u[1:] = spread * np.random.default_rng(seed).standard_normal((starts - 1, unknowns.size))
-    search.check_dependence()
-    return search.result(u)
+    with Working("fit") as tell:
+        tell("a run with the parameters to start from", 0, PHASES)
+        run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), newton=newton)
+        run()
+        if newton is None and run.plan.has_fallback:
+            newton = Newton("nested")
+        shooting = Shooting(model, unknowns, data, steps, scheme, newton or Newton(), float(macro_dt), segments)
+        search = _Search(shooting, max_steps)
+        u = np.zeros((starts, unknowns.size))
+        u[1:] = spread * np.random.default_rng(seed).standard_normal((starts - 1, unknowns.size))
+        search.check_dependence(tell)
+        return search.result(u, tell)
 
 
 def _optimistix():
@@ -219,8 +224,9 @@ class _Search:
         """`jacobian`, compiled."""
         return jax.jit(self.jacobian)
 
-    def check_dependence(self) -> None:
+    def check_dependence(self, tell: Progress) -> None:
         """Refuse parameters that change nothing that was measured."""
+        tell("compiling and running the derivatives by the parameters", 1, PHASES)
         at = np.zeros(self.size), self.others / self.scale, self.shooting.values
         by_parameters = np.asarray(self.compiled_jacobian(*at)[0])
         dead = np.flatnonzero(~by_parameters.any(axis=0))
@@ -231,13 +237,15 @@ class _Search:
                 "it out, or start elsewhere."
             )
 
-    def result(self, u) -> Fit:
+    def result(self, u, tell: Progress) -> Fit:
         """The best of the searches from the rows of u."""
+        tell(f"compiling the search, then at most {self.max_steps} steps of it", 2, PHASES)
         z = np.broadcast_to(self.others / self.scale, (len(u), *self.others.shape))
         solve = jax.jit(jax.vmap(self.solve, (0, 0, None)))
         found = [np.asarray(a) for a in solve(u, z, self.shooting.values)]
         squares = np.sum(found[2] ** 2, axis=1)
         u, z, misses, iterations, good, gap = (a[np.argmin(squares)] for a in found)
+        tell("the derivatives at what the search came to", 3, PHASES)
         by_parameters, by_starts = (np.asarray(a) for a in self.compiled_jacobian(u, z, self.shooting.values))
         return Fit.of(
             self.shooting,

@@ -1,5 +1,6 @@
 """Batches of runs: many starts, step sizes or parameters of one system, lane by lane independent."""
 
+import warnings
 from dataclasses import replace
 from functools import lru_cache
 
@@ -14,6 +15,7 @@ from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import Engine
 from vmri_jax.running.memory import check_memory
+from vmri_jax.running.progress import Working
 from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory, from_arrays
 from vmri_jax.schemes.composition import Composition, stage_scheme
@@ -25,6 +27,10 @@ WORKING_SET = 4096
 """Fast and slow variables at all nodes of a macro step that the lanes of a chunk may have together, 32 kB."""
 FEWEST, MOST = 64, 1024
 """Lanes of a chunk. With fewer of them a lane takes longer, even where 64 do not fit into the cache."""
+
+
+class FailedLanesWarning(UserWarning):
+    """Lanes of a batch failed: they are NaN from a step on, and the others are right."""
 
 
 def simulate_batch(
@@ -42,12 +48,14 @@ def simulate_batch(
     newton: Newton | None = None,
     chunk: int | None = None,
     devices: int = 1,
+    warn: bool = True,
 ) -> Trajectory:
     """Simulate a batch of states, each lane as `simulate` would; the arrays returned have a leading batch axis.
 
-    Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. A lane that fails is NaN from there on and has
-    its status in ``.result`` and ``.failed_at``; others do not notice, and nothing is raised. Lanes that the nested march does
-    not solve are run again with the exact arrowhead.
+    Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike `simulate` it never raises because of a
+    step: a lane that fails is NaN from there on and has its status in ``.result`` and ``.failed_at``, and others do not notice. A
+    `FailedLanesWarning` says how many there are. Lanes that the nested march does not solve are run again with the exact arrowhead,
+    which is compiled for the first of them.
 
     Args:
         system, scheme: what moves, a `System`, `Problem` or scene, and how.
@@ -58,6 +66,7 @@ def simulate_batch(
         params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
         devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
+        warn: give a `FailedLanesWarning` where lanes failed; False for a program that looks at the statuses itself.
 
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
@@ -96,7 +105,8 @@ def simulate_batch(
         "state": tuple(np.asarray(a, dtype=float) for a in vars(states).values()),
         "macro_dt": None if dt.ndim == 0 else dt * (scheme.num_micro if micro_dt is not None else 1),
     }
-    trajectory = _in_chunks(run, run.engine, batch, width, devices)
+    with Working("simulate_batch: compiled if it is the first of its kind, then stepped"):
+        trajectory = _in_chunks(run, run.engine, batch, width, devices)
     unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
     failed = np.flatnonzero(unsolved)
     if failed.size and run.plan.has_fallback:
@@ -107,9 +117,29 @@ def simulate_batch(
             2 ** int(failed.size - 1).bit_length()
         )  # of a few sizes, so that few programs serve all numbers of failures
         filled = failed[np.minimum(np.arange(rooms), failed.size - 1)]
-        again = _in_chunks(run, exact, jax.tree.map(lambda a: a[filled], batch), width, devices)
+        with Working(
+            f"simulate_batch: {failed.size} of {lanes} lanes, which the first method does not solve, with the fallback"
+        ):
+            again = _in_chunks(run, exact, jax.tree.map(lambda a: a[filled], batch), width, devices)
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
+    if warn:
+        _warn_of_failures(trajectory)
     return trajectory.of(run.origin if params is None else run.origin._replace(params=params, lanes=True))
+
+
+def _warn_of_failures(trajectory: Trajectory) -> None:
+    """Warn about lanes that failed, and say how the first of them did."""
+    failed_at = np.asarray(trajectory.failed_at)
+    failed = np.flatnonzero(failed_at >= 0)
+    if failed.size:
+        first = int(failed[0])
+        result = Result(int(trajectory.result[first]))
+        warnings.warn(
+            f"simulate_batch: {failed.size} of {failed_at.size} lanes failed and are NaN from there on; .result and .failed_at say "
+            f"which. The first is lane {first}, at macro step {failed_at[first]} ({result.name}): {result.message}",
+            FailedLanesWarning,
+            stacklevel=3,
+        )
 
 
 def _first(dt):

@@ -1,6 +1,6 @@
 """The engine of all runs: a loop of macro steps inside a scan over saved nodes, compiled once per structure."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -113,6 +113,7 @@ class Engine:
         system, tolerance, num_micro = stepper.system, stepper.newton.tolerance, stepper.scheme.num_micro
         no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
         no_micro = jnp.zeros((num_micro, state.q_f.shape[0])) if self.save_micro else None
+        first = step
         take = _step_of(stepper, t_start, macro_dt, self.save_micro)
 
         def interval(at: _At):
@@ -123,18 +124,25 @@ class Engine:
             return at, worst, micro
 
         def nothing(at: _At):
-            return at, no_info, no_micro
+            micro = None if no_micro is None else jnp.where(at.failed_at < 0, no_micro, jnp.nan)
+            return at, no_info, micro
 
-        def save(at: _At, moves):
-            at, worst, micro = interval(at) if moves is None else jax.lax.cond(moves, interval, nothing, at)
+        def save(at: _At, number):
+            if number is None:
+                at, worst, micro = interval(at)
+            else:
+                moves = number > 0
+                if saves is not None:  # one run: after a failure no step is tried, only the clock goes on
+                    moves &= (number <= saves) & (at.failed_at < 0)
+                at, worst, micro = jax.lax.cond(moves, interval, nothing, at)
+                t = t_start + (first + number * save_every) * macro_dt
+                at = at._replace(state=replace(at.state, t=jnp.where(at.failed_at < 0, at.state.t, t)))
             node, at = _node(system, tolerance, at)
             return at, (node, worst, micro)
 
         at = _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
         if loops is PLAIN:  # one place for the first node and all others: compiled once
-            number = np.arange(self.num_saves + 1)
-            moves = number > 0 if saves is None else (number > 0) & (number <= saves)
-            at, (nodes, *between) = jax.lax.scan(save, at, moves)
+            at, (nodes, *between) = jax.lax.scan(save, at, np.arange(self.num_saves + 1))
             worst, micro = jax.tree.map(lambda a: a[1:], between)
         else:  # derivatives of that would take twice as long to compile
             first, at = _node(system, tolerance, at)

@@ -1,8 +1,13 @@
-"""Progress of long work: who is told, and how it is shown, as a bar in a terminal and as lines elsewhere."""
+"""Progress of long work: who is told, and how it is shown, as a bar in a terminal and as lines elsewhere.
+
+Work that takes more than two seconds says by a line what it does, whether it was asked for progress or not. A thread of its own
+writes the lines, so that they come while JAX compiles, too.
+"""
 
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 Progress = Callable[[str, int, int], None]
@@ -10,7 +15,79 @@ Progress = Callable[[str, int, int], None]
 
 
 SECONDS = 2.0
-"""Between two lines, where the output is no terminal; what takes less shows none."""
+"""Before the first line, and between two lines that tell something new; with a larger value the user waits longer in silence."""
+LONGEST_SILENCE = 60.0
+"""Seconds between two lines at most. Lines that tell nothing new come after twice the time of the one before; with a larger value the
+log of a run that compiles for an hour has fewer lines."""
+LOOKS = 0.5
+"""Seconds between two looks of the thread at the work; a larger value makes lines late by as much."""
+
+
+class Working:
+    """Within, what is being done is said on the error stream if it takes more than two seconds.
+
+        with Working("fit") as tell:
+            tell("the Jacobian at the start", 1, 3)
+
+    It costs about a microsecond where nothing is said. Works within each other share one line, the outermost one first.
+    """
+
+    def __init__(self, name: str, shown: bool = True):
+        self.name, self.shown, self.what, self.part = name, shown, "", ""
+        self.begin = self.last = time.monotonic()
+        self.wait, self.said = SECONDS, ""
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """A `Progress`: what is done now."""
+        self.what, self.part = what, f"{done / total:4.0%}  " if 0 < done < total else ""
+
+    def __enter__(self) -> Progress:
+        _works.append(self)
+        if not _awake.is_set():
+            _wake()
+        return self
+
+    def __exit__(self, *_) -> None:
+        _works.remove(self)
+
+    def say(self, inner: Sequence["Working"], now: float) -> None:
+        """A line about this and the works within it, if it is time for one."""
+        works = [self, *inner]
+        if not all(work.shown for work in works):
+            return
+        line = "; ".join(filter(None, (": ".join(filter(None, (work.name, work.what))) for work in works)))
+        news = self.part + line != self.said
+        if now - self.last < (SECONDS if news else self.wait):
+            return
+        self.wait = SECONDS if news else min(2 * self.wait, LONGEST_SILENCE)
+        self.last, self.said = now, self.part + line
+        print(f"{now - self.begin:5.0f} s  {self.said}", file=sys.stderr, flush=True)
+
+
+_works: list[Working] = []
+_awake = threading.Event()
+_watchers: list[threading.Thread] = []
+
+
+def _wake() -> None:
+    """Have the thread look at the work; after a fork of the process there is none yet."""
+    _awake.set()
+    if not any(watcher.is_alive() for watcher in _watchers):
+        _watchers[:] = [threading.Thread(target=_watch, name="vmri_jax progress", daemon=True)]
+        _watchers[0].start()
+
+
+def _watch() -> None:
+    while True:
+        _awake.wait()
+        time.sleep(LOOKS)
+        works = tuple(_works)
+        if works:
+            works[0].say(works[1:], time.monotonic())
+        else:
+            _awake.clear()
+            if _works:  # begun in between
+                _awake.set()
 
 
 @contextmanager
@@ -22,25 +99,13 @@ def progress_shown() -> Iterator[Progress]:
 
     console = Console(stderr=True)
     if not (console.is_terminal or console.is_jupyter):
-        yield _lines()
+        with Working("") as tell:
+            yield tell
         return
     columns = BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}")
-    with Bars(*columns, console=console, transient=True) as bars:
+    with Bars(*columns, console=console, transient=True) as bars, Working("", shown=False):
         task = bars.add_task("starting")
         yield lambda what, done, total: bars.update(task, description=what, completed=done, total=total)
-
-
-def _lines() -> Progress:
-    begin = last = time.monotonic()
-
-    def tell(what: str, done: int, total: int) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= SECONDS and done < total:
-            last = now
-            print(f"{now - begin:5.0f} s {done / total:4.0%}  {what}", file=sys.stderr, flush=True)
-
-    return tell
 
 
 def silent(what: str, done: int, total: int) -> None:

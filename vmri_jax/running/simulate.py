@@ -22,10 +22,11 @@ from vmri_jax.running.adjoints import check_adjoint
 from vmri_jax.running.arguments import check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Engine, engine, room_for
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
+from vmri_jax.running.largest_motion import what_moves_most
 from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
-from vmri_jax.running.progress import progress_shown
+from vmri_jax.running.progress import Working, progress_shown
 from vmri_jax.running.summaries import summary_of_prepared
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
@@ -37,6 +38,11 @@ from vmri_jax.steppers.results import Method, Result, SimulationError
 
 SHOWN = 50
 """A run with a progress bar is computed in about so many parts."""
+STEPPING = "the run: it is compiled if it is the first of its kind, then stepped"
+FALLING_BACK = (
+    "a step that the first method does not solve: the fallback is compiled if it is new, then the run is made with it"
+)
+"""What a run says of itself when it takes long."""
 
 
 def simulate(
@@ -76,7 +82,8 @@ def simulate(
         newton: how implicit equations are solved.
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN from the failure on.
-        progress: show a progress bar; the run is then compiled for a part of its saved nodes.
+        progress: show a progress bar; the run is then compiled for a part of its saved nodes. Without it a run that takes more than
+            two seconds says so by a line now and then.
         adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
             "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
 
@@ -99,11 +106,11 @@ def simulate(
         return know(traced_run(run, adjoint), run.origin)
     run.check()
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
-    trajectory = run.in_parts() if progress else run()
+    trajectory = run.in_parts() if progress else run(throw=False)
     if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
         check_constraints(run.system, run.state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
-        raise simulation_error(trajectory, run.macro_dt, save_every)
+        raise simulation_error(trajectory, run.macro_dt, save_every, scheme.num_micro)
     lost = lost_energy(trajectory, float(run.macro_dt)) if int(trajectory.failed_at) < 0 else ""
     if lost:
         warnings.warn(f"simulate: {lost}", LostEnergyWarning, stacklevel=2)
@@ -129,7 +136,9 @@ def prepare(
         trajectory = run()
         other = run(other_state, macro_dt=0.02, params=other_params)
 
-    A call costs some ten microseconds besides its steps. Arguments as of `simulate`.
+    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The
+    fallback of the method "auto" is not compiled here, but by the first call that needs it, which says so and takes as long as this.
+    Arguments as of `simulate`.
 
     Returns:
         The `Simulation`.
@@ -144,7 +153,10 @@ def prepare(
     check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
     leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
     run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start, room=run.num_saves)
-    jax.block_until_ready(run._program(False)(leaves, run.start_arrays, macro_dt, 0, 0))  # no steps: it only compiles
+    with Working("prepare: compiling the run"):
+        jax.block_until_ready(
+            run._program(False)(leaves, run.start_arrays, macro_dt, 0, 0)
+        )  # no steps: it only compiles
     return run
 
 
@@ -191,20 +203,22 @@ class Simulation:
     structure: Any = field(repr=False)
     may_fall_back: bool = True
 
-    def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = False) -> Trajectory:
+    def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = True) -> Trajectory:
         """The run, or the same from another start, with another step size, other parameters, another number of steps.
 
         Args:
             state, macro_dt, params: of the same shapes as before; None for those of the run.
             num_steps: a multiple of the number of saved intervals, which stays; None for that of the run.
-            throw: raise `SimulationError` if a step fails; else the status is in the trajectory.
+            throw: raise `SimulationError` if a step fails, as `simulate` does; else return the trajectory, NaN from the failure on.
 
         Raises:
             ValueError: arrays of other shapes; a function of the system that uses traced numbers which are not in params.
+            SimulationError: a step failed.
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
         origin = self.origin if params is None else self.origin._replace(params=params)
-        arrays = self._program(False)(*arguments)
+        with Working(STEPPING):
+            arrays = self._program(False)(*arguments)
         if not is_concrete(arrays):
             raise ValueError(
                 "simulate: a function of the system uses a number that jax.grad, vmap or jvp traces, and that is not among its arguments. "
@@ -214,9 +228,10 @@ class Simulation:
         if int(trajectory.failed_at) < 0:
             return trajectory
         if self._fallback_helps(trajectory):
-            trajectory = know(from_arrays(self._program(True)(*arguments), self.num_saves), origin)
+            with Working(FALLING_BACK):
+                trajectory = know(from_arrays(self._program(True)(*arguments), self.num_saves), origin)
         if throw and int(trajectory.failed_at) >= 0:
-            raise simulation_error(trajectory, arguments[2], arguments[3])
+            raise simulation_error(trajectory, arguments[2], arguments[3], self.scheme.num_micro)
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
@@ -325,7 +340,8 @@ class Simulation:
         """The next `saves` saved intervals, at most `room`; again with the fallback if the first method fails."""
         piece, end = self._advance(at, saves)
         if not at.fell_back and self._fallback_helps(piece):
-            return self._advance(self.start(at.state, at.step, fell_back=True), saves)
+            with Working(FALLING_BACK):
+                return self._advance(self.start(at.state, at.step, fell_back=True), saves)
         return piece, end
 
     def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
@@ -406,8 +422,8 @@ def _check_once(known: _Known) -> None:
         check_constraints(known.system, known.state, known.what)
 
 
-def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> SimulationError:
-    """The error that says how a failed run failed."""
+def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micro: int) -> SimulationError:
+    """The error that says how a failed run failed, and what moved most before that."""
     from vmri_jax.stability.labels import swapped_at_start  # only where a run failed: it stands on this room
 
     step = int(trajectory.failed_at)
@@ -419,6 +435,7 @@ def simulation_error(trajectory: Trajectory, macro_dt, save_every: int) -> Simul
         int(trajectory.info.iterations[interval]),
         float(trajectory.info.residual[interval]),
         trajectory,
+        what_moves_most(trajectory, step, save_every, float(macro_dt), num_micro),
     )
     return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, macro_dt, save_every))
 

@@ -230,7 +230,8 @@ def _check_placed(name: str, placed) -> None:
 def fully_implicit(num_micro: int) -> Scheme:
     """V and W at the midpoint of every micro interval. Order 2, symmetric, implicit.
 
-    Evaluations per macro step and Newton iteration: V num_micro, W num_micro.
+    Evaluations per macro step and Newton iteration: V num_micro, W num_micro. The first choice where springs are stiff: their ``omega h``
+    limits no step. Constraints act at the nodes, as in `fully_explicit`: light links that are pulled tight need ``omega h < 2`` here, too.
 
     Args:
         num_micro: micro steps per macro step.
@@ -268,7 +269,8 @@ def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
     """V as a kick at the macro nodes, W as kicks at the micro nodes (impulse method, r-RESPA at alpha = 1/2).
 
     Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints: V once and
-    W num_micro times per macro step, no Newton. Stable only for omega h < 2.
+    W num_micro times per macro step, no Newton. Stable only for omega h < 2. The first choice where the fast motion is that of rigid
+    links: there `fully_implicit` has the same limit and gives the same motion.
 
     Args:
         num_micro: micro steps per macro step.

@@ -69,7 +69,7 @@ class Coupled(Solver):
         method = Method[self.linear_solver.upper()]
         status = status_of(equations, result, method, iterations, rows, g, self.newton.tolerance)
         if equations.system.is_constrained:
-            failed = status.result > Result.CONVERGED_AT_ROUNDOFF
+            failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & _starts_finite(equations)
             never = partial(jnp.asarray, False)
             dependent = jax.lax.cond(failed, partial(has_dependent_constraints, equations), never)
             status = status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))
@@ -89,7 +89,8 @@ class Coupled(Solver):
             x, result, k = self._iterate(shorter, _stretched(at.rates, at.length), limit, damped)
             return at.after(x, result, k, left)
 
-        whole = Part(jnp.ones(()), jnp.ones(()), guess, guess, jnp.asarray(RUNNING), jnp.asarray(0))
+        tried = jnp.where(_starts_finite(equations), RUNNING, Result.NON_FINITE)  # after a failure nothing is tried
+        whole = Part(jnp.ones(()), jnp.ones(()), guess, guess, tried, jnp.asarray(0))
         done = jax.lax.while_loop(lambda at: at.result == RUNNING, attempt, whole)
         return done.x, done.result, done.iterations
 
@@ -157,6 +158,11 @@ class Part(NamedTuple):
         result = jnp.where(goes_on, RUNNING, result)
         length = jnp.minimum(solved + stride, 1.0)
         return Part(length, length - solved, rates, x, result, self.iterations + iterations)
+
+
+def _starts_finite(equations: StepEquations):
+    """Whether the step starts from numbers: it does not where a step before it failed."""
+    return jnp.isfinite(max_abs(equations.p_s) + max_abs(equations.p_f))
 
 
 def _stretched(x: Unknowns, factor) -> Unknowns:

@@ -36,13 +36,15 @@ _MESSAGES = {
     ),
     Result.STAGNATED: (
         "Newton's iteration used up its iterations while still improving slowly, and so did shorter parts of the step. Likely "
-        "causes: the step is too large for the fast forces, or the constraints are nearly dependent. Try a smaller macro_dt "
-        "or a larger num_micro, or raise Newton(max_iterations=...)."
+        "causes: the step is too large for the motion or for the fast forces, or the constraints are nearly dependent. Try a smaller "
+        "macro_dt or a larger num_micro, or raise Newton(max_iterations=...)."
     ),
     Result.DIVERGED: (
         "Newton's iteration moved away from a solution, and following the solution of shorter steps ended before the whole "
         "step: there may be none. Likely causes: the step is too large for the curvature of the potentials or constraints, "
-        "or the run is unstable and its energy has grown. Try a smaller macro_dt, and look at the energy before the failure."
+        "or the run is unstable and its energy has grown. Forces of constraints act at the nodes in implicit schemes too: a light "
+        "link that is pulled tight swings with omega = 2 sqrt(force / (mass length)), and needs steps below 2 / omega with any "
+        "scheme. Try a smaller macro_dt, and look at the energy before the failure."
     ),
     Result.NON_FINITE: (
         "a NaN or infinity appeared. Likely causes: an explicit scheme beyond its stability limit (omega h < 2), a function "
@@ -118,15 +120,19 @@ class SimulationError(RuntimeError):
         time: time at the start of that step.
         iterations, residual: the most Newton iterations and the largest residual of a step from the saved node before to it.
         trajectory: the `Trajectory` up to the failure (NaN after it).
+        moved: which body or coordinate moved most before it, and what that means for the step; empty where it is not known.
         labels: what is wrong with what is slow and what is fast; empty where nothing is.
     """
 
-    def __init__(self, result: Result, step: int, time: float, iterations: int, residual: float, trajectory):
-        self.result, self.step, self.time = result, step, time
+    def __init__(
+        self, result: Result, step: int, time: float, iterations: int, residual: float, trajectory, moved: str = ""
+    ):
+        self.result, self.step, self.time, self.moved = result, step, time, moved
         self.iterations, self.residual, self.trajectory, self.labels = iterations, residual, trajectory, ""
+        said = f"{result.message} {moved}".strip()
         super().__init__(
             f"macro step {step} at t = {time:.6g} failed ({result.name}) after {iterations} Newton iterations with residual "
-            f"{residual:.2e}: {result.message} The trajectory up to there is in this exception's .trajectory; "
+            f"{residual:.2e}: {said} The trajectory up to there is in this exception's .trajectory; "
             "throw=False returns it instead of raising."
         )
 
@@ -148,4 +154,5 @@ class SimulationError(RuntimeError):
         return self
 
     def __reduce__(self):
-        return type(self), (self.result, self.step, self.time, self.iterations, self.residual, self.trajectory)
+        fields = self.result, self.step, self.time, self.iterations, self.residual, self.trajectory, self.moved
+        return type(self), fields

@@ -302,6 +302,7 @@ def _runs(
         save_every=num_steps // num_saves,
         params=params,
         newton=newton,
+        warn=False,
     )
     return [jax.tree.map(lambda a, i=i: a[i], batch) for i in range(len(problems))]
 

@@ -62,12 +62,12 @@ class Program:
         return {"macro_dt": self.t_end / num_steps, "num_steps": num_steps}
 
     def __call__(self, num_steps: int) -> Trajectory:
-        """The trajectory with `num_saves` + 1 nodes.
+        """The trajectory with `num_saves` + 1 nodes, NaN from a failing step on.
 
         Raises:
             ValueError: num_steps is not a positive multiple of num_saves.
         """
-        return self._run(**self._steps(num_steps))
+        return self._run(**self._steps(num_steps), throw=False)
 
     def timed(self, num_steps: int):
         """A function without arguments that runs and waits, for a clock; takes the fallback if the run needs it."""

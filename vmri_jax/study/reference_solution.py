@@ -109,4 +109,4 @@ def reference_solution(
         coarse, n = fine, 2 * n
     if best is not None:
         return best
-    raise simulation_error(trajectory, t_end / n, n // num_saves)
+    raise simulation_error(trajectory, t_end / n, n // num_saves, num_micro=1)

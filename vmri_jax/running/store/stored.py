@@ -11,6 +11,7 @@ from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import Exports
+from vmri_jax.running.largest_motion import what_moves_most
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
 from vmri_jax.running.summaries import named_coordinates
@@ -139,8 +140,12 @@ class StoredTrajectory(Exports):
         for first in range(0, len(self) - 1, self.chunk):
             yield self[first : first + self.chunk + 1]
 
-    def raise_failure(self) -> None:
-        """Raise the `SimulationError` of a run that failed; its trajectory is this one."""
+    def raise_failure(self, num_micro: int = 1) -> None:
+        """Raise the `SimulationError` of a run that failed; its trajectory is this one.
+
+        Args:
+            num_micro: micro steps of the macro step.
+        """
         if self.success:
             return
         interval = self.failed_at // self.save_every
@@ -149,7 +154,8 @@ class StoredTrajectory(Exports):
         time = float(before.t[0] + (before.t[1] - before.t[0]) * within / self.save_every)
         iterations, residual = int(before.info.iterations[0]), float(before.info.residual[0])
         macro_dt = float(before.t[1] - before.t[0]) / self.save_every
-        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self).advised(macro_dt)
+        moved = what_moves_most(before, 0, 1, macro_dt, num_micro)
+        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self, moved).advised(macro_dt)
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
         return read_rows(self.path, name, rows, self.chunk)

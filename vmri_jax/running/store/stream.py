@@ -3,7 +3,7 @@
 import os
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +14,7 @@ from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.engine import room_for
 from vmri_jax.running.files import clear_partial
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.progress import Progress, progress_shown, silent
+from vmri_jax.running.progress import Progress, Working, progress_shown
 from vmri_jax.running.simulate import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import changed_conditions, differences, environment, identity
@@ -98,7 +98,7 @@ def stream(
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
-    with interrupts_noted() as interrupted, progress_shown() if progress else nullcontext(silent) as tell:
+    with interrupts_noted() as interrupted, progress_shown() if progress else Working("stream") as tell:
         if overwrite or not path.exists():
             with _explained(path, 0):
                 layout.create(path, attributes, Record.of(run.start()))
@@ -113,7 +113,7 @@ def stream(
     stored = StoredTrajectory(path)
     stored = stored.of(run.origin) if len(stored) else stored
     if throw:
-        stored.raise_failure()
+        stored.raise_failure(scheme.num_micro)
     return stored
 
 

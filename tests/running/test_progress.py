@@ -1,0 +1,45 @@
+"""Lines about work that takes long: on the error stream, unasked, and none about what is short."""
+
+import time
+
+import pytest
+
+from vmri_jax.running import progress
+from vmri_jax.running.progress import Working, progress_shown
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Lines after 50 ms instead of 2 s."""
+    monkeypatch.setattr(progress, "SECONDS", 0.05)
+    monkeypatch.setattr(progress, "LOOKS", 0.01)
+    time.sleep(0.6)  # the thread may still sleep for its usual time
+
+
+def test_long_work_says_what_it_does(quick, capsys):
+    with Working("fit") as tell:
+        tell("the search", 1, 4)
+        with Working("compiling"):
+            time.sleep(0.4)
+    first, *others = capsys.readouterr().err.splitlines()
+    assert first.split() == ["0", "s", "25%", "fit:", "the", "search;", "compiling"]
+    assert 1 <= len(others) <= 3  # the same line again comes after 2, 4, 8 times as long
+
+
+def test_short_work_says_nothing(capsys):
+    with Working("simulate"):
+        time.sleep(0.1)
+    assert capsys.readouterr().err == ""
+
+
+def test_what_has_been_asked_for_is_said_in_a_pipe_without_news(quick, capsys):
+    with progress_shown() as tell:
+        tell("simulating", 1, 2)
+        time.sleep(0.3)
+    assert "50%  simulating" in capsys.readouterr().err
+
+
+def test_a_bar_says_it_alone(quick, capsys):
+    with Working("", shown=False), Working("simulate"):
+        time.sleep(0.3)
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,104 @@
+"""Which body or coordinate moves most in a step: what a step that fails is probably too large for."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.names import AXES, Names
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+
+LARGE_TURN = 0.5
+"""Radians that a rigid body may turn in a step. Directors that multipliers hold from the start of a step have no next position beyond
+one radian; with a larger value a step near that limit is no longer blamed."""
+LARGE_MOVE = 0.25
+"""Part of the extent of all positions that a point or a coordinate may move in a step; with a larger value a step that throws a point
+through the others is no longer blamed."""
+
+
+class Motion(NamedTuple):
+    """How far a body, or a coordinate without a body, moves in a step.
+
+    name: of the body or coordinate.
+    micro: whether it is fast, so that a micro step counts.
+    amount: radians that a rigid body turns; else the part of the extent of all positions.
+    turns: whether it is a turn.
+    """
+
+    name: str
+    micro: bool
+    amount: float
+    turns: bool
+
+    @property
+    def size(self) -> float:
+        """The amount over what a step allows."""
+        return self.amount / (LARGE_TURN if self.turns else LARGE_MOVE)
+
+    def sentence(self, macro_dt: float) -> str:
+        """What it means for the step.
+
+        Args:
+            macro_dt: H, the step at which it moves so far.
+        """
+        step = "micro step" if self.micro else "macro step"
+        moves = f"turns {self.amount:.2g} rad" if self.turns else f"moves {self.amount:.1%} of the extent of the system"
+        if self.size < 1:
+            return f"Most motion before it: {self.name} {moves} in a {step}, which is little."
+        else_fast = ", or more micro steps" if self.micro else ", or make it fast, so that micro steps follow it"
+        return (
+            f"{self.name} {moves} in a {step}, which is too much for one step: take macro_dt below "
+            f"{macro_dt / self.size:.2g}{else_fast}."
+        )
+
+
+def largest_motion(system: System, state: State, names: Names | None, macro_dt: float, num_micro: int) -> Motion | None:
+    """The motion that is largest over what a step allows; None where there are no coordinates or no numbers.
+
+    A rigid body turns by ``h |omega|`` with ``2 |omega|^2 = sum_i |dd_i/dt|^2`` over its three directors d_i.
+
+    Args:
+        system, state: what moves, and where it is before the step.
+        names: of its coordinates, None if they have none.
+        macro_dt: H, length of the macro step.
+        num_micro: micro steps in it.
+    """
+    q, h = {"s": np.asarray(state.q_s), "f": np.asarray(state.q_f)}, {"s": macro_dt, "f": macro_dt / num_micro}
+    v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
+    moves = {"s": h["s"] * np.asarray(v_s), "f": h["f"] * np.asarray(v_f)}
+    known = (names or Names()).of_coordinates(q["s"].size, q["f"].size)
+    labels = {"s": known.slow_coordinates, "f": known.fast_coordinates}
+    positions = np.concatenate([q[part][known.positions(part)] for part in ("s", "f")])
+    extent = float(np.ptp(positions)) if positions.size > 1 else 0.0
+    motions = []
+    for name, place in known.bodies.items():
+        move, micro = moves[place.part][place.start : place.start + place.size], place.part == "f"
+        if name in known.rigid:
+            squares = np.sum(move[len(AXES) :].reshape(-1, len(AXES)) ** 2, axis=1)
+            three = len(squares) == len(AXES)
+            turn = np.sqrt(squares.sum() / 2 if three else squares.max(initial=0.0))
+            motions.append(Motion(name, micro, float(turn), True))
+            move = move[: len(AXES)]
+        if name in known.numbered:
+            most = int(np.abs(move).argmax())
+            name, move = labels[place.part][place.start + most], move[most]
+        if extent > 0:
+            motions.append(Motion(name, micro, float(np.linalg.norm(move) / extent), False))
+    return max((motion for motion in motions if np.isfinite(motion.amount)), key=lambda m: m.size, default=None)
+
+
+def what_moves_most(trajectory, step: int, save_every: int, macro_dt: float, num_micro: int) -> str:
+    """The sentence about the largest motion at the last node before a step that failed; empty where nothing is known.
+
+    Args:
+        trajectory: of the run, or a part of it, with the node before the failure; it may know its system.
+        step: number of the step that failed, counted from the first node of `trajectory`.
+        save_every: macro steps from one node to the next.
+        macro_dt, num_micro: of the run.
+    """
+    if trajectory.origin.system is None:
+        return ""
+    system = trajectory.origin.known_system.replace(params=trajectory.origin.params)
+    motion = largest_motion(system, trajectory[step // save_every], trajectory.names, macro_dt, num_micro)
+    return "" if motion is None else motion.sentence(macro_dt)
