@@ -16,6 +16,10 @@ LARGE_MOVE = 0.25
 """Part of the extent of all positions that a point or a coordinate may move in a step; with a larger value a step that throws a point
 through the others is no longer blamed."""
 
+RUN_AWAY = 20.0
+"""Multiple of what a step allows above which a motion is the outcome of an instability, not its cause; with a larger value steps are
+advised that follow from numbers of an explosion."""
+
 
 class Motion(NamedTuple):
     """How far a body, or a coordinate without a body, moves in a step.
@@ -46,6 +50,11 @@ class Motion(NamedTuple):
         moves = f"turns {self.amount:.2g} rad" if self.turns else f"moves {self.amount:.1%} of the extent of the system"
         if self.size < 1:
             return f"Most motion before it: {self.name} {moves} in a {step}, which is little."
+        if self.size > RUN_AWAY:
+            return (
+                f"{self.name} has run away before it: the run was unstable, its steps too large for a vibration. Look at the energy "
+                "of the nodes before."
+            )
         else_fast = ", or more micro steps" if self.micro else ", or make it fast, so that micro steps follow it"
         return (
             f"{self.name} {moves} in a {step}, which is too much for one step: take macro_dt below "

@@ -14,15 +14,14 @@ from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
 from vmri_jax.mechanics.checks import check_flags, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
-from vmri_jax.mechanics.jumps import in_words, jump_ahead
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.adjoints import check_adjoint
 from vmri_jax.running.arguments import check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Engine, engine, room_for
+from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.largest_motion import what_moves_most
 from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
@@ -34,7 +33,7 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import Plan, plan
-from vmri_jax.steppers.results import Method, Result, SimulationError
+from vmri_jax.steppers.results import Method
 
 SHOWN = 50
 """A run with a progress bar is computed in about so many parts."""
@@ -420,31 +419,3 @@ def _check_once(known: _Known) -> None:
     check_mass(known.system, known.state.q_s, known.state.q_f)
     if known.constraints:
         check_constraints(known.system, known.state, known.what)
-
-
-def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micro: int) -> SimulationError:
-    """The error that says how a failed run failed, and what moved most before that."""
-    from vmri_jax.stability.labels import swapped_at_start  # only where a run failed: it stands on this room
-
-    step = int(trajectory.failed_at)
-    interval = step // save_every
-    error = SimulationError(
-        Result(int(trajectory.result)),
-        step,
-        float(trajectory.t[0] + step * macro_dt),
-        int(trajectory.info.iterations[interval]),
-        float(trajectory.info.residual[interval]),
-        trajectory,
-        what_moves_most(trajectory, step, save_every, float(macro_dt), num_micro),
-    )
-    return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, macro_dt, save_every))
-
-
-def _jump(trajectory: Trajectory, macro_dt, save_every: int) -> str:
-    """The sentence about a force that jumps in the failing step or the one after it; empty where none does."""
-    system, interval = trajectory.origin.system, int(trajectory.failed_at) // save_every
-    if system is None or np.ndim(trajectory.t) != 1:
-        return ""
-    last = trajectory[interval]
-    steps = int(trajectory.failed_at) - interval * save_every + 2
-    return in_words(jump_ahead(system, last, steps * float(macro_dt)), trajectory.names)

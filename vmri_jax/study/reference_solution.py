@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.progress import Progress, silent
-from vmri_jax.running.simulate import simulation_error
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import galerkin
 from vmri_jax.study.program import Program, joined

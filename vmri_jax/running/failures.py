@@ -1,0 +1,36 @@
+"""The error of a run that failed: how, and what probably made it fail."""
+
+import numpy as np
+
+from vmri_jax.mechanics.jumps import in_words, jump_ahead
+from vmri_jax.running.largest_motion import what_moves_most
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.steppers.results import Result, SimulationError
+
+
+def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micro: int) -> SimulationError:
+    """The error that says how a failed run failed, and what moved most before that."""
+    from vmri_jax.stability.labels import swapped_at_start  # only where a run failed: it stands on this room
+
+    step = int(trajectory.failed_at)
+    interval = step // save_every
+    error = SimulationError(
+        Result(int(trajectory.result)),
+        step,
+        float(trajectory.t[0] + step * macro_dt),
+        int(trajectory.info.iterations[interval]),
+        float(trajectory.info.residual[interval]),
+        trajectory,
+        what_moves_most(trajectory, step, save_every, float(macro_dt), num_micro),
+    )
+    return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, macro_dt, save_every))
+
+
+def _jump(trajectory: Trajectory, macro_dt, save_every: int) -> str:
+    """The sentence about a force that jumps in the failing step or the one after it; empty where none does."""
+    system, interval = trajectory.origin.system, int(trajectory.failed_at) // save_every
+    if system is None or np.ndim(trajectory.t) != 1:
+        return ""
+    last = trajectory[interval]
+    steps = int(trajectory.failed_at) - interval * save_every + 2
+    return in_words(jump_ahead(system, last, steps * float(macro_dt)), trajectory.names)
