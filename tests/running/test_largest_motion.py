@@ -51,4 +51,6 @@ def test_points_and_coordinates_count_by_the_extent_of_the_system(fpu):
     assert motion.name == "elongations[1]"
     assert motion.amount == pytest.approx(0.4 / extent, rel=1e-12)
     assert "take macro_dt below" in motion.sentence(0.1)
-    assert largest_motion(fpu.system, state, None, 0.1, 10).name == "q_f[1]"
+    assert "elongations[1] has run away before it" in motion._replace(amount=1e9).sentence(0.1)
+    unnamed = largest_motion(fpu.system, state, None, 0.1, 10)
+    assert unnamed is not None and unnamed.name == "q_f[1]"

@@ -33,7 +33,7 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import Plan, plan
-from vmri_jax.steppers.results import Method
+from vmri_jax.steppers.results import Method, Result
 
 SHOWN = 50
 """A run with a progress bar is computed in about so many parts."""
