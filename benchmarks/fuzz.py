@@ -5,7 +5,6 @@ Runs happen in a process of their own, which is replaced where it hangs or dies.
 
 import dataclasses
 import json
-import linecache
 import multiprocessing
 import traceback
 import warnings
@@ -25,7 +24,7 @@ from benchmarks.measure import Tell, silent
 from tests.verification import random_systems as rs
 from vmri_jax.ensembles.executors import as_done, executor_of
 from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
-from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
+from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE, is_refusal
 
 DRAWS = 50
 """Runs of a structure, which share its compiled programs."""
@@ -99,11 +98,10 @@ HONEST = "REFUSED", *vm.Result.__members__
 
 def refusal(error: Exception) -> str:
     """ "REFUSED" for a ValueError or TypeError that this package raised itself, else what it was and where."""
-    frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
-    where = frame.f_globals.get("__name__", "?")
-    raised = "raise" in linecache.getline(frame.f_code.co_filename, line)
-    if isinstance(error, ValueError | TypeError) and where.split(".")[0] == "vmri_jax" and raised:
+    if is_refusal(error):
         return "REFUSED"
+    frame, _ = list(traceback.walk_tb(error.__traceback__))[-1]
+    where = frame.f_globals.get("__name__", "?")
     return f"foreign error: {type(error).__name__} in {where}: {str(error)[:200]}"
 
 

@@ -1,6 +1,8 @@
 """Figures: what is drawn, and that nothing outside the figure is touched."""
 
 import dataclasses
+from io import BytesIO
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,19 @@ from vmri_jax import plots
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.trajectory import RunInfo
-from vmri_jax.study import ConvergenceRow, ConvergenceStudy, CostRow, CostStudy, ReferenceSolution
+from vmri_jax.study import (
+    ConvergenceRow,
+    ConvergenceStudy,
+    CostReport,
+    CostRow,
+    CostStudy,
+    ReferenceSolution,
+    WorkPrecision,
+    WorkRow,
+    families,
+)
+from vmri_jax.study.advisor import Setting
+from vmri_jax.study.cost_report import Answer, _draw_num_micro, _draw_shares
 
 
 def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
@@ -233,3 +247,67 @@ def test_global_settings_stay_as_they_were():
     before = dict(matplotlib.rcParams)
     plots.plot_convergence(study())
     assert dict(matplotlib.rcParams) == before
+
+
+# --- nothing to show ---------------------------------------------------------------------------------------------------
+
+EXACT = ReferenceSolution(np.zeros((2, 2)), np.zeros((2, 2)))
+
+
+def work_row(error: float, seconds: float = 1e-3) -> WorkRow:
+    """A run with this error and time."""
+    return WorkRow(
+        "impulse", 2, 2, 4, 0.1, error, error, seconds, seconds, seconds, 1.0, 0, 0, 0, 1, "EXPLICIT", "CONVERGED"
+    )
+
+
+@pytest.mark.parametrize(
+    "errors", [(), (0.0, 0.0), (np.nan, np.nan), (0.0, 1e-3)], ids=["none", "zero", "failed", "one"]
+)
+@pytest.mark.parametrize("work", ["seconds", "solves"])
+def test_runs_without_a_positive_error_or_work_are_drawn(errors, work):
+    study = WorkPrecision(tuple(map(work_row, errors)), 1.0, EXACT)
+    assert is_drawn(study.plot(work=work))
+
+
+@pytest.mark.parametrize("errors", [(0.0, 0.0), (np.nan, np.nan)], ids=["zero", "failed"])
+def test_convergence_without_a_positive_error_is_drawn(errors):
+    numbers = dict.fromkeys(
+        ("energy_error", "energy_drift", "energy_band", "momentum_error", "constraint_residual"), 0.0
+    )
+    rows = tuple(
+        ConvergenceRow("impulse", "", 2, 1, step, error, error, iterations=1, method="EXPLICIT", result="", **numbers)
+        for step, error in zip((0.1, 0.05), errors, strict=True)
+    )
+    assert is_drawn(ConvergenceStudy(rows, {"": EXACT}).plot([2]))
+
+
+def test_costs_of_runs_that_all_failed_are_drawn():
+    row = CostRow("", "dense", 2, 8, 4, np.nan, np.nan, 1.0, 1, "DENSE", "NON_FINITE")
+    assert is_drawn(plots.plot_cost({"failed": CostStudy((row,))}))
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_the_panels_of_a_cost_page_are_drawn_whatever_they_hold(count):
+    """A panel gets a curve with three numbers of micro steps; the page is drawn in the course of the search, before there are any."""
+    family = families()[0]
+    found = tuple(Setting(family, n, 4, work_row(1e-3)) for n in range(1, count + 1))
+    answers = (Answer(1e-2, found[0] if found else None, found), Answer(1e-4, None, ()))
+    report = CostReport(Path("cost.html"), "", 1.0, answers, WorkPrecision((), 1.0, EXACT), {})
+    assert is_drawn(_draw_num_micro(report, plots.LIGHT))
+    assert is_drawn(_draw_shares(report, plots.LIGHT))
+
+
+def test_a_single_node_and_a_run_that_failed_at_once_are_drawn():
+    nodes = run(constrained=True)
+    assert is_drawn(nodes[0:1].plot())
+    names = "t", "q_s", "q_f", "energy", "constraint_residual"
+    nothing = {name: np.full(np.shape(getattr(nodes, name)), np.nan) for name in names}
+    assert is_drawn(dataclasses.replace(nodes, **nothing).plot())
+
+
+def is_drawn(figure) -> bool:
+    """Whether matplotlib draws it, without a warning."""
+    file = BytesIO()
+    figure.savefig(file, format="svg")
+    return file.tell() > 1000

@@ -6,6 +6,7 @@ import importlib
 import os
 import re
 import signal
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,12 @@ import vmri_jax as vm
 from tests.animation.support import swinging
 from vmri_jax import cli
 from vmri_jax.catalogue import SCHEMES, find_problem, find_scheme
+from vmri_jax.check import Outcome
 from vmri_jax.cli.run import _energy_balance
 from vmri_jax.running.quantities import Work
 from vmri_jax.running.simulate import Simulation
-from vmri_jax.study import families, reference_solution
+from vmri_jax.study import ReferenceSolution, WorkPrecision, families, reference_solution
+from vmri_jax.study.advisor import SearchInterrupted
 
 USER_FILE = """
 import jax.numpy as jnp
@@ -350,3 +353,109 @@ def test_simulate_composes(vmri):
     code, text = vmri("simulate", "fpu", *RUN, "--num-micro", "3", "--compose", "suzuki4")
     assert code == 0
     assert "15 micro steps" in text
+
+
+# --- places that cannot be written, and parts that fail late -----------------------------------------------------------
+
+
+COMPUTING = {
+    "cli.run": "_run",
+    "cli.study": "recommend",
+    "study.cost_report": "reference_solution",
+    "cli.stability": "stability_map",
+    "cli.check": "cases_for",
+}
+"""What the commands compute with."""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("simulate", "fpu", *RUN, "--out", "PLACE.npz"),
+        ("simulate", "fpu", *RUN, "--out", "PLACE.zarr"),
+        ("simulate", "fpu", *RUN, "--plot", "PLACE.png"),
+        ("tune", "fpu", "--error", "1e-3", "--t-end", "1", "--out", "PLACE.csv"),
+        ("cost", "fpu", "--out", "PLACE"),
+        ("stability", "--out", "PLACE.png"),
+        ("check", "fpu", "--out", "PLACE"),
+        ("animate", "run.npz", "--out", "PLACE.html"),
+    ],
+)
+@pytest.mark.parametrize("place", ["user.py/x", "no/such/folder/x", "x" * 260])
+def test_a_place_that_cannot_be_written_is_refused_before_any_compute(vmri, monkeypatch, arguments, place):
+    if arguments[0] in ("cost", "check") and place.startswith("no/"):
+        pytest.skip("folders are made")
+
+    def too_early(*_, **__):
+        raise AssertionError("computed before the place was checked")
+
+    for module, name in COMPUTING.items():
+        monkeypatch.setattr(importlib.import_module(f"vmri_jax.{module}"), name, too_early)
+    code, text = vmri(*(word.replace("PLACE", place) for word in arguments))
+    assert code in (1, 2)
+    assert re.search("cannot be (written|made)|does not exist|Not written", text), text
+
+
+def test_a_fault_inside_is_no_usage_error(tmp_path, monkeypatch):
+    """An error that another library raises, or Python itself, is shown with its origin, and what was computed is told first."""
+    monkeypatch.chdir(tmp_path)
+
+    def broken(*_):
+        return int("a fault")
+
+    monkeypatch.setattr("vmri_jax.plots.plot_trajectory", broken)
+    result = CliRunner().invoke(cli.app, ["simulate", "fpu", *RUN, "--plot", "run.png", "--out", "run.npz"])
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ValueError)
+    assert "Usage" not in result.output
+    assert "A fault inside" in result.output
+    assert "energy change" in result.output
+    assert (tmp_path / "run.npz").exists()
+
+
+NOTHING = WorkPrecision((), 1.0, ReferenceSolution(np.zeros((2, 1)), np.zeros((2, 1))))
+
+
+def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cost_report = importlib.import_module("vmri_jax.study.cost_report")
+
+    def failing(problem, name, out, **_):
+        search: Any = SimpleNamespace(rows=lambda: NOTHING, t_end=1.0)
+        return cost_report._write(search, [cost_report.Answer(1e-2, None)], problem, name, out)
+
+    def broken(*_):
+        return int("no figure")
+
+    monkeypatch.setattr("vmri_jax.plots.plot_work_precision", broken)
+    monkeypatch.setattr("vmri_jax.cli.study.cost_report", failing)
+    result = CliRunner().invoke(cli.app, ["cost", "fpu", "--out", "page"])
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ValueError)  # the fault itself, no usage error
+    assert "not reached" in result.output
+    assert "page/cost.csv" in result.output
+    assert (tmp_path / "page" / "cost.csv").exists()
+
+
+def test_ctrl_c_leaves_the_runs_of_a_search(vmri, tmp_path, monkeypatch):
+    def stopped(*_, **__):
+        raise SearchInterrupted(NOTHING)
+
+    monkeypatch.setattr("vmri_jax.cli.study.recommend", stopped)
+    code, text = vmri("tune", "fpu", "--error", "1e-2", "--t-end", "0.2", "--out", "runs.csv")
+    assert code == 130
+    assert "the best of them are above" in text
+    assert (tmp_path / "runs.csv").exists()
+
+
+def test_ctrl_c_leaves_the_cases_that_were_done(vmri, tmp_path, monkeypatch):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vmri_jax.check.cases.single_precision", lambda *_: Outcome("refused", True))
+    monkeypatch.setattr("vmri_jax.check.cases.bad_lane", stopped)
+    code, text = vmri("check", "user.py:my_problem", "--case", "10", "--case", "11", "--out", "cases")
+    assert code == 130
+    assert "1 of 1 criteria met" in text
+    assert "After 1 of 2 cases" in text
+    assert (tmp_path / "cases" / "cases.md").exists()

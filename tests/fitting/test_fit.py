@@ -214,3 +214,18 @@ def test_without_optimistix(monkeypatch):
     monkeypatch.setitem(sys.modules, "optimistix", None)
     with pytest.raises(ImportError, match=r"vmri_jax\[fit\]"):
         fit(GOOD)
+
+
+def spring(q_s, q_f, params):
+    return params["stiffness"] * (q_s @ q_s + q_f @ q_f) / 2
+
+
+@pytest.mark.parametrize("slow", [True, False], ids=["slow alone", "fast alone"])
+def test_systems_with_one_kind_of_variables_are_fitted(slow):
+    q, none = np.ones(1), np.zeros(0)
+    mass, start = (vm.ConstantMass(q, none), (q, none)) if slow else (vm.ConstantMass(none, q), (none, q))
+    problem = vm.Problem(vm.System(mass, spring, params={"stiffness": np.array(8.0)}), *start)
+    run = vm.simulate(problem, vm.fully_explicit(1), macro_dt=0.05, num_steps=6)
+    data = Measured(run.t, run.q_s if slow else run.q_f, sigma=1e-3, observe=lambda s: s.q_s if slow else s.q_f)
+    found = vm.fit(problem, data, {"stiffness": Unknown(7.0, lower=0)}, scheme=vm.fully_explicit(1), macro_dt=0.05)
+    assert found.parameters["stiffness"] == pytest.approx(8.0, abs=1e-9)  # measured: 1e-13

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.small_systems import driven, moving_constraints
 from tests.study.test_convergence import PROBLEM
 from vmri_jax.study import (
     Program,
@@ -19,7 +20,7 @@ from vmri_jax.study import (
     reference_solution,
     work_precision,
 )
-from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search
+from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search, SearchInterrupted, another_start
 from vmri_jax.study.cost_report import default_t_end
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
@@ -211,3 +212,25 @@ def test_cost_report(tmp_path):
     assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)
     with pytest.raises(ValueError, match="positive"):
         cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))
+
+
+def test_another_start_fits_constraints_that_move():
+    """Its velocities differ from those of the problem, keep ``G v + dg/dt = 0``, and so are accepted without projection."""
+    problem = moving_constraints()
+    other = another_start(problem, speed=1.0)
+    assert 1e-3 < np.abs(other.v_f - problem.v_f).max() < 0.1
+    assert not other.project
+    state = other.state()  # refused, or warned of, where a part of the velocities above 1e-6 does not fit
+    assert vm.diagnostics.constraint_residual(problem.system, state)[1] < 1e-12
+    at_rest = another_start(driven(), speed=2.0)
+    assert np.abs(at_rest.v_s).max() > 1e-3
+
+
+def test_ctrl_c_keeps_the_runs(reference, monkeypatch):
+    def stopped(self, settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Search, "_timed", stopped)
+    with pytest.raises(SearchInterrupted, match="interrupted after") as caught:
+        recommend(PROBLEM, 1e-3, 1.0, menu=SHORT_MENU[:1], reference=reference, verify=False)
+    assert len(caught.value.runs.rows) > 3

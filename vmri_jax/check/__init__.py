@@ -2,6 +2,6 @@
 
 from vmri_jax.check.case import Case, Outcome
 from vmri_jax.check.cases import cases_for
-from vmri_jax.check.report import Report, Row, run_cases
+from vmri_jax.check.report import CasesInterrupted, Report, Row, run_cases
 
-__all__ = ["Case", "Outcome", "Report", "Row", "cases_for", "run_cases"]
+__all__ = ["Case", "CasesInterrupted", "Outcome", "Report", "Row", "cases_for", "run_cases"]

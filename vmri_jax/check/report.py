@@ -109,6 +109,14 @@ class Report(ResultTable):
         return [folder / name for name in names]
 
 
+class CasesInterrupted(KeyboardInterrupt):
+    """Cases were stopped by Ctrl-C; the `Report` of those that were done before is in `.report`."""
+
+    def __init__(self, report: Report, asked: int):
+        self.report = report
+        super().__init__(f"After {len(report.rows)} of {asked} cases.")
+
+
 def run_cases(
     cases: Sequence[Case], numbers: Collection[int] = (), full: bool = False, progress: Progress = silent
 ) -> Report:
@@ -122,6 +130,7 @@ def run_cases(
 
     Raises:
         ValueError: a number that no case has.
+        CasesInterrupted: Ctrl-C; the cases that were done are in its report.
     """
     known = [case.number for case in cases]
     unknown = sorted(set(numbers) - set(known))
@@ -131,7 +140,10 @@ def run_cases(
     for k, case in enumerate(chosen):
         progress(f"{case.number} {case.title}", k, len(chosen))
         start = time.perf_counter()
-        outcome = _outcome(case, full)
+        try:
+            outcome = _outcome(case, full)
+        except KeyboardInterrupt:
+            raise CasesInterrupted(Report(tuple(rows), full), len(chosen)) from None
         rows.append(Row(case, outcome, time.perf_counter() - start))
     progress("done", len(chosen), len(chosen))
     return Report(tuple(rows), full)

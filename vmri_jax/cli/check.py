@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from vmri_jax.catalogue import find_problem
-from vmri_jax.check import Case, cases_for, run_cases
+from vmri_jax.check import Case, CasesInterrupted, cases_for, run_cases
 from vmri_jax.cli import options
-from vmri_jax.cli.common import console, refusals
+from vmri_jax.cli.common import check_target_folder, console, print_failure, refusals
 from vmri_jax.running.progress import progress_shown
 
 Numbers = Annotated[list[int] | None, typer.Option("--case", help="Number of a case; again for more of them.")]
@@ -23,14 +23,19 @@ def check(system: options.System, case: Numbers = None, full: Full = False, out:
     Steps are chosen from its frequencies. Cases that do not apply say why. Ends with code 1 if a criterion is not met.
     """
     with refusals():
+        check_target_folder("--out", out)
         cases = cases_for(find_problem(system))
     run_and_show(cases, case or (), full, out)
 
 
 def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out: Path | None) -> None:
     """Run these cases, print the table, write the files; exit code 1 if a criterion is not met, 2 for an unknown number."""
+    stopped = None
     with refusals(), progress_shown() as tell:
-        report = run_cases(cases, numbers, full, tell)
+        try:
+            report = run_cases(cases, numbers, full, tell)
+        except CasesInterrupted as interrupted:
+            report, stopped = interrupted.report, interrupted
     console.print(report.table())
     judged = [row for row in report.rows if row.outcome.passed is not None]
     missed = [str(row.case.number) for row in judged if row.missed]
@@ -38,7 +43,11 @@ def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out:
     if missed:
         console.print(f"missed: {', '.join(missed)}")
     if out is not None:
-        for path in report.write(out):
-            console.print(f"wrote {path}", soft_wrap=True)
+        with refusals():
+            for path in report.write(out):
+                console.print(f"wrote {path}", soft_wrap=True)
+    if stopped is not None:
+        print_failure("Interrupted", str(stopped))
+        raise typer.Exit(130)
     if missed:
         raise typer.Exit(1)

@@ -1,6 +1,5 @@
 """What all commands share: the console, refusals and failures, tables, a progress bar, files to be written."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +11,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from vmri_jax.mechanics.checks import is_refusal
+from vmri_jax.running.files import check_writable, make_writable_folder
 from vmri_jax.running.printed import OutputConsole
 
 console = OutputConsole()
@@ -27,6 +28,8 @@ class BadInput(typer.BadParameter):
         return self.message
 
 
+FAULT = "This is no error of your command, but of the program. Please report it, with the command and the lines below."
+
 RUN = "Run and see:  vmri simulate fpu --macro-dt 0.05 --steps 400 --out run.npz"
 RIGHT = "Is it right:  vmri check my_system.py:problem"
 COSTS = "What it costs:  vmri tune fpu --error 1e-4 --t-end 2"
@@ -36,15 +39,21 @@ MANY = "Many runs, and what there is:  vmri sweep --example"
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Errors of what is called within become panels.
+    """Refusals of what is called within become panels; any other error is a fault inside, and is shown as such.
 
     Raises:
         BadInput: an argument was wrong, or a file is missing or in the way.
         typer.Exit: a file could not be written.
+        ValueError, TypeError: raised by another library, or by Python: no argument of the command is to blame.
     """
     try:
         yield
-    except (ValueError, TypeError, FileExistsError, FileNotFoundError) as error:
+    except (ValueError, TypeError) as error:
+        if not is_refusal(error):
+            print_failure("A fault inside", FAULT)
+            raise
+        raise BadInput(str(error)) from error
+    except (FileExistsError, FileNotFoundError) as error:
         raise BadInput(str(error)) from error
     except OSError as error:
         print_failure("Not written", error.strerror or str(error))
@@ -82,7 +91,7 @@ def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) 
     """Refuse a file to be written before anything is computed.
 
     Raises:
-        ValueError: the file has another ending, no folder, or no permission.
+        ValueError: the file has another ending, no folder, or cannot be written.
     """
     if path is None:
         return
@@ -90,5 +99,23 @@ def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) 
         raise ValueError(f"{option} {path}: the file must end in {' or '.join(endings)}.")
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{option} {path}: the folder {path.parent} does not exist; make it first.")
-    if path.is_dir() or not os.access(path if path.exists() else path.resolve().parent, os.W_OK):
-        raise ValueError(f"{option} {path} cannot be written; give another file.")
+    try:
+        check_writable(path)
+    except OSError as error:
+        raise ValueError(
+            f"{option} {path} cannot be written ({error.strerror or error}); give another file."
+        ) from error
+
+
+def check_target_folder(option: str, path: Path | None) -> None:
+    """Make a folder that results are to be written into, and refuse a place where none can be, before anything is computed.
+
+    Raises:
+        ValueError: the folder cannot be made, or no file can be written in it.
+    """
+    if path is None:
+        return
+    try:
+        make_writable_folder(path)
+    except OSError as error:
+        raise ValueError(f"{option} {path}: {error.strerror or error}; give a folder that can be written.") from error

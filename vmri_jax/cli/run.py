@@ -93,29 +93,38 @@ def simulate(
         start = time.perf_counter()
         trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
         seconds = time.perf_counter() - start
-        if out is not None and isinstance(trajectory, Trajectory):
-            trajectory.save(out, problem.drawing)
-        if plot is not None:
-            nodes = trajectory if isinstance(trajectory, Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
-            plots.save(plots.plot_trajectory(nodes, f"{system}, {scheme}, {num_micro} micro steps"), plot)
-    saved = [str(path) for path in (out, plot) if path is not None]
+        saved = [str(out)] if streamed else []
+        try:  # what was computed is told whatever happens to its files
+            if out is not None and isinstance(trajectory, Trajectory):
+                trajectory.save(out, problem.drawing)
+                saved.append(str(out))
+            if plot is not None:
+                nodes = (
+                    trajectory if isinstance(trajectory, Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
+                )
+                plots.save(plots.plot_trajectory(nodes, f"{system}, {scheme}, {num_micro} micro steps"), plot)
+                saved.append(str(plot))
+        finally:
+            if stopped is None:
+                done = (steps - (0 if before is None else before.step)) * chosen.num_micro
+                _print_named(
+                    {
+                        "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
+                        "": nothing_fast(chosen, problem.q_f.size),
+                        "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
+                        "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
+                        **_summary(trajectory, problem.system.is_constrained),
+                        "saved": ", ".join(saved)
+                        or "nothing" + ("" if out or plot else "; give --out run.npz or --plot run.png"),
+                    }
+                )
+            else:
+                code = _print_stop(stopped, saved, streamed)
     if stopped is not None:
-        code = _print_stop(stopped, saved, streamed)
         if code == 1:
             step = {"macro-dt": macro_dt, "micro-dt": micro_dt, "scheme": scheme, "num-micro": num_micro}
             _print_advice(system, step | {"alpha": alpha, "degree": degree, "rule": rule, "compose": compose})
         raise typer.Exit(code)
-    done = (steps - (0 if before is None else before.step)) * chosen.num_micro
-    _print_named(
-        {
-            "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
-            "": nothing_fast(chosen, problem.q_f.size),
-            "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
-            "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
-            **_summary(trajectory, problem.system.is_constrained),
-            "saved": ", ".join(saved) or "nothing; give --out run.npz or --plot run.png",
-        }
-    )
 
 
 def _print_named(texts: dict[str, str]) -> None:
@@ -166,7 +175,7 @@ def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
     if (resume or overwrite) and not streamed:
         option = "--resume" if resume else "--overwrite"
         raise ValueError(f"{option} is for a run that is written all along; give --out with a file that ends in .zarr.")
-    if not streamed:
+    if out is not None and not (streamed and out.is_dir()):  # what is in a store decides whether it may be gone on with
         check_target_file("--out", out, (".npz", ".zarr"))
     return streamed
 

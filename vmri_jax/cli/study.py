@@ -13,8 +13,8 @@ from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import options
 from vmri_jax.cli.common import (
     COSTS,
-    BadInput,
     check_target_file,
+    check_target_folder,
     console,
     print_failure,
     print_written,
@@ -23,8 +23,8 @@ from vmri_jax.cli.common import (
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study import WorkPrecision, cost_report, recommend
-from vmri_jax.study.advisor import NothingReached, check_target
-from vmri_jax.study.cost_report import PERIODS
+from vmri_jax.study.advisor import NothingReached, SearchInterrupted, check_target
+from vmri_jax.study.cost_report import PERIODS, PageFailed
 from vmri_jax.study.table import rich_table
 from vmri_jax.study.work import duration
 
@@ -48,14 +48,13 @@ def tune(
         problem = find_problem(system)
         check_target(error, t_end, problem)
         try:
-            with _search() as tell:
+            with _search(out) as tell:
                 found = recommend(problem, error, t_end, exhaustive=exhaustive, progress=tell)
         except NothingReached as failure:
-            _write_runs(failure.runs, out)
             console.print(failure.runs.table())
+            _write_runs(failure.runs, out)
             print_failure("Nothing reached the error", f"{failure} The best runs are above.")
             raise typer.Exit(1) from failure
-        _write_runs(found.runs, out)
     console.print("[bold]Errors against time[/bold], the best of all runs\n", found.runs.table())
     best = rich_table(found.columns, found.shown())
     console.print(f"\n[bold]For an error of {error:g}[/bold], the choice first\n", best)
@@ -67,6 +66,8 @@ def tune(
     if any(setting.row.seconds < found.setting.row.seconds for setting in found.others):
         console.print("Faster ones kept the error by luck: from another start theirs is more than twice as large.")
     console.print(f"\n[bold]{escape(found.setting.command(system))}[/bold]", soft_wrap=True)
+    with refusals():
+        _write_runs(found.runs, out)
 
 
 @app.command(
@@ -88,25 +89,32 @@ def cost(
         problem = find_problem(system)
         for asked in error or [np.finfo(float).max]:
             check_target(asked, 1.0 if t_end is None else t_end, problem)
+        check_target_folder("--out", out)
         try:
-            out.mkdir(parents=True, exist_ok=True)
-            with _search() as tell:
+            with _search(None) as tell:
                 report = cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
-        except OSError as wrong:
-            raise BadInput(f"--out {out}: {wrong.strerror}; give a folder that can be written.") from wrong
+        except PageFailed as failure:
+            console.print(failure.report.table())
+            print_written("\nRuns", out / "cost.csv")
+            raise failure.__cause__ or failure from None
     console.print(report.table())
     print_written("\nPage", report.path)
 
 
 @contextmanager
-def _search() -> Iterator[Progress]:
-    """A progress bar, and a panel where the reference solution fails."""
+def _search(out: Path | None) -> Iterator[Progress]:
+    """A progress bar, and a panel where the reference solution fails; after Ctrl-C the best of the runs so far, which are written to `out`."""
     try:
         with progress_shown() as tell:
             yield tell
     except SimulationError as failure:
         print_failure("No reference solution", str(failure))
         raise typer.Exit(1) from failure
+    except SearchInterrupted as stopped:
+        console.print(stopped.runs.table())
+        _write_runs(stopped.runs, out)
+        print_failure("Interrupted", f"After {len(stopped.runs.rows)} runs; the best of them are above.")
+        raise typer.Exit(130) from stopped
 
 
 def _write_runs(runs: WorkPrecision, out: Path | None) -> None:

@@ -18,7 +18,7 @@ from vmri_jax.ensembles.work import AnyScheme, Steps, Work
 from vmri_jax.ensembles.worker import NotAWorker, call_in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
-from vmri_jax.running.files import clear_partial
+from vmri_jax.running.files import check_writable, clear_partial
 from vmri_jax.running.interrupts import interrupts_noted
 from vmri_jax.running.progress import Progress, progress_shown, silent
 from vmri_jax.running.store.layout import locked
@@ -350,6 +350,7 @@ def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
     if not path.resolve().parent.is_dir():
         raise FileNotFoundError(f"ensemble: out is {path}, but the folder {path.parent} does not exist; make it first.")
     if not path.exists():
+        check_writable(path)
         return
     there = store.read_attributes(path)  # or it is something else
     if not (resume or overwrite):

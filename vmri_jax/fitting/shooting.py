@@ -105,8 +105,9 @@ class Shooting:
             u: search variables of the parameters.
             starts: (segments - 1, 2 n) positions and velocities where the parts after the first one start.
         """
-        if self.segments == 1:  # JAX's own forward mode, by the parameters alone
-            observed, ends = jax.tree.map(lambda a: a[None], self._part(u, self.start(u), 0))
+        if self.segments == 1:  # JAX's own forward mode, by the parameters alone, from the start of the problem itself
+            problem = self.model(self.unknowns.at(u))
+            observed, ends = jax.tree.map(lambda a: a[None], self._run(problem, problem.state()))
         else:
             observed, ends = self._parts(u, jnp.concatenate([self.start(u)[None], starts]))
         predicted = [
@@ -156,9 +157,12 @@ class Shooting:
         system, n_s, n = problem.system, problem.q_s.size, problem.q_s.size + problem.q_f.size
         t = problem.t + number * (self.length * self.macro_dt)
         phase = jnp.split(start, [n_s, n, n + n_s])
-        state = initial_state(system, *phase, t=t, project=self.segments > 1 and system.is_constrained)
+        return self._run(problem, initial_state(system, *phase, t=t, project=system.is_constrained))
+
+    def _run(self, problem: Problem, state: State):
+        """Observed quantities at the nodes of a run of one part from a state, and where it ends."""
         run = simulate(
-            system,
+            problem.system,
             self.scheme,
             state,
             macro_dt=self.macro_dt,

@@ -1,5 +1,6 @@
 """Checks at the door: bad input is refused before any compute, with what came, what was expected and what to do."""
 
+import linecache
 import traceback
 from pathlib import Path
 
@@ -193,3 +194,14 @@ def describe(value) -> str:
     if isinstance(value, tuple):
         return "(" + ", ".join(describe(v) for v in value) + ")"
     return f"shape {value.shape}" if hasattr(value, "shape") else type(value).__name__
+
+
+def is_refusal(error: Exception) -> bool:
+    """Whether this package refused an argument: a ValueError or TypeError of one of its own ``raise`` statements.
+
+    Errors of other libraries, and those of Python itself (as of ``zip(strict=True)``), are faults.
+    """
+    frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
+    own = frame.f_globals.get("__name__", "").partition(".")[0] == "vmri_jax"
+    raised = linecache.getline(frame.f_code.co_filename, line).lstrip().startswith("raise ")
+    return isinstance(error, ValueError | TypeError) and own and raised

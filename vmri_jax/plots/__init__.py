@@ -20,6 +20,7 @@ from vmri_jax.plots.theme import (
     log_ticks,
     new_figure,
     panel_grid,
+    positive,
     save,
     style,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "plot_oscillatory_energies",
     "plot_trajectory",
     "plot_work_precision",
+    "positive",
     "save",
     "style",
 ]

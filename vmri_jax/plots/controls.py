@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vmri_jax.plots.runs import coordinates, position_panels
+from vmri_jax.plots.runs import coordinates, limit_times, position_panels
 from vmri_jax.plots.theme import LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
 
 if TYPE_CHECKING:
@@ -29,11 +29,13 @@ def plot_control(optimum: "Optimum", *, title: str = "", theme: Theme = LIGHT) -
             above.stairs(column, edges, baseline=None, color=color, linewidth=1.4, label=label)
             for bound in (side[number] for side in optimum.bounds if np.isfinite(side[number])):
                 above.axhline(bound, color=color, linewidth=0.8, linestyle=":")
-        above.set(ylabel="controls $u$", xlim=(t[0], t[-1]))
+        above.set(ylabel="controls $u$")
+        limit_times(above, t)
         legend_beside(above)
         for axes, (values, labels, what) in zip(middle, panels, strict=True):
             coordinates(axes, t, values, labels, theme)
-            axes.set(ylabel=what, xlim=(t[0], t[-1]))
+            axes.set(ylabel=what)
+            limit_times(axes, t)
         (middle or [above])[-1].set_xlabel("time $t$")
         for name, color in zip(("update", "gap", "miss", "over"), theme.curves, strict=False):
             values = np.array([told[name] for told in optimum.history])

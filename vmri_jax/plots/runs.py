@@ -55,12 +55,12 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
         raise ValueError("plot: this is a batch of runs; take one of them, run.lane(i).")
     t = np.asarray(trajectory.t)
     residual = np.asarray(trajectory.constraint_residual)
-    constrained = bool(np.nanmax(residual) > 0)
+    constrained = bool(np.any(residual > 0))
     positions = position_panels(trajectory)
     driven = trajectory.keeps_energy is False
     count = len(positions) + (2 if driven else 1) + constrained
     with new_figure(7.2, 0.4 + 1.85 * count, title, theme) as figure:
-        axes = figure.subplots(count, sharex=True)
+        axes = figure.subplots(count, sharex=True, squeeze=False)[:, 0]
         for panel, (values, labels, what) in zip(axes, positions, strict=False):
             coordinates(panel, t, values, labels, theme)
             panel.set_ylabel(what)
@@ -74,7 +74,8 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
             axes[-1].semilogy(t, shown[:, 1], "--", linewidth=_thin(t), label="velocity $|G v|$")
             axes[-1].set_ylabel("constraint residual")
             legend_beside(axes[-1])
-        axes[-1].set(xlabel="time $t$", xlim=(t[0], t[-1]))
+        axes[-1].set(xlabel="time $t$")
+        limit_times(axes[-1], t)
         figure.align_ylabels()
     return figure
 
@@ -94,7 +95,8 @@ def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Th
         axes = figure.subplots()
         axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
         coordinates(axes, t, energies, [f"$I_{{{i + 1}}}$" for i in range(energies.shape[1])], theme)
-        axes.set(xlabel="time $t$", ylabel="oscillatory energy", xlim=(t[0], t[-1]))
+        axes.set(xlabel="time $t$", ylabel="oscillatory energy")
+        limit_times(axes, t)
         axes.set_ylim(bottom=0)
     return figure
 
@@ -115,6 +117,13 @@ def position_panels(run: Run) -> list[tuple[np.ndarray, list[str], str]]:
         for values, shown, labels, what in panels
         if shown
     ]
+
+
+def limit_times(axes: Axes, t) -> None:
+    """Limits of a time axis: the first and the last node that was reached; matplotlib's own where there is one node only."""
+    reached = t[np.isfinite(t)]
+    if reached.size and reached[0] < reached[-1]:
+        axes.set_xlim(reached[0], reached[-1])
 
 
 def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> None:
@@ -169,7 +178,10 @@ def _energy_balance(above: Axes, below: Axes, trajectory: Run, theme: Theme) -> 
 
 def _not_below_roundoff(axis: Axis, values) -> None:
     """Limits that do not blow up round-off: they span `ROUNDOFF` of the values at least."""
-    middle, size = np.nanmean(values), np.nanmax(np.abs(values), initial=0.0)
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return
+    middle, size = finite.mean(), np.abs(finite).max()
     low, high = axis.get_view_interval()
     half = ROUNDOFF * max(size, 1.0) / 2
     if high - low < 2 * half:

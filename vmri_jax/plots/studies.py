@@ -17,6 +17,7 @@ from vmri_jax.plots.theme import (
     log_ticks,
     new_figure,
     panel_grid,
+    positive,
 )
 
 
@@ -49,13 +50,16 @@ def plot_convergence(
             steps = []
             for i, scheme in enumerate(study.schemes):
                 macro_dt, errors = study.errors(scheme, quantity)
-                axes.loglog(macro_dt, errors, label=f"{scheme}   {_orders(study, scheme)}", **curve_look(i, theme))
+                axes.loglog(
+                    macro_dt, positive(errors), label=f"{scheme}   {_orders(study, scheme)}", **curve_look(i, theme)
+                )
                 steps += list(macro_dt)
             for order in orders:
                 _guide_triangle(axes, study, quantity, order, theme)
             axes.set(title=name, xlabel="macro step $H$")
             axes.set(ylabel=rf"largest error $|{quantity} - {quantity}_{{\mathrm{{ref}}}}|$")
             log_ticks(axes.xaxis, steps)
+            log_ticks(axes.yaxis, [])
         legend_below(figure)
     return figure
 
@@ -108,15 +112,15 @@ def plot_work_precision(
     front = [row for row in study.pareto(work) if getattr(row, work) > 0]
     with new_figure(7.2, 4.3, title, theme) as figure:
         axes = figure.subplots()
-        best, errors = [getattr(row, work) for row in front], [row.error_q for row in front]
+        best, errors = [getattr(row, work) for row in front], positive([row.error_q for row in front])
         under = {"color": theme.faint, "linewidth": 7, "solid_capstyle": "round", "zorder": 1}
         axes.loglog(best, errors, label="best of all", **under)
         for i, scheme in enumerate(study.schemes):
             curve = sorted(study.curve(scheme), key=lambda row: row.num_steps)
-            x, y = [getattr(row, work) or np.nan for row in curve], [row.error_q for row in curve]
+            x, y = (positive([getattr(row, name) for row in curve]) for name in (work, "error_q"))
             axes.loglog(x, y, label=scheme, markersize=4, linewidth=1.1, **curve_look(i, theme))
         axes.set(xlabel=WORK[work], ylabel=r"largest error $|q - q_{\mathrm{ref}}|$")
-        axes.set_ylim(top=30 * max(errors, default=1.0))
+        axes.set_ylim(top=30 * np.nanmax(errors, initial=0.0) or None)
         if study.reference.error_q > axes.get_ylim()[0]:
             axes.axhline(study.reference.error_q, color=theme.ink, linewidth=0.8, linestyle=":")
             above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}

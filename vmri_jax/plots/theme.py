@@ -193,14 +193,22 @@ def legend_beside(axes: Axes, title: str | None = None, size: float = 9.0) -> No
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title=title, **look)
 
 
+def positive(values: Any) -> np.ndarray:
+    """Values for a logarithmic axis: NaN, which is not drawn, where they are not positive."""
+    values = np.asarray(values, dtype=float)
+    return np.where(values > 0, values, np.nan)
+
+
 def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
-    """Labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them.
+    """A logarithmic axis with labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them.
 
     Args:
-        axis: logarithmic.
-        values: what is drawn along it.
+        axis: of a panel with or without curves.
+        values: numbers that are drawn along the axis.
     """
-    finite = [value for value in values if np.isfinite(value)]
+    if axis.get_scale() != "log":  # no curve has made it so yet, and ticks of logarithms refuse the limits 0 and 1
+        (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
+    finite = [value for value in values if np.isfinite(value) and value > 0]
     axis.set_minor_formatter(NullFormatter())
     if finite and max(finite) < 30 * min(finite):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

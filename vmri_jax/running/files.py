@@ -66,6 +66,44 @@ def check_place(path: Path) -> None:
         raise IsADirectoryError(f"{path} is a folder; give the name of a file.")
 
 
+def check_writable(path: Path) -> None:
+    """Refuse a place where no file can be written, before long work: a file is made beside `path` and removed again.
+
+    Permissions alone do not tell: on a file system that is read-only, or for a name that is too long, only an attempt does.
+
+    Raises:
+        FileNotFoundError, IsADirectoryError: as of `check_place`.
+        OSError: the folder or the file cannot be written.
+    """
+    path = path.resolve()
+    check_place(path)
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(f"{path} cannot be written: there is a file that may not be changed; give another name.")
+    if path.exists() and not path.is_file():  # a device
+        return
+    attempt = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        attempt.touch()
+        attempt.unlink()
+    except OSError as error:
+        raise OSError(error.errno, f"{path} cannot be written: {error.strerror}. Give another place.") from error
+
+
+def make_writable_folder(path: Path) -> None:
+    """Make a folder with all folders above it, and refuse one in which no file can be written.
+
+    Raises:
+        OSError: it cannot be made, or no file can be made in it.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(
+            error.errno, f"the folder {path} cannot be made: {error.strerror}. Give another place."
+        ) from error
+    check_writable(path / "attempt")
+
+
 def synchronize(path: Path) -> None:
     """Wait until a file, or the entries of a folder, are on disk."""
     if os.name == "nt":  # folders cannot be opened there, files only for writing

@@ -6,16 +6,21 @@ families, uphill from where they stand, and tries them with one micro step. Stag
 """
 
 import time
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from vmri_jax import diagnostics
-from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.mechanics.projection import legendre, project_momentum
+from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
@@ -33,6 +38,8 @@ MARGIN = 10.0
 """A target must lie so many times above the error of the reference."""
 SHOWN = 5
 """Settings that a recommendation and `vmri tune` print."""
+SHAKE = 0.01
+"""Velocities of the other start differ by about this part: the motion is another one, with the same time scales."""
 LUCK = 2.0
 """A setting whose error from another start is so many times larger was lucky; the next one is tried."""
 LONGEST = 5.0
@@ -72,6 +79,14 @@ class NothingReached(ValueError):
     def __init__(self, message: str, runs: WorkPrecision):
         self.runs = runs
         super().__init__(message)
+
+
+class SearchInterrupted(KeyboardInterrupt):
+    """A search was stopped by Ctrl-C; the runs until then are in `.runs`."""
+
+    def __init__(self, runs: WorkPrecision):
+        self.runs = runs
+        super().__init__(f"interrupted after {len(runs.rows)} runs; they are in this exception's .runs.")
 
 
 class Search:
@@ -222,6 +237,14 @@ class Search:
         self.settings |= {(s.family.name, s.num_micro, s.num_steps): s for s in found}
         return found
 
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Within, Ctrl-C raises `SearchInterrupted`, with all runs so far."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            raise SearchInterrupted(self.rows()) from None
+
     def rows(self) -> WorkPrecision:
         """All runs so far."""
         order = sorted(self.settings.values(), key=lambda s: (s.family.name, s.num_micro, s.num_steps))
@@ -341,6 +364,10 @@ def recommend(
         ValueError: an error below round-off or below what the reference can tell.
         NothingReached: no setting keeps the error; carries the runs.
         SimulationError: the reference could not be computed.
+        SearchInterrupted: Ctrl-C during the search; carries the runs.
+
+    Warns:
+        UserWarning: the setting was found, but could not be checked from another start.
     """
     problem = problem_of("recommend", problem)
     check_target(error, t_end, problem)
@@ -354,7 +381,8 @@ def recommend(
         )
     for fallback in (False, True):  # runs that need it are seldom the cheapest, and it takes long to compile
         search = Search(problem, t_end, families() if menu is None else menu, reference, newton, fallback)
-        found = search.cheapest(error, progress, exhaustive)
+        with search.kept():
+            found = search.cheapest(error, progress, exhaustive)
         if found:
             break
     else:
@@ -367,7 +395,14 @@ def recommend(
     chosen, checked = found[0], None
     if verify:
         progress("another start", 1, 1)
-        chosen, checked = _not_by_luck(found, _from_another_start(problem, t_end, reference.num_saves, newton))
+        try:
+            with search.kept():
+                chosen, checked = _not_by_luck(found, _from_another_start(problem, t_end, reference, newton))
+        except SimulationError as failure:
+            warnings.warn(
+                f"recommend: the setting is not checked from another start, for the reference solution fails there: {failure}",
+                stacklevel=2,
+            )
     progress("done", 1, 1)
     others = tuple(setting for setting in found if setting is not chosen)
     return Recommendation(error, chosen, others, checked, search.rows())
@@ -382,18 +417,37 @@ def _not_by_luck(found: Sequence[Setting], verified: Callable[[Setting], Verific
     return found[0], verified(found[0])
 
 
-def _from_another_start(problem, t_end, num_saves: int, newton) -> Callable[[Setting], Verification]:
-    """Runs a setting from a start whose velocities differ by about a hundredth."""
-    random = np.random.default_rng(1)
-    size = 0.01 * max(np.abs(problem.v_s).max(initial=0), np.abs(problem.v_f).max(initial=0))
-    v_s, v_f = (v + size * random.normal(size=np.shape(v)) for v in (problem.v_s, problem.v_f))
-    other = replace(problem, v_s=v_s, v_f=v_f)
+def another_start(problem: Problem, speed: float) -> Problem:
+    """The problem with velocities that differ by about a hundredth, and that fit its constraints, the moving ones too.
+
+    The velocities get random differences; the momenta that belong to them are projected onto the hidden constraints.
+
+    Args:
+        problem: of the search.
+        speed: mean speed of the run: the size of velocities where the run starts at rest.
+    """
+    system, state, random = problem.system, problem.state(), np.random.default_rng(1)
+    at_start = problem.v_s, problem.v_f
+    size = SHAKE * max(speed, *(float(np.abs(v).max(initial=0.0)) for v in at_start))
+    shaken = [np.asarray(v) + size * random.normal(size=np.shape(v)) for v in at_start]
+    momenta = legendre(system, state.q_s, state.q_f, *shaken)
+    *_, v_s, v_f = jax.jit(project_momentum)(system, State(state.t, state.q_s, state.q_f, *momenta), at_start)
+    return replace(problem, q_s=state.q_s, q_f=state.q_f, v_s=v_s, v_f=v_f, project=False)
+
+
+def _from_another_start(
+    problem: Problem, t_end: float, seen: ReferenceSolution, newton
+) -> Callable[[Setting], Verification]:
+    """Runs a setting from another start, which the search has not seen."""
+    num_saves = seen.num_saves
+    other = another_start(problem, float(np.abs(seen.q - seen.q[0]).max()) / t_end)
     reference = reference_solution(other, t_end, num_saves=num_saves)
 
     def verified(setting: Setting) -> Verification:
         program = Program(other, setting.scheme, t_end, num_saves, newton)
         seconds = program.seconds(setting.num_steps, 5)
-        row, seen = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds), setting.row
-        return Verification(row.error_q, row.seconds, row.error_q / seen.error_q, row.seconds / seen.seconds)
+        row, known = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds), setting.row
+        grown = row.error_q / known.error_q if known.error_q else 1.0  # no error at all: nothing moves
+        return Verification(row.error_q, row.seconds, grown, row.seconds / known.seconds)
 
     return verified

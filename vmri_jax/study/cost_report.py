@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ from matplotlib.ticker import EngFormatter
 from vmri_jax import diagnostics, plots
 from vmri_jax.mechanics.invariants import potentials
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import Progress, part, silent
 from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.advisor import MARGIN, Search, Setting
@@ -45,6 +47,16 @@ class Answer:
     error: float
     setting: Setting | None
     all: tuple[Setting, ...] = ()
+
+
+class PageFailed(RuntimeError):
+    """The search came to its end, but its page could not be drawn or written; what was found is in `.report` and in cost.csv."""
+
+    def __init__(self, report: "CostReport"):
+        self.report = report
+        super().__init__(
+            f"{report.path} could not be drawn or written; all runs are in {report.path.with_name('cost.csv')}."
+        )
 
 
 def _of_setting(form: Callable[[WorkRow], str]) -> Callable[[Answer], str]:
@@ -120,10 +132,12 @@ def cost_report(
     Raises:
         ValueError: errors that are not positive.
         SimulationError: no reference solution could be computed.
+        SearchInterrupted: Ctrl-C; the page has the errors that were searched for before.
+        PageFailed: the page could not be drawn or written; carries the report.
     """
     problem = problem_of("cost_report", problem)
     out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
+    make_writable_folder(out)
     t_end = default_t_end(problem) if t_end is None else t_end
     reference = reference_solution(problem, t_end, num_saves=1, progress=progress)
     if errors is None:
@@ -137,11 +151,14 @@ def cost_report(
     answers, deadline = [], time.monotonic() + BUDGET
     for i, error in enumerate(sorted(errors, reverse=True)):
         left = deadline - time.monotonic()
-        found = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
+        with search.kept():
+            found = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
         answers.append(Answer(error, found[0] if found else None, tuple(found)))
-        _write(search, answers, problem, name, out)
+        with suppress(PageFailed):  # the page is drawn again, and its failure told, when all is known
+            _write(search, answers, problem, name, out)
     progress("measuring times", 1, 1)
-    search.time_again(_shown(answers))
+    with search.kept():
+        search.time_again(_shown(answers))
     report = _write(search, answers, problem, name, out)
     progress("done", 1, 1)
     return report
@@ -152,12 +169,22 @@ def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: st
     runs, shares = search.rows(), _shares(problem, answers[len(answers) // 2].setting)
     report = CostReport(out / "cost.html", name, search.t_end, tuple(answers), runs, shares)
     labels = _shown(answers)
-    shown = replace(runs, rows=tuple(row for label in labels for row in runs.rows if row.scheme == label))
     runs.to_csv(out / "cost.csv")
-    title = f"{name}: what accuracy costs over a time of {search.t_end:g}"
+    try:
+        _draw(report, problem, labels)
+    except Exception as error:
+        raise PageFailed(report) from error
+    return report
+
+
+def _draw(report: CostReport, problem: Problem, labels: Sequence[str]) -> None:
+    """The figure and the page of a report."""
+    runs, name, out = report.runs, report.name, report.path.parent
+    shown = replace(runs, rows=tuple(row for label in labels for row in runs.rows if row.scheme == label))
+    title = f"{name}: what accuracy costs over a time of {report.t_end:g}"
     plots.save(plots.plot_work_precision(shown, title), out / "cost.png")
     n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
-    reached = [answer for answer in answers if answer.setting is not None]
+    reached = [answer for answer in report.answers if answer.setting is not None]
     write_page(
         report.path,
         TEMPLATE,
@@ -171,7 +198,6 @@ def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: st
         by_num_micro=embedded(partial(_draw_num_micro, report)),
         shares_figure=embedded(partial(_draw_shares, report)),
     )
-    return report
 
 
 def _shown(answers: Sequence[Answer]) -> list[str]:
@@ -248,7 +274,7 @@ def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
             for name in names:
                 settings = sorted((s for s in answer.all if s.family.name == name), key=lambda s: s.num_micro)
                 if len(settings) >= 3:
-                    x, y = [s.num_micro for s in settings], [s.row.seconds for s in settings]
+                    x, y = [s.num_micro for s in settings], plots.positive([s.row.seconds for s in settings])
                     axes.loglog(x, y, label=name, markersize=3.5, linewidth=1.2, **looks[name])
             axes.set(title=f"error {answer.error:.0e}", xlabel="num_micro")
             plots.log_ticks(axes.xaxis, [s.num_micro for shown in answers for s in shown.all])

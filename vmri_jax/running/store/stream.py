@@ -12,7 +12,7 @@ from typing import Any
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.engine import room_for
-from vmri_jax.running.files import clear_partial
+from vmri_jax.running.files import check_writable, clear_partial
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, Working, progress_shown
 from vmri_jax.running.simulate import Simulation, simulation
@@ -82,12 +82,12 @@ def stream(
         Interrupted: Ctrl-C; the chunk at work was finished first (a second Ctrl-C does not wait for it).
     """
     path = Path(out)
+    _check_place(path, resume, overwrite)
     run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
     num_steps = run.num_steps
     if not run.is_concrete:
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
     run.check("stream: the state")
-    _check_place(path, resume, overwrite)
     attributes = {
         "num_steps": num_steps,
         "save_every": save_every,
@@ -163,6 +163,7 @@ def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
     if not path.resolve().parent.is_dir():
         raise FileNotFoundError(f"stream: out is {path}, but the folder {path.parent} does not exist; make it first.")
     if not path.exists():
+        check_writable(path)
         return
     found = StoredTrajectory(path)  # or it is something else
     if not (resume or overwrite):
