@@ -15,7 +15,9 @@ STRUCTURES = {
     "explicit": rs.Structure(2, 1, 2, **SPRINGS, scheme="fully explicit", num_micro=5),
     "corrected kicks": rs.Structure(2, 1, 1, **SPRINGS, scheme="takahashi imada", num_micro=2),
     "linear": rs.Structure(2, 1, 2, "matrix", "harmonic", "harmonic", scheme="explicit slow", num_micro=3),
-    "drift": rs.Structure(2, 1, 2, **SPRINGS, constraint="chain", scheme="fully explicit"),
+    "drift": rs.Structure(
+        2, 1, 1, "matrix", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", scheme="fully explicit"
+    ),
     "slow and fast apart": rs.Structure(
         2, 1, 2, **SPRINGS, constraint="anchored", slow_constraint="sphere", scheme="explicit slow", num_micro=3
     ),
@@ -25,7 +27,10 @@ STRUCTURES = {
     "march that moves": rs.Structure(
         2, 1, 1, **SPRINGS, constraint="rod", moving=True, scheme="gauss", num_micro=2, degree=2
     ),
-    "collocation": rs.Structure(2, 1, 1, **SPRINGS, constraint="rod", scheme="lobatto", degree=4),
+    "march without constraints": rs.Structure(1, 1, 2, **SPRINGS, scheme="gauss", num_micro=2, degree=3),
+    "collocation": rs.Structure(
+        2, 1, 1, "matrix", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", scheme="gauss", degree=3
+    ),
     "arrowhead": rs.Structure(
         1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="arrowhead"
     ),
@@ -61,6 +66,7 @@ METHODS = {
     "slow and fast apart": "NESTED",
     "nested": "NESTED",
     "march that moves": "NESTED",
+    "march without constraints": "NESTED",
     "collocation": "COLLOCATION",
     "arrowhead": "ARROWHEAD",
     "kinetic function and all else": "ARROWHEAD",

@@ -11,6 +11,7 @@ from vmri_jax.diagnostics import null_space_condition, symplectic_defect
 from vmri_jax.steppers.newton.null_space import inverse, inverse_with_multipliers, motions
 
 NULL_SPACE = vm.Newton(method="null_space")
+REFERENCE = "triple_spherical_pendulum", pytest.param("simple_atomic_model", marks=pytest.mark.full)
 
 
 def test_bases_span_what_is_free_and_what_is_held():
@@ -30,7 +31,7 @@ def test_the_inverse_is_that_with_multipliers(degree):
     np.testing.assert_allclose(inverse(a, g_0, g_1), inverse_with_multipliers(a, g_0, g_1), atol=1e-11)
 
 
-@pytest.mark.parametrize("name", ["triple_spherical_pendulum", "simple_atomic_model"])
+@pytest.mark.parametrize("name", REFERENCE)
 @pytest.mark.parametrize(("step", "steps"), [(0.01, 200), pytest.param(0.001, 10_000, marks=pytest.mark.full)])
 def test_trajectories_are_those_of_the_method_with_multipliers(name, step, steps):
     """Over longer times both part, as does every other method: the motion is chaotic."""
@@ -67,7 +68,7 @@ def test_steps_are_symplectic():
     assert float(defect) < 1e-11
 
 
-@pytest.mark.parametrize("name", ["triple_spherical_pendulum", "simple_atomic_model"])
+@pytest.mark.parametrize("name", REFERENCE)
 def test_the_condition_does_not_depend_on_the_step(name):
     problem = getattr(systems, name)()
     found = [

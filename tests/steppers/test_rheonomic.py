@@ -97,9 +97,9 @@ def run(system, scheme, num_steps, **options):
 
 
 CASES = [
-    ("cart that is moved", fully_implicit(3), (20, 40)),
+    pytest.param("cart that is moved", fully_implicit(3), (20, 40), marks=pytest.mark.full),
     ("cart that is moved", galerkin(2, 2), (10, 20)),
-    ("pivot that is moved", explicit_slow(3), (20, 40)),
+    pytest.param("pivot that is moved", explicit_slow(3), (20, 40), marks=pytest.mark.full),
     ("pivot that is moved", compose(fully_explicit(2), "suzuki4"), (20, 40)),
 ]
 
@@ -117,7 +117,7 @@ def test_order(name, scheme, steps):
     [
         ("pivot on a sprung cart", galerkin(2, 2), "nested"),
         pytest.param("pivot on a sprung cart", galerkin(2, 2), "dense", marks=pytest.mark.full),
-        ("cart that is moved", fully_implicit(3), "nested"),
+        pytest.param("cart that is moved", fully_implicit(3), "nested", marks=pytest.mark.full),
     ],
 )
 def test_all_methods_find_the_same(name, scheme, method):
