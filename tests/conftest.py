@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import jax
+import psutil
 import pytest
 from hypothesis import settings
 
@@ -16,6 +17,9 @@ settings.load_profile("repeatable")
 
 MANY_MAPS = 20_000
 """Memory maps of a process from which on compiled programs are forgotten; Linux allows 65 530."""
+MUCH_MEMORY = 1.2e9
+"""Bytes of a process from which on compiled programs are forgotten after a file of tests. A larger value saves the compiling of the
+few programs that files share, and two workers need more than a small machine has."""
 LONGEST = ("verification", "steppers")
 """Folders whose files take longest come first, so that workers end together."""
 
@@ -65,10 +69,11 @@ def pytest_collection_modifyitems(config, items):
 
 @pytest.fixture(scope="module", autouse=True)
 def forget_programs():
-    """Compiled programs go when they hold too many memory maps; until then other modules share them."""
+    """Compiled programs go when they hold too many memory maps or too much memory; until then other modules share them."""
     yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and len(maps.read_text().splitlines()) > MANY_MAPS:
+    many_maps = maps.exists() and len(maps.read_text().splitlines()) > MANY_MAPS
+    if many_maps or psutil.Process().memory_info().rss > MUCH_MEMORY:
         jax.clear_caches()
 
 
