@@ -49,14 +49,14 @@ STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 """Weights of central differences of order 8."""
 
 
-def slopes(function, dimension: int, step: float = 0.01) -> np.ndarray:
-    """Derivative at zero of a function of `dimension` numbers by differences of order 8, which compiles nothing."""
+def slopes(function, directions: np.ndarray, step: float = 0.01) -> np.ndarray:
+    """Derivatives at zero of a function along directions, the last axis, by differences of order 8, which compile nothing."""
 
     def along(direction):
         differences = ((k, function(k * step * direction) - function(-k * step * direction)) for k in STENCIL)
         return sum(STENCIL[k] / step * difference for k, difference in differences)
 
-    return np.stack([along(direction) for direction in np.eye(dimension)], axis=1)
+    return np.stack([along(direction) for direction in directions], axis=-1)
 
 
 NAMES = "q_s", "q_f", "p_s", "p_f"
@@ -73,15 +73,16 @@ def phase(states) -> np.ndarray:
 
 
 def area_change(ends, dimension: int) -> float:
-    """Largest change of the symplectic form between the two states ``ends(x)``, x coordinates near zero, over its size."""
-    derivative = slopes(lambda x: np.stack([phase(state) for state in ends(x)], axis=1), dimension)
+    """Relative change of ``omega(u, v)``, the symplectic form of one pair of random directions, between two states.
 
-    def form(states):
-        dq, dp = np.split(states, 2)
-        return dq.T @ dp - dp.T @ dq
-
-    start, end = form(derivative[:, :, 0]), form(derivative[:, :, 1])
-    return relative_difference(end, start)
+    The states are ``ends(x)``, with x of `dimension` coordinates near zero. Where any other pair of directions changes, this one does.
+    """
+    pair = np.random.default_rng(0).standard_normal((2, dimension))
+    pair /= np.linalg.norm(pair, axis=1, keepdims=True)
+    tangents = slopes(lambda x: np.stack([phase(state) for state in ends(x)]), pair)
+    (dq_u, dp_u), (dq_v, dp_v) = (np.split(tangents[..., i], 2, axis=1) for i in (0, 1))
+    start, end = np.sum(dq_u * dp_v - dp_u * dq_v, axis=1)
+    return float(abs(end / start - 1))
 
 
 def states_near(problem, dimension: int):

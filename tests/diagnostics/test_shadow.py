@@ -18,9 +18,13 @@ def gain(t, q_s, q_f, v_s, v_f, params):
     return params["gain"] * v_s, params["gain"] * v_f
 
 
+STEPS = 10_000
+"""Of all runs of the chain, so that tests share compiled programs."""
+
+
 @pytest.fixture(scope="module")
 def run():
-    return vm.simulate(CHAIN, SCHEME, macro_dt=0.01, num_steps=2000)
+    return vm.simulate(CHAIN, SCHEME, macro_dt=0.01, num_steps=STEPS)
 
 
 @pytest.mark.parametrize(
@@ -29,7 +33,7 @@ def run():
         ("fpu", vm.explicit_slow(10), 0.005, 1e6),  # measured 4e6
         ("fpu", vm.compose(vm.fully_explicit(2), "suzuki4"), 0.01, 30),  # the energy itself is kept better: 80
         ("tsp", vm.explicit_slow(10), 0.001, 1e5),  # 2e6
-        ("sam", vm.explicit_slow(10), 0.002, 1e5),  # 3e5
+        pytest.param("sam", vm.explicit_slow(10), 0.002, 1e5, marks=pytest.mark.full),  # 3e5
     ],
 )
 def test_it_stands_still(name, scheme, macro_dt, least):
@@ -60,7 +64,7 @@ def test_a_drift_that_is_put_in_is_found(per_step, run):
         np.mean(run.energy)
     )  # about: the share of the energy that the force acts on is half of it on average
     forced = CHAIN.system.replace(force=gain, params=CHAIN.system.params | {"gain": per_step / 0.01 / 2})
-    driven = vm.simulate(forced, SCHEME, CHAIN.state(), macro_dt=0.01, num_steps=10_000)
+    driven = vm.simulate(forced, SCHEME, CHAIN.state(), macro_dt=0.01, num_steps=STEPS)
     found = shadow_energy(CHAIN, SCHEME, driven, k=7)
     per_time = per_step / 0.01 * kinetic / 2
     assert found.drifts
@@ -75,7 +79,7 @@ def test_no_drift_where_there_is_none(run):
 
 
 def test_refusals(run):
-    sparse = vm.simulate(CHAIN, SCHEME, macro_dt=0.01, num_steps=200, save_every=4)
+    sparse = vm.simulate(CHAIN, SCHEME, macro_dt=0.01, num_steps=4 * STEPS, save_every=4)
     with pytest.raises(ValueError, match="every macro node saved"):
         shadow_energy(CHAIN, SCHEME, sparse)
     with pytest.raises(ValueError, match="at least 31 nodes"):

@@ -14,10 +14,10 @@ from vmri_jax import Newton, State, fully_explicit, fully_implicit, galerkin, in
 
 CHAIN = systems.fermi_pasta_ulam(1)
 CASES = {  # problem, scheme, macro_dt, name and entry of the parameter
-    "chain, fully implicit": (CHAIN, fully_implicit(4), 0.05, "omega", None),
-    "chain, fully explicit": (CHAIN, fully_explicit(4), 0.05, "omega", None),
+    "chain, fully implicit": (CHAIN, fully_implicit(2), 0.05, "omega", None),
+    "chain, fully explicit": (CHAIN, fully_explicit(2), 0.05, "omega", None),
     "chain, gauss 2": (CHAIN, galerkin(2, 2), 0.05, "omega", None),
-    "cart, fully implicit": (cart(), fully_implicit(3), 0.1, None, None),
+    "cart, fully implicit": (cart(), fully_implicit(2), 0.1, None, None),
     "fpu, fully implicit": (PROBLEMS["fpu"](), fully_implicit(4), 0.05, "omega", None),
     "tsp, fully implicit": (PROBLEMS["tsp"](), fully_implicit(3), 0.02, "stiffness", None),
     "sam, fully implicit": (PROBLEMS["sam"](), fully_implicit(2), 0.02, "stiffness", 2),
@@ -105,7 +105,7 @@ def test_gradient_with_respect_to_a_state_and_the_step():
 
 
 def test_forward_reverse_and_both_methods_agree():
-    """Forward mode goes through what reverse mode transposes: one of the methods in forward mode will do."""
+    """Forward mode goes through what reverse mode transposes: each method in one of the modes will do."""
     problem = cart()
     state = problem.state()
 
@@ -124,7 +124,7 @@ def test_forward_reverse_and_both_methods_agree():
     at = problem.system.params
     values = [
         float(jax.jit(derivative(end), static_argnums=1)(at, method))
-        for method, derivative in (("arrowhead", jax.jacfwd), ("arrowhead", jax.grad), ("dense", jax.grad))
+        for method, derivative in (("arrowhead", jax.grad), ("dense", jax.jacfwd))
     ]
     assert abs(values[0]) > 1e-6
     assert np.allclose(values, values[0], rtol=1e-9, atol=0)

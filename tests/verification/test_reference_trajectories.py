@@ -20,12 +20,17 @@ def scheme_of(case):
 
 
 RUNS = [(name, method) for name in sorted(CASES) for method in ("auto", "dense", "nested", "arrowhead")]
-ALWAYS = ("tsp_fully_implicit_a05_p5", "sam_explicit_slow_a05_p4")
-"""Cases with constraints that the dense method solves also without --full; it makes the same of the others."""
+DENSE = ("fpu3_fully_implicit_a05_p5", "tsp_fully_implicit_a05_p5", "sam_explicit_slow_a05_p4")
+"""Cases that the dense method solves also without --full; it makes the same of the others."""
+SCHEMES = ("fully_implicit_a05", "explicit_slow_a05", "fully_explicit_a025")
+"""Schemes of which every system is solved without --full; others differ in the weights of their rules or in num_micro."""
+OTHERS = ("tsp_explicit_slow_a10_p5", "tsp_fully_implicit_p1")
 
 
 def is_long(name, method) -> bool:
-    return method in ("nested", "arrowhead") or (method == "dense" and name[:3] != "fpu" and name not in ALWAYS)
+    if method == "auto":
+        return name not in OTHERS and not any(scheme in name for scheme in SCHEMES)
+    return method != "dense" or name not in DENSE
 
 
 @pytest.mark.parametrize(
