@@ -10,19 +10,33 @@ import pytest
 
 import vmri_jax as vm
 from tests.support import PROBLEMS
-from tests.user_systems import cart
+from tests.user_systems import LENGTH, cart, own_rod
 from vmri_jax.running import adjoints, engine, loops
 
+
+def heavy(q_f, params):
+    return params * q_f[1]
+
+
 CHAIN = vm.systems.fermi_pasta_ulam(1)
+PENDULUM = vm.Problem(
+    vm.System(vm.ConstantMass([], [1.0, 1.0]), fast_potential=heavy, constraint=own_rod, params=jnp.asarray(9.81)),
+    [],
+    [LENGTH, 0.0],
+    [],
+    [0.0, 0.5],
+)
 SYMMETRIC = vm.fully_explicit(2)
+SIMPLE = {"kicks": SYMMETRIC, "solved": vm.fully_implicit(2)}
 UNSYMMETRIC = replace(SYMMETRIC, fast=vm.micro(vm.quadrature.left))
-LONG = ("fpu", "chain", "tsp", "composed")
+LONG = ("fpu", "kicks", "tsp", "cart", "composed")
 OTHERS = ("checkpoint", "reversible", "forward")
 CASES = {  # problem, scheme, macro_dt, steps
     "fpu": (PROBLEMS["fpu"], vm.fully_implicit(4), 0.02, 40),
     "tsp": (PROBLEMS["tsp"], vm.fully_implicit(3), 0.01, 40),
     "cart": (cart, vm.fully_explicit(2), 0.05, 40),
-    "chain": (lambda: CHAIN, vm.fully_implicit(2), 0.05, 40),
+    "pendulum": (lambda: PENDULUM, vm.fully_explicit(2), 0.05, 40),
+    "kicks": (lambda: CHAIN, vm.fully_explicit(2), 0.05, 40),
     "composed": (cart, vm.compose(vm.fully_explicit(2), "suzuki4"), 0.05, 12),
 }
 
@@ -73,16 +87,31 @@ def test_all_adjoints_agree(case, adjoint):
 
 
 def test_every_node_saved_needs_no_step_back():
-    assert_agree(gradient("chain", 1, "reversible"), gradient("chain", 1, "stored"))
+    assert_agree(gradient("kicks", 1, "reversible"), gradient("kicks", 1, "stored"))
 
 
-@pytest.mark.parametrize("save_every", [1, 5])
-def test_levels_of_checkpoints(monkeypatch, save_every):
-    """Four levels of saved nodes; two of saved nodes and two of the steps between."""
+@pytest.fixture
+def three_parts_a_level(monkeypatch):
     monkeypatch.setattr(loops, "WIDTH", 3)
     monkeypatch.setattr(engine, "WHOLE", 1)
     engine.engine.cache_clear()  # programs with other levels
-    assert_agree(gradient("chain", save_every, "checkpoint"), gradient("chain", save_every, "stored"), 1e-11)
+    yield
+    engine.engine.cache_clear()
+
+
+@pytest.mark.usefixtures("three_parts_a_level")
+@pytest.mark.parametrize("save_every", [1, 5])
+def test_levels_of_checkpoints(save_every):
+    """Four levels of saved nodes; two of saved nodes and two of the steps between."""
+    assert_agree(gradient("kicks", save_every, "checkpoint"), gradient("kicks", save_every, "stored"), 1e-11)
+
+
+@pytest.mark.full
+@pytest.mark.usefixtures("three_parts_a_level")
+def test_levels_of_checkpoints_of_steps_that_are_solved():
+    """Two levels of the steps between."""
+    cost, p_f = simple_cost("checkpoint")
+    assert_agree(jax.jit(jax.grad(cost))(p_f), simple_gradient("stored")(p_f), 1e-11)
 
 
 def memory(adjoint: str, steps: int, save_every: int) -> float:
@@ -116,30 +145,30 @@ def test_where_the_march_fails_the_arrowhead_is_differentiated(adjoint):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
 
 
-def simple_cost(adjoint):
+def simple_cost(adjoint, steps="solved"):
     """Of a small system without constraints, a function of the momenta at the start alone."""
-    cost, at = cost_of(CHAIN, vm.fully_implicit(2), 0.05, 6, 6, vm.Newton("nested"), adjoint=adjoint)
+    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, 6, vm.Newton("nested"), adjoint=adjoint)
     return (lambda p_f: cost(at[0], at[1], p_f, at[3])), at[2]
 
 
 @cache
-def simple_gradient(adjoint):
+def simple_gradient(adjoint, steps="solved"):
     """Of `simple_cost`, compiled."""
-    return jax.jit(jax.grad(simple_cost(adjoint)[0]))
+    return jax.jit(jax.grad(simple_cost(adjoint, steps)[0]))
 
 
-@pytest.mark.parametrize("adjoint", ["checkpoint", "reversible"])
-def test_lanes_of_gradients(adjoint):
-    cost, at = simple_cost(adjoint)
+@pytest.mark.parametrize(("adjoint", "steps"), [("checkpoint", "kicks"), ("reversible", "solved")])
+def test_lanes_of_gradients(adjoint, steps):
+    cost, at = simple_cost(adjoint, steps)
     starts = jnp.stack([at, 1.1 * at])
     lanes = jax.jit(jax.vmap(jax.grad(cost)))(starts)
-    np.testing.assert_allclose(lanes[1], simple_gradient("stored")(starts[1]), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(lanes[1], simple_gradient("stored", steps)(starts[1]), rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize("adjoint", ["checkpoint", "reversible"])
 @pytest.mark.parametrize(("second", "compiled"), [(jax.jacfwd, False), (jax.jacrev, True)])
 def test_second_derivatives_are_refused(adjoint, second, compiled):
-    cost, at = simple_cost(adjoint)
+    cost, at = simple_cost(adjoint, "kicks")
     gradient = jax.grad(cost)
     with pytest.raises(TypeError, match="stored"):
         second(jax.jit(gradient) if compiled else gradient)(at)
