@@ -168,7 +168,7 @@ def test_lanes_of_gradients(adjoint, steps):
 @pytest.mark.parametrize("adjoint", ["checkpoint", "reversible"])
 @pytest.mark.parametrize(("second", "compiled"), [(jax.jacfwd, False), (jax.jacrev, True)])
 def test_second_derivatives_are_refused(adjoint, second, compiled):
-    cost, at = simple_cost(adjoint, "kicks")
+    cost, at = simple_cost(adjoint)
     gradient = jax.grad(cost)
     with pytest.raises(TypeError, match="stored"):
         second(jax.jit(gradient) if compiled else gradient)(at)
