@@ -1,5 +1,5 @@
 """A single interval of higher degree in modes of time: the step is that of the whole equations, in few passes. With constraints
-of all kinds it is held to the textbook in `tests/test_textbook.py`."""
+of all kinds it is held to the textbook in `tests/textbook`."""
 
 import dataclasses
 

@@ -1,5 +1,5 @@
 """Drift along the constraints: the multipliers alone are solved for, errors are within the tolerance. Its steps are held to the
-textbook in `tests/test_textbook.py`."""
+textbook in `tests/textbook`."""
 
 import dataclasses
 

@@ -1,5 +1,5 @@
 """The nested march: few passes, errors within the tolerance, honest about what it did. Its steps are held to the textbook in
-`tests/test_textbook.py`, and those of the reference problems to trajectories of another program in `tests/verification`."""
+`tests/textbook`, and those of the reference problems to trajectories of another program in `tests/verification`."""
 
 import os
 

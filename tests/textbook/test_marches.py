@@ -1,0 +1,51 @@
+"""Steps that are marched through, micro interval after micro interval, against the textbook."""
+
+import pytest
+
+from tests.textbook.agreement import SPRINGS, assert_agrees
+from tests.verification import random_systems as rs
+from vmri_jax import Method
+
+STRUCTURES = {
+    "drift": (
+        Method.RATTLE,
+        rs.Structure(
+            2, 1, 1, "matrix", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", scheme="fully explicit"
+        ),
+    ),
+    "nested": (
+        Method.NESTED,
+        rs.Structure(
+            2, 1, 2, "matrix", **SPRINGS, constraint="rod", slow_constraint="norm", scheme="fully explicit", num_micro=4
+        ),
+    ),
+    "march that moves": (
+        Method.NESTED,
+        rs.Structure(2, 1, 1, **SPRINGS, constraint="rod", moving=True, scheme="gauss", num_micro=2, degree=2),
+    ),
+    "march without constraints": (
+        Method.NESTED,
+        rs.Structure(1, 1, 2, **SPRINGS, scheme="gauss", num_micro=2, degree=3),
+    ),
+    "collocation": (
+        Method.COLLOCATION,
+        rs.Structure(
+            2,
+            1,
+            1,
+            "matrix",
+            **SPRINGS,
+            constraint="rod",
+            moving=True,
+            slow_constraint="norm",
+            scheme="gauss",
+            degree=3,
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_steppers_solve_the_equations_of_the_textbook(name):
+    method, structure = STRUCTURES[name]
+    assert_agrees(name, structure, method)

@@ -1,0 +1,58 @@
+"""Steps whose unknowns are solved for at once, against the textbook."""
+
+import pytest
+
+from benchmarks import oracle
+from tests.textbook.agreement import SPRINGS, agrees, assert_agrees
+from tests.verification import random_systems as rs
+from vmri_jax import Method
+
+STRUCTURES = {
+    "arrowhead": (
+        Method.ARROWHEAD,
+        rs.Structure(1, 2, 2, **SPRINGS, force="drag", scheme="gauss", num_micro=3, degree=3, method="arrowhead"),
+    ),
+    "kinetic function and all else": (
+        Method.ARROWHEAD,
+        rs.Structure(
+            2, 1, 1, "bent", **SPRINGS, constraint="rod", moving=True, slow_constraint="norm", force="drag", num_micro=2
+        ),
+    ),
+    "null space": (
+        Method.NULL_SPACE,
+        rs.Structure(
+            2,
+            1,
+            2,
+            "matrix",
+            **SPRINGS,
+            constraint="rod",
+            moving=True,
+            slow_constraint="norm",
+            scheme="gauss",
+            num_micro=2,
+            degree=2,
+            method="null_space",
+        ),
+    ),
+    "own rules": (
+        Method.DENSE,
+        rs.Structure(
+            1, 1, 2, "coupled", **SPRINGS, force="drive", scheme="mixed", num_micro=2, degree=2, method="dense"
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_steppers_solve_the_equations_of_the_textbook(name):
+    method, structure = STRUCTURES[name]
+    assert_agrees(name, structure, method)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("first", range(0, 500, oracle.DRAWS))
+def test_random_systems_follow_the_textbook(first):
+    for number, structure, draw in oracle.systems(first + oracle.DRAWS, seed=0):
+        if number >= first:
+            agrees(structure, draw)
