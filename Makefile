@@ -6,7 +6,8 @@ ENVIRONMENT ?= .venv
 OLDER ?= python3.11
 NEWER ?= python3.13
 
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+# Workers take one core each: threads of BLAS for small matrices only get in their way.
 TOOLS := tests/benchmarks tests/pages tests/ensembles/test_workers.py
 
 .PHONY: reproduce test test-tools smoke notebooks docs bench lint lock clean
