@@ -10,6 +10,7 @@ from benchmarks.__main__ import app
 from vmri_jax.check import Case, Outcome, run_cases
 from vmri_jax.check.pictures import draw_energy
 from vmri_jax.cli import app as vmri
+from vmri_jax.running.progress import Working
 
 RAISES = "bad | luck"
 
@@ -33,6 +34,13 @@ def test_a_case_that_raises_is_a_failed_row_with_the_reason():
     assert report.rows[0].outcome.values == {"band": 0.5, "full": 1.0}
     assert not report.passed
     assert told == [("1 steady", 0, 2), ("2 broken", 1, 2), ("done", 2, 2)]
+
+
+def test_cases_say_which_one_runs_where_nobody_listens(monkeypatch):
+    works = []
+    monkeypatch.setattr(Working, "__call__", lambda work, what, done, total: works.append(f"{work.name}: {what}"))
+    run_cases(CASES)
+    assert works == ["run_cases: 1 steady", "run_cases: 2 broken"]
 
 
 def test_numbers_choose_cases_and_unknown_ones_are_refused():

@@ -22,7 +22,7 @@ from vmri_jax.cli.run import _energy_balance
 from vmri_jax.running.quantities import Work
 from vmri_jax.running.simulate import Simulation
 from vmri_jax.study import ReferenceSolution, WorkPrecision, families, reference_solution
-from vmri_jax.study.advisor import SearchInterrupted
+from vmri_jax.study.table import StudyInterrupted
 
 USER_FILE = """
 import jax.numpy as jnp
@@ -439,7 +439,7 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
 
 def test_ctrl_c_leaves_the_runs_of_a_search(vmri, tmp_path, monkeypatch):
     def stopped(*_, **__):
-        raise SearchInterrupted(NOTHING)
+        raise StudyInterrupted(NOTHING)
 
     monkeypatch.setattr("vmri_jax.cli.study.recommend", stopped)
     code, text = vmri("tune", "fpu", "--error", "1e-2", "--t-end", "0.2", "--out", "runs.csv")

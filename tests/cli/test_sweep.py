@@ -1,6 +1,7 @@
 """`vmri sweep`: files, stores, what is said."""
 
 import re
+import sys
 import tomllib
 from importlib.resources import files
 
@@ -161,3 +162,16 @@ def test_bad_options_are_refused(vmri):
     assert "choose one of them" in vmri("sweep", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1")[1]
     assert "does not exist; write one with: vmri sweep --example" in vmri("sweep", "nothing.toml")[1]
     assert "must end in .png" in vmri("sweep", "--plot", "map.txt")[1]
+
+
+@pytest.mark.parametrize(
+    ("package", "options"),
+    [("dask.array", ["--plot", "map.png"]), ("distributed", ["--scheduler", "tcp://localhost:1"])],
+)
+def test_a_package_that_is_not_installed_is_named_before_any_compute(vmri, tmp_path, monkeypatch, package, options):
+    monkeypatch.setitem(sys.modules, package, None)
+    code, text = vmri("sweep", *options)
+    assert code == 1
+    assert "Not installed" in text
+    assert f"{options[0]} needs {package}; install it with pip install 'vmri_jax[ensemble]'" in text
+    assert not (tmp_path / "runs.zarr").exists()

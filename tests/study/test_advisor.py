@@ -20,8 +20,9 @@ from vmri_jax.study import (
     reference_solution,
     work_precision,
 )
-from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search, SearchInterrupted, another_start
+from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search, another_start
 from vmri_jax.study.cost_report import default_t_end
+from vmri_jax.study.table import StudyInterrupted
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
 
@@ -231,6 +232,6 @@ def test_ctrl_c_keeps_the_runs(reference, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Search, "_timed", stopped)
-    with pytest.raises(SearchInterrupted, match="interrupted after") as caught:
+    with pytest.raises(StudyInterrupted, match="interrupted after") as caught:
         recommend(PROBLEM, 1e-3, 1.0, menu=SHORT_MENU[:1], reference=reference, verify=False)
     assert len(caught.value.runs.rows) > 3

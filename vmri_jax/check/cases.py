@@ -28,6 +28,7 @@ from vmri_jax.check.pictures import draw_energy
 from vmri_jax.diagnostics import step_condition
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.progress import Working
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
@@ -199,7 +200,10 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         ValueError: the problem is refused by `initial_state`.
     """
     problem = problem_of("cases_for", problem)
-    own, system = resolved(problem), problem.system
+    with Working("cases_for") as tell:
+        tell("small motions about the start", 0, 1)
+        own = resolved(problem)
+    system = problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
     one_way = _turns_one_way(problem)
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Collection, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from rich.text import Text
 
 from vmri_jax import plots
 from vmri_jax.check.case import Case, Outcome
-from vmri_jax.running.progress import Progress, silent
+from vmri_jax.running.progress import Progress, Working, silent
 from vmri_jax.study.table import Column, ResultTable, rich_table
 
 VERDICTS = {True: ("pass", "green"), False: ("fail", "red"), None: ("does not apply", "dim")}
@@ -126,7 +127,7 @@ def run_cases(
         cases: e.g. ``cases_for(problem)``.
         numbers: which of them; all by default.
         full: the full form instead of the quick one.
-        progress: called before every case and at the end.
+        progress: called before every case and at the end; without it a line tells the case, where it takes more than two seconds.
 
     Raises:
         ValueError: a number that no case has.
@@ -137,14 +138,15 @@ def run_cases(
     if unknown:
         raise ValueError(f"run_cases: there is no case {', '.join(map(str, unknown))}; they go from 1 to {max(known)}.")
     chosen, rows = [case for case in cases if not numbers or case.number in numbers], []
-    for k, case in enumerate(chosen):
-        progress(f"{case.number} {case.title}", k, len(chosen))
-        start = time.perf_counter()
-        try:
-            outcome = _outcome(case, full)
-        except KeyboardInterrupt:
-            raise CasesInterrupted(Report(tuple(rows), full), len(chosen)) from None
-        rows.append(Row(case, outcome, time.perf_counter() - start))
+    with Working("run_cases") if progress is silent else nullcontext(progress) as tell:
+        for k, case in enumerate(chosen):
+            tell(f"{case.number} {case.title}", k, len(chosen))
+            start = time.perf_counter()
+            try:
+                outcome = _outcome(case, full)
+            except KeyboardInterrupt:
+                raise CasesInterrupted(Report(tuple(rows), full), len(chosen)) from None
+            rows.append(Row(case, outcome, time.perf_counter() - start))
     progress("done", len(chosen), len(chosen))
     return Report(tuple(rows), full)
 

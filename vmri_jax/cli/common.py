@@ -43,15 +43,18 @@ def refusals() -> Iterator[None]:
 
     Raises:
         BadInput: an argument was wrong, or a file is missing or in the way.
-        typer.Exit: a file could not be written.
-        ValueError, TypeError: raised by another library, or by Python: no argument of the command is to blame.
+        typer.Exit: a file could not be written; a package of an extra is not installed.
+        ValueError, TypeError, ImportError: raised by another library, or by Python: no argument of the command is to blame.
     """
     try:
         yield
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, ImportError) as error:
         if not is_refusal(error):
             print_failure("A fault inside", FAULT)
             raise
+        if isinstance(error, ImportError):
+            print_failure("Not installed", str(error))
+            raise typer.Exit(1) from error
         raise BadInput(str(error)) from error
     except (FileExistsError, FileNotFoundError) as error:
         raise BadInput(str(error)) from error

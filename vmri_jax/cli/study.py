@@ -22,10 +22,10 @@ from vmri_jax.cli.common import (
 )
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study import WorkPrecision, cost_report, recommend
-from vmri_jax.study.advisor import NothingReached, SearchInterrupted, check_target
+from vmri_jax.study import cost_report, recommend
+from vmri_jax.study.advisor import NothingReached, check_target
 from vmri_jax.study.cost_report import PERIODS, PageFailed
-from vmri_jax.study.table import rich_table
+from vmri_jax.study.table import ResultTable, StudyInterrupted, rich_table
 from vmri_jax.study.work import duration
 
 app = typer.Typer()
@@ -110,13 +110,13 @@ def _search(out: Path | None) -> Iterator[Progress]:
     except SimulationError as failure:
         print_failure("No reference solution", str(failure))
         raise typer.Exit(1) from failure
-    except SearchInterrupted as stopped:
+    except StudyInterrupted as stopped:
         console.print(stopped.runs.table())
         _write_runs(stopped.runs, out)
         print_failure("Interrupted", f"After {len(stopped.runs.rows)} runs; the best of them are above.")
         raise typer.Exit(130) from stopped
 
 
-def _write_runs(runs: WorkPrecision, out: Path | None) -> None:
+def _write_runs(runs: ResultTable, out: Path | None) -> None:
     if out is not None:
         runs.to_csv(out) if out.suffix.lower() == ".csv" else runs.to_json(out)

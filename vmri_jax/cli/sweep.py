@@ -28,6 +28,7 @@ from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Produ
 from vmri_jax.ensembles.executors import local_workers
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.mechanics.names import near
+from vmri_jax.running.export import extra
 
 EXAMPLE = Path("sweep.toml")
 SETTINGS = ("t_end", "num_steps", "macro_dt", "micro_dt", "num_micro", "save", "num_saves", "project", "chunk")
@@ -58,6 +59,9 @@ def sweep(
             _write_example(file)
             return
         check_target_file("--plot", plot, PICTURES)
+        if plot is not None:
+            for package in ("xarray", "dask.array"):  # they read the store, after all is computed
+                extra(package, "--plot", "ensemble")
         if workers is not None and scheduler is not None:
             raise ValueError("--workers and --scheduler are given; choose one of them.")
         given = read_sweep(file)
@@ -183,10 +187,9 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
     if workers is not None:
         opened = local_workers(workers)
     else:
-        from distributed import Client  # Dask is an extra
-
+        distributed = extra("distributed", "--scheduler", "ensemble")
         try:
-            opened = Client(scheduler, timeout=10)
+            opened = distributed.Client(scheduler, timeout=10)
         except (OSError, ValueError) as error:
             raise ValueError(f"--scheduler {scheduler}: no scheduler of Dask answers there ({error}).") from error
     with opened as client:

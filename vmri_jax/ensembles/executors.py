@@ -20,6 +20,14 @@ LOOK = 1.0
 scheduler is gone."""
 
 
+class MappingInterrupted(KeyboardInterrupt):
+    """`mapped` was stopped by Ctrl-C; `.results` has a result for each call, None for those that were not done."""
+
+    def __init__(self, results: list):
+        self.results = results
+        super().__init__(f"interrupted after {sum(one is not None for one in results)} of {len(results)} calls.")
+
+
 class Here(Executor):
     """Runs every task in this process, when it is submitted."""
 
@@ -141,6 +149,9 @@ def mapped(
         arguments: of every call; they can be pickled if workers are to have them.
         executor: as of `ensemble`.
         told: ``told(done, number)``, how many are done when number `number` is handed over.
+
+    Raises:
+        MappingInterrupted: Ctrl-C; carries the results until then.
     """
     given = list(arguments)
     found: list = [None] * len(given)
@@ -154,6 +165,9 @@ def mapped(
                 return tasks.submit(task, *given[i])
             return tasks.submit(*call_in_worker(versions, call_packed, packed(what, (task, given[i]))))
 
-        for (i,), future in as_done(submit, room, calls):
-            found[i] = future.result()
+        try:
+            for (i,), future in as_done(submit, room, calls):
+                found[i] = future.result()
+        except KeyboardInterrupt:
+            raise MappingInterrupted(found) from None
     return found

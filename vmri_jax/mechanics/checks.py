@@ -197,11 +197,11 @@ def describe(value) -> str:
 
 
 def is_refusal(error: Exception) -> bool:
-    """Whether this package refused an argument: a ValueError or TypeError of one of its own ``raise`` statements.
+    """Whether this package refused: a ValueError, TypeError, or ImportError (no optional package) of one of its own ``raise`` statements.
 
     Errors of other libraries, and those of Python itself (as of ``zip(strict=True)``), are faults.
     """
     frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
     own = frame.f_globals.get("__name__", "").partition(".")[0] == "vmri_jax"
     raised = linecache.getline(frame.f_code.co_filename, line).lstrip().startswith("raise ")
-    return isinstance(error, ValueError | TypeError) and own and raised
+    return isinstance(error, ValueError | TypeError | ImportError) and own and raised

@@ -7,7 +7,7 @@ from vmri_jax.study.cost_report import CostReport, cost_report
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.table import Column, ResultTable, StudyInterrupted
 from vmri_jax.study.work import WorkPrecision, WorkRow, work_precision
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Recommendation",
     "ReferenceSolution",
     "ResultTable",
+    "StudyInterrupted",
     "WorkPrecision",
     "WorkRow",
     "convergence_study",

@@ -24,7 +24,7 @@ from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import ResultTable
+from vmri_jax.study.table import ResultTable, StudyInterrupted
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration, timed_in_turn, work_row
 
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
@@ -79,14 +79,6 @@ class NothingReached(ValueError):
     def __init__(self, message: str, runs: WorkPrecision):
         self.runs = runs
         super().__init__(message)
-
-
-class SearchInterrupted(KeyboardInterrupt):
-    """A search was stopped by Ctrl-C; the runs until then are in `.runs`."""
-
-    def __init__(self, runs: WorkPrecision):
-        self.runs = runs
-        super().__init__(f"interrupted after {len(runs.rows)} runs; they are in this exception's .runs.")
 
 
 class Search:
@@ -239,11 +231,11 @@ class Search:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Within, Ctrl-C raises `SearchInterrupted`, with all runs so far."""
+        """Within, Ctrl-C raises `StudyInterrupted`, with all runs so far."""
         try:
             yield
         except KeyboardInterrupt:
-            raise SearchInterrupted(self.rows()) from None
+            raise StudyInterrupted(self.rows()) from None
 
     def rows(self) -> WorkPrecision:
         """All runs so far."""
@@ -320,12 +312,17 @@ class Recommendation(ResultTable):
         return self.setting.num_steps
 
 
+def round_off(problem: Problem) -> tuple[float, float]:
+    """The largest position at the start, and what round-off alone makes of it in a run."""
+    size = float(max(np.abs(problem.q_s).max(initial=0), np.abs(problem.q_f).max(initial=0), 1e-300))
+    return size, 100 * np.finfo(float).eps * size
+
+
 def check_target(error: float, t_end: float, problem: Problem) -> None:
     """Refuse errors and times that no run can meet."""
     if not (np.isfinite(t_end) and t_end > 0):
         raise ValueError(f"recommend: t_end is {t_end}; it must be a positive number.")
-    size = float(max(np.abs(problem.q_s).max(initial=0), np.abs(problem.q_f).max(initial=0), 1e-300))
-    floor = 100 * np.finfo(float).eps * size
+    size, floor = round_off(problem)
     if not (np.isfinite(error) and error > floor):
         raise ValueError(
             f"recommend: error is {error:g}; the largest position is {size:.3g}, so that round-off alone is about "
@@ -364,7 +361,7 @@ def recommend(
         ValueError: an error below round-off or below what the reference can tell.
         NothingReached: no setting keeps the error; carries the runs.
         SimulationError: the reference could not be computed.
-        SearchInterrupted: Ctrl-C during the search; carries the runs.
+        StudyInterrupted: Ctrl-C during the search; carries the runs.
 
     Warns:
         UserWarning: the setting was found, but could not be checked from another start.

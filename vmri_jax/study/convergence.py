@@ -16,7 +16,7 @@ import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
-from vmri_jax.ensembles.executors import mapped
+from vmri_jax.ensembles.executors import MappingInterrupted, mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.export import extra
@@ -28,7 +28,7 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.table import Column, ResultTable, StudyInterrupted
 
 FLOOR_FACTOR = 100.0
 """Errors below this many times the error of the reference say nothing about the scheme and are not fitted."""
@@ -232,6 +232,7 @@ def convergence_study(
 
     Raises:
         ValueError: no scheme, a step that does not divide `t_end` as above, a reference of another shape.
+        StudyInterrupted: Ctrl-C; carries the study of the runs that were done.
     """
     problem = problem_of("convergence_study", problem)
     if not schemes:
@@ -247,14 +248,18 @@ def convergence_study(
 
     problems = list(cases.values())
     labels = [(label, num_steps) for label in schemes for num_steps in steps]
-    runs = mapped(
-        "convergence_study",
-        _runs,
-        [(problems, schemes[label], num_steps, t_end, num_saves, newton) for label, num_steps in labels],
-        executor,
-        lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][1]:g}", done, total),
-    )
-    found = dict(zip(labels, runs, strict=True))
+    stopped = None
+    try:
+        runs = mapped(
+            "convergence_study",
+            _runs,
+            [(problems, schemes[label], num_steps, t_end, num_saves, newton) for label, num_steps in labels],
+            executor,
+            lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][1]:g}", done, total),
+        )
+    except MappingInterrupted as interrupted:
+        runs, stopped = interrupted.results, interrupted
+    done = {label: run for label, run in zip(labels, runs, strict=True) if run is not None}
     energies = {case: _energies(changed, references[case]) for case, changed in cases.items()}
     rows = [
         _row(
@@ -264,16 +269,20 @@ def convergence_study(
             t_end / num_steps,
             changed.system,
             momentum_maps,
-            found[label, num_steps][k],
+            done[label, num_steps][k],
             references[case],
             energies[case],
         )
         for label, scheme in schemes.items()
         for k, (case, changed) in enumerate(cases.items())
         for num_steps in steps
+        if (label, num_steps) in done
     ]
+    study = ConvergenceStudy(tuple(rows), references)
+    if stopped is not None:
+        raise StudyInterrupted(study) from None
     progress("done", total, total)
-    return ConvergenceStudy(tuple(rows), references)
+    return study
 
 
 def _cases(problem: Problem, params: Mapping[str, Any] | None) -> dict[str, Problem]:

@@ -13,7 +13,7 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.table import Column, ResultTable, StudyInterrupted
 from vmri_jax.study.timing import interleaved
 
 
@@ -118,6 +118,7 @@ def cost_study(
 
     Raises:
         ValueError: an empty or bad argument.
+        StudyInterrupted: Ctrl-C; carries the programs that were run, with times where they were measured.
     """
     problem = problem_of("cost_study", problem)
     if not num_micro or not methods or repeats < 1 or not (micro_dt > 0 and t_end > 0):
@@ -127,18 +128,26 @@ def cost_study(
         )
     total = len(num_micro) * len(methods) + 1
     runs: list[tuple[str, Program, int, Trajectory]] = []
-    for method in methods:
-        newton = Newton(method=method)  # pyright: ignore[reportArgumentType]
-        for n in num_micro:
-            progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
-            num_steps = max(1, round(t_end / (n * micro_dt)))
-            program = Program(problem, scheme(n), num_steps * n * micro_dt, newton=newton)
-            runs.append((method, program, num_steps, program(num_steps)))
-    progress(f"{label} measuring times".strip(), total - 1, total)
-    calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}
-    seconds = interleaved(calls, repeats, min_seconds)
+    seconds: dict[str, list[float]] = {}
+
+    def study() -> CostStudy:
+        return CostStudy(tuple(_row(label, *run, seconds.get(str(i), [np.nan])) for i, run in enumerate(runs)))
+
+    try:
+        for method in methods:
+            newton = Newton(method=method)  # pyright: ignore[reportArgumentType]
+            for n in num_micro:
+                progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
+                num_steps = max(1, round(t_end / (n * micro_dt)))
+                program = Program(problem, scheme(n), num_steps * n * micro_dt, newton=newton)
+                runs.append((method, program, num_steps, program(num_steps)))
+        progress(f"{label} measuring times".strip(), total - 1, total)
+        calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}
+        seconds = interleaved(calls, repeats, min_seconds)
+    except KeyboardInterrupt:
+        raise StudyInterrupted(study()) from None
     progress("done", total, total)
-    return CostStudy(tuple(_row(label, *run, seconds.get(str(i), [np.nan])) for i, run in enumerate(runs)))
+    return study()
 
 
 def _row(

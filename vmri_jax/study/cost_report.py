@@ -21,10 +21,10 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import Progress, part, silent
 from vmri_jax.running.timing import seconds_each
-from vmri_jax.study.advisor import MARGIN, Search, Setting
+from vmri_jax.study.advisor import MARGIN, Search, Setting, round_off
 from vmri_jax.study.families import Family, families
 from vmri_jax.study.html import embedded, write_page
-from vmri_jax.study.reference_solution import reference_solution
+from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration
 
@@ -130,9 +130,9 @@ def cost_report(
         progress: told what is running.
 
     Raises:
-        ValueError: errors that are not positive.
+        ValueError: errors that are not positive; none are asked for, and the system does not move.
         SimulationError: no reference solution could be computed.
-        SearchInterrupted: Ctrl-C; the page has the errors that were searched for before.
+        StudyInterrupted: Ctrl-C; the page has the errors that were searched for before.
         PageFailed: the page could not be drawn or written; carries the report.
     """
     problem = problem_of("cost_report", problem)
@@ -141,8 +141,7 @@ def cost_report(
     t_end = default_t_end(problem) if t_end is None else t_end
     reference = reference_solution(problem, t_end, num_saves=1, progress=progress)
     if errors is None:
-        motion = 10.0 ** math.floor(math.log10(max(np.abs(reference.q[-1] - reference.q[0]).max(), 1e-300)))
-        errors = [motion * error for error in RELATIVE_ERRORS if motion * error > MARGIN * reference.error_q]
+        errors = _default_errors(problem, reference, t_end)
     if not errors or min(errors) <= 0:
         raise ValueError(
             f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions."
@@ -162,6 +161,25 @@ def cost_report(
     report = _write(search, answers, problem, name, out)
     progress("done", 1, 1)
     return report
+
+
+def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float) -> list[float]:
+    """RELATIVE_ERRORS of how far the system moves, those that the reference and round-off let be told.
+
+    Raises:
+        ValueError: there is none, as where nothing moves.
+    """
+    moved = float(np.abs(reference.q[-1] - reference.q[0]).max())
+    least = max(MARGIN * reference.error_q, round_off(problem)[1])
+    motion = 10.0 ** math.floor(math.log10(max(moved, 1e-300)))
+    errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
+    if not errors:
+        raise ValueError(
+            f"cost_report: at t_end = {t_end:g} the positions are those of the start up to {moved:.1e}, and errors below {least:.1e} "
+            "cannot be told from round-off or from the error of the reference solution: the system is at rest, back at its start, or "
+            "chaotic. Give a start that moves, another t_end, or the errors that you accept."
+        )
+    return errors
 
 
 def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: str, out: Path) -> CostReport:

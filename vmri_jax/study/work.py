@@ -1,13 +1,13 @@
 """Work and precision: what an error costs in time and in evaluations, run by run, and the best of all runs."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from vmri_jax import diagnostics, plots
-from vmri_jax.ensembles.executors import mapped
+from vmri_jax.ensembles.executors import MappingInterrupted, mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.schemes.composition import Composition
@@ -16,7 +16,7 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Column, ResultTable
+from vmri_jax.study.table import Column, ResultTable, StudyInterrupted
 from vmri_jax.study.timing import interleaved, machine
 
 FINEST_ERROR = 1e-10
@@ -193,6 +193,7 @@ def work_precision(
 
     Raises:
         ValueError: no scheme, or numbers of steps that are no multiples of num_saves.
+        StudyInterrupted: Ctrl-C; carries the runs that were done, with the time of one call where their turn had not come.
     """
     problem = problem_of("work_precision", problem)
     if not schemes:
@@ -207,16 +208,23 @@ def work_precision(
         _Ladder(problem, label, scheme, t_end, num_saves, newton, num_steps, reference, frequency)
         for label, scheme in schemes.items()
     ]
-    if executor is None:
-        runs: list[tuple[Program, WorkRow]] = []
-        for i, ladder in enumerate(ladders):
-            runs += _climbed(ladder, lambda n, i=i: progress(f"{ladders[i].label}, {n} steps", i, total))
-        progress("measuring times", len(schemes), total)
-        rows = timed_in_turn(runs, repeats)
-    else:
-        timed = [(ladder, repeats) for ladder in ladders]
-        told = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
-        rows = [row for part in mapped("work_precision", _timed, timed, executor, told) for row in part]
+    runs: list[tuple[Program, WorkRow]] = []
+    try:
+        if executor is None:
+            for i, ladder in enumerate(ladders):
+                for run in _climbed(ladder, lambda n, i=i: progress(f"{ladders[i].label}, {n} steps", i, total)):
+                    runs.append(run)
+            progress("measuring times", len(schemes), total)
+            rows = timed_in_turn(runs, repeats)
+        else:
+            timed = [(ladder, repeats) for ladder in ladders]
+            told = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
+            rows = [row for part in mapped("work_precision", _timed, timed, executor, told) for row in part]
+    except MappingInterrupted as stopped:
+        rows = [row for part in stopped.results if part is not None for row in part]
+        raise StudyInterrupted(WorkPrecision(tuple(rows), t_end, reference)) from None
+    except KeyboardInterrupt:
+        raise StudyInterrupted(WorkPrecision(tuple(row for _, row in runs), t_end, reference)) from None
     progress("done", 1, 1)
     return WorkPrecision(tuple(rows), t_end, reference)
 
@@ -235,8 +243,8 @@ class _Ladder(NamedTuple):
     frequency: float
 
 
-def _climbed(ladder: _Ladder, told: Callable[[int], None] = lambda _: None) -> list[tuple[Program, WorkRow]]:
-    """All runs of a ladder, with the time of one call each."""
+def _climbed(ladder: _Ladder, told: Callable[[int], None] = lambda _: None) -> Iterator[tuple[Program, WorkRow]]:
+    """All runs of a ladder, one after the other, with the time of one call each."""
     program = Program(ladder.problem, ladder.scheme, ladder.t_end, ladder.num_saves, ladder.newton)
     per_save = ladder.frequency * ladder.t_end / ladder.scheme.num_micro / ladder.scheme.degree / ladder.num_saves
     left, seen = list(ladder.num_steps or [ladder.num_saves * max(1, int(per_save))]), []
@@ -245,14 +253,14 @@ def _climbed(ladder: _Ladder, told: Callable[[int], None] = lambda _: None) -> l
         told(n)
         seconds = program.seconds(n, 1, 0.0)
         seen.append(work_row(ladder.label, program, n, ladder.reference).timed(seconds))
+        yield program, seen[-1]
         if ladder.num_steps is None and _goes_on(seen, ladder.reference):
             left = [2 * n]
-    return [(program, row) for row in seen]
 
 
 def _timed(ladder: _Ladder, repeats: int) -> list[WorkRow]:
     """The rows of a ladder."""
-    return timed_in_turn(_climbed(ladder), repeats)
+    return timed_in_turn(list(_climbed(ladder)), repeats)
 
 
 def timed_in_turn(runs: Sequence[tuple[Program, WorkRow]], repeats: int) -> list[WorkRow]:

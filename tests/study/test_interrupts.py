@@ -1,0 +1,89 @@
+"""Ctrl-C in a study keeps what is done; a cost report of a system at rest says so."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.small_systems import one_coordinate
+from vmri_jax.study import (
+    ConvergenceStudy,
+    Program,
+    ReferenceSolution,
+    StudyInterrupted,
+    convergence_study,
+    cost_report,
+    cost_study,
+    work_precision,
+)
+from vmri_jax.study.program import joined
+
+SCHEME, T_END = vm.fully_explicit(1), 0.08
+
+
+def ctrl_c(words: str):
+    """A `progress` during which the user presses Ctrl-C before the work of these words."""
+
+    def progress(what: str, done: int, total: int) -> None:
+        if words in what:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+@pytest.fixture(scope="module")
+def reference() -> ReferenceSolution:
+    return ReferenceSolution(*joined(Program(one_coordinate(), SCHEME, T_END)(256)))
+
+
+def test_convergence_studies_keep_their_rows(reference):
+    steps = [0.04, 0.02, 0.01]
+    with pytest.raises(StudyInterrupted, match="interrupted after 2 runs") as caught:
+        convergence_study(
+            *(one_coordinate(), {"explicit": SCHEME}, steps, T_END),
+            num_saves=1,
+            reference=reference,
+            progress=ctrl_c("H = 0.01"),
+        )
+    study = caught.value.runs
+    assert isinstance(study, ConvergenceStudy)
+    assert [row.macro_dt for row in study.rows] == steps[:2]
+    assert study.order("explicit") == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("words", "rows"), [("4 steps", 1), ("measuring times", 3)])
+def test_work_and_precision_keeps_its_rows(reference, words, rows):
+    with pytest.raises(StudyInterrupted) as caught:
+        work_precision(
+            *(one_coordinate(), {"explicit": SCHEME}, T_END),
+            num_steps=[2, 4, 8],
+            reference=reference,
+            progress=ctrl_c(words),
+        )
+    kept = caught.value.runs.rows
+    assert [row.num_steps for row in kept] == [2, 4, 8][:rows]
+    assert all(row.seconds > 0 and np.isfinite(row.error_q) for row in kept)
+
+
+def test_cost_studies_keep_their_rows():
+    with pytest.raises(StudyInterrupted) as caught:
+        cost_study(
+            *(one_coordinate(), vm.fully_explicit, [1]),
+            micro_dt=0.01,
+            t_end=T_END,
+            methods=("auto",),
+            progress=ctrl_c("measuring times"),
+        )
+    (row,) = caught.value.runs.rows
+    assert row.result == "CONVERGED"
+    assert np.isnan(row.us_per_micro_step)
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-17])
+def test_a_cost_report_of_a_system_at_rest_says_so(monkeypatch, tmp_path, error):
+    """Its errors are parts of how far it moves; it came as "errors are []"."""
+    at_rest = ReferenceSolution(np.ones((2, 1)), np.zeros((2, 1)), error)
+    monkeypatch.setattr(import_module("vmri_jax.study.cost_report"), "reference_solution", lambda *_, **__: at_rest)
+    with pytest.raises(ValueError, match=r"positions are those of the start up to 0\.0e\+00.*at rest"):
+        cost_report(one_coordinate(), "pendulum", tmp_path, t_end=1.0)
