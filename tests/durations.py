@@ -6,6 +6,7 @@ too it is the fairer measure; wall time with two workers is about half of its su
 
 import os
 import resource
+import time
 from collections import defaultdict
 
 import pytest
@@ -14,6 +15,8 @@ SECONDS_OF_A_TEST = 30.0
 """Most processor time of one test: it is compiling programs, and a developer who runs this test alone waits for it."""
 SECONDS_OF_A_FILE = 60.0
 """Most processor time of one file: a worker takes whole files, so a longer one may leave the other worker without work."""
+SECONDS_OF_THE_MEASURE = 0.17
+"""Processor time of the loop of `slowness` where the budgets were set. A machine that takes longer gets as much more."""
 LISTED = 15
 """Rows of the list of the slowest files and of the slowest tests."""
 
@@ -22,6 +25,13 @@ def processor_time() -> float:
     """Seconds of this process, its threads, and its children that have ended."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system
+
+
+def slowness() -> float:
+    """Processor time of a loop in Python over that of the machine on which the budgets were set, at least 1."""
+    start = time.process_time()
+    sum(i * i for i in range(3_000_000))
+    return max((time.process_time() - start) / SECONDS_OF_THE_MEASURE, 1.0)
 
 
 class Durations:
@@ -33,6 +43,7 @@ class Durations:
 
     def __init__(self, budget: bool):
         self.budget = budget
+        self.slowness = slowness() if budget else 1.0
         self.start = 0.0
         self.seconds: dict[str, float] = {}
         self.memory = 0.0
@@ -65,7 +76,7 @@ class Durations:
 
     def excesses(self) -> list[str]:
         """A sentence for every test and every file above its budget."""
-        limits = (self.seconds, SECONDS_OF_A_TEST), (self.files(), SECONDS_OF_A_FILE)
+        limits = (self.seconds, self.slowness * SECONDS_OF_A_TEST), (self.files(), self.slowness * SECONDS_OF_A_FILE)
         return [
             f"{name} took {seconds:.0f} s of processor time; the budget is {limit:.0f} s"
             for durations, limit in limits
