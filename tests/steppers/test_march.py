@@ -225,8 +225,9 @@ def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
     assert all(around[:1] == ("cond",) for around in found)
 
 
-def test_a_fallback_keeps_what_was_computed(fpu):
+def test_a_fallback_keeps_what_was_computed():
     """The run goes on from the last saved node, with the same trajectory as the exact method."""
+    fpu = systems.fermi_pasta_ulam(1)
     scheme = fully_implicit(100)
     free = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20)
     first = int(free.info.iterations[0])
@@ -239,7 +240,7 @@ def test_a_fallback_keeps_what_was_computed(fpu):
     assert largest_difference(run.q_f[:10], exact.q_f[:10]) < 1e-8  # errors grow fast at this step; measured 1e-10
 
 
-@pytest.mark.parametrize("method", ["nested", "arrowhead"])
+@pytest.mark.parametrize("method", ["nested", pytest.param("arrowhead", marks=pytest.mark.full)])
 def test_fixed_iterations(method):
     problem = cart()
 

@@ -138,10 +138,9 @@ def test_structure_with_constraints():
 
 
 def test_average_of_a_nonlinear_vibration_by_all_methods():
-    found, expected, plain = dumbbell_run(), dumbbell_run(method="arrowhead"), dumbbell_run(explicit_slow(3))
-    assert largest_difference(expected.p_f[1], plain.p_f[1]) > 1e-6  # measured 4.7e-5
+    march, arrowhead = dumbbell_run(), dumbbell_run(method="arrowhead")
     for name in NAMES:
-        assert relative_difference(getattr(found, name), getattr(expected, name)) < 1e-13  # measured 2e-14
+        assert relative_difference(getattr(march, name), getattr(arrowhead, name)) < 1e-13  # measured 2e-14
 
 
 def test_evaluations_are_stated():

@@ -6,6 +6,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.scene.gallery_scenes import gallery_scene
+from tests.user_systems import cart
 from vmri_jax import systems
 from vmri_jax.diagnostics import null_space_condition, symplectic_defect
 from vmri_jax.steppers.newton.null_space import inverse, inverse_with_multipliers, motions
@@ -31,11 +32,22 @@ def test_the_inverse_is_that_with_multipliers(degree):
     np.testing.assert_allclose(inverse(a, g_0, g_1), inverse_with_multipliers(a, g_0, g_1), atol=1e-11)
 
 
-@pytest.mark.parametrize("name", REFERENCE)
-@pytest.mark.parametrize(("step", "steps"), [(0.01, 200), pytest.param(0.001, 10_000, marks=pytest.mark.full)])
-def test_trajectories_are_those_of_the_method_with_multipliers(name, step, steps):
-    """Over longer times both part, as does every other method: the motion is chaotic."""
-    problem = getattr(systems, name)()
+LONG = pytest.mark.full  # the motion is chaotic: over longer times both part, as does every other method
+
+
+@pytest.mark.parametrize(
+    ("make", "step", "steps"),
+    [
+        (cart, 0.01, 200),
+        *(
+            pytest.param(make, step, steps, marks=LONG)
+            for make in (systems.triple_spherical_pendulum, systems.simple_atomic_model)
+            for step, steps in ((0.01, 200), (0.001, 10_000))
+        ),
+    ],
+)
+def test_trajectories_are_those_of_the_method_with_multipliers(make, step, steps):
+    problem = make()
     arguments = {"macro_dt": step, "num_steps": steps, "save_every": 20}
     runs = [
         vm.simulate(problem, vm.fully_implicit(num_micro=5), newton=newton, **arguments)
