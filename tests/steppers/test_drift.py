@@ -91,7 +91,7 @@ def test_one_correction_where_the_motion_is_smooth(tsp):
     assert np.asarray(info.iterations).mean() < 1.1  # measured 1.0
 
 
-@pytest.mark.full  # as with every first method, see test_march
+@pytest.mark.full  # as with every first method, see test_fallback
 def test_where_it_fails_the_whole_equations_are_asked(tsp):
     """A step so long that the rods cannot follow."""
     start = tsp.state()
@@ -105,7 +105,7 @@ def test_where_it_fails_the_whole_equations_are_asked(tsp):
     assert int(auto.info.method[0]) == Method.ARROWHEAD
 
 
-@pytest.mark.full  # as with every method, see test_march
+@pytest.mark.full  # as with every method, see test_fallback
 def test_fixed_iterations(tsp):
     free, _ = phases(tsp, Newton())
     fixed, info = phases(tsp, Newton(fixed_iterations=4))

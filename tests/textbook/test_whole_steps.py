@@ -31,7 +31,6 @@ STRUCTURES = {
             slow_constraint="norm",
             scheme="gauss",
             num_micro=2,
-            degree=2,
             method="null_space",
         ),
     ),
