@@ -69,7 +69,7 @@ def test_springs_end_at_points_of_bodies_and_arms_reach_to_joints():
     drawn = scene.drawing()
     assert drawn["links"] == [["arm", "hinge hub-arm in arm"]]  # within the hub there is nothing to see
     assert drawn["anchors"] == [{"body": "hub (0.5, 0, 0)", "point": [3.0, 0.0, 2.0], "kind": "spring"}]
-    run = vm.simulate(scene, vm.fully_implicit(num_micro=1), macro_dt=0.02, num_steps=5)
+    run = vm.simulate(scene, vm.fully_explicit(num_micro=1), macro_dt=0.02, num_steps=5)
     seen = motion(run, Drawing.from_dict(drawn))
     data = _data(seen, layout(seen))
     assert len(data["solids"]) == 1

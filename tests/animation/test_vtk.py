@@ -22,7 +22,7 @@ def moved():
         ],
         [Gravity(), Anchor("bob", [0.0, 0.0, 0.0]), Spring(("bob", "tip"), 100.0)],
     )
-    run = vm.simulate(scene, vm.fully_implicit(2), macro_dt=0.05, num_steps=6)
+    run = vm.simulate(scene, vm.fully_explicit(2), macro_dt=0.05, num_steps=6)
     return motion(run, Drawing.from_dict(scene.drawing()), scene.system())
 
 
