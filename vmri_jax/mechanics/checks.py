@@ -2,6 +2,7 @@
 
 import linecache
 import traceback
+from functools import lru_cache
 from pathlib import Path
 
 import jax
@@ -160,15 +161,27 @@ def _check_indices(what: str, function, args) -> None:
 
     The function is traced once more with arrays of NumPy; other errors are those of operations that NumPy's arrays do not have.
     """
-    raw = function.function if isinstance(function, TracedOnce) else function
-    moving, params = jax.tree.map(lambda a: np.zeros(np.shape(a)), args[:-1]), args[-1]
+    if isinstance(function, ConstantMass):
+        return
+    raw = getattr(function, "function", function)  # of `KineticFunction` and `TracedOnce`
+    raw = raw.function if isinstance(raw, TracedOnce) else raw
+    leaves, structure = jax.tree.flatten(args)
+    missing = _missing_entry(raw, structure, tuple(np.shape(leaf) for leaf in leaves))
+    if missing:
+        raise ValueError(f"{what} takes an entry that is not there{missing}.")
+
+
+@lru_cache(maxsize=1024)
+def _missing_entry(function, structure, shapes: tuple[tuple[int, ...], ...]) -> str:
+    """The line and the words of NumPy's refusal; empty if every entry is there. Remembered, since tracing costs milliseconds."""
     try:
         with np.errstate(all="ignore"):
-            jax.eval_shape(lambda: raw(*moving, params))
+            jax.eval_shape(lambda: function(*jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])))
     except IndexError as error:
-        raise ValueError(f"{what} takes an entry that is not there{_line_of(error)}: {error}.") from None
+        return f"{_line_of(error)}: {error}"
     except Exception:
-        return
+        return ""
+    return ""
 
 
 def _line_of(error: Exception) -> str:
