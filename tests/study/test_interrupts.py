@@ -9,6 +9,7 @@ import vmri_jax as vm
 from tests.small_systems import one_coordinate
 from vmri_jax.study import (
     ConvergenceStudy,
+    Family,
     Program,
     ReferenceSolution,
     StudyInterrupted,
@@ -78,6 +79,22 @@ def test_cost_studies_keep_their_rows():
     (row,) = caught.value.runs.rows
     assert row.result == "CONVERGED"
     assert np.isnan(row.us_per_micro_step)
+
+
+def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_path, reference):
+    """Ctrl-C in the figures of the page ended `vmri cost` without a word of what it had found."""
+
+    def drawing(*_):
+        raise KeyboardInterrupt
+
+    module = import_module("vmri_jax.study.cost_report")
+    monkeypatch.setattr(module, "reference_solution", lambda *_, **__: reference)
+    monkeypatch.setattr(module, "_draw", drawing)
+    monkeypatch.setattr("vmri_jax.study.advisor.NUM_MICRO", (1,))
+    menu = [Family("fully explicit", vm.fully_explicit, "--scheme fully-explicit", 1)]
+    with pytest.raises(StudyInterrupted) as caught:
+        cost_report(one_coordinate(), "mass", tmp_path, t_end=T_END, errors=[1e-3], menu=menu)
+    assert caught.value.runs.rows
 
 
 @pytest.mark.parametrize("error", [0.0, 1e-17])

@@ -148,17 +148,16 @@ def cost_report(
         )
     search = Search(problem, t_end, families() if menu is None else menu, reference)
     answers, deadline = [], time.monotonic() + BUDGET
-    for i, error in enumerate(sorted(errors, reverse=True)):
-        left = deadline - time.monotonic()
-        with search.kept():
-            found = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
-        answers.append(Answer(error, found[0] if found else None, tuple(found)))
-        with suppress(PageFailed):  # the page is drawn again, and its failure told, when all is known
-            _write(search, answers, problem, name, out)
-    progress("measuring times", 1, 1)
-    with search.kept():
+    with search.kept():  # while the page is drawn, too
+        for i, error in enumerate(sorted(errors, reverse=True)):
+            left = deadline - time.monotonic()
+            settings = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
+            answers.append(Answer(error, settings[0] if settings else None, tuple(settings)))
+            with suppress(PageFailed):  # the page is drawn again, and its failure told, when all is known
+                _write(search, answers, problem, name, out)
+        progress("measuring times", 1, 1)
         search.time_again(_shown(answers))
-    report = _write(search, answers, problem, name, out)
+        report = _write(search, answers, problem, name, out)
     progress("done", 1, 1)
     return report
 
