@@ -1,0 +1,205 @@
+"""Lanes of batches: parameters and steps of their own, failures, chunks, devices, and what is refused."""
+
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.running.test_batch import SYSTEMS, lane_of, spread
+from tests.support import largest_difference
+from vmri_jax import (
+    Method,
+    Newton,
+    Result,
+    State,
+    explicit_slow,
+    fully_explicit,
+    fully_implicit,
+    initial_state,
+    simulate,
+    simulate_batch,
+)
+
+
+def batch_of_three(chain, states: State):
+    """Each lane with a step size and a stiffness of its own."""
+    return simulate_batch(
+        chain.system, SCHEME_OF_THREE, states, macro_dt=STEPS, num_steps=10, params={"omega": OMEGAS}, newton=MARCH
+    )
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return SYSTEMS["chain"]()
+
+
+@pytest.fixture(scope="module")
+def three(chain):
+    return batch_of_three(chain, spread(chain, 3))
+
+
+def test_step_sizes_and_params_per_lane(chain, three):
+    for lane in range(3):
+        system = chain.system.replace(params={"omega": OMEGAS[lane]})
+        state = lane_of(spread(chain, 3), lane)
+        alone = simulate(system, SCHEME_OF_THREE, state, macro_dt=STEPS[lane], num_steps=10, newton=MARCH)
+        assert largest_difference(three.p_f[lane], alone.p_f) < 1e-12
+
+
+def test_a_failing_lane_leaves_the_others_alone(chain, three):
+    states = spread(chain, 3)
+    states = State(states.t, states.q_s.at[1, 0].set(1e200), states.q_f, states.p_s, states.p_f)
+    with pytest.warns(vm.FailedLanesWarning, match=r"1 of 3 lanes failed .* lane 1, at macro step 0 \(NON_FINITE\)"):
+        batch = batch_of_three(chain, states)
+    assert np.asarray(batch.failed_at).tolist() == [-1, 0, -1]
+    assert bool(jnp.all(jnp.isnan(batch.q_f[1, 1:])))
+    assert largest_difference(batch.q_f[2], three.q_f[2]) == 0
+
+
+LANES, BAD = 16, 7
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme", "macro_dt", "newton"),
+    [("chain", fully_implicit(2), 0.05, Newton()), ("cart", explicit_slow(2), 0.02, Newton("nested"))],
+)
+def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, newton):
+    """Over starts, step sizes and parameters. One start has velocities beyond what a double can square."""
+    problem, rng = SYSTEMS[name](), np.random.default_rng(5)
+    v_s = np.array(problem.v_s + 0.3 * rng.normal(size=(LANES, problem.v_s.size)))
+    v_f = np.array(problem.v_f + 0.3 * rng.normal(size=(LANES, problem.v_f.size)))
+    v_f[BAD] *= 1e200
+    steps = macro_dt * np.linspace(0.2, 1.0, LANES)
+    params = jax.tree.map(lambda stiffness: stiffness * np.linspace(0.4, 1.0, LANES), problem.system.params)
+
+    def go(v_s, v_f, macro_dt, params):
+        system = problem.system.replace(params=params)
+        state = initial_state(system, problem.q_s, problem.q_f, v_s, v_f, project=True)
+        return simulate(system, scheme, state, macro_dt=macro_dt, newton=newton, throw=False, **RUN)
+
+    batch = jax.jit(jax.vmap(go))(v_s, v_f, steps, params)
+    assert batch.q_f.shape == (LANES, 5, problem.q_f.size)
+    assert np.flatnonzero(~np.asarray(batch.success)).tolist() == [BAD]
+    assert Result(int(batch.result[BAD])) in (Result.NON_FINITE, Result.DIVERGED, Result.STAGNATED)
+    assert int(batch.failed_at[BAD]) == 0
+    assert np.isnan(batch.q_f[BAD, 1:]).all()
+    worst = 0.0
+    for lane in [*range(BAD), *range(BAD + 1, LANES)]:
+        alone = go(v_s[lane], v_f[lane], steps[lane], jax.tree.map(lambda a, lane=lane: a[lane], params))
+        assert largest_difference(batch.t[lane], alone.t) < 1e-15
+        for field in ("q_s", "q_f", "p_s", "p_f"):
+            a, b = np.asarray(getattr(batch, field)[lane]), np.asarray(getattr(alone, field))
+            worst = max(worst, largest_difference(a, b) / np.abs(b).max())
+        assert np.abs(np.asarray(batch.info.iterations[lane] - alone.info.iterations)).max() <= 1  # at the tolerance
+    assert worst < 3e-13  # measured 3.7e-14
+
+
+def test_lanes_that_the_march_does_not_solve_are_solved_exactly(chain):
+    run = simulate_batch(
+        chain.system, fully_implicit(100), spread(chain, 3), macro_dt=1.0, num_steps=5, newton=Newton(max_iterations=8)
+    )
+    assert np.all(np.asarray(run.result) <= Result.CONVERGED_AT_ROUNDOFF)
+    assert np.any(np.asarray(run.info.method) == Method.ARROWHEAD)
+
+
+def test_chunks_of_a_batch_do_not_change_it(fpu):
+    """Eighteen chunks of two lanes, the last of them half full."""
+    states = spread(fpu, 35)
+    run = {"macro_dt": 0.02, "num_steps": 12, "save_every": 4}
+    whole = simulate_batch(fpu.system, fully_explicit(3), states, **run)
+    in_chunks = simulate_batch(fpu.system, fully_explicit(3), states, chunk=2, **run)
+    assert in_chunks.q_f.shape == whole.q_f.shape == (35, 4, 3)
+    for name in ("q_s", "p_f", "energy"):
+        assert largest_difference(getattr(in_chunks, name), getattr(whole, name)) < 1e-13
+    assert np.array_equal(in_chunks.failed_at, np.full(35, -1))
+
+
+def test_one_compilation_for_all_chunks_and_step_sizes(fpu):
+    calls = 0
+
+    def counted(q_f, params):
+        nonlocal calls
+        calls += 1
+        return params["omega"] ** 2 / 2 * jnp.sum(q_f**2)
+
+    system = fpu.system.replace(fast_potential=counted)
+    simulate_batch(system, fully_explicit(4), spread(fpu, 7), macro_dt=0.02, num_steps=10, chunk=2)
+    before = calls
+    simulate_batch(system, fully_explicit(4), spread(fpu, 5), macro_dt=0.01, num_steps=20, save_every=2, chunk=2)
+    assert calls == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"macro_dt": np.ones(2)}, r"macro_dt has shape \(2,\); give a number, or one for each of the 3 lanes"),
+        ({"macro_dt": np.array([0.1, -0.1, 0.1])}, "every macro_dt must be a positive number"),
+        ({"num_steps": 0}, "num_steps is 0; it must be an integer of at least 1"),
+        ({"devices": 99}, "devices is 99, but JAX has"),
+        ({"chunk": 0}, "chunk is 0; it must be an integer of at least 1, or None"),
+    ],
+)
+def test_bad_input_is_refused(fpu, changes, message):
+    with pytest.raises(ValueError, match=message):
+        simulate_batch(fpu.system, fully_explicit(4), spread(fpu, 3), **({"macro_dt": 0.1, "num_steps": 2} | changes))
+
+
+def test_states_without_a_batch_axis_are_refused(fpu):
+    with pytest.raises(ValueError, match="give t \\(batch,\\) and all others \\(batch, n\\)"):
+        simulate_batch(fpu.system, fully_explicit(4), fpu.state(), macro_dt=0.1, num_steps=1)
+
+
+def test_devices_share_a_batch_and_configure_comes_first():
+    """In a process of its own: flags are read when JAX starts."""
+    program = """
+import numpy as np
+import vmri_jax as vm
+vm.configure(devices=2)
+import jax, jax.numpy as jnp
+problem = vm.systems.fermi_pasta_ulam(1)
+states = jax.tree.map(lambda a: a + 1e-3 * jnp.arange(5.0).reshape(5, *[1] * a.ndim), problem.state())
+march = vm.Newton("nested")
+one, two, chunks = (
+    vm.simulate_batch(problem.system, vm.fully_implicit(2), states, macro_dt=0.02, num_steps=5, newton=march, **how)
+    for how in ({}, {"devices": 2}, {"devices": 2, "chunk": 1})
+)
+assert jax.device_count() == 2
+assert np.abs(one.q_f - two.q_f).max() < 1e-13 and np.abs(one.q_f - chunks.q_f).max() < 1e-13
+try:
+    vm.configure(devices=3)
+except RuntimeError as error:
+    assert "already started" in str(error)
+vm.configure(devices=2)  # nothing new: fine
+print("same")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    assert done.stdout.strip() == "same", done.stderr
+
+
+def test_a_lane_off_the_constraints_has_failed():
+    name, scheme, macro_dt, _ = WAYS["drift along constraints"]
+    problem = SYSTEMS[name]()
+    states = spread(problem, 5)
+    states = eqx.tree_at(lambda s: s.q_f, states, states.q_f.at[1].multiply(1.01))
+    run = simulate_batch(problem.system, scheme, states, macro_dt=macro_dt, newton=MARCH, warn=False, **RUN)
+    assert np.flatnonzero(run.result).tolist() == [1]
+    assert run.result[1] == Result.CONSTRAINT_VIOLATED
+    assert run.failed_at.tolist() == [-1, 0, -1, -1, -1]
+    assert np.isnan(run.q_f[1]).all()
+    assert run.constraint_residual[0].max() < 1e-10
+
+
+def test_tracers_are_refused(fpu):
+    def end(omega):
+        states = jax.tree.map(lambda a: jnp.stack([a, a]), fpu.state())
+        params = {"omega": jnp.stack([omega, omega])}
+        run = vm.simulate_batch(fpu, vm.explicit_slow(5), states, macro_dt=0.01, num_steps=10, params=params)
+        return run.q_s[-1, -1, 0]
+
+    with pytest.raises(ValueError, match=r"simulate_batch: arguments are tracers; .*jax\.vmap of simulate"):
+        jax.grad(end)(50.0)
