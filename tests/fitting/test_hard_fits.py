@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.fitting.test_fit import CHAIN, DT, SCHEME, measured, product
+from tests.fitting.test_fit import CHAIN, DT, IMPLICIT, SCHEME, measured, product
 from tests.support import PROBLEMS
 from vmri_jax.fitting import Unknown
 

@@ -1,6 +1,6 @@
 """Adjoints of runs: lanes of gradients, second derivatives, what auto chooses, and what is refused."""
 
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,21 +8,9 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.running.test_adjoints import CHAIN, SIMPLE, UNSYMMETRIC, cost_of
+from tests.running.test_adjoints import UNSYMMETRIC, simple_cost, simple_gradient
 from tests.user_systems import cart
 from vmri_jax.running import adjoints
-
-
-def simple_cost(adjoint, steps="solved"):
-    """Of a small system without constraints, a function of the momenta at the start alone."""
-    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, 6, vm.Newton("nested"), adjoint=adjoint)
-    return (lambda p_f: cost(at[0], at[1], p_f, at[3])), at[2]
-
-
-@cache
-def simple_gradient(adjoint, steps="solved"):
-    """Of `simple_cost`, compiled."""
-    return jax.jit(jax.grad(simple_cost(adjoint, steps)[0]))
 
 
 @pytest.mark.parametrize(("adjoint", "steps"), [("checkpoint", "kicks"), ("reversible", "solved")])

@@ -64,6 +64,18 @@ def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, newton=Non
     return cost, (jax.tree.map(jnp.asarray, system.params), state.p_s, state.p_f, jnp.asarray(macro_dt))
 
 
+def simple_cost(adjoint, steps="solved"):
+    """Of a small system without constraints, a function of the momenta at the start alone."""
+    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, 6, vm.Newton("nested"), adjoint=adjoint)
+    return (lambda p_f: cost(at[0], at[1], p_f, at[3])), at[2]
+
+
+@cache
+def simple_gradient(adjoint, steps="solved"):
+    """Of `simple_cost`, compiled."""
+    return jax.jit(jax.grad(simple_cost(adjoint, steps)[0]))
+
+
 @cache
 def gradient(case: str, save_every: int, adjoint: str, save_micro: bool = False):
     """All derivatives of a case in a row."""

@@ -13,7 +13,6 @@ from tests.stability.systems import swinging
 from tests.support import PROBLEMS, largest_difference
 from tests.user_systems import cart
 from vmri_jax import (
-    Newton,
     Result,
     State,
     compose,
@@ -68,9 +67,3 @@ def test_lanes_equal_single_runs(way, chunk):
     for lane in (0, 4):
         assert largest_difference(batch.q_f[lane], single(way, lane).q_f) < bound
         assert largest_difference(batch.t[lane], single(way, lane).t) == 0
-
-
-STEPS, OMEGAS = jnp.array([0.01, 0.02, 0.03]), jnp.array([30.0, 50.0, 60.0])
-
-
-SCHEME_OF_THREE, MARCH = fully_implicit(2), Newton("nested")

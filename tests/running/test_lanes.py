@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.running.test_batch import SYSTEMS, lane_of, spread
+from tests.running.test_batch import RUN, SYSTEMS, WAYS, lane_of, spread
 from tests.support import largest_difference
 from vmri_jax import (
     Method,
@@ -24,6 +24,9 @@ from vmri_jax import (
     simulate,
     simulate_batch,
 )
+
+STEPS, OMEGAS = jnp.array([0.01, 0.02, 0.03]), jnp.array([30.0, 50.0, 60.0])
+SCHEME_OF_THREE, MARCH = fully_implicit(2), Newton("nested")
 
 
 def batch_of_three(chain, states: State):
