@@ -58,7 +58,8 @@ def test_a_run_whose_implied_rows_leave_zero_stops(implied):
 def test_lanes_fail_alone():
     problem, tilts = falling(0.0), jnp.array([0.0, 1e-3, 0.99e-5])
     states = jax.tree.map(lambda a: jnp.stack([a] * 3), problem.state())
-    run = vm.simulate_batch(problem.system, SCHEME, states, params={"tilt": tilts}, **STEPS)
+    with pytest.warns(vm.FailedLanesWarning, match=r"2 of 3 lanes failed.*lane 1, at macro step 0 \(NOT_IMPLIED\)"):
+        run = vm.simulate_batch(problem.system, SCHEME, states, params={"tilt": tilts}, **STEPS)
     assert run.result.tolist() == [Result.CONVERGED, Result.NOT_IMPLIED, Result.NOT_IMPLIED]
     assert run.failed_at.tolist() == [-1, 0, 10]
 

@@ -138,7 +138,8 @@ def test_a_run_watches_what_was_dropped():
     assert system.num_constraints(*scene.start[:2]) == (0, 1)
     longer = system.params | {effect: {"length": np.array(2.0 + 1e-5)}}
     params, states = jax.tree.map(lambda *lanes: jnp.stack(lanes), (system.params, state), (longer, state))
-    run = vm.simulate_batch(system, vm.fully_explicit(1), states, macro_dt=0.01, num_steps=4, params=params)
+    with pytest.warns(vm.FailedLanesWarning, match=r"1 of 2 lanes failed.*lane 1, at macro step 0 \(NOT_IMPLIED\)"):
+        run = vm.simulate_batch(system, vm.fully_explicit(1), states, macro_dt=0.01, num_steps=4, params=params)
     assert run.result.tolist() == [vm.Result.CONVERGED, vm.Result.NOT_IMPLIED]
     assert run.constraint_residual[0].max() < 1e-13  # measured 1e-15
 
