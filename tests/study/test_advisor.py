@@ -86,7 +86,8 @@ def test_the_front_falls(found):
     assert found.runs.cheapest(1e-30) is None
 
 
-def test_it_prints_the_best_few_and_keeps_all(found, tmp_path):
+def test_it_prints_the_best_few_and_keeps_all(found, tmp_path, monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)  # that workers of pytest have
     head, *rows, last = str(found).splitlines()
     assert head.split()[:2] == ["scheme", "H"]
     assert len(rows) == min(5, 1 + len(found.others))

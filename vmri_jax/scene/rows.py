@@ -56,7 +56,7 @@ class ConstraintRows:
         rows: one entry for each of them.
         elements: their functions.
         start: (n,) coordinates at the start.
-        masses: (n,).
+        masses: (n,); 1 each where they are traced, since they only weigh the choice of the rows to drop.
         scales: (n,) by how much each coordinate changes in a large motion: the extent of the scene for positions, 1 for
             directors of rigid bodies, and for general coordinates their value, at least 1.
         num_slow: number of slow coordinates.
@@ -82,10 +82,9 @@ class ConstraintRows:
             name: place.start + np.arange(place.size) + (num_slow if place.part == "f" else 0)
             for name, place in sorting.places.items()
         }
-        start, masses = (
-            np.concatenate([np.asarray(getattr(bodies[name], of)) for name in order])
-            for of in ("coordinates", "masses")
-        )
+        start = np.concatenate([np.asarray(bodies[name].coordinates) for name in order])
+        masses = [bodies[name].masses for name in order]
+        masses = np.concatenate(masses) if is_concrete(masses) else np.ones_like(start)
         rows, elements = [], []
         for i, part in held:
             number = 0

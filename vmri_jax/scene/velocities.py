@@ -32,12 +32,12 @@ def with_rates(sorting: Sorting, effects: Sequence[Effect], system: System, want
         system: of the scene.
         wanted: rates by the name of the joint.
     """
-    q_s, q_f, v_s, v_f = sorting.start
-    q, v, n_s = jnp.concatenate([q_s, q_f]), np.concatenate([v_s, v_f]), q_s.size
-    if not is_concrete((q, v, system)):
+    if not is_concrete((sorting.start, system)):
         raise TypeError(
             "Scene.with_rates: numbers of the scene are traced; find its velocities outside of jit and grad."
         )
+    q_s, q_f, v_s, v_f = sorting.start
+    q, v, n_s = jnp.concatenate([q_s, q_f]), np.concatenate([v_s, v_f]), q_s.size
     columns = {name: place.start + (n_s if place.part == "f" else 0) for name, place in sorting.places.items()}
 
     def constraints(t, q):
