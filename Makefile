@@ -8,7 +8,7 @@ NEWER ?= python3.13
 
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 # Workers take one core each: threads of BLAS for small matrices only get in their way.
-TOOLS := tests/benchmarks tests/pages tests/ensembles/test_workers.py
+TOOLS := tests/benchmarks tests/pages tests/tools tests/ensembles/test_workers.py
 
 .PHONY: reproduce test test-tools smoke notebooks docs bench lint lock clean
 
@@ -18,7 +18,7 @@ reproduce: .venv/installed  ## the quick reference study: figures, tables and ou
 test: .venv/installed  ## the library
 	$(PYTEST) $(addprefix --ignore=,tests/smoke $(TOOLS)) $(OPTIONS)
 
-test-tools: .venv/installed  ## benchmarks, notebooks, programs and commands of the pages, ensembles on workers
+test-tools: .venv/installed  ## benchmarks, notebooks, programs and commands of the pages, every tool on every small system, ensembles on workers
 	$(PYTEST) $(TOOLS) $(OPTIONS)
 
 smoke:  ## a few minutes: every kind of step, with another environment, make smoke ENVIRONMENT=/path/to/venv

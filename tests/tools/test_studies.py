@@ -1,0 +1,51 @@
+"""Every system through the studies of accuracy and cost; `recommend` and `cost_report` are run by the commands `tune` and `cost`."""
+
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.tools.table import MACRO_DT, SCHEME, T_END, Cell, cells, check
+from vmri_jax import plots, study
+
+
+def reference_solution(cell: Cell) -> None:
+    assert cell.reference.error_q < 1e-5
+
+
+def convergence_study(cell: Cell) -> None:
+    rows = study.convergence_study(
+        cell.moving, {"explicit": SCHEME}, [MACRO_DT, MACRO_DT / 2], T_END, num_saves=1, reference=cell.reference
+    )
+    assert all(np.isfinite(row.error_q) for row in rows.rows)
+    assert str(rows)
+    plots.save(rows.plot([2]), cell.folder / "orders.png")
+    rows.to_csv(cell.folder / "orders.csv")
+    rows.to_json(cell.folder / "orders.json")
+    rows.to_xarray()
+
+
+def work_precision(cell: Cell) -> None:
+    rows = study.work_precision(
+        cell.moving, {"explicit": SCHEME}, T_END, num_steps=[8, 16], reference=cell.reference, repeats=1
+    )
+    assert all(np.isfinite(row.error_q) for row in rows.rows)
+    assert str(rows)
+    for work in ("seconds", "solves", "fast_evaluations"):
+        plots.save(rows.plot(work=work), cell.folder / "work.png")
+
+
+def cost_study(cell: Cell) -> None:
+    rows = study.cost_study(
+        cell.moving, vm.fully_explicit, [1], micro_dt=MACRO_DT, t_end=T_END, methods=["auto"], repeats=1, min_seconds=0
+    )
+    assert str(rows)
+    plots.save(rows.plot(), cell.folder / "cost.png")
+
+
+TOOLS = {tool.__name__: tool for tool in (reference_solution, convergence_study, work_precision, cost_study)}
+REFUSED = {}
+
+
+@cells(TOOLS)
+def test_cell(tool: str, system: str, tmp_path, monkeypatch: pytest.MonkeyPatch):
+    check(TOOLS, REFUSED, tool, Cell(system, tmp_path, monkeypatch))
