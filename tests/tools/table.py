@@ -82,10 +82,16 @@ def reference_of(system: str) -> ReferenceSolution:
     return reference_solution(SYSTEMS[system], T_END, num_saves=1, num_steps=REFERENCE_STEPS, degree=1)
 
 
+QUICK = ("one_coordinate", "fast_alone")
+"""Systems whose cells run always; with all systems the table takes some ten minutes, and runs with --full."""
+
+
 def cells(tools: Tools, full: Collection[tuple[str, str]] = ()):
-    """A decorator: a test for each tool and each system; those of `full` run with --full only."""
+    """A decorator: a test for each tool and each system; those of `full`, and systems that are not quick, run with --full only."""
     pairs = [(tool, system) for system in SYSTEMS for tool in tools]
-    marked = [pytest.param(*pair, marks=pytest.mark.full if pair in full else ()) for pair in pairs]
+    marked = [
+        pytest.param(*pair, marks=() if pair[1] in QUICK and pair not in full else pytest.mark.full) for pair in pairs
+    ]
     return pytest.mark.parametrize(("tool", "system"), marked)
 
 
