@@ -40,10 +40,11 @@ def fit(cell: Cell) -> None:
         effect, name = ("springs", "stiffness") if "springs" in known else ("gravity", "acceleration")
         right = float(known[effect][name])
 
-        def model(values):
+        def with_number(values):
             params = known | {effect: known[effect] | {name: values[name]}}
             return replace(cell.problem, system=cell.problem.system.replace(params=params))
 
+        model = with_number
     else:
         name = "soft" if run.q_s.size else "stiff"
         right = float(known[name])
