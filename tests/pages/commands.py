@@ -102,11 +102,13 @@ def output(command: str, folder: Path, code: int = 0) -> str:
     if program == "vmri":
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)
+            patch.delenv("COLUMNS", raising=False)  # set by workers of pytest; a pipe has no width
             done = CliRunner().invoke(vmri, words)
         assert done.exception is None or isinstance(done.exception, SystemExit), repr(done.exception)
         assert done.exit_code == code, done.output
         return done.output
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment.pop("COLUMNS", None)
     run = subprocess.run(
         [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
