@@ -36,7 +36,7 @@ def test_a_plan_says_how_a_step_is_solved(fpu):
     kinetic energy that is a function, needs the whole equations."""
     rule = micro(quadrature.midpoint)
     inside = Scheme(4, kinetic=rule, slow=macro(quadrature.gauss(2)), fast=rule)
-    forced, whole = fpu.system.replace(force=drag), "all unknowns of the step at once"
+    forced, whole = fpu.system.replace(force=drag), "march over the micro intervals with exact matrices"
     assert str(plan(fpu, fully_implicit(4))).startswith("nested march")
     assert "nested march" not in str(plan(fpu, explicit_slow(4)))
     assert "nested march" in str(plan(forced, explicit_slow(4), fpu.state()))

@@ -1,4 +1,4 @@
-"""The Newton matrix in blocks against the derivative of the whole residual, on a system with everything in it."""
+"""The Newton matrix, factored interval by interval, against the derivative of the whole residual, on a system with everything in it."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,9 @@ from jax.flatten_util import ravel_pytree
 from tests.user_systems import bent_system
 from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, quadrature
 from vmri_jax.schemes.equations import StepEquations
-from vmri_jax.steppers.coupled import LINEAR_SOLVERS
+from vmri_jax.steppers.march import MarchEquations, factor, solve
+from vmri_jax.steppers.marched import INVERSES
+from vmri_jax.steppers.newton import dense
 
 SCHEMES = {
     "fully implicit": fully_implicit(3),
@@ -53,10 +55,12 @@ def test_all_take_the_direction_of_the_derivative_of_the_residual(name):
     @jax.jit
     def directions(x):
         residual = equations.residual(x)
-        return {
-            name: ravel_pytree(solve(factor(equations, x), residual))[0]
-            for name, (factor, solve) in LINEAR_SOLVERS.items()
-        }
+        found = {"dense": ravel_pytree(dense.solve(dense.factor(equations, x), residual))[0]}
+        for name, inverted in INVERSES.items():
+            march = MarchEquations(equations, inverted)
+            direction = solve(march, factor(march, *march.rows(x)), *march.rows(residual))
+            found[name] = ravel_pytree(march.by_name(*direction))[0]
+        return found
 
     found = directions(x)
     for direction in found.values():

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from vmri_jax import kernels
 from vmri_jax.kernels import Full, Sparsity
+from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
 MAX_ITERATIONS = 50
@@ -28,8 +29,8 @@ def project_momentum(system: System, state, guess=None, sparsity: Sparsity | Non
     """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their velocities.
 
     v is the velocity of the projected momentum, ``p - G^T mu = dT/dv``: of all v with ``G v + dg/dt = 0`` the one that
-    minimises ``T(v) - p . v``. For constant masses that is one linear solve. Else it is Newton's iteration with a line search,
-    and the kinetic energy must be convex in the velocities.
+    minimises ``T(v) - p . v``. For a kinetic energy that is quadratic in the velocities that is one linear solve. Else it is Newton's
+    iteration with a line search, and the kinetic energy must be convex in the velocities.
 
     Args:
         state: a `State`: time, positions and momenta.
@@ -91,7 +92,8 @@ def _velocity(system: System, q_s, q_f, jacobian, own, p, guess):
         system, q_s, q_f, jacobian, own, p = at
         hessian, gradient = (d(lambda v: kinetic(system, q_s, q_f, v))(v) for d in (jax.hessian, jax.grad))
         matrix = kernels.saddle(hessian, jacobian.T, jacobian)
-        return jnp.linalg.solve(matrix, jnp.concatenate([p - gradient, -(jacobian @ v + own)]))[: v.size]
+        rows = jnp.concatenate([p - gradient, -(jacobian @ v + own)])
+        return kernels.solve(matrix, rows[:, None])[: v.size, 0]
 
     def search(carry):
         v, k, _ = carry
@@ -105,6 +107,8 @@ def _velocity(system: System, q_s, q_f, jacobian, own, p, guess):
         return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
 
     at = (system, q_s, q_f, jacobian, own, p)
+    if has_constant_hessian(lambda v: kinetic(system, q_s, q_f, v), guess):
+        return direction(at, jnp.zeros_like(p))  # T is quadratic in v: Newton's first step is the solution
     fixed, guess = jax.lax.stop_gradient((at, guess))
     fractions = jnp.append(0.5 ** jnp.arange(12.0), 0.0)
     start = (guess, 0, jnp.asarray(False))

@@ -29,7 +29,8 @@ from vmri_jax.mechanics.structure import curved_directions
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
-from vmri_jax.steppers.interval import Accepted, constant_mass, expected
+from vmri_jax.steppers.accept import Accepted, expected
+from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import Full, Sparsity, inverse, matvec, max_abs, regularized, solve
-from vmri_jax.mechanics.arrays import Number
+from vmri_jax.kernels import Full, Sparsity, inverse, matvec, regularized, solve
 from vmri_jax.mechanics.constraint_pattern import fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
@@ -21,65 +20,13 @@ from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
 from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
-ROUNDOFF = 4.0
-"""Changes of the positions below so many units of round-off are accepted."""
-PATIENCE = 20
-"""After so many iterations round-off is accepted that constraints hand from slow to fast variables and back."""
 SMALL = 16
 """Matrices of micro intervals up to this size are renewed with every macro step."""
-SAFETY = 10.0
-"""Of the tolerance, and of how corrections shrink from one iteration to the next."""
-
-
-class Accepted(NamedTuple):
-    """Changes of the increments that are accepted: relative to the motion over the step, and round-off of the positions.
-
-    tolerance: of Newton, over `SAFETY`, since what is left of every step adds up.
-    slow, fast: round-off, (2,): of these variables alone, and with that of variables that constraints tie to them. At the origin
-        they have none of their own.
-    """
-
-    tolerance: Number
-    slow: Float[Array, "2"]
-    fast: Float[Array, "2"]
-
-    @classmethod
-    def of(cls, equations: StepEquations, newton) -> "Accepted":
-        """For a step from its positions."""
-        slow, fast = max_abs(equations.q_s), max_abs(equations.q_f)
-        to_slow = to_fast = 0.0
-        if equations.system.constraint is not None and equations.q_s.size and equations.q_f.size:
-            masses = constant_mass(equations.system)
-            m_s, m_f = (mass.times(jnp.ones(mass.size)) for mass in (masses.slow_mass, masses.fast_mass))
-            to_slow, to_fast = (jnp.minimum(1.0, jnp.max(a) / jnp.min(b)) for a, b in ((m_f, m_s), (m_s, m_f)))
-        floors = (
-            jnp.stack([slow, jnp.maximum(slow, to_slow * fast)]),
-            jnp.stack([fast, jnp.maximum(fast, to_fast * slow)]),
-        )
-        return cls(newton.tolerance / SAFETY, *(ROUNDOFF * jnp.finfo(float).eps * floor for floor in floors))
-
-    def sizes(self, motions, iterations) -> tuple[Any, Any]:
-        """The changes (slow, fast) that are accepted with such motions after so many iterations."""
-        numbers = jnp.finfo(float)
-        rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny  # variables at rest have no size of their own
-        late = (iterations >= PATIENCE) * 1
-        floors = self.slow[late], self.fast[late]
-        slow, fast = (self.tolerance * size + floor + rest for size, floor in zip(motions, floors, strict=True))
-        return slow, fast
-
-    def over(self, changes, motions, iterations):
-        """Changes (slow, fast) over what is accepted of them, see `sizes`; the larger of the two."""
-        return jnp.maximum(*(c / size for c, size in zip(changes, self.sizes(motions, iterations), strict=True)))
 
 
 def along(weights, increments):
     """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
     return jnp.sum(weights[..., None] * increments, axis=-2)
-
-
-def expected(moved, before):
-    """The next correction, with a margin, after this one and the one before."""
-    return jnp.minimum(SAFETY * moved / (before + jnp.finfo(float).tiny), 1.0) * moved
 
 
 def constant_mass(system: System) -> ConstantMass:

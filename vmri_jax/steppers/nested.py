@@ -27,7 +27,8 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import SMALL, Accepted, Interval, Matrix, along, constant_mass, expected
+from vmri_jax.steppers.accept import Accepted, expected
+from vmri_jax.steppers.interval import SMALL, Interval, Matrix, along, constant_mass
 from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor

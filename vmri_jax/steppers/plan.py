@@ -34,6 +34,7 @@ from vmri_jax.steppers.free_flight import FreeFlight
 from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
 from vmri_jax.steppers.kicked import Kicked, average_over_fast_motion
 from vmri_jax.steppers.linear import Linear
+from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.nested import Nested
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.parts import fast_alone, fast_part, slow_part
@@ -126,7 +127,7 @@ def plan(
     choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None, once)
     stepper: Stepper = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
     rarely = _projects_rarely(stepper)
-    if not rarely and (system.is_constrained or not system.has_constant_mass):
+    if not rarely and system.is_constrained:
         stepper = Projected(stepper)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
@@ -178,16 +179,17 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)
     if not can_be_nested or newton.method not in ("auto", "nested"):
-        linear_solver = newton.method if newton.method in ("dense", "null_space") else "arrowhead"
         n_g, n_gs = system.num_constraints(q_s, q_f)
         sizes = q_s.size, n_gs, q_f.size, n_g, scheme.degree
-        return Solved(system, scheme, Coupled(newton, linear_solver, sizes), rows, choice.once)
+        linear_solver = "null_space" if newton.method == "null_space" else "arrowhead"
+        solver = Coupled(newton) if newton.method == "dense" else Marched(newton, linear_solver, sizes)
+        return Solved(system, scheme, solver, rows, choice.once)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
     solver = _first_choice(system, scheme, newton, interval, rows, q_s, q_f)
     if choice.falls_back:
-        solver = Fallback(solver, Coupled(newton, "arrowhead"))
+        solver = Fallback(solver, Marched(newton, "arrowhead"))
     return Solved(system, scheme, solver, rows, choice.once)
 
 

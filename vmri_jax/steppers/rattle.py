@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import Full, Sparsity, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
-from vmri_jax.steppers.interval import Accepted, along, constant_mass
+from vmri_jax.steppers.accept import Accepted
+from vmri_jax.steppers.interval import along, constant_mass
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of

@@ -24,7 +24,7 @@ from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
 
 ROOT = "root"
-"""Name of the solution of a step for `jax.checkpoint`: with it, derivatives need not solve the step again."""
+"""Name of the solution of a step and of its status for `jax.checkpoint`: with them, derivatives need not solve the step again."""
 
 
 class Solution(NamedTuple):
@@ -41,6 +41,12 @@ class Solver(ABC):
 
     def init(self, equations: StepEquations, velocity) -> Any:
         """What the first step starts from; velocity (v_s, v_f) at the start of the run."""
+        n_g, n_gs = equations.system.num_constraints(equations.q_s, equations.q_f)
+        v_s, v_f = velocity
+        return self.remembers(equations, equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs)))
+
+    def remembers(self, equations: StepEquations, guess: Unknowns) -> Any:
+        """What a step starts from that has no other past than a guess."""
         return ()
 
     def renew(self, equations: StepEquations, own) -> Any:
@@ -67,7 +73,7 @@ class Solver(ABC):
 class SolvedState(NamedTuple):
     """Where the next iteration starts.
 
-    velocity: (v_s, v_f) after the last projection; with constant masses it follows from the momenta instead.
+    velocity: (v_s, v_f) at about the end of the last step.
     multiplier, slow_multiplier: Lagrange multipliers at the last control nodes that have any.
     solver: what the solver carries.
     """
@@ -115,15 +121,19 @@ class Solved(Stepper):
             v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)  # with the kicks
         guess = equations.guess(v_s, v_f, own.multiplier, own.slow_multiplier)
         found, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, own.solver)))
-        root = checkpoint_name((found.x, found.end), ROOT)
+        root, status = checkpoint_name(((found.x, found.end), found.status), ROOT)
         derivative = differentiable_once if self.once else differentiable
         x, (q_f, p_s, p_f) = derivative(equations, *root)
 
         lambdas = physical_multipliers(self.scheme, macro_dt, x.multiplier, x.slow_multiplier)
         q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])
-        info = StepInfo(*found.status, q_f_micro, *lambdas)
+        result, method, iterations, left = status
+        info = StepInfo(result, method, iterations, left, q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
-        return end, info, SolvedState(own.velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
+        if not self.system.has_constant_mass:  # a guess for the next step, for the cost of nothing
+            v_s, v_f = x.slow[-1] / macro_dt, x.fast[-1, -1] / equations.micro_dt
+        velocity = jax.lax.stop_gradient((v_s, v_f))
+        return end, info, SolvedState(velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
 
     def project(self, state: State, own: SolvedState) -> tuple[State, SolvedState]:
         p_s, p_f, v_s, v_f = project_momentum(self.system, state, own.velocity, self.sparsity)
@@ -154,7 +164,11 @@ class Fallback(Solver):
         found, learned = self.first.solve(equations, guess, own)
         converged = found.status.result <= Result.CONVERGED_AT_ROUNDOFF
         own = jax.tree.map(partial(jnp.where, converged), learned, own)  # nothing is learned from a failure
-        return jax.lax.cond(converged, lambda: found, lambda: self.exact.solve(equations, guess, ())[0]), own
+        return jax.lax.cond(
+            converged,
+            lambda: found,
+            lambda: self.exact.solve(equations, guess, self.exact.remembers(equations, guess))[0],
+        ), own
 
     def continued(self, own, last) -> Any:
         return self.first.continued(own, last)

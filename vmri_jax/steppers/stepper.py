@@ -82,7 +82,8 @@ class Stepper(ABC):
         """A macro step: `renew`, then `move`; NON_FINITE where a momentum is, since positions follow momenta."""
         state, info, own = self.move(state, self.renew(state, own, macro_dt), macro_dt)
         finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))
-        return state, replace(info, result=jnp.where(finite, info.result, Result.NON_FINITE)), own
+        stands = finite | (info.result > Result.CONVERGED_AT_ROUNDOFF)  # a failure has been named already
+        return state, replace(info, result=jnp.where(stands, info.result, Result.NON_FINITE)), own
 
     def project(self, state: State, own) -> tuple[State, Any]:
         """Momenta onto the hidden constraints, ``G v + dg/dt = 0``."""

@@ -8,11 +8,10 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
-from vmri_jax import kernels
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.newton import arrowhead
-from vmri_jax.steppers.newton.null_space import inverse_with_multipliers
+from vmri_jax.steppers.march import MarchEquations, factor, solve
 
 SECOND = (
     "the adjoint of this run has first derivatives in reverse mode only. For second derivatives and forward mode take "
@@ -22,11 +21,9 @@ SECOND = (
 
 def _direction(equations: StepEquations, x: Unknowns):
     """``residual -> -(dR/dx)^-1 residual`` with the matrix at x, itself without derivative."""
-    elementwise = equations.scheme.degree == 1  # nearly symmetric blocks need no pivots
-    inverted = kernels.inverse if elementwise else jnp.linalg.inv
-    factors = arrowhead.factor(equations, x, partial(inverse_with_multipliers, inverted=inverted))
-    factors = jax.lax.stop_gradient(factors)
-    return lambda residual: arrowhead.solve(factors, residual)
+    of = MarchEquations(equations)
+    factors = jax.lax.stop_gradient(factor(of, *of.rows(x)))
+    return lambda residual: of.by_name(*solve(of, factors, *of.rows(residual)))
 
 
 def _end(equations: StepEquations, x: Unknowns):
@@ -44,14 +41,26 @@ def differentiable(equations: StepEquations, x: Unknowns, end):
 def _implicit_derivative(primals, tangents):
     equations, root, _ = primals
     direction = _direction(equations, root)
-    # For second derivatives: one more Newton step moves nothing, but makes the root depend on the equations; and one more
-    # correction of dx changes nothing, but makes it depend on the matrix at x, so that one set of factors does for all. To call
-    # `differentiable` again would not do: in reverse mode JAX forgets the rules of what it has evaluated already.
+    # For second derivatives: one more Newton step moves nothing, but makes the root depend on the equations. To call `differentiable`
+    # again would not do: in reverse mode JAX forgets the rules of what it has evaluated already.
     x = jax.tree.map(jnp.add, root, direction(equations.residual(root)))
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
-    dx = direction(change)
-    _, cancels = jax.jvp(equations.residual, (x,), (dx,))
-    dx = jax.tree.map(jnp.add, dx, direction(jax.tree.map(jnp.add, cancels, change)))
+
+    # Another derivative of dx sees the matrix at x, by the rule of JAX for linear solves; the first one has one set of factors.
+    rows, by_name = ravel_pytree(jax.tree.map(jnp.negative, change))
+
+    def product(dx):
+        """``dR/dx dx``."""
+        return ravel_pytree(jax.jvp(equations.residual, (x,), (by_name(dx),))[1])[0]
+
+    def solved(_, rows):
+        """``(dR/dx)^-1`` times the rows."""
+        return -ravel_pytree(direction(by_name(rows)))[0]
+
+    def solved_transposed(_, rows):
+        return jax.linear_transpose(partial(solved, None), rows)(rows)[0]
+
+    dx = by_name(jax.lax.custom_linear_solve(product, rows, solved, solved_transposed))
     end, d_end = jax.jvp(_end, (equations, x), (tangents[0], dx))
     return (x, end), (dx, d_end)
 

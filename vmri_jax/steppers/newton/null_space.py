@@ -21,14 +21,11 @@ part I, Comput. Methods Appl. Mech. Engng 194 (2005); S. Leyendecker, J. E. Mars
 constrained dynamical systems, ZAMM 88 (2008).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-
-from vmri_jax.kernels import saddle
 
 
 class Motions(NamedTuple):
@@ -70,14 +67,17 @@ def inverse(a, g_0, g_1):
     return jnp.concatenate([top, bottom], axis=-2)
 
 
-def inverse_with_multipliers(a, g_0, g_1, inverted: Callable = jnp.linalg.inv):
-    """The same by elimination with the multipliers among the unknowns, kept regular where constraints become dependent.
+def inverse_without_multipliers(a, b, c, nodes: int):
+    """Inverse of ``[[A, B], [C, 0]]`` with ``B = -G_0^T`` and ``C = G_1``, block diagonal with one block for each of the nodes."""
+    if not b.shape[-1]:
+        return jnp.linalg.inv(a)
+    return inverse(a, -_diagonal_blocks(b.T, nodes), _diagonal_blocks(c, nodes))
 
-    Args:
-        inverted: inverts the matrices.
-    """
-    down, across = (_block_diagonal(g) for g in (g_1, g_0))
-    return inverted(saddle(a, -jnp.swapaxes(across, -1, -2), down))
+
+def _diagonal_blocks(whole, nodes: int):
+    """(r, n, m) blocks on the diagonal of a matrix (r n, r m)."""
+    n, m = (size // nodes for size in whole.shape)
+    return jnp.stack([whole[i * n : (i + 1) * n, i * m : (i + 1) * m] for i in range(nodes)])
 
 
 def _block_diagonal(blocks):

@@ -1,0 +1,240 @@
+"""The equations of a macro step, cut into its micro intervals.
+
+Interval m begins with the fast position F_0 and the momentum p that the interval before hands on. Its part of the augmented action is
+
+    A_m(S, F) = sum over terms, over their nodes i in this interval:  H w_i term(q(theta_i), qdot(theta_i))
+                - sum_j mu_j . g(q at its control node j) / h        (0 <= j < r)
+
+with S_0..S_r the slow control points of the macro step, F_0..F_r the fast ones of this interval. Its equations, all times h, are
+
+    p + D_{F_0} A_m = 0      D_{F_j} A_m = 0  (0 < j < r)      g = 0 at its control nodes 1..r
+
+for the fast increments and the scaled multipliers mu. It hands on ``F_r`` and ``D_{F_r} A_m``, and pushes the slow control points by
+``D_{S_i} A_m``. The sum of these impulses over the intervals enters the slow equations:
+
+    p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)        g_s = 0 at S_1..S_r
+
+These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vmri_jax.kernels import matmul
+from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
+from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
+from vmri_jax.schemes.path import NodeGroup, Nodes, control_nodes, lagrange_basis, lagrange_derivative
+
+
+class IntervalPath(NamedTuple):
+    """The path over one micro interval.
+
+    slow_start, slow: start and increments of the slow control points, of the whole macro step.
+    fast_start, fast: start and increments of the fast control points of this interval.
+    """
+
+    slow_start: Float[Array, "n_s"]
+    slow: Float[Array, "r n_s"]
+    fast_start: Float[Array, "n_f"]
+    fast: Float[Array, "r n_f"]
+
+
+class Arriving(NamedTuple):
+    """What the intervals before hand on.
+
+    q_f, p_f: fast position, and fast momentum times h.
+    start, slow: gradients of their actions (times h) by the start and by the increments of the slow path.
+    """
+
+    q_f: Float[Array, "n_f"]
+    p_f: Float[Array, "n_f"]
+    start: Float[Array, "n_s"]
+    slow: Float[Array, "r n_s"]
+
+
+class IntervalUnknowns(NamedTuple):
+    """Unknowns of a micro interval, and with the same shapes its residual: fast equations at nodes 0..r-1, g at nodes 1..r."""
+
+    fast: Float[Array, "r n_f"]
+    multiplier: Float[Array, "r n_g"]
+
+
+class IntervalNodes:
+    """The quadrature nodes of a term, interval by interval: as many rows for each interval as the fullest one has.
+
+    Rows without a node have weight 0.
+
+    Args:
+        nodes: on the macro step.
+    """
+
+    def __init__(self, nodes: Nodes):
+        rows: list[list[NodeGroup]] = []
+        for group in nodes.groups:
+            free = (row for row in rows if all(g.stop <= group.first or group.stop <= g.first for g in row))
+            row = next(free, None)
+            if row is None:
+                row = []
+                rows.append(row)
+            row.append(group)
+        n, r = nodes.num_micro, nodes.degree
+        c, used = np.full((n, len(rows)), 0.5), np.zeros((n, len(rows)), bool)
+        for k, row in enumerate(rows):
+            for group in row:
+                c[group.first : group.stop, k], used[group.first : group.stop, k] = group.c, True
+        self.has_nodes = used.any(axis=1)
+        if used.all() and all(len(row) == 1 for row in rows):
+            self.weights = jnp.stack([row[0].weights[0] for row in rows])[None]  # of all intervals
+        else:
+            padded = [[np.zeros(n), *(_padded(group, n) for group in row)] for row in rows]
+            self.weights = jnp.stack([sum(row) for row in padded], axis=1)
+        self.theta = (np.arange(n)[:, None] + c) / n
+        self.tables = {
+            "q_s": lagrange_basis(r, self.theta)[..., 1:],
+            "v_s": lagrange_derivative(r, self.theta)[..., 1:],
+            "q_f": lagrange_basis(r, c)[..., 1:],
+            "v_f": lagrange_derivative(r, c)[..., 1:],
+        }
+
+    def sample(self, path: IntervalPath, equations: StepEquations, m, names: tuple[str, ...]) -> list:
+        """By name, of the path at the nodes of interval m: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
+
+        def along(name: str):
+            if name == "t":
+                return equations.t + equations.macro_dt * of_interval(self.theta, m)
+            start, increments = (path.slow_start, path.slow) if name[2] == "s" else (path.fast_start, path.fast)
+            moved = matmul(of_interval(self.tables[name], m), increments)
+            if name[0] == "q":
+                return start + moved
+            return moved / (equations.macro_dt if name[2] == "s" else equations.micro_dt)
+
+        return [along(name) for name in names]
+
+
+def _padded(group: NodeGroup, num_micro: int):
+    """(num_micro,) weights of a group, 0 in the intervals without it."""
+    return jnp.pad(jnp.asarray(group.weights), (group.first, num_micro - group.stop))
+
+
+def of_interval(table, m):
+    """The rows of interval m: a constant where all intervals have the same ones."""
+    if len(table) == 1 or (isinstance(table, np.ndarray) and np.ptp(table, axis=0).max(initial=0.0) == 0.0):
+        return table[0]
+    return jnp.asarray(table)[m]
+
+
+class Intervals:
+    """The equations of the micro intervals of a macro step, and the slow ones.
+
+    Args:
+        equations: of the macro step.
+    """
+
+    def __init__(self, equations: StepEquations):
+        self.equations = equations
+        terms = lagrangian(equations.system, equations.scheme).terms
+        self._masses = None  # kinetic energy of constant masses: their operators and quadratic forms, slow and fast
+        for term in terms:
+            if isinstance(term, QuadraticKinetic):
+                slow, fast = term.mass.slow_mass, term.mass.fast_mass
+                self._masses = (slow, term.slow_form[1:, 1:]), (fast, term.fast_form[1:, 1:])
+        others = (term for term in terms if isinstance(term, Term) and term.inside.groups)
+        self._terms = [(term, IntervalNodes(term.inside)) for term in others]
+        self._force_nodes = IntervalNodes(equations.force_nodes)
+        n, r = equations.scheme.num_micro, equations.scheme.degree
+        self._slow_basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # at the control nodes, by slow increments
+
+    def evaluate(self, m, x: IntervalUnknowns, arriving: Arriving, slow) -> tuple[IntervalUnknowns, Arriving]:
+        """Residual of interval m, and what it hands on.
+
+        Args:
+            m: number of the interval.
+            x: its unknowns.
+            arriving: from the intervals before.
+            slow: (r, n_s) increments of the slow path.
+        """
+        equations = self.equations
+        path = IntervalPath(equations.q_s, slow, arriving.q_f, x.fast)
+        d = jax.grad(self._action)(path, path, x.multiplier, m)
+        d_fast = d.fast
+        if self._masses is not None:
+            mass, form = self._masses[1]
+            d_fast += matmul(form, mass.times(x.fast))
+        slots = jnp.concatenate([(arriving.p_f + d.fast_start - d_fast.sum(0))[None], d_fast])
+        residual = IntervalUnknowns(slots[:-1], self._constraints(path, m, slice(1, None)))
+        on = Arriving(arriving.q_f + x.fast[-1], slots[-1], arriving.start + d.slow_start, arriving.slow + d.slow)
+        return residual, on
+
+    def _action(self, path: IntervalPath, held: IntervalPath, mu, m):
+        """``h A_m`` without the kinetic energy of constant masses; forces, along `held`, act on the displacement of `path`."""
+        equations = self.equations
+        total = jnp.zeros(())
+        for term, nodes in self._terms:
+
+            def of_term(path, term=term, nodes=nodes):
+                values = jax.vmap(term.integrand)(*nodes.sample(path, equations, m, term.arguments))
+                return term.sign * term.times_step(equations.macro_dt) * jnp.sum(of_interval(nodes.weights, m) * values)
+
+            total += _where_there_are_nodes(nodes, m, of_term, path)
+        if equations.system.force is not None:
+            total += _where_there_are_nodes(
+                self._force_nodes, m, lambda paths: self._virtual_work(paths[0], paths[1], m), (path, held)
+            )
+        total *= equations.micro_dt
+        if equations.system.constraint is not None:
+            total -= jnp.sum(mu * self._constraints(path, m, slice(0, -1)))
+        return total
+
+    def _virtual_work(self, path: IntervalPath, held: IntervalPath, m):
+        """``H sum_i w_i F(t_i, q_i, v_i) . q_i``."""
+        equations, nodes = self.equations, self._force_nodes
+        at_nodes = nodes.sample(held, equations, m, ("t", "q_s", "q_f", "v_s", "v_f"))
+        f_s, f_f = jax.vmap(equations.system.forces)(*at_nodes)
+        q_s, q_f = nodes.sample(path, equations, m, ("q_s", "q_f"))
+        work = jnp.sum(f_s * q_s, axis=1) + jnp.sum(f_f * q_f, axis=1)
+        return equations.macro_dt * jnp.sum(of_interval(nodes.weights, m) * work)
+
+    def _constraints(self, path: IntervalPath, m, nodes: slice):
+        """(r, n_g) values of g at control nodes of interval m."""
+        equations = self.equations
+        c = control_nodes(equations.scheme.degree)[nodes]
+        times = equations.t + equations.micro_dt * (m + c)
+        q_s = path.slow_start + matmul(of_interval(self._slow_basis, m)[nodes], path.slow)
+        q_f = jnp.concatenate([path.fast_start[None], path.fast_start + path.fast])[nodes]
+        return jax.vmap(equations.system.g)(times, q_s, q_f)
+
+    def slow_evaluate(self, slow, multiplier, arriving: Arriving):
+        """Residual of the slow equations ((r, n_s), (r, n_gs)), and the slow momentum at the end of the step.
+
+        The end momentum is that of the start plus all impulses. Impulses of potentials that do not see a common shift of the slow
+        variables cancel, so that a momentum that is conserved is so to round-off.
+
+        Args:
+            slow, multiplier: (r, n_s) increments, (r, n_gs) scaled multipliers.
+            arriving: what the last micro interval hands on.
+        """
+        equations = self.equations
+        d = arriving.slow
+        if self._masses is not None:
+            mass, form = self._masses[0]
+            d += matmul(form, mass.times(slow)) / equations.scheme.num_micro
+        times = equations.t + equations.macro_dt * control_nodes(equations.scheme.degree)
+        nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow])
+        pull = jax.vjp(lambda q: jax.vmap(equations.system.g_slow)(times[:-1], q), nodes[:-1])[1]
+        impulses = pull(multiplier / equations.scheme.num_micro)[0]
+        rows = (
+            jnp.concatenate([(equations.micro_dt * equations.p_s + arriving.start - d.sum(0))[None], d[:-1]]) - impulses
+        )
+        p_s = equations.p_s + (arriving.start - impulses.sum(0)) / equations.micro_dt
+        return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
+
+
+def _where_there_are_nodes(nodes: IntervalNodes, m, function, path):
+    """The sum of a term over the nodes of interval m. A rule on the macro step has none in most intervals: they cost nothing."""
+    if nodes.has_nodes.all():
+        return function(path)
+    return jax.lax.cond(jnp.asarray(nodes.has_nodes)[m], function, lambda _: jnp.zeros(()), path)

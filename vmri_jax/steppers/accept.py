@@ -1,0 +1,75 @@
+"""When the corrections of a step are small enough: one test, with one meaning of `Newton.tolerance`.
+
+A correction of the slow or of the fast increments is accepted if its largest entry is at most
+
+    tolerance / 10 * (largest increment)  +  4 eps (largest position)  +  rest
+
+The error that a step leaves is that of the corrections which were not made, and those of all steps add up: hence the tenth. Positions
+cannot be known better than their round-off. The rest, eps times the largest increment of all, is for variables at rest, which have
+no size of their own.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vmri_jax.kernels import max_abs
+from vmri_jax.mechanics.arrays import Number
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.schemes.equations import StepEquations
+
+ROUNDOFF = 4.0
+"""Changes of the positions below so many units of round-off are accepted."""
+PATIENCE = 20
+"""After so many iterations round-off is accepted that constraints hand from slow to fast variables and back."""
+SAFETY = 10.0
+"""Of the tolerance, and of how corrections shrink from one iteration to the next."""
+
+
+class Accepted(NamedTuple):
+    """Changes of the increments that are accepted: relative to the motion over the step, and round-off of the positions.
+
+    tolerance: of Newton, over `SAFETY`, since what is left of every step adds up.
+    slow, fast: round-off, (2,): of these variables alone, and with that of variables that constraints tie to them. At the origin
+        they have none of their own.
+    """
+
+    tolerance: Number
+    slow: Float[Array, "2"]
+    fast: Float[Array, "2"]
+
+    @classmethod
+    def of(cls, equations: StepEquations, newton) -> "Accepted":
+        """For a step from its positions."""
+        slow, fast = max_abs(equations.q_s), max_abs(equations.q_f)
+        to_slow = to_fast = 0.0
+        if equations.system.constraint is not None and equations.q_s.size and equations.q_f.size:
+            to_slow = to_fast = 1.0
+            masses = equations.system.kinetic
+            if isinstance(masses, ConstantMass):
+                m_s, m_f = (mass.times(jnp.ones(mass.size)) for mass in (masses.slow_mass, masses.fast_mass))
+                to_slow, to_fast = (jnp.minimum(1.0, jnp.max(a) / jnp.min(b)) for a, b in ((m_f, m_s), (m_s, m_f)))
+        floors = (
+            jnp.stack([slow, jnp.maximum(slow, to_slow * fast)]),
+            jnp.stack([fast, jnp.maximum(fast, to_fast * slow)]),
+        )
+        return cls(newton.tolerance / SAFETY, *(ROUNDOFF * jnp.finfo(float).eps * floor for floor in floors))
+
+    def sizes(self, motions, iterations) -> tuple[Any, Any]:
+        """The changes (slow, fast) that are accepted with such motions after so many iterations."""
+        numbers = jnp.finfo(float)
+        rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny  # variables at rest have no size of their own
+        late = (iterations >= PATIENCE) * 1
+        floors = self.slow[late], self.fast[late]
+        slow, fast = (self.tolerance * size + floor + rest for size, floor in zip(motions, floors, strict=True))
+        return slow, fast
+
+    def over(self, changes, motions, iterations):
+        """Changes (slow, fast) over what is accepted of them, see `sizes`; the larger of the two."""
+        return jnp.maximum(*(c / size for c, size in zip(changes, self.sizes(motions, iterations), strict=True)))
+
+
+def expected(moved, before):
+    """The next correction, with a margin, after this one and the one before."""
+    return jnp.minimum(SAFETY * moved / (before + jnp.finfo(float).tiny), 1.0) * moved

@@ -1,0 +1,359 @@
+"""The march: a macro step of any Lagrangian, micro interval by micro interval, with exact matrices.
+
+A micro interval is a map ``(q_f, p_f, slow path) -> (q_f, p_f, impulses on the slow path)``, given by its equations R_m = 0 for its own
+unknowns x_m (`vmri_jax.schemes.intervals`). Unknowns of the macro step are those and z, the slow increments and slow multipliers.
+
+A pass goes over the intervals in order. Each corrects its unknowns once, and hands on what follows from the correction to first
+order:
+
+    d_m = -(dR_m/dx_m)^-1 R_m        x_m <- x_m + d_m
+
+After the last one the slow equations R_s = 0, which the impulses of all intervals enter, are corrected once,
+
+    d = -(dR_s/dz)^-1 R_s            z <- z + d,    x_m <- x_m + (dx_m/dz) d
+
+In an *exact* pass the matrices are computed: those of the intervals by `jax.jacfwd`, and dR_s/dz with the answer of all
+intervals to the slow path, since the pass carries along how x_m and what is handed on change with z. Further passes, also those of
+the next steps, keep all matrices while the corrections shrink, and cost one gradient of the action each.
+
+Nothing here remembers a step before: the guess comes from outside.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vmri_jax.kernels import inverse, matmul, matvec, max_abs, saddle
+from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
+
+
+class IntervalMatrices(NamedTuple):
+    """The equations of a micro interval, linearised: k unknowns, r n_s slow increments; o numbers are handed on besides q_f.
+
+    inverse: of the derivative of its residual by its unknowns.
+    by_position, by_slow: derivative of the residual by the position that arrives and by the slow increments.
+    hands_on, hands_on_by_position, hands_on_by_slow: derivative of the momentum and the impulses that are handed on.
+    """
+
+    inverse: Float[Array, "k k"]
+    by_position: Float[Array, "k n_f"]
+    by_slow: Float[Array, "k r*n_s"]
+    hands_on: Float[Array, "o k"]
+    hands_on_by_position: Float[Array, "o n_f"]
+    hands_on_by_slow: Float[Array, "o r*n_s"]
+
+
+class Matrices(NamedTuple):
+    """What an exact pass leaves for further passes.
+
+    intervals: inverses and ``d(handed on)/dx``, with the intervals as first axis.
+    response: ``dx_m/dz`` by the slow increments.
+    slow: inverse of the slow equations once the intervals are eliminated.
+    """
+
+    inverse: Float[Array, "num_micro k k"]
+    hands_on: Float[Array, "num_micro o k"]
+    response: Float[Array, "num_micro k r*n_s"]
+    slow: Float[Array, "b b"]
+
+
+class Handed(NamedTuple):
+    """What arrives at an interval, as vectors or as matrices with one column for each direction.
+
+    position: q_f. rest: momentum p_f times h, then the gradients of the action by start and increments of the slow path.
+    """
+
+    position: Float[Array, "n_f ..."]
+    rest: Float[Array, "o ..."]
+
+
+class MarchEquations:
+    """The equations of a macro step with unknowns in rows: x (num_micro, k) of the intervals, z (b,) of the slow path.
+
+    Args:
+        equations: of the macro step.
+        inverted: inverts a matrix ``[[A, B], [C, 0]]``, given as (A, B, C, number of nodes).
+    """
+
+    def __init__(self, equations: StepEquations, inverted=None):
+        self.equations, self.intervals = equations, Intervals(equations)
+        self.inverted = inverted or inverse_with_multipliers
+        self.n, self.r = equations.scheme.num_micro, equations.scheme.degree
+        self.n_s, self.n_f = equations.q_s.size, equations.q_f.size
+        self.n_g, self.n_gs = equations.system.num_constraints(equations.q_s, equations.q_f)
+        self.num_fast, self.num_slow = self.r * self.n_f, self.r * self.n_s
+
+    def rows(self, x: Unknowns):
+        """(z, x) of the unknowns by name."""
+        z = jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
+        return z, jnp.concatenate([x.fast.reshape(self.n, -1), x.multiplier.reshape(self.n, -1)], axis=1)
+
+    def by_name(self, z, x) -> Unknowns:
+        """The unknowns by name, of their rows."""
+        return Unknowns(
+            z[: self.num_slow].reshape(self.r, self.n_s),
+            z[self.num_slow :].reshape(self.r, self.n_gs),
+            x[:, : self.num_fast].reshape(self.n, self.r, self.n_f),
+            x[:, self.num_fast :].reshape(self.n, self.r, self.n_g),
+        )
+
+    def start(self) -> Handed:
+        """What arrives at the first interval."""
+        equations = self.equations
+        return Handed(
+            equations.q_f, jnp.concatenate([equations.micro_dt * equations.p_f, jnp.zeros(self.n_s + self.num_slow)])
+        )
+
+    def no_matrices(self) -> Matrices:
+        """The shapes of the matrices, all zero."""
+        n, k, o = self.n, self.num_fast + self.r * self.n_g, self.n_f + self.n_s + self.num_slow
+        b = self.num_slow + self.r * self.n_gs
+        return Matrices(*map(jnp.zeros, ((n, k, k), (n, o, k), (n, k, self.num_slow), (b, b))))
+
+    def interval(self, m, x, arriving: Handed, slow):
+        """Residual (k,) of interval m, and the rest (o,) that it hands on."""
+        unknowns = IntervalUnknowns(
+            x[: self.num_fast].reshape(self.r, self.n_f), x[self.num_fast :].reshape(self.r, self.n_g)
+        )
+        residual, on = self.intervals.evaluate(m, unknowns, self._apart(arriving), slow.reshape(self.r, self.n_s))
+        return jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)]), _together(on).rest
+
+    def slow_equations(self, z, arriving: Handed):
+        """Residual (b,) of the slow equations, and the slow momentum at the end."""
+        slow, multiplier = z[: self.num_slow].reshape(self.r, self.n_s), z[self.num_slow :].reshape(self.r, self.n_gs)
+        (rows, g), p_s = self.intervals.slow_evaluate(slow, multiplier, self._apart(arriving))
+        return jnp.concatenate([rows.reshape(-1), g.reshape(-1)]), p_s
+
+    def _apart(self, arriving: Handed) -> Arriving:
+        p_f, start, slow = jnp.split(arriving.rest, [self.n_f, self.n_f + self.n_s])
+        return Arriving(arriving.position, p_f, start, slow.reshape(self.r, self.n_s))
+
+    def interval_matrices(self, m, x, arriving: Handed, slow) -> IntervalMatrices:
+        """The derivatives of interval m."""
+
+        def all_of(x, position, slow):
+            return self.interval(m, x, Handed(position, arriving.rest), slow)
+
+        by_x, by_position, by_slow = zip(
+            *jax.jacfwd(all_of, argnums=(0, 1, 2))(x, arriving.position, slow), strict=True
+        )
+        return IntervalMatrices(
+            self.inverse(by_x[0], self.num_fast), by_position[0], by_slow[0], by_x[1], by_position[1], by_slow[1]
+        )
+
+    def slow_inverse(self, z, arriving: Handed, answers: Handed):
+        """Inverse (b, b) of the slow equations.
+
+        Args:
+            answers: how what arrives at them changes with the slow increments, one column for each.
+        """
+
+        def along(dz, dposition, drest):
+            return jax.jvp(
+                lambda *at: self.slow_equations(at[0], Handed(*at[1:]))[0], (z, *arriving), (dz, dposition, drest)
+            )[1]
+
+        answers = Handed(*(jnp.pad(a, [(0, 0), (0, z.size - self.num_slow)]) for a in answers))
+        matrix = jax.vmap(along, in_axes=-1, out_axes=-1)(jnp.eye(z.size), *answers)
+        return self.inverse(matrix, self.num_slow)
+
+    def inverse(self, matrix, size: int):
+        """Of a matrix whose first `size` unknowns are increments, the others multipliers."""
+        if len(matrix) == size:
+            return self.inverted(matrix, matrix[:, :0], matrix[:0], self.r)
+        return self.inverted(matrix[:size, :size], matrix[:size, size:], matrix[size:, :size], self.r)
+
+    def answer(self, matrices: IntervalMatrices, residual, arriving: Handed, slow):
+        """To a change of the residual, of what arrives, and of the slow increments: (dx, change of what is handed on).
+
+        All have one column for each direction. The unknowns cancel the change of the residual.
+        """
+        rows = residual + matmul(matrices.by_position, arriving.position) + matmul(matrices.by_slow, slow)
+        rows = rows.at[: self.n_f].add(arriving.rest[: self.n_f])  # the momentum that arrives
+        dx = -matmul(matrices.inverse, rows)
+        return dx, self.handed(
+            arriving,
+            dx,
+            matmul(matrices.hands_on, dx)
+            + matmul(matrices.hands_on_by_position, arriving.position)
+            + matmul(matrices.hands_on_by_slow, slow),
+        )
+
+    def last_increment(self, x):
+        """(n_f, ...) of the unknowns (k, ...): from the start of the interval to its end."""
+        return x[self.num_fast - self.n_f : self.num_fast]
+
+    def handed(self, arriving: Handed, dx, rest):
+        """The change of what is handed on: the momentum is a new one, impulses add up."""
+        position = arriving.position + self.last_increment(dx)
+        return Handed(position, rest.at[self.n_f :].add(arriving.rest[self.n_f :]))
+
+    def corrected(self, inverse, hands_on, x, residual, arriving: Handed, rest) -> tuple[Any, Handed]:
+        """The correction ``-(dR/dx)^-1 R`` of an interval, and what it hands on with it."""
+        d = -matvec(inverse, residual)
+        return d, Handed(arriving.position + self.last_increment(x + d), rest + matvec(hands_on, d))
+
+    def worse(self, worst: "Worst", residual, d) -> "Worst":
+        """The worst so far, with one more residual and its correction d."""
+        moved, rows = max_abs(d[: self.num_fast]), max_abs(residual)
+        singular = jnp.isfinite(rows) & ~jnp.isfinite(max_abs(d))
+        return Worst(jnp.maximum(worst.moved, moved), jnp.maximum(worst.rows, rows), worst.is_singular | singular)
+
+    def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed) -> "Passed":
+        """A pass that has met all intervals, with the correction of the slow unknowns."""
+        residual, p_s = self.slow_equations(z, end)
+        dz = -matvec(matrices.slow, residual)
+        dx = jnp.sum(matrices.response * dz[: self.num_slow], axis=-1)
+        return Passed(z, x, dz, dx, end, p_s, self.worse(worst, residual, dz)._replace(moved=worst.moved))
+
+
+def _together(on: Arriving) -> Handed:
+    return Handed(on.q_f, jnp.concatenate([on.p_f, on.start, on.slow.reshape(-1)]))
+
+
+def inverse_with_multipliers(a, b, c, nodes: int):
+    """Inverse of ``[[A, B], [C, 0]]`` by elimination, kept regular where constraints become dependent."""
+    return inverse(saddle(a, b, c) if b.shape[-1] else a)
+
+
+class Worst(NamedTuple):
+    """The worst of all intervals in a pass.
+
+    moved: largest correction of a fast increment.
+    rows: largest entry of a residual before the corrections; momentum equations are times h.
+    is_singular: whether a finite residual had a correction that is not finite.
+    """
+
+    moved: Float[Array, ""]
+    rows: Float[Array, ""]
+    is_singular: Bool[Array, ""]
+
+    @classmethod
+    def none(cls) -> "Worst":
+        """Before the first interval."""
+        return cls(jnp.zeros(()), jnp.zeros(()), jnp.asarray(False))
+
+
+class Passed(NamedTuple):
+    """Unknowns after a pass, with their next correction by the slow equations.
+
+    z, x: unknowns, x corrected by the pass.
+    dz, dx: correction of z, and the answer of x to it; the next pass begins with it.
+    end, p_s: what the last interval hands on, and the slow momentum at the end.
+    """
+
+    z: Float[Array, "b"]
+    x: Float[Array, "num_micro k"]
+    dz: Float[Array, "b"]
+    dx: Float[Array, "num_micro k"]
+    end: Handed
+    p_s: Float[Array, "n_s"]
+    worst: Worst
+
+
+def exact_pass(of: MarchEquations, z, x, past, from_past) -> tuple[Matrices, Passed]:
+    """A pass that computes all matrices, each interval at what the intervals before it hand on after their correction.
+
+    Args:
+        of: the equations.
+        z, x: unknowns.
+        past: of the unknowns of earlier intervals.
+        from_past: whether x starts from where the intervals before lead to, instead of the x that is given.
+    """
+    slow, unit = z[: of.num_slow], jnp.eye(of.num_slow)
+
+    def interval(carry, given):
+        arriving, answers, past, worst = carry
+        m, x = given
+        x = jnp.where(from_past, past.next(m), x)
+        residual, rest = of.interval(m, x, arriving, slow)
+        by_x, hands_on = jax.jacfwd(lambda x: of.interval(m, x, arriving, slow))(x)
+        inverse = of.inverse(by_x, of.num_fast)
+
+        # how the interval answers to the slow increments: at fixed x, and by its own unknowns
+        def along(answer: Handed, dslow):
+            return jax.jvp(lambda a, s: of.interval(m, x, a, s), (arriving, slow), (answer, dslow))[1]
+
+        rows, rests = jax.vmap(along, in_axes=-1, out_axes=-1)(answers, unit)
+        response = -matmul(inverse, rows)
+        answers = Handed(answers.position + of.last_increment(response), rests + matmul(hands_on, response))
+
+        d, on = of.corrected(inverse, hands_on, x, residual, arriving, rest)
+        carry = on, answers, past.add(m, x + d), of.worse(worst, residual, d)
+        return carry, (x + d, inverse, hands_on, response)
+
+    start = of.start()
+    none = Handed(*(jnp.zeros((a.size, of.num_slow)) for a in start))
+    carry = start, none, past, Worst.none()
+    (end, answers, _, worst), kept = jax.lax.scan(interval, carry, (jnp.arange(of.n), x))
+    x, inverse, hands_on, response = kept
+    matrices = Matrices(inverse, hands_on, response, of.slow_inverse(z, end, answers))
+    return matrices, of.passed(matrices, z, x, worst, end)
+
+
+def further_pass(of: MarchEquations, matrices: Matrices, z, x, past, from_past) -> Passed:
+    """A pass with the matrices of an earlier one, of this step or of one before. Arguments as of `exact_pass`."""
+    slow = z[: of.num_slow]
+
+    def interval(carry, given):
+        arriving, past, worst = carry
+        m, x, inverse, hands_on = given
+        x = jnp.where(from_past, past.next(m), x)
+        residual, rest = of.interval(m, x, arriving, slow)
+        d, on = of.corrected(inverse, hands_on, x, residual, arriving, rest)
+        return (on, past.add(m, x + d), of.worse(worst, residual, d)), x + d
+
+    given = jnp.arange(of.n), x, matrices.inverse, matrices.hands_on
+    (end, _, worst), x = jax.lax.scan(interval, (of.start(), past, Worst.none()), given)
+    return of.passed(matrices, z, x, worst, end)
+
+
+class Factors(NamedTuple):
+    """The Newton matrix of a macro step, with the intervals eliminated, one after the other.
+
+    intervals: their derivatives, with the intervals as first axis.
+    response, slow: as of `Matrices`.
+    """
+
+    intervals: IntervalMatrices
+    response: Float[Array, "num_micro k r*n_s"]
+    slow: Float[Array, "b b"]
+
+
+def factor(of: MarchEquations, z, x) -> Factors:
+    """The matrix ``dR/d(z, x)`` at the solution, factored. A macro step is solved with it once, for the derivative of the solution."""
+    slow, unit = z[: of.num_slow], jnp.eye(of.num_slow)
+
+    def interval(carry, given):
+        arriving, answers = carry
+        m, x = given
+        rest = of.interval(m, x, arriving, slow)[1]
+        matrices = of.interval_matrices(m, x, arriving, slow)
+        response, answers = of.answer(matrices, jnp.zeros((x.size, of.num_slow)), answers, unit)
+        return (Handed(arriving.position + of.last_increment(x), rest), answers), (matrices, response)
+
+    start = of.start()
+    none = Handed(*(jnp.zeros((a.size, of.num_slow)) for a in start))
+    (end, answers), (matrices, response) = jax.lax.scan(interval, (start, none), (jnp.arange(of.n), x))
+    return Factors(matrices, response, of.slow_inverse(z, end, answers))
+
+
+def solve(of: MarchEquations, factors: Factors, rows_z, rows_x):
+    """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and has a transpose."""
+
+    def interval(arriving, given):
+        matrices, rows = given
+        dx, arriving = of.answer(matrices, rows[:, None], arriving, jnp.zeros((of.num_slow, 1)))
+        return arriving, dx[:, 0]
+
+    none = Handed(*(jnp.zeros((a.size, 1)) for a in of.start()))
+    end, dx = jax.lax.scan(interval, none, (factors.intervals, rows_x))
+    # the slow equations are linear in what arrives at them
+    along = Handed(*(a[:, 0] for a in end))
+    zero = jnp.zeros_like(rows_z)
+    change = jax.jvp(lambda a: of.slow_equations(zero, a)[0], (of.start(),), (along,))[1]
+    dz = -matvec(factors.slow, rows_z + change)
+    return dz, dx + jnp.sum(factors.response * dz[: of.num_slow], axis=-1)

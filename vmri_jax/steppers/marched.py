@@ -1,0 +1,249 @@
+"""The march as a solver: passes until the corrections are small enough, see `vmri_jax.steppers.march`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from vmri_jax.kernels import max_abs
+from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.steppers.accept import Accepted, expected
+from vmri_jax.steppers.continuation import has_dependent_constraints, solve_in_parts, starts_finite
+from vmri_jax.steppers.march import (
+    MarchEquations,
+    Matrices,
+    Passed,
+    Worst,
+    exact_pass,
+    further_pass,
+    inverse_with_multipliers,
+)
+from vmri_jax.steppers.newton import Newton, null_space
+from vmri_jax.steppers.predictors import PolynomialPredictor
+from vmri_jax.steppers.results import RUNNING, Method, Result
+from vmri_jax.steppers.solved import Solution, Solver, status_of
+
+CONTRACTION = 0.03
+"""Matrices are kept while every pass makes the corrections smaller by this factor; above it an exact pass is cheaper."""
+PLAIN_PASSES = 30
+"""Passes of the first attempt, of which about half are exact ones, after which parts of the step are tried."""
+INVERSES: dict[str, Callable] = {
+    "arrowhead": inverse_with_multipliers,
+    "null_space": null_space.inverse_without_multipliers,
+}
+"""How the matrices of micro intervals and of the slow equations are inverted."""
+
+
+class Parabola(NamedTuple):
+    """Unknowns of the micro intervals one after the other; they go on as the parabola through the last three does.
+
+    Kicks at the macro nodes, and the constraint force that two macro steps share, let the first interval of every macro step
+    stand out from its neighbours.
+
+    last: of the last three intervals, the last one first, without the jump.
+    jump: by how much the first interval of a macro step stands out.
+    """
+
+    last: Float[Array, "3 k"]
+    jump: Float[Array, "k"]
+
+    @classmethod
+    def constant(cls, x) -> "Parabola":
+        """A past in which nothing changed."""
+        return cls(jnp.stack([x, x, x]), jnp.zeros_like(x))
+
+    def next(self, m):
+        """The value that is expected in interval m of a macro step."""
+        return 3 * (self.last[0] - self.last[1]) + self.last[2] + jnp.where(m == 0, self.jump, 0.0)
+
+    def add(self, m, x) -> "Parabola":
+        """With the value of interval m."""
+        x = x - jnp.where(m == 0, self.jump, 0.0)
+        return self._replace(last=jnp.concatenate([x[None], self.last[:2]]))
+
+    def after_step(self, x) -> "Parabola":
+        """With the values (num_micro, k) of a macro step."""
+        after = self
+        if len(x) > 1:
+            after = self._replace(jump=x[0] - (self.last[0] + x[1]) / 2)
+        for m in range(max(len(x) - 3, 0), len(x)):
+            after = after.add(m, x[m])
+        return after
+
+
+class MarchMemory(NamedTuple):
+    """What a macro step hands to the next one.
+
+    slow, fast: the past of the slow unknowns, step by step, and of the fast ones, micro interval by micro interval.
+    matrices: of the last exact pass.
+    rate: by which passes with them made the corrections smaller, the last time; infinite where there are no matrices.
+    """
+
+    slow: PolynomialPredictor
+    fast: Parabola
+    matrices: Matrices
+    rate: Float[Array, ""]
+
+
+class Progress(NamedTuple):
+    """Where the iteration is.
+
+    passed: the last pass.
+    matrices: of the last exact pass.
+    size: its largest correction, of slow and fast increments.
+    rate: by which the next pass is expected to make the corrections smaller if it keeps the matrices.
+    curvature: rate of passes after an exact one over the size of that one.
+    exact_size: size of the last exact pass.
+    still_moves: largest correction of fast increments that is expected of another pass.
+    passes, result: how many passes there were, and `Result`.
+    """
+
+    passed: Passed
+    matrices: Matrices
+    size: Float[Array, ""]
+    rate: Float[Array, ""]
+    curvature: Float[Array, ""]
+    exact_size: Float[Array, ""]
+    still_moves: Float[Array, ""]
+    passes: Int[Array, ""]
+    result: Int[Array, ""]
+
+
+@dataclass(frozen=True)
+class Marched(Solver):
+    """Passes until one more would change neither the slow increments nor those of the micro intervals.
+
+    linear_solver: "arrowhead", elimination with multipliers, or "null_space", without them.
+    sizes: (n_s, n_gs, n_f, n_g) and the degree, which are told where multipliers are eliminated.
+    """
+
+    newton: Newton
+    linear_solver: str
+    sizes: tuple[int, int, int, int, int] | None = None
+
+    def remembers(self, equations: StepEquations, guess: Unknowns) -> MarchMemory:
+        of = MarchEquations(equations)
+        z, x = of.rows(guess)
+        return MarchMemory(
+            PolynomialPredictor.constant(z), Parabola.constant(x[0]), of.no_matrices(), jnp.asarray(jnp.inf)
+        )
+
+    def solve(self, equations: StepEquations, guess: Unknowns, own: MarchMemory) -> tuple[Solution, MarchMemory]:
+        of = MarchEquations(equations)
+        z, x = of.rows(guess)
+        zero = jnp.zeros(())
+        passed = Passed(z, x, z, x, of.start(), equations.p_s, Worst.none())
+        start = Progress(
+            passed,
+            own.matrices,
+            zero + jnp.inf,
+            own.rate,
+            zero,
+            zero + jnp.inf,
+            zero,
+            jnp.asarray(0),
+            jnp.asarray(RUNNING),
+        )
+        if self.newton.fixed_iterations is not None:
+            done = self._iterate(of, guess, start, own, None)
+            result, passes = done.result, done.passes
+        else:
+
+            def part(equations, guess, limit, is_first):
+                done = self._iterate(MarchEquations(equations), guess, start, own, limit, is_first)
+                return done, of.by_name(done.passed.z, done.passed.x), done.result, done.passes
+
+            parts = solve_in_parts(equations, guess, start, part, self.newton.max_iterations, PLAIN_PASSES)
+            done, result, passes = parts.solution, parts.result, parts.iterations
+        return self._solution(of, done, result, passes), self._learned(of, own, done)
+
+    def _iterate(
+        self, of: MarchEquations, guess: Unknowns, start: Progress, own: MarchMemory, limit, is_first: Any = True
+    ) -> Progress:
+        """Passes, at most `limit`: of the first attempt from what the steps before lead to, of others from the guess."""
+        accepted, fixed = Accepted.of(of.equations, self.newton), self.newton.fixed_iterations
+        z, x = of.rows(guess)
+        z = jnp.where(is_first, own.slow.next(of.num_slow), z)
+        at = start._replace(
+            passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
+            rate=jnp.where(is_first, own.rate, jnp.inf),
+        )
+        of.inverted = INVERSES[self.linear_solver]
+
+        def judged(now: Passed, before: Progress) -> Progress:
+            slow, fast = max_abs(now.dz[: of.num_slow]), now.worst.moved
+            still_moves = jnp.where(before.passes > 0, expected(fast, before.passed.worst.moved), fast)
+            motions = max_abs(now.z[: of.num_slow]), max_abs(now.x[:, : of.num_fast])
+            passes, size = before.passes + 1, jnp.maximum(slow, fast)
+            over = accepted.over((slow, still_moves), motions, passes)
+            result = jnp.where(over <= 1, Result.CONVERGED, RUNNING)
+            if limit is not None:
+                failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
+                result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
+            lost = is_first & (size > before.size)  # what was predicted is no guess: the next attempt starts elsewhere
+            result = jnp.where(lost & (result == RUNNING), Result.DIVERGED, result)
+            broken = jnp.where(now.worst.is_singular, Result.SINGULAR, Result.NON_FINITE)
+            result = jnp.where(jnp.isfinite(over), result, broken)
+            return before._replace(passed=now, size=size, still_moves=still_moves, passes=passes, result=result)
+
+        def unknowns(at: Progress) -> tuple:
+            passed = at.passed
+            return passed.z + passed.dz, passed.x + passed.dx, own.fast, is_first & (at.passes == 0)
+
+        def exact(at: Progress) -> Progress:
+            matrices, now = exact_pass(of, *unknowns(at))
+            at = judged(now, at)._replace(matrices=matrices)
+            return at._replace(rate=at.curvature * at.size, exact_size=at.size)
+
+        def further(at: Progress) -> Progress:
+            now = judged(further_pass(of, at.matrices, *unknowns(at)), at)
+            rate = jnp.where(at.passes > 0, now.size / at.size, at.rate)
+            return now._replace(rate=rate, curvature=jnp.maximum(at.curvature, rate / at.exact_size))
+
+        def passes(at: Progress) -> Progress:
+            """Passes with the matrices that are kept, and an exact one where they are not enough."""
+            at = jax.lax.while_loop(lambda at: (at.result == RUNNING) & (at.rate <= CONTRACTION), further, at)
+            return jax.lax.cond(at.result == RUNNING, exact, lambda at: at, at)
+
+        return self.newton.iterate(passes if fixed is None else exact, at)
+
+    def _solution(self, of: MarchEquations, done: Progress, result, passes) -> Solution:
+        equations, passed = of.equations, done.passed
+        x = of.by_name(passed.z, passed.x)
+        end = passed.end.position, passed.p_s, passed.end.rest[: of.n_f] / equations.micro_dt
+        g = jnp.zeros(())
+        if equations.system.is_constrained:
+            path = equations.path(x)
+            q_s, q_f = path.control_points()
+            g_fast = jax.vmap(equations.system.g)(path.control_times()[1:], q_s[1:], q_f[1:])
+            g_slow = jax.vmap(equations.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:])
+            g = jnp.maximum(max_abs(g_fast), max_abs(g_slow))
+        left = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
+        method = Method[self.linear_solver.upper()]
+        status = status_of(
+            equations, result, method, passes, passed.worst.rows * jnp.minimum(left, 1.0), g, self.newton.tolerance
+        )
+        if equations.system.is_constrained:
+            failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & starts_finite(equations)
+            never = partial(jnp.asarray, False)
+            dependent = jax.lax.cond(failed, partial(has_dependent_constraints, equations), never)
+            status = status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))
+        return Solution(x, end, status)
+
+    def _learned(self, of: MarchEquations, own: MarchMemory, done: Progress) -> MarchMemory:
+        passed = done.passed
+        fast = own.fast.after_step(passed.x)
+        return MarchMemory(own.slow.add(passed.z, of.num_slow), fast, done.matrices, done.rate)
+
+    def lines(self) -> list[str]:
+        head = f"march over the micro intervals with exact matrices, {self.linear_solver.replace('_', ' ')}"
+        if self.linear_solver != "null_space" or self.sizes is None:
+            return [head]
+        *counts, r = self.sizes
+        parts = zip(("slow variables", "each micro interval"), counts[::2], counts[1::2], strict=True)
+        few = [f"  unknowns of {what}: {r * (n - g)}, with multipliers {r * (n + g)}" for what, n, g in parts if g]
+        return [head, *few]
