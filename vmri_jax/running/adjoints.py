@@ -80,13 +80,18 @@ def _told(kind: str, num_steps: int, primals, tangents):
 
 def one_or_other(first: Callable, other: Callable, arrays) -> Trajectory:
     """``first(arrays)``, or ``other(arrays)`` if that fails; their derivatives are in reverse mode only."""
+    of_real, real = _apart(arrays)
+    return _one_or_other(of_real(first), of_real(other), real)
+
+
+def _apart(arrays) -> tuple[Callable, dict]:
+    """The real ones among the leaves by their number, and what makes a function of the arrays one of those."""
     leaves, structure = jax.tree.flatten(arrays)
-    real = {i: leaf for i, leaf in enumerate(leaves) if _is_real(leaf)}
 
     def of_real(run):
         return lambda real: run(jax.tree.unflatten(structure, [real.get(i, leaf) for i, leaf in enumerate(leaves)]))
 
-    return _one_or_other(of_real(first), of_real(other), real)
+    return of_real, {i: leaf for i, leaf in enumerate(leaves) if _is_real(leaf)}
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -107,6 +112,28 @@ def _its_derivative(first: Callable, other: Callable, kept, cotangent: Trajector
 
 
 _one_or_other.defvjp(_the_one_that_worked, _its_derivative)
+
+
+def by_the_other(first: Callable, other: Callable, arrays) -> Trajectory:
+    """``first(arrays)``, with the derivative of ``other(arrays)``, which finds the same; in reverse mode only."""
+    of_real, real = _apart(arrays)
+    return _by_the_other(of_real(first), of_real(other), real)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _by_the_other(first: Callable, other: Callable, real) -> Trajectory:
+    return first(real)
+
+
+def _other_run(first: Callable, other: Callable, real):
+    return jax.vjp(other, real)
+
+
+def _other_derivative(first: Callable, other: Callable, pull, cotangent: Trajectory):
+    return pull(cotangent)
+
+
+_by_the_other.defvjp(_other_run, _other_derivative)
 
 
 class _Interval(NamedTuple):

@@ -110,17 +110,13 @@ def simulate_batch(
     unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
     failed = np.flatnonzero(unsolved)
     if failed.size and run.plan.has_fallback:
-        exact = replace(
-            run.engine, structure=jax.tree.structure((replace(run.newton, method="arrowhead"), scheme, system))
-        )
-        rooms = (
-            2 ** int(failed.size - 1).bit_length()
-        )  # of a few sizes, so that few programs serve all numbers of failures
+        # rooms of a few sizes, so that few programs serve all numbers of failures
+        rooms = 2 ** int(failed.size - 1).bit_length()
         filled = failed[np.minimum(np.arange(rooms), failed.size - 1)]
         with Working(
-            f"simulate_batch: {failed.size} of {lanes} lanes, which the first method does not solve, with the fallback"
+            f"simulate_batch: {failed.size} of {lanes} lanes, which the first method does not solve, with exact matrices"
         ):
-            again = _in_chunks(run, exact, jax.tree.map(lambda a: a[filled], batch), width, devices)
+            again = _in_chunks(run, run.exact_engine, jax.tree.map(lambda a: a[filled], batch), width, devices)
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
     if warn:
         _warn_of_failures(trajectory)

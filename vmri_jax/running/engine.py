@@ -31,14 +31,11 @@ class Engine:
         structure: of the pytree (newton, scheme, system).
         num_saves: saved intervals that there is room for.
         save_micro: whether micro nodes are saved.
-        falls_back: whether a step that the first method does not solve goes to the fallback of `newton`, which takes long to
-            compile.
     """
 
     structure: Any
     num_saves: int
     save_micro: bool
-    falls_back: bool
 
     @cached_property
     def whole(self):
@@ -104,7 +101,7 @@ class Engine:
     def stepper(self, leaves, state: State, once: bool = False) -> Plan:
         """How its steps are taken."""
         newton, scheme, system = jax.tree.unflatten(self.structure, leaves)
-        return plan(system, scheme, state, newton, fallback=self.falls_back, once=once)
+        return plan(system, scheme, state, newton, fallback=False, once=once)
 
     def _run(
         self, stepper: Plan, state: State, own, t_start, macro_dt, step, save_every, saves=None, loops: Loops = PLAIN

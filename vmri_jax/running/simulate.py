@@ -39,7 +39,7 @@ SHOWN = 50
 """A run with a progress bar is computed in about so many parts."""
 STEPPING = "the run: it is compiled if it is the first of its kind, then stepped"
 FALLING_BACK = (
-    "a step that the first method does not solve: the fallback is compiled if it is new, then the run is made with it"
+    "a step that the first method does not solve: the run is made again with exact matrices, compiled if they are new"
 )
 """What a run says of itself when it takes long."""
 
@@ -164,7 +164,7 @@ class Checkpoint(NamedTuple):
 
     step: macro steps done.
     state, memory: at the node reached, and what the last step hands on.
-    fell_back: whether the first method has given way to its fallback.
+    fell_back: whether the first method has given way to exact matrices.
     """
 
     step: int
@@ -177,15 +177,15 @@ class Checkpoint(NamedTuple):
 class Simulation:
     """A run whose arguments have been checked: at once by a call, or piece by piece from a `Checkpoint`.
 
-    "auto" is first the nested march alone, since its fallback takes long to compile. Only what the march does not solve is
-    computed with the fallback, which is then compiled.
+    A run is made with the first method of its plan. The fallback is a policy of the run: a run in which that method fails is made again
+    with exact matrices, by a program that is compiled then.
 
     Attributes:
         system, scheme, newton, state, num_steps, save_every, save_micro: as of `simulate`.
         macro_dt: an array of shape ().
         names: of bodies and constraints, None if there are none.
         room: saved intervals that the program has room for.
-        may_fall_back: whether what the first method does not solve is computed with the fallback, else it fails.
+        may_fall_back: whether a run that the first method does not solve is made again with exact matrices, else it fails.
     """
 
     system: System
@@ -234,7 +234,7 @@ class Simulation:
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
-        """The program of the run without the fallback, to look into."""
+        """The program of the run by its first method, to look into."""
         return self._program(False).lower(*self._arguments(None, None, None, None)).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
@@ -311,17 +311,23 @@ class Simulation:
 
     @cached_property
     def engine(self) -> Engine:
-        """Its programs without the fallback."""
+        """Its programs with the first method."""
         return self.engine_for(False, self.num_saves)
 
     @cached_property
     def exact_engine(self) -> Engine:
-        """Its programs with the fallback."""
+        """Its programs with exact matrices, for what the first method does not solve."""
         return self.engine_for(True, self.num_saves)
 
-    def engine_for(self, falls_back: bool, num_saves: int) -> Engine:
-        """Programs for another number of saved intervals."""
-        return engine(self.structure, num_saves, self.save_micro, falls_back)
+    def engine_for(self, is_exact: bool, num_saves: int) -> Engine:
+        """Programs with the first method or with exact matrices, for a number of saved intervals."""
+        structure = self._exact_structure if is_exact else self.structure
+        return engine(structure, num_saves, self.save_micro)
+
+    @cached_property
+    def _exact_structure(self):
+        newton = replace(self.newton, method="arrowhead")
+        return jax.tree.structure((newton, self.scheme, self.system))
 
     def check(self, what: str = "simulate: the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return something else than they should, and constraints that cannot be kept."""
