@@ -20,6 +20,7 @@ from benchmarks import (
     ensembles,
     floor,
     fuzz,
+    instructions,
     kills,
     orders,
     peers,
@@ -63,6 +64,7 @@ for _name, _module in {
     "compile": compilation,
     "control": control,
     "orders": orders,
+    "programs": instructions,
     "savings": savings,
     "squeezer": squeezer,
 }.items():

@@ -23,7 +23,6 @@ from vmri_jax import (
     plan,
     quadrature,
     simulate,
-    systems,
 )
 
 
@@ -106,89 +105,6 @@ def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp):
     assert run.success
     assert np.all(run.info.method == Method.ARROWHEAD)
     assert largest_difference(run.q_f, exact.q_f) == 0.0
-
-
-def drag(t, q_s, q_f, v_s, v_f, params):
-    return -0.1 * v_s, -0.2 * v_f * jnp.sum(v_f**2)
-
-
-def test_a_plan_says_how_a_step_is_solved(fpu):
-    """Only kicks by V let slow and fast variables go their own ways, a force couples them; a term inside the macro interval, or a
-    kinetic energy that is a function, needs the whole equations."""
-    rule = micro(quadrature.midpoint)
-    inside = Scheme(4, kinetic=rule, slow=macro(quadrature.gauss(2)), fast=rule)
-    forced, whole = fpu.system.replace(force=drag), "march over the micro intervals with exact matrices"
-    assert str(plan(fpu, fully_implicit(4))).startswith("nested march")
-    assert "nested march" not in str(plan(fpu, explicit_slow(4)))
-    assert "nested march" in str(plan(forced, explicit_slow(4), fpu.state()))
-    assert str(plan(fpu, inside)).startswith(whole)
-    assert str(plan(double_pendulum(), fully_implicit(3))).startswith(whole)
-    with pytest.raises(ValueError, match="method 'nested' needs a ConstantMass, and potentials"):
-        plan(fpu, inside, newton=Newton("nested"))
-
-
-def test_explicit_steps_have_no_iterations(fpu):
-    run = simulate(fpu, fully_explicit(4), macro_dt=0.01, num_steps=20)
-    assert np.all(run.info.method == Method.EXPLICIT)
-    assert np.all(run.info.iterations == 0)
-
-
-def test_auto_falls_back_where_the_march_does_not_converge():
-    """At H = 2 the curvature of V outweighs the mass of the slow variables."""
-    problem, newton = two_oscillators(kappa=25.0), Newton(max_iterations=6)
-
-    def go(state, newton):
-        step = {"macro_dt": 40.0, "num_steps": 3, "newton": newton, "throw": False}
-        return simulate(problem.system, fully_implicit(20), state, **step)
-
-    state = problem.state()
-    march, run, exact = (go(state, n) for n in (Newton("nested", max_iterations=6), newton, Newton("arrowhead")))
-    assert int(march.result) == Result.STAGNATED
-    assert int(march.failed_at) == 0
-    assert run.success
-    assert np.all(run.info.method == Method.ARROWHEAD)
-    for name in ("q_s", "q_f", "p_s", "p_f"):
-        found, expected = getattr(run, name)[1], getattr(exact, name)[1]
-        assert largest_difference(found, expected) / np.abs(expected).max() < 1e-12
-    inside = jax.jit(lambda state: go(state, newton))(state)
-    assert int(inside.info.method.max()) == Method.ARROWHEAD
-    assert largest_difference(inside.q_f, run.q_f) < 1e-11
-
-
-def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
-    """A library call in it would keep the loop over macro steps from being one kernel."""
-
-    def loops_around(jaxpr, name, around: tuple[str, ...] = ()):
-        """For every equation of this name the loops and conditions that it is in, the outermost first."""
-        for eqn in jaxpr.eqns:
-            kind = eqn.primitive.name
-            if kind == name:
-                yield around
-            inside = (*around, kind) if kind in ("while", "scan", "cond") else around
-            for part in jaxprs_in_params(eqn.params):
-                yield from loops_around(part, name, inside)
-
-    def run(state):
-        return simulate(tsp.system, fully_explicit(5), state, macro_dt=0.001, num_steps=5).q_f
-
-    found = list(loops_around(jax.make_jaxpr(run)(tsp.state()).jaxpr, "svd"))
-    assert found
-    assert all(around[:1] == ("cond",) for around in found)
-
-
-def test_a_fallback_keeps_what_was_computed():
-    """The run goes on from the last saved node, with the same trajectory as the exact method."""
-    fpu = systems.fermi_pasta_ulam(1)
-    scheme = fully_implicit(100)
-    free = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20)
-    first = int(free.info.iterations[0])
-    assert first < int(free.info.iterations.max())
-    run = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20, newton=Newton(max_iterations=first))
-    exact = simulate(fpu.system, scheme, fpu.state(), macro_dt=1.0, num_steps=20, newton=Newton("arrowhead"))
-    methods = np.asarray(run.info.method)
-    assert methods[0] == Method.NESTED
-    assert Method.ARROWHEAD in methods
-    assert largest_difference(run.q_f[:10], exact.q_f[:10]) < 1e-8  # errors grow fast at this step; measured 1e-10
 
 
 @pytest.mark.parametrize("method", ["nested", pytest.param("arrowhead", marks=pytest.mark.full)])

@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from scipy.linalg import block_diag
 
 import vmri_jax as vm
@@ -32,8 +31,8 @@ def test_the_inverse_is_that_with_multipliers(degree):
     random = np.random.default_rng(degree)
     a = jnp.asarray(random.normal(size=(6 * degree, 6 * degree)) + 8 * np.eye(6 * degree))
     g_0, g_1 = (jnp.asarray(block_diag(*random.normal(size=(degree, 2, 6)))) for _ in range(2))
-    inverses = [f(a, -g_0.T, g_1, degree) for f in (inverse_without_multipliers, inverse_with_multipliers)]
-    np.testing.assert_allclose(*inverses, atol=1e-11)
+    blocks = a, -g_0.T, g_1, degree
+    np.testing.assert_allclose(inverse_without_multipliers(*blocks), inverse_with_multipliers(*blocks), atol=1e-11)
 
 
 LONG = pytest.mark.full  # the motion is chaotic: over longer times both part, as does every other method

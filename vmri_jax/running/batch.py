@@ -1,7 +1,6 @@
 """Batches of runs: many starts, step sizes or parameters of one system, lane by lane independent."""
 
 import warnings
-from dataclasses import replace
 from functools import lru_cache
 
 import jax

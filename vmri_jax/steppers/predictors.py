@@ -3,7 +3,10 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from vmri_jax.kernels import matmul
 
 ORDER = 10
 """Highest order of the polynomials."""
@@ -37,11 +40,10 @@ class PolynomialPredictor(NamedTuple):
 
     def add(self, x, measured: int) -> "PolynomialPredictor":
         """With one more step."""
-        rows = [x]
-        for before in self.differences[:-1]:
-            rows.append(rows[-1] - before)
+        sums = matmul(np.tri(ORDER + 1), self.differences[:-1])
+        differences = jnp.concatenate([x[None], x - sums])
         missed = self._missed(measured)
-        return PolynomialPredictor(jnp.stack(rows), jnp.where(jnp.isfinite(missed), FADING * missed, 0.0))
+        return PolynomialPredictor(differences, jnp.where(jnp.isfinite(missed), FADING * missed, 0.0))
 
     def _missed(self, measured: int):
         """(ORDER + 1,) by how much each order has missed, infinite where a step had failed."""

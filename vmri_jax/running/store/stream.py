@@ -125,7 +125,7 @@ def _go_on(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iterato
         return
     run = replace(run, room=room_for(chunk))  # one program for all parts
     try:
-        at = record.checkpoint(like=run.start())
+        at = record.checkpoint(like=run.start(fell_back=record.fell_back))
     except ValueError as error:
         raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
     writer = layout.Writer(path, rows + 1, chunk)

@@ -1,0 +1,108 @@
+"""Programs of runs and gradients: their instructions after XLA's optimisation, and the processor time until they are compiled."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+import vmri_jax as vm
+from benchmarks.measure import Ratio, Tell, silent
+from benchmarks.programs import problem
+from benchmarks.report import Claim, Report, growing
+from vmri_jax.steppers.newton.options import Choice
+
+COLUMNS = ("program", "instructions", "to compile, s")
+STEPS = 100
+"""Macro steps of a program; their number changes nothing in a run, and a gradient keeps what it needs of each."""
+MICRO_DT = 2e-4
+
+
+def double_pendulum() -> vm.Problem:
+    """Two rods on one another, in angles: a kinetic energy that depends on positions."""
+
+    def kinetic(q_s, q_f, v_s, v_f, params):
+        return v_f[0] ** 2 + v_f[1] ** 2 / 8 + v_f[0] * v_f[1] * jnp.cos(q_f[0] - q_f[1]) / 2
+
+    def potential(q_f, params):
+        return -9.81 * (2 * jnp.cos(q_f[0]) + jnp.cos(q_f[1]) / 2) + 50 * (1 - jnp.cos(q_f[1]))
+
+    return vm.Problem(
+        vm.System(kinetic=kinetic, fast_potential=potential), q_s=[], q_f=[0.6, 0.3], v_s=[], v_f=[0.0, 1.0]
+    )
+
+
+@dataclass(frozen=True)
+class Program:
+    """A run, or the value and the gradient of a function of its end.
+
+    most: instructions that it had when it was written down; a test allows a tenth more.
+    """
+
+    problem: Callable[[], vm.Problem]
+    scheme: vm.Scheme
+    most: int
+    method: Choice = "auto"
+    is_gradient: bool = False
+
+    def compiled(self) -> jax.stages.Compiled:
+        """The program."""
+        problem, macro_dt = self.problem(), MICRO_DT * self.scheme.num_micro
+        options = {"macro_dt": macro_dt, "num_steps": STEPS, "save_every": STEPS, "newton": vm.Newton(self.method)}
+        if not self.is_gradient:
+            return vm.prepare(problem, self.scheme, **options).compiled()
+
+        def last(state: vm.State):
+            """Positions at the end."""
+            run = vm.simulate(problem.system, self.scheme, state, **options)
+            return jnp.sum(run.q_s[-1] ** 2) + jnp.sum(run.q_f[-1] ** 2)
+
+        return jax.jit(jax.value_and_grad(last)).lower(problem.state()).compile()
+
+
+FPU, TSP, SAM = (partial(problem, name) for name in ("FPU l=3", "TSP", "SAM"))
+PROGRAMS: dict[str, Program] = {
+    "double pendulum in angles, fully_implicit(1)": Program(double_pendulum, vm.fully_implicit(1), 3100),
+    "double pendulum in angles, galerkin(1, 3)": Program(double_pendulum, vm.galerkin(1, 3), 3300),
+    "FPU, fully_explicit(5)": Program(FPU, vm.fully_explicit(5), 900),
+    "FPU, fully_implicit(5)": Program(FPU, vm.fully_implicit(5), 3800),
+    "FPU, fully_implicit(5), exact matrices": Program(FPU, vm.fully_implicit(5), 4250, "arrowhead"),
+    "TSP, fully_explicit(5)": Program(TSP, vm.fully_explicit(5), 5200),
+    "TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 5650),
+    "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5750, "arrowhead"),
+    "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 7500),
+    "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7800, "arrowhead"),
+    "gradient: double pendulum, fully_implicit(1)": Program(
+        double_pendulum, vm.fully_implicit(1), 5200, is_gradient=True
+    ),
+    "gradient: TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 12600, is_gradient=True),
+}
+
+
+def instructions(compiled: jax.stages.Compiled) -> int:
+    """Instructions of a compiled program, parameters and constants included."""
+    return len(re.findall(r"= \S+ ([a-z\-]+)\(", compiled.as_text() or ""))
+
+
+def sizes(name: str) -> list[str]:
+    """ "quick" or "full": names of programs."""
+    return [name for name in PROGRAMS if "SAM" not in name] if name == "quick" else list(PROGRAMS)
+
+
+def run(size: list[str], name: str, tell: Tell = silent) -> Iterator[Report]:
+    """Compile them one after the other, a report after each."""
+    return growing("programs", name, (measured(name, tell) for name in size))
+
+
+def measured(name: str, tell: Tell = silent) -> tuple[list[dict], list[Claim]]:
+    """The row of a program, and its instructions over those that were written down."""
+    tell(name)
+    program = PROGRAMS[name]
+    start = time.process_time()
+    count = instructions(program.compiled())
+    row = {"program": name, "instructions": count, "to compile, s": time.process_time() - start}
+    part = count / program.most
+    return [row], [Claim(f"{name}: instructions over those written down", Ratio(part, part, part), 1.1)]
