@@ -64,7 +64,10 @@ def test_the_fallback_takes_over_and_says_so(tsp, capsys, monkeypatch):
     run = prepare(tsp, fully_implicit(10), macro_dt=0.2, num_steps=20, save_every=5, newton=newton)
     trajectory = run()
     assert trajectory.success
-    assert "a step that the first method does not solve: the run is made again with exact matrices" in capsys.readouterr().err
+    assert (
+        "a step that the first method does not solve: the run is made again with exact matrices"
+        in capsys.readouterr().err
+    )
     assert np.any(np.asarray(trajectory.info.method) == Method.ARROWHEAD)
     run.timed()()
 

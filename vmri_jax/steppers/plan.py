@@ -9,7 +9,8 @@ The cheapest stepper that the rules and the system allow is found from outside t
 * *free flight*: nothing but kinetic energy of constant masses is left;
 * *linear*: what is left is linear, in fast variables alone;
 * else equations are solved: for the multipliers of a drift (*Rattle*), for one interval of high degree (*collocation*), for the
-  micro intervals in order (*nested*), or for all unknowns at once (*coupled*), also where one of the others fails (*fallback*).
+  micro intervals in order with cheap matrices (*nested*), or in the same order with exact ones (*march*), also where one of the
+  others fails (*fallback*). The dense matrix of all unknowns at once (*coupled*) is the reference of studies.
 """
 
 from collections.abc import Callable
@@ -116,7 +117,7 @@ def plan(
         system, scheme: what moves, a `Problem` or a scene, or a `System` with a state, and how.
         state: any state of the system; only the shapes of its arrays matter.
         newton: how implicit equations are solved.
-        fallback: whether a first choice that does not converge gives way to another one, which takes long to compile.
+        fallback: whether a step that the first choice does not solve is solved by the march with exact matrices, in the same program.
         once: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:

@@ -18,13 +18,13 @@ class Newton(eqx.Module):
     | method | matrix of an iteration | cost per micro step |
     |---|---|---|
     | "nested" | slow path outside, micro intervals in order, each with a small matrix of its own | lowest |
-    | "arrowhead" | exact block elimination, O(num_micro) | |
+    | "arrowhead" | the same march with exact matrices, kept over passes and steps while corrections shrink | |
     | "null_space" | the same without multipliers: matrices of the free motions alone | |
     | "dense" | exact, one dense factorisation, O(num_micro^2): baseline and oracle | highest |
 
     "auto" takes "nested" where the terms can be cut into micro intervals (constant masses, potentials on the micro grid
-    or kicks at the macro nodes), and "arrowhead" where they cannot or where "nested" does not converge; which one it was
-    is in ``StepInfo.method`` and ``Trajectory.info.method``. ``print(vm.plan(system, scheme, state))`` shows it beforehand.
+    or kicks at the macro nodes), and "arrowhead" where they cannot; a run in which "nested" does not converge is made again by
+    "arrowhead". Which one it was is in ``StepInfo.method`` and ``Trajectory.info.method``. ``print(vm.plan(system, scheme, state))`` shows it beforehand.
     "nested" includes its special cases: a single drift along the constraints between kicks (RATTLE), and a single interval
     of higher degree (``galerkin(1, degree)``), which is solved for all variables at once in modes of time.
 
