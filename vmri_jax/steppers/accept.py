@@ -23,6 +23,9 @@ ROUNDOFF = 4.0
 """Changes of the positions below so many units of round-off are accepted."""
 PATIENCE = 20
 """After so many iterations round-off is accepted that constraints hand from slow to fast variables and back."""
+FLOOR = 100.0
+"""Corrections that no longer shrink are accepted below so many units of round-off of the positions. Nearly dependent constraints
+let them wander there; with a larger value, steps that converge slowly would be cut off."""
 SAFETY = 10.0
 """Of the tolerance, and of how corrections shrink from one iteration to the next."""
 
@@ -64,6 +67,11 @@ class Accepted(NamedTuple):
         floors = self.slow[late], self.fast[late]
         slow, fast = (self.tolerance * size + floor + rest for size, floor in zip(motions, floors, strict=True))
         return slow, fast
+
+    def at_floor(self, size, before):
+        """Whether corrections have stopped shrinking at `FLOOR` units of round-off of the positions: more cannot be had."""
+        floor = FLOOR / ROUNDOFF * jnp.maximum(self.slow[0], self.fast[0])
+        return (size > before / 2) & (size <= floor)
 
     def over(self, changes, motions, iterations):
         """Changes (slow, fast) over what is accepted of them, see `sizes`; the larger of the two."""

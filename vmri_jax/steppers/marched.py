@@ -145,7 +145,8 @@ class Marched(Solver):
             motions = max_abs(now.z[: of.num_slow]), max_abs(now.x[:, : of.num_fast])
             passes, size = before.passes + 1, jnp.maximum(slow, fast)
             over = accepted.over((slow, still_moves), motions, passes)
-            result = jnp.where(over <= 1, Result.CONVERGED, RUNNING)
+            at_floor = accepted.at_floor(size, before.size)
+            result = jnp.where(over <= 1, Result.CONVERGED, jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, RUNNING))
             if limit is not None:
                 failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
                 result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
