@@ -49,7 +49,7 @@ def test_work_precision(client):
 
 
 def test_fuzzing(client, tmp_path):
-    here = fuzz.fuzz(2, 1, tmp_path / "here.jsonl", 300.0)
-    there = fuzz.fuzz(2, 1, tmp_path / "there.jsonl", 300.0, executor=client)
+    here = fuzz.fuzz(1, 1, tmp_path / "here.jsonl", 300.0)
+    there = fuzz.fuzz(1, 1, tmp_path / "there.jsonl", 300.0, executor=client)
     assert here == there
     assert not fuzz.wrong(there)

@@ -49,7 +49,7 @@ class IntervalMatrices(NamedTuple):
 class Matrices(NamedTuple):
     """What an exact pass leaves for further passes.
 
-    intervals: inverses and ``d(handed on)/dx``, with the intervals as first axis.
+    inverse, hands_on: of the intervals, as of `IntervalMatrices`, with the intervals as first axis.
     response: ``dx_m/dz`` by the slow increments.
     slow: inverse of the slow equations once the intervals are eliminated.
     """
@@ -151,13 +151,12 @@ class MarchEquations:
             answers: how what arrives at them changes with the slow increments, one column for each.
         """
 
-        def along(dz, dposition, drest):
-            return jax.jvp(
-                lambda *at: self.slow_equations(at[0], Handed(*at[1:]))[0], (z, *arriving), (dz, dposition, drest)
-            )[1]
+        def along(dz, answer: Handed):
+            return jax.jvp(lambda z, a: self.slow_equations(z, a)[0], (z, arriving), (dz, answer))[1]
 
-        answers = Handed(*(jnp.pad(a, [(0, 0), (0, z.size - self.num_slow)]) for a in answers))
-        matrix = jax.vmap(along, in_axes=-1, out_axes=-1)(jnp.eye(z.size), *answers)
+        # multipliers of the slow constraints change nothing that arrives
+        answers = jax.tree.map(lambda a: jnp.pad(a, [(0, 0), (0, z.size - self.num_slow)]), answers)
+        matrix = jax.vmap(along, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)
         return self.inverse(matrix, self.num_slow)
 
     def inverse(self, matrix, size: int):
@@ -254,61 +253,61 @@ class Passed(NamedTuple):
     worst: Worst
 
 
-def exact_pass(of: MarchEquations, z, x, past, from_past) -> tuple[Matrices, Passed]:
+def exact_pass(march: MarchEquations, z, x, past, from_past) -> tuple[Matrices, Passed]:
     """A pass that computes all matrices, each interval at what the intervals before it hand on after their correction.
 
     Args:
-        of: the equations.
+        march: the equations.
         z, x: unknowns.
         past: of the unknowns of earlier intervals.
         from_past: whether x starts from where the intervals before lead to, instead of the x that is given.
     """
-    slow, unit = z[: of.num_slow], jnp.eye(of.num_slow)
+    slow, unit = z[: march.num_slow], jnp.eye(march.num_slow)
 
     def interval(carry, given):
         arriving, answers, past, worst = carry
         m, x = given
         x = jnp.where(from_past, past.next(m), x)
-        residual, rest = of.interval(m, x, arriving, slow)
-        by_x, hands_on = jax.jacfwd(lambda x: of.interval(m, x, arriving, slow))(x)
-        inverse = of.inverse(by_x, of.num_fast)
+        residual, rest = march.interval(m, x, arriving, slow)
+        by_x, hands_on = jax.jacfwd(lambda x: march.interval(m, x, arriving, slow))(x)
+        inverse = march.inverse(by_x, march.num_fast)
 
         # how the interval answers to the slow increments: at fixed x, and by its own unknowns
         def along(answer: Handed, dslow):
-            return jax.jvp(lambda a, s: of.interval(m, x, a, s), (arriving, slow), (answer, dslow))[1]
+            return jax.jvp(lambda a, s: march.interval(m, x, a, s), (arriving, slow), (answer, dslow))[1]
 
         rows, rests = jax.vmap(along, in_axes=-1, out_axes=-1)(answers, unit)
         response = -matmul(inverse, rows)
-        answers = Handed(answers.position + of.last_increment(response), rests + matmul(hands_on, response))
+        answers = Handed(answers.position + march.last_increment(response), rests + matmul(hands_on, response))
 
-        d, on = of.corrected(inverse, hands_on, x, residual, arriving, rest)
-        carry = on, answers, past.add(m, x + d), of.worse(worst, residual, d)
+        d, on = march.corrected(inverse, hands_on, x, residual, arriving, rest)
+        carry = on, answers, past.add(m, x + d), march.worse(worst, residual, d)
         return carry, (x + d, inverse, hands_on, response)
 
-    start = of.start()
-    none = Handed(*(jnp.zeros((a.size, of.num_slow)) for a in start))
+    start = march.start()
+    none = Handed(*(jnp.zeros((a.size, march.num_slow)) for a in start))
     carry = start, none, past, Worst.none()
-    (end, answers, _, worst), kept = jax.lax.scan(interval, carry, (jnp.arange(of.n), x))
+    (end, answers, _, worst), kept = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
     x, inverse, hands_on, response = kept
-    matrices = Matrices(inverse, hands_on, response, of.slow_inverse(z, end, answers))
-    return matrices, of.passed(matrices, z, x, worst, end)
+    matrices = Matrices(inverse, hands_on, response, march.slow_inverse(z, end, answers))
+    return matrices, march.passed(matrices, z, x, worst, end)
 
 
-def further_pass(of: MarchEquations, matrices: Matrices, z, x, past, from_past) -> Passed:
+def further_pass(march: MarchEquations, matrices: Matrices, z, x, past, from_past) -> Passed:
     """A pass with the matrices of an earlier one, of this step or of one before. Arguments as of `exact_pass`."""
-    slow = z[: of.num_slow]
+    slow = z[: march.num_slow]
 
     def interval(carry, given):
         arriving, past, worst = carry
         m, x, inverse, hands_on = given
         x = jnp.where(from_past, past.next(m), x)
-        residual, rest = of.interval(m, x, arriving, slow)
-        d, on = of.corrected(inverse, hands_on, x, residual, arriving, rest)
-        return (on, past.add(m, x + d), of.worse(worst, residual, d)), x + d
+        residual, rest = march.interval(m, x, arriving, slow)
+        d, on = march.corrected(inverse, hands_on, x, residual, arriving, rest)
+        return (on, past.add(m, x + d), march.worse(worst, residual, d)), x + d
 
-    given = jnp.arange(of.n), x, matrices.inverse, matrices.hands_on
-    (end, _, worst), x = jax.lax.scan(interval, (of.start(), past, Worst.none()), given)
-    return of.passed(matrices, z, x, worst, end)
+    given = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
+    (end, _, worst), x = jax.lax.scan(interval, (march.start(), past, Worst.none()), given)
+    return march.passed(matrices, z, x, worst, end)
 
 
 class Factors(NamedTuple):
@@ -323,37 +322,37 @@ class Factors(NamedTuple):
     slow: Float[Array, "b b"]
 
 
-def factor(of: MarchEquations, z, x) -> Factors:
+def factor(march: MarchEquations, z, x) -> Factors:
     """The matrix ``dR/d(z, x)`` at the solution, factored. A macro step is solved with it once, for the derivative of the solution."""
-    slow, unit = z[: of.num_slow], jnp.eye(of.num_slow)
+    slow, unit = z[: march.num_slow], jnp.eye(march.num_slow)
 
     def interval(carry, given):
         arriving, answers = carry
         m, x = given
-        rest = of.interval(m, x, arriving, slow)[1]
-        matrices = of.interval_matrices(m, x, arriving, slow)
-        response, answers = of.answer(matrices, jnp.zeros((x.size, of.num_slow)), answers, unit)
-        return (Handed(arriving.position + of.last_increment(x), rest), answers), (matrices, response)
+        rest = march.interval(m, x, arriving, slow)[1]
+        matrices = march.interval_matrices(m, x, arriving, slow)
+        response, answers = march.answer(matrices, jnp.zeros((x.size, march.num_slow)), answers, unit)
+        return (Handed(arriving.position + march.last_increment(x), rest), answers), (matrices, response)
 
-    start = of.start()
-    none = Handed(*(jnp.zeros((a.size, of.num_slow)) for a in start))
-    (end, answers), (matrices, response) = jax.lax.scan(interval, (start, none), (jnp.arange(of.n), x))
-    return Factors(matrices, response, of.slow_inverse(z, end, answers))
+    start = march.start()
+    none = Handed(*(jnp.zeros((a.size, march.num_slow)) for a in start))
+    (end, answers), (matrices, response) = jax.lax.scan(interval, (start, none), (jnp.arange(march.n), x))
+    return Factors(matrices, response, march.slow_inverse(z, end, answers))
 
 
-def solve(of: MarchEquations, factors: Factors, rows_z, rows_x):
+def solve(march: MarchEquations, factors: Factors, rows_z, rows_x):
     """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and has a transpose."""
 
     def interval(arriving, given):
         matrices, rows = given
-        dx, arriving = of.answer(matrices, rows[:, None], arriving, jnp.zeros((of.num_slow, 1)))
+        dx, arriving = march.answer(matrices, rows[:, None], arriving, jnp.zeros((march.num_slow, 1)))
         return arriving, dx[:, 0]
 
-    none = Handed(*(jnp.zeros((a.size, 1)) for a in of.start()))
+    none = Handed(*(jnp.zeros((a.size, 1)) for a in march.start()))
     end, dx = jax.lax.scan(interval, none, (factors.intervals, rows_x))
     # the slow equations are linear in what arrives at them
     along = Handed(*(a[:, 0] for a in end))
     zero = jnp.zeros_like(rows_z)
-    change = jax.jvp(lambda a: of.slow_equations(zero, a)[0], (of.start(),), (along,))[1]
+    change = jax.jvp(lambda a: march.slow_equations(zero, a)[0], (march.start(),), (along,))[1]
     dz = -matvec(factors.slow, rows_z + change)
-    return dz, dx + jnp.sum(factors.response * dz[: of.num_slow], axis=-1)
+    return dz, dx + jnp.sum(factors.response * dz[: march.num_slow], axis=-1)

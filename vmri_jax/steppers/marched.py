@@ -91,58 +91,59 @@ class Marched(Solver):
     sizes: tuple[int, int, int, int, int] | None = None
 
     def remembers(self, equations: StepEquations, guess: Unknowns) -> MarchMemory:
-        of = MarchEquations(equations)
-        z, x = of.rows(guess)
+        march = self._march(equations)
+        z, x = march.rows(guess)
         return MarchMemory(
-            PolynomialPredictor.constant(z), Parabola.constant(x[0]), of.no_matrices(), jnp.asarray(jnp.inf)
+            PolynomialPredictor.constant(z), Parabola.constant(x[0]), march.no_matrices(), jnp.asarray(jnp.inf)
         )
 
     def solve(self, equations: StepEquations, guess: Unknowns, own: MarchMemory) -> tuple[Solution, MarchMemory]:
-        of = MarchEquations(equations)
-        z, x = of.rows(guess)
-        zero = jnp.zeros(())
-        passed = Passed(z, x, z, x, of.start(), equations.p_s, Worst.none())
+        march = self._march(equations)
+        z, x = march.rows(guess)
+        zero, infinite = jnp.zeros(()), jnp.asarray(jnp.inf)
         start = Progress(
-            passed,
-            own.matrices,
-            zero + jnp.inf,
-            own.rate,
-            zero,
-            zero + jnp.inf,
-            zero,
-            jnp.asarray(0),
-            jnp.asarray(RUNNING),
+            passed=Passed(z, x, z, x, march.start(), equations.p_s, Worst.none()),
+            matrices=own.matrices,
+            size=infinite,
+            rate=own.rate,
+            curvature=zero,
+            exact_size=infinite,
+            still_moves=zero,
+            passes=jnp.asarray(0),
+            result=jnp.asarray(RUNNING),
         )
         if self.newton.fixed_iterations is not None:
-            done = self._iterate(of, guess, start, own, None)
-            result, passes = done.result, done.passes
-        else:
+            done = self._iterate(march, guess, start, own, None)
+            result = jnp.where(done.result == RUNNING, Result.STAGNATED, done.result)
+            return self._solution(march, done, result, done.passes), self._learned(march, own, done)
 
-            def part(equations, guess, limit, is_first):
-                done = self._iterate(MarchEquations(equations), guess, start, own, limit, is_first)
-                return done, of.by_name(done.passed.z, done.passed.x), done.result, done.passes
+        def part(equations, guess, limit, is_first):
+            done = self._iterate(self._march(equations), guess, start, own, limit, is_first)
+            return done, march.by_name(done.passed.z, done.passed.x), done.result, done.passes
 
-            parts = solve_in_parts(equations, guess, start, part, self.newton.max_iterations, PLAIN_PASSES)
-            done, result, passes = parts.solution, parts.result, parts.iterations
-        return self._solution(of, done, result, passes), self._learned(of, own, done)
+        parts = solve_in_parts(equations, guess, start, part, self.newton.max_iterations, PLAIN_PASSES)
+        done = parts.solution
+        return self._solution(march, done, parts.result, parts.iterations), self._learned(march, own, done)
+
+    def _march(self, equations: StepEquations) -> MarchEquations:
+        return MarchEquations(equations, INVERSES[self.linear_solver])
 
     def _iterate(
-        self, of: MarchEquations, guess: Unknowns, start: Progress, own: MarchMemory, limit, is_first: Any = True
+        self, march: MarchEquations, guess: Unknowns, start: Progress, own: MarchMemory, limit, is_first: Any = True
     ) -> Progress:
         """Passes, at most `limit`: of the first attempt from what the steps before lead to, of others from the guess."""
-        accepted, fixed = Accepted.of(of.equations, self.newton), self.newton.fixed_iterations
-        z, x = of.rows(guess)
-        z = jnp.where(is_first, own.slow.next(of.num_slow), z)
+        accepted, fixed = Accepted.of(march.equations, self.newton), self.newton.fixed_iterations
+        z, x = march.rows(guess)
+        z = jnp.where(is_first, own.slow.next(march.num_slow), z)
         at = start._replace(
             passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
             rate=jnp.where(is_first, own.rate, jnp.inf),
         )
-        of.inverted = INVERSES[self.linear_solver]
 
         def judged(now: Passed, before: Progress) -> Progress:
-            slow, fast = max_abs(now.dz[: of.num_slow]), now.worst.moved
+            slow, fast = max_abs(now.dz[: march.num_slow]), now.worst.moved
             still_moves = jnp.where(before.passes > 0, expected(fast, before.passed.worst.moved), fast)
-            motions = max_abs(now.z[: of.num_slow]), max_abs(now.x[:, : of.num_fast])
+            motions = max_abs(now.z[: march.num_slow]), max_abs(now.x[:, : march.num_fast])
             passes, size = before.passes + 1, jnp.maximum(slow, fast)
             over = accepted.over((slow, still_moves), motions, passes)
             at_floor = accepted.at_floor(size, before.size)
@@ -161,12 +162,12 @@ class Marched(Solver):
             return passed.z + passed.dz, passed.x + passed.dx, own.fast, is_first & (at.passes == 0)
 
         def exact(at: Progress) -> Progress:
-            matrices, now = exact_pass(of, *unknowns(at))
+            matrices, now = exact_pass(march, *unknowns(at))
             at = judged(now, at)._replace(matrices=matrices)
             return at._replace(rate=at.curvature * at.size, exact_size=at.size)
 
         def further(at: Progress) -> Progress:
-            now = judged(further_pass(of, at.matrices, *unknowns(at)), at)
+            now = judged(further_pass(march, at.matrices, *unknowns(at)), at)
             rate = jnp.where(at.passes > 0, now.size / at.size, at.rate)
             return now._replace(rate=rate, curvature=jnp.maximum(at.curvature, rate / at.exact_size))
 
@@ -177,10 +178,10 @@ class Marched(Solver):
 
         return self.newton.iterate(passes if fixed is None else exact, at)
 
-    def _solution(self, of: MarchEquations, done: Progress, result, passes) -> Solution:
-        equations, passed = of.equations, done.passed
-        x = of.by_name(passed.z, passed.x)
-        end = passed.end.position, passed.p_s, passed.end.rest[: of.n_f] / equations.micro_dt
+    def _solution(self, march: MarchEquations, done: Progress, result, passes) -> Solution:
+        equations, passed = march.equations, done.passed
+        x = march.by_name(passed.z, passed.x)
+        end = passed.end.position, passed.p_s, passed.end.rest[: march.n_f] / equations.micro_dt
         g = jnp.zeros(())
         if equations.system.is_constrained:
             path = equations.path(x)
@@ -200,10 +201,10 @@ class Marched(Solver):
             status = status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))
         return Solution(x, end, status)
 
-    def _learned(self, of: MarchEquations, own: MarchMemory, done: Progress) -> MarchMemory:
+    def _learned(self, march: MarchEquations, own: MarchMemory, done: Progress) -> MarchMemory:
         passed = done.passed
         fast = own.fast.after_step(passed.x)
-        return MarchMemory(own.slow.add(passed.z, of.num_slow), fast, done.matrices, done.rate)
+        return MarchMemory(own.slow.add(passed.z, march.num_slow), fast, done.matrices, done.rate)
 
     def lines(self) -> list[str]:
         head = f"march over the micro intervals with exact matrices, {self.linear_solver.replace('_', ' ')}"

@@ -21,9 +21,9 @@ SECOND = (
 
 def _direction(equations: StepEquations, x: Unknowns):
     """``residual -> -(dR/dx)^-1 residual`` with the matrix at x, itself without derivative."""
-    of = MarchEquations(equations)
-    factors = jax.lax.stop_gradient(factor(of, *of.rows(x)))
-    return lambda residual: of.by_name(*solve(of, factors, *of.rows(residual)))
+    march = MarchEquations(equations)
+    factors = jax.lax.stop_gradient(factor(march, *march.rows(x)))
+    return lambda residual: march.by_name(*solve(march, factors, *march.rows(residual)))
 
 
 def _end(equations: StepEquations, x: Unknowns):
