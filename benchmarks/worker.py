@@ -293,7 +293,7 @@ def main() -> None:
     options = parser.parse_args()
     answers, sys.stdout = sys.stdout, sys.stderr
     if not options.as_imported:
-        (vm if hasattr(vm, "configure") else vm.runtime).configure()  # pyright: ignore[reportAttributeAccessIssue]
+        (vm if hasattr(vm, "configure") else vm.runtime).configure(cache=None)  # pyright: ignore[reportAttributeAccessIssue]
     for name in options.plain:
         use_plain(name)
     timed = Timed()

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from vmri_jax.configure import FAST_LOOPS
 
 
@@ -34,6 +36,34 @@ except RuntimeError as error:
         " ".join(["--xla_cpu_enable_fast_math=false", *FAST_LOOPS, "2 float64"]),
         "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made.",
     ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "folder"),
+    [("", "/tmp/somewhere/vmri_jax"), ("cache=False", "None"), ("cache='/tmp/mine'", "/tmp/mine")],
+)
+def test_programs_are_kept_on_disk(arguments, folder):
+    program = f"""
+import os, jax
+os.environ["XDG_CACHE_HOME"] = "/tmp/somewhere"
+import vmri_jax as vm
+vm.configure({arguments})
+vm.configure()
+print(jax.config.jax_compilation_cache_dir)
+"""
+    if arguments == "cache=False":
+        program = program.replace("vm.configure()\n", "")
+    assert printed(program).split() == [folder]
+
+
+def test_a_folder_that_jax_has_already_is_kept():
+    program = """
+import jax, vmri_jax as vm
+jax.config.update("jax_compilation_cache_dir", "/tmp/mine")
+vm.configure()
+print(jax.config.jax_compilation_cache_dir)
+"""
+    assert printed(program).split() == ["/tmp/mine"]
 
 
 def test_import_and_questions_change_nothing():

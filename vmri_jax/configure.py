@@ -35,7 +35,7 @@ class NotConfiguredWarning(UserWarning):
     """Runs are right but slow: the program did not call ``vm.configure()`` before JAX started."""
 
 
-def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str | Path | None = None) -> None:
+def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str | Path | bool | None = True) -> None:
     """Set up JAX for this toolkit: 64-bit floats, and loops that are compiled into one kernel.
 
     Args:
@@ -43,7 +43,8 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
             more than the operation: without, a macro step of a small system takes 2 to 5 times as long. Programs then also
             run in the thread that calls them, which saves some ten microseconds per call.
         devices: number of CPU devices, for `simulate_batch(..., devices=...)`; one device uses one core.
-        cache: folder in which compiled programs are kept between processes, e.g. `cache_folder()`.
+        cache: folder in which compiled programs are kept between processes; True for `cache_folder()`, unless JAX has a folder
+            already; False or None to leave it as it is. The folder grows with every new program; it may be deleted at any time.
 
     Raises:
         RuntimeError: JAX has already started without these settings.
@@ -61,7 +62,9 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
     jax.config.update("jax_enable_x64", True)
     if fast_loops:
         jax.config.update("jax_cpu_enable_async_dispatch", False)
-    if cache is not None:
+    if cache is True:
+        cache = jax.config.jax_compilation_cache_dir is None and cache_folder()  # pyright: ignore[reportAttributeAccessIssue]
+    if cache is not None and cache is not False:
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS_WORTH_KEEPING)
 
@@ -85,7 +88,7 @@ def warn_if_slow() -> None:
 
 
 def cache_folder() -> Path:
-    """Where the command line and the benchmarks keep compiled programs: ``$XDG_CACHE_HOME/vmri_jax``."""
+    """Where compiled programs are kept between processes: ``$XDG_CACHE_HOME/vmri_jax``, by default ``~/.cache/vmri_jax``."""
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "vmri_jax"
 
 

@@ -14,7 +14,7 @@ from vmri_jax.cli.check import check
 from vmri_jax.cli.common import MANY, RIGHT, RUN
 from vmri_jax.cli.new import new
 from vmri_jax.cli.sweep import sweep
-from vmri_jax.configure import cache_folder, configure
+from vmri_jax.configure import configure
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -32,7 +32,7 @@ app.command(rich_help_panel=MANY)(sweep)
 
 def main() -> None:
     """Entry point."""
-    configure(cache=cache_folder())
+    configure()
     app()
 
 
