@@ -20,6 +20,7 @@ from benchmarks import (
     ensembles,
     floor,
     fuzz,
+    gpu,
     instructions,
     kills,
     orders,
@@ -80,6 +81,12 @@ def batch_command(
 ) -> None:
     prepare(core if devices == 1 else -1, devices=devices)
     _measure("batch", batch, full, out, devices=devices)
+
+
+@app.command("gpu", help=gpu.__doc__)
+def gpu_command(full: Full = False, out: Out = OUT) -> None:
+    prepare()
+    _measure("gpu", gpu, full, out)
 
 
 @app.command("peers")

@@ -92,7 +92,8 @@ def check_mass(system: System, q_s, q_f) -> None:
     """
     if system.has_constant_mass:
         return
-    mass = np.asarray(_mass_matrix(system, q_s, q_f, *_nearby(np.zeros_like(q_s), np.zeros_like(q_f))))
+    with jax.ensure_compile_time_eval():  # velocities may be traced, positions are not
+        mass = np.asarray(_mass_matrix(system, q_s, q_f, *_nearby(np.zeros_like(q_s), np.zeros_like(q_f))))
     if not np.isfinite(mass).all():
         raise ValueError(
             "System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?)."
