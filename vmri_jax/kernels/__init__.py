@@ -8,6 +8,7 @@ import os
 
 from vmri_jax.kernels import cpu, plain
 from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity
+from vmri_jax.kernels.cpu import inverse_in_loop
 from vmri_jax.kernels.saddle import REGULARIZATION, regularized, saddle
 
 CHOICES = {"plain": plain, "cpu": cpu}
@@ -31,6 +32,7 @@ __all__ = [
     "FullInverse",
     "Sparsity",
     "inverse",
+    "inverse_in_loop",
     "matmul",
     "matvec",
     "max_abs",

@@ -60,6 +60,12 @@ def inverse(a):
     n = a.shape[-1]
     if n > ELEMENTWISE:
         return jnp.linalg.inv(a)
+    return inverse_in_loop(a)
+
+
+def inverse_in_loop(a):
+    """The same for every size without LAPACK, whose calls for many matrices wait for each other for ever within a loop."""
+    n = a.shape[-1]
     if n > UNROLLED:
         full = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, -n % REGISTER)])
         return jax.lax.fori_loop(0, n, _exchanged, full, unroll=TOGETHER)[..., :n]

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vmri_jax.kernels import inverse, matmul, matvec, max_abs, saddle
+from vmri_jax.kernels import inverse_in_loop, matmul, matvec, max_abs, saddle
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 
@@ -215,7 +215,7 @@ def _together(on: Arriving) -> Handed:
 
 def inverse_with_multipliers(a, b, c, nodes: int):
     """Inverse of ``[[A, B], [C, 0]]`` by elimination, kept regular where constraints become dependent."""
-    return inverse(saddle(a, b, c) if b.shape[-1] else a)
+    return inverse_in_loop(saddle(a, b, c) if b.shape[-1] else a)
 
 
 class Worst(NamedTuple):
