@@ -26,7 +26,7 @@ GRADIENT_LANES = 1000
 APART = 1e-9
 """Largest difference of positions between CPU and GPU, relative to the largest position. Sums are taken in another order there."""
 FINER = 8
-"""Steps of the reference over those of the run: its error is a sixty-fourth of that of the run, at order 2."""
+"""Steps of the reference over steps of the run. At order 2 the error of the reference is a sixty-fourth of the error of the run."""
 TOLERANCES = 10.0 ** -np.arange(2.0, 12.0)
 """Of diffrax: the loosest one that is as accurate as our run is timed."""
 

@@ -17,7 +17,7 @@ from vmri_jax.steppers.newton.options import Choice
 
 COLUMNS = ("program", "instructions", "to compile, s")
 STEPS = 100
-"""Macro steps of a program; their number changes nothing in a run, and a gradient keeps what it needs of each."""
+"""Macro steps of a program. The size of a program does not depend on this number."""
 MICRO_DT = 2e-4
 
 

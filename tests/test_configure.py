@@ -48,11 +48,8 @@ import os, jax
 os.environ["XDG_CACHE_HOME"] = "/tmp/somewhere"
 import vmri_jax as vm
 vm.configure({arguments})
-vm.configure()
 print(jax.config.jax_compilation_cache_dir)
 """
-    if arguments == "cache=False":
-        program = program.replace("vm.configure()\n", "")
     assert printed(program).split() == [folder]
 
 

@@ -63,8 +63,9 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
     if fast_loops:
         jax.config.update("jax_cpu_enable_async_dispatch", False)
     if cache is True:
-        cache = jax.config.jax_compilation_cache_dir is None and cache_folder()  # pyright: ignore[reportAttributeAccessIssue]
-    if cache is not None and cache is not False:
+        known = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+        cache = None if known else cache_folder()
+    if cache:
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SECONDS_WORTH_KEEPING)
 

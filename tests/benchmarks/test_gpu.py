@@ -1,4 +1,4 @@
-"""The parts of the benchmark of GPUs, on the CPU: what it runs, compares and hands over."""
+"""The parts of the benchmark of GPUs, on the CPU: its runs, comparisons and tables."""
 
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,8 @@
 """Small dense algebra: the one place for what is written for speed alone.
 
 Two modules have the same names: `plain`, what a reader expects, and `cpu`, the tuned form. The environment variable
-VMRI_KERNELS (``plain`` or ``cpu``, the default) chooses one when the package is imported. `band` inverts what has many zeros.
+VMRI_KERNELS (``plain`` or ``cpu``, the default) chooses one when the package is imported. `band` inverts matrices with many zeros.
+`inverse_in_loop` is that of `cpu` with both.
 """
 
 import os

@@ -64,7 +64,11 @@ def inverse(a):
 
 
 def inverse_in_loop(a):
-    """The same for every size without LAPACK, whose calls for many matrices wait for each other for ever within a loop."""
+    """`inverse` of every size without LAPACK.
+
+    With `jnp.linalg.inv` of 18 rows in the loop of a march, over lanes and tangents (`advise` for docs/how_to/molecules.md), XLA's CPU
+    runtime waits for ever (jaxlib 0.10.2).
+    """
     n = a.shape[-1]
     if n > UNROLLED:
         full = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, -n % REGISTER)])

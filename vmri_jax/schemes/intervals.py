@@ -64,41 +64,54 @@ class IntervalUnknowns(NamedTuple):
 
 
 class IntervalNodes:
-    """The quadrature nodes of a term, interval by interval: as many rows for each interval as the fullest one has.
-
-    Rows without a node have weight 0.
+    """Quadrature nodes of a term, as many in each of the micro intervals that have them.
 
     Args:
-        nodes: on the macro step.
+        groups: of nodes at the same local coordinates; each group fills a range of intervals, and no two of a row the same interval.
+        num_micro, degree: of the scheme.
     """
 
-    def __init__(self, nodes: Nodes):
-        rows: list[list[NodeGroup]] = []
-        for group in nodes.groups:
-            free = (row for row in rows if all(g.stop <= group.first or group.stop <= g.first for g in row))
-            row = next(free, None)
-            if row is None:
-                row = []
-                rows.append(row)
-            row.append(group)
-        n, r = nodes.num_micro, nodes.degree
-        c, used = np.full((n, len(rows)), 0.5), np.zeros((n, len(rows)), bool)
-        for k, row in enumerate(rows):
+    def __init__(self, groups: list[list[NodeGroup]], num_micro: int, degree: int):
+        n = num_micro
+        c = np.zeros((n, len(groups)))
+        self.has_nodes = np.zeros(n, bool)
+        for k, row in enumerate(groups):
             for group in row:
-                c[group.first : group.stop, k], used[group.first : group.stop, k] = group.c, True
-        self.has_nodes = used.any(axis=1)
-        if used.all() and all(len(row) == 1 for row in rows):
-            self.weights = jnp.stack([row[0].weights[0] for row in rows])[None]  # of all intervals
+                c[group.first : group.stop, k] = group.c
+                self.has_nodes[group.first : group.stop] = True
+        if self.has_nodes.all() and all(len(row) == 1 for row in groups):
+            self.weights = jnp.stack([row[0].weights[0] for row in groups])[None]  # of all intervals
         else:
-            padded = [[np.zeros(n), *(_padded(group, n) for group in row)] for row in rows]
-            self.weights = jnp.stack([sum(row) for row in padded], axis=1)
+            self.weights = jnp.stack(
+                [sum((_padded(group, n) for group in row), jnp.zeros(n)) for row in groups], axis=1
+            )
         self.theta = (np.arange(n)[:, None] + c) / n
         self.tables = {
-            "q_s": lagrange_basis(r, self.theta)[..., 1:],
-            "v_s": lagrange_derivative(r, self.theta)[..., 1:],
-            "q_f": lagrange_basis(r, c)[..., 1:],
-            "v_f": lagrange_derivative(r, c)[..., 1:],
+            "q_s": lagrange_basis(degree, self.theta)[..., 1:],
+            "v_s": lagrange_derivative(degree, self.theta)[..., 1:],
+            "q_f": lagrange_basis(degree, c)[..., 1:],
+            "v_f": lagrange_derivative(degree, c)[..., 1:],
         }
+
+    @classmethod
+    def of(cls, nodes: Nodes) -> "list[IntervalNodes]":
+        """The nodes of a rule: together those that all intervals have, alone each row that only some have.
+
+        Functions are evaluated nowhere else: a potential may not be defined there, and a rule on the macro step has no node
+        in most intervals.
+        """
+        rows: list[list[NodeGroup]] = []
+        for group in nodes.groups:
+            apart = (row for row in rows if all(g.stop <= group.first or group.stop <= g.first for g in row))
+            row = next(apart, None)
+            if row is None:
+                rows.append([group])
+            else:
+                row.append(group)
+        everywhere = [row for row in rows if sum(group.size for group in row) == nodes.num_micro]
+        parts = [everywhere] if everywhere else []
+        parts += [[row] for row in rows if row not in everywhere]
+        return [cls(part, nodes.num_micro, nodes.degree) for part in parts]
 
     def sample(self, path: IntervalPath, equations: StepEquations, m, names: tuple[str, ...]) -> list:
         """By name, of the path at the nodes of interval m: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
@@ -143,8 +156,9 @@ class Intervals:
                 slow, fast = term.mass.slow_mass, term.mass.fast_mass
                 self._masses = (slow, term.slow_form[1:, 1:]), (fast, term.fast_form[1:, 1:])
         others = (term for term in terms if isinstance(term, Term) and term.inside.groups)
-        self._terms = [(term, IntervalNodes(term.inside)) for term in others]
-        self._force_nodes = IntervalNodes(equations.force_nodes)
+        self._terms = [(term, nodes) for term in others for nodes in IntervalNodes.of(term.inside)]
+        has_force = equations.system.force is not None
+        self._force_nodes = IntervalNodes.of(equations.force_nodes) if has_force else []
         n, r = equations.scheme.num_micro, equations.scheme.degree
         self._slow_basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # at the control nodes, by slow increments
 
@@ -180,18 +194,21 @@ class Intervals:
                 return term.sign * term.times_step(equations.macro_dt) * jnp.sum(of_interval(nodes.weights, m) * values)
 
             total += _where_there_are_nodes(nodes, m, of_term, path)
-        if equations.system.force is not None:
-            total += _where_there_are_nodes(
-                self._force_nodes, m, lambda paths: self._virtual_work(paths[0], paths[1], m), (path, held)
-            )
+        for nodes in self._force_nodes:
+
+            def of_force(paths, nodes=nodes):
+                path, held = paths
+                return self._virtual_work(path, held, nodes, m)
+
+            total += _where_there_are_nodes(nodes, m, of_force, (path, held))
         total *= equations.micro_dt
         if equations.system.constraint is not None:
             total -= jnp.sum(mu * self._constraints(path, m, slice(0, -1)))
         return total
 
-    def _virtual_work(self, path: IntervalPath, held: IntervalPath, m):
+    def _virtual_work(self, path: IntervalPath, held: IntervalPath, nodes: IntervalNodes, m):
         """``H sum_i w_i F(t_i, q_i, v_i) . q_i``."""
-        equations, nodes = self.equations, self._force_nodes
+        equations = self.equations
         at_nodes = nodes.sample(held, equations, m, ("t", "q_s", "q_f", "v_s", "v_f"))
         f_s, f_f = jax.vmap(equations.system.forces)(*at_nodes)
         q_s, q_f = nodes.sample(path, equations, m, ("q_s", "q_f"))

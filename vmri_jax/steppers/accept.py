@@ -4,7 +4,7 @@ A correction of the slow or of the fast increments is accepted if its largest en
 
     tolerance / 10 * (largest increment)  +  4 eps (largest position)  +  rest
 
-The error that a step leaves is that of the corrections which were not made, and those of all steps add up: hence the tenth. Positions
+The error of a step is the sum of the corrections that were not made, and the errors of all steps add up: hence the tenth. Positions
 cannot be known better than their round-off. The rest, eps times the largest increment of all, is for variables at rest, which have
 no size of their own.
 """
@@ -20,14 +20,17 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.schemes.equations import StepEquations
 
 ROUNDOFF = 4.0
-"""Changes of the positions below so many units of round-off are accepted."""
+"""Units of round-off of the positions below which a correction is accepted. With fewer, steps at round-off would not end; with more,
+the momenta would lose digits."""
 PATIENCE = 20
-"""After so many iterations round-off is accepted that constraints hand from slow to fast variables and back."""
+"""Iterations after which the round-off of tied variables is accepted too: constraints hand it from slow to fast variables and back. With
+fewer, slow variables at the origin would be solved to fewer digits."""
 FLOOR = 100.0
-"""Corrections that no longer shrink are accepted below so many units of round-off of the positions. Nearly dependent constraints
-let them wander there; with a larger value, steps that converge slowly would be cut off."""
+"""Units of round-off of the positions below which corrections that no longer shrink are accepted. Nearly dependent constraints
+let corrections wander there; with more, steps that converge slowly would be cut off."""
 SAFETY = 10.0
-"""Of the tolerance, and of how corrections shrink from one iteration to the next."""
+"""Factor below the tolerance, since errors of steps add up, and margin on the contraction that is expected of the next correction. A
+larger one costs passes."""
 
 
 class Accepted(NamedTuple):

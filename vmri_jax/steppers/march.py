@@ -195,18 +195,12 @@ class MarchEquations:
         d = -matvec(inverse, residual)
         return d, Handed(arriving.position + self.last_increment(x + d), rest + matvec(hands_on, d))
 
-    def worse(self, worst: "Worst", residual, d) -> "Worst":
-        """The worst so far, with one more residual and its correction d."""
-        moved, rows = max_abs(d[: self.num_fast]), max_abs(residual)
-        singular = jnp.isfinite(rows) & ~jnp.isfinite(max_abs(d))
-        return Worst(jnp.maximum(worst.moved, moved), jnp.maximum(worst.rows, rows), worst.is_singular | singular)
-
     def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed) -> "Passed":
         """A pass that has met all intervals, with the correction of the slow unknowns."""
         residual, p_s = self.slow_equations(z, end)
         dz = -matvec(matrices.slow, residual)
         dx = jnp.sum(matrices.response * dz[: self.num_slow], axis=-1)
-        return Passed(z, x, dz, dx, end, p_s, self.worse(worst, residual, dz)._replace(moved=worst.moved))
+        return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, worst.moved))
 
 
 def _together(on: Arriving) -> Handed:
@@ -234,6 +228,12 @@ class Worst(NamedTuple):
     def none(cls) -> "Worst":
         """Before the first interval."""
         return cls(jnp.zeros(()), jnp.zeros(()), jnp.asarray(False))
+
+    def add(self, residual, correction, moved) -> "Worst":
+        """With one more residual, its correction, and the largest correction of a fast increment in it."""
+        rows = max_abs(residual)
+        singular = jnp.isfinite(rows) & ~jnp.isfinite(max_abs(correction))
+        return Worst(jnp.maximum(self.moved, moved), jnp.maximum(self.rows, rows), self.is_singular | singular)
 
 
 class Passed(NamedTuple):
@@ -268,8 +268,8 @@ def exact_pass(march: MarchEquations, z, x, past, from_past) -> tuple[Matrices, 
         arriving, answers, past, worst = carry
         m, x = given
         x = jnp.where(from_past, past.next(m), x)
-        residual, rest = march.interval(m, x, arriving, slow)
-        by_x, hands_on = jax.jacfwd(lambda x: march.interval(m, x, arriving, slow))(x)
+        (residual, rest), push = jax.linearize(lambda x: march.interval(m, x, arriving, slow), x)
+        by_x, hands_on = jax.vmap(push, out_axes=-1)(jnp.eye(x.size))
         inverse = march.inverse(by_x, march.num_fast)
 
         # how the interval answers to the slow increments: at fixed x, and by its own unknowns
@@ -281,7 +281,7 @@ def exact_pass(march: MarchEquations, z, x, past, from_past) -> tuple[Matrices, 
         answers = Handed(answers.position + march.last_increment(response), rests + matmul(hands_on, response))
 
         d, on = march.corrected(inverse, hands_on, x, residual, arriving, rest)
-        carry = on, answers, past.add(m, x + d), march.worse(worst, residual, d)
+        carry = on, answers, past.add(m, x + d), worst.add(residual, d, max_abs(d[: march.num_fast]))
         return carry, (x + d, inverse, hands_on, response)
 
     start = march.start()
@@ -303,7 +303,7 @@ def further_pass(march: MarchEquations, matrices: Matrices, z, x, past, from_pas
         x = jnp.where(from_past, past.next(m), x)
         residual, rest = march.interval(m, x, arriving, slow)
         d, on = march.corrected(inverse, hands_on, x, residual, arriving, rest)
-        return (on, past.add(m, x + d), march.worse(worst, residual, d)), x + d
+        return (on, past.add(m, x + d), worst.add(residual, d, max_abs(d[: march.num_fast]))), x + d
 
     given = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
     (end, _, worst), x = jax.lax.scan(interval, (march.start(), past, Worst.none()), given)

@@ -73,7 +73,8 @@ class Solver(ABC):
 class SolvedState(NamedTuple):
     """Where the next iteration starts.
 
-    velocity: (v_s, v_f) at about the end of the last step.
+    velocity: (v_s, v_f), the mean of the last micro interval, or after a projection that of the node; with constant masses the
+        velocities of a guess follow from the momenta instead.
     multiplier, slow_multiplier: Lagrange multipliers at the last control nodes that have any.
     solver: what the solver carries.
     """
@@ -130,9 +131,9 @@ class Solved(Stepper):
         result, method, iterations, left = status
         info = StepInfo(result, method, iterations, left, q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
-        if not self.system.has_constant_mass:  # a guess for the next step, for the cost of nothing
-            v_s, v_f = x.slow[-1] / macro_dt, x.fast[-1, -1] / equations.micro_dt
-        velocity = jax.lax.stop_gradient((v_s, v_f))
+        velocity = own.velocity
+        if not self.system.has_constant_mass:  # the mean over the last interval, as a guess for the next step
+            velocity = jax.lax.stop_gradient((x.slow[-1] / macro_dt, x.fast[-1, -1] / equations.micro_dt))
         return end, info, SolvedState(velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
 
     def project(self, state: State, own: SolvedState) -> tuple[State, SolvedState]:
