@@ -69,15 +69,13 @@ def test_the_setting_keeps_the_error(found):
 
 
 def test_steps_are_as_few_as_possible(found):
-    """A run with hardly fewer steps missed the error. One with far fewer may be lucky, where errors of two terms cancel."""
+    """Of the scheme that is chosen, the fewest steps that keep the error are known within a tenth; more are taken only if faster."""
     chosen = found.setting.row
-    missed = [
-        row.num_steps
-        for row in found.runs.rows
-        if (row.scheme, row.num_micro) == (chosen.scheme, chosen.num_micro)
-        if row.num_steps < found.num_steps and row.error_q > 1e-5
-    ]
-    assert found.num_steps <= max(max(missed) + 1, 1.1 * max(missed))
+    rows = [row for row in found.runs.rows if (row.scheme, row.num_micro) == (chosen.scheme, chosen.num_micro)]
+    fewest = min((row for row in rows if row.error_q <= 1e-5), key=lambda row: row.num_steps)
+    missed = max(row.num_steps for row in rows if row.num_steps < fewest.num_steps)
+    assert fewest.num_steps <= max(missed + 1, 1.1 * missed)
+    assert chosen is fewest or chosen.seconds < fewest.seconds
 
 
 def test_from_another_start_it_does_about_as_well(found):
