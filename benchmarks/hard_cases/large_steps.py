@@ -13,7 +13,9 @@ from vmri_jax.diagnostics import step_condition
 from vmri_jax.study.timing import interleaved
 
 EXACT = vm.Newton(method="arrowhead")
-"""Newton's iteration with the exact matrix, whose iterations are counted."""
+"""The march with exact matrices, which a pass may take over from those before it: it has to converge."""
+DENSE = vm.Newton(method="dense")
+"""Newton's iteration as textbooks have it, with the matrix of every iterate: its iterations are counted."""
 
 
 @hard_case(5, "explicit limit")
@@ -44,22 +46,24 @@ def large_macro_step(full: bool) -> Outcome:
     """
     problem, scheme, steps = vm.systems.fermi_pasta_ulam(), vm.fully_implicit(100), 100 if full else 20
     one, two = (run(problem, scheme, h, steps, newton=EXACT) for h in (1.0, 2.0))
-    at_first = int(np.max(np.asarray(one.info.iterations)[:20]))
-    later = f", {status(one)}" if not one.success else ""
+    newton = iterations(run(problem, scheme, 1.0, 20, newton=DENSE))
+    passes = int(np.max(np.asarray(one.info.iterations)[:20]))
+    begins_well = one.success or int(one.failed_at) >= 20
+    later = "" if one.success else f", {status(one)}"
     band = energy(two, 1, float(two.energy[0])).band
     return Outcome(
-        f"H = 1: {at_first} iterations in 20 steps{later}; H = 2: {status(two)}",
-        at_first <= 8 and (not two.success or band < 2),
-        {"iterations": at_first, "failed_at_1": one.failed_at, "failed_at_2": two.failed_at},
+        f"H = 1: {newton} iterations in 20 steps, {passes} passes of the march{later}; H = 2: {status(two)}",
+        begins_well and newton <= 8 and (not two.success or band < 2),
+        {"iterations": newton, "passes": passes, "failed_at_1": one.failed_at, "failed_at_2": two.failed_at},
     )
 
 
 PENDULUM = vm.fully_implicit(5)
 
 
-def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int) -> vm.Trajectory:
-    """With 20 saved nodes, so that one program does all of them."""
-    return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, newton=EXACT)
+def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int, newton=EXACT) -> vm.Trajectory:
+    """With 20 saved nodes."""
+    return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, newton=newton)
 
 
 @hard_case(7, "large constrained step")
@@ -69,12 +73,19 @@ def large_constrained_step(full: bool) -> Outcome:
     at most 4 Newton iterations; H = 0.2 goes on or fails plainly, constraints kept
     """
     problem = vm.systems.triple_spherical_pendulum()
-    usual, large = (_pendulum_run(problem, h, 400 if full else 40) for h in (0.05, 0.2))
+    steps = 400 if full else 40
+    usual, large = (_pendulum_run(problem, h, steps) for h in (0.05, 0.2))
+    newton = _pendulum_run(problem, 0.05, steps, DENSE)
     kept = float(np.nanmax(np.asarray(large.constraint_residual)[:, 0]))
     return Outcome(
-        f"H = 0.05: {iterations(usual)} iterations, {status(usual)}; H = 0.2: {status(large)}, constraint {kept:.1e}",
-        usual.success and iterations(usual) <= 4 and kept < 1e-10,
-        {"iterations": iterations(usual), "failed_at_0.2": int(large.failed_at), "constraint_0.2": kept},
+        f"H = 0.05: {iterations(newton)} iterations, {status(usual)} in {iterations(usual)} passes; H = 0.2: {status(large)}, constraint {kept:.1e}",
+        usual.success and newton.success and iterations(newton) <= 4 and kept < 1e-10,
+        {
+            "iterations": iterations(newton),
+            "passes": iterations(usual),
+            "failed_at_0.2": int(large.failed_at),
+            "constraint_0.2": kept,
+        },
     )
 
 
@@ -87,8 +98,9 @@ def mass_ratios(full: bool) -> Outcome:
     values = {}
     for ratio in (1e4, 1e6, 1e8):
         problem = vm.systems.triple_spherical_pendulum(masses=(ratio, 1.0, 1.0))
-        trajectory = _pendulum_run(problem, 0.01, 1000 if full else 100)
-        values[f"iterations_{ratio:.0e}"] = iterations(trajectory) if trajectory.success else np.inf
+        steps = 1000 if full else 100
+        march, newton = (_pendulum_run(problem, 0.01, steps, way) for way in (EXACT, DENSE))
+        values[f"iterations_{ratio:.0e}"] = iterations(newton) if march.success and newton.success else np.inf
         values[f"condition_{ratio:.0e}"] = step_condition(problem, PENDULUM, macro_dt=0.01)
     worst = max(v for name, v in values.items() if name.startswith("iterations"))
     condition = max(v for name, v in values.items() if name.startswith("condition"))

@@ -28,6 +28,9 @@ fewer, slow variables at the origin would be solved to fewer digits."""
 FLOOR = 100.0
 """Units of round-off of the positions below which corrections that no longer shrink are accepted. Nearly dependent constraints
 let corrections wander there; with more, steps that converge slowly would be cut off."""
+FLOOR_OF_NEWTON = 1e5
+"""The same for a correction with exact matrices. So near to a solution it shrinks, unless nothing but round-off of the constraints is left
+of the residual, which rows that hardly see the fast variables magnify. With more, singular solutions are taken for regular ones."""
 SAFETY = 10.0
 """Factor below the tolerance, since errors of steps add up, and margin on the contraction that is expected of the next correction. A
 larger one costs passes."""
@@ -71,10 +74,9 @@ class Accepted(NamedTuple):
         slow, fast = (self.tolerance * size + floor + rest for size, floor in zip(motions, floors, strict=True))
         return slow, fast
 
-    def at_floor(self, size, before):
-        """Whether corrections have stopped shrinking at `FLOOR` units of round-off of the positions: more cannot be had."""
-        floor = FLOOR / ROUNDOFF * jnp.maximum(self.slow[0], self.fast[0])
-        return (size > before / 2) & (size <= floor)
+    def at_floor(self, size, before, floor=FLOOR):
+        """Whether corrections have stopped shrinking at so many units of round-off of the positions: more cannot be had."""
+        return (size > before / 2) & (size <= floor / ROUNDOFF * jnp.maximum(self.slow[0], self.fast[0]))
 
     def over(self, changes, motions, iterations):
         """Changes (slow, fast) over what is accepted of them, see `sizes`; the larger of the two."""

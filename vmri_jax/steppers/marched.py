@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
-from vmri_jax.steppers.accept import Accepted, expected
+from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, Accepted, expected
 from vmri_jax.steppers.continuation import has_dependent_constraints, solve_in_parts, starts_finite
 from vmri_jax.steppers.march import (
     MarchEquations,
@@ -163,8 +163,11 @@ class Marched(Solver):
 
         def exact(at: Progress) -> Progress:
             matrices, now = exact_pass(march, *unknowns(at))
-            at = judged(now, at)._replace(matrices=matrices)
-            return at._replace(rate=at.curvature * at.size, exact_size=at.size)
+            after = judged(now, at)
+            at_floor = (after.result == RUNNING) & accepted.at_floor(after.size, at.size, FLOOR_OF_NEWTON)
+            result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, after.result)
+            rate = after.curvature * after.size
+            return after._replace(matrices=matrices, rate=rate, exact_size=after.size, result=result)
 
         def further(at: Progress) -> Progress:
             now = judged(further_pass(march, at.matrices, *unknowns(at)), at)
