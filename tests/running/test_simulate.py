@@ -26,7 +26,6 @@ from vmri_jax import (
     plan,
     simulate,
 )
-from vmri_jax.running.engine import engine
 from vmri_jax.scene import Body, Scene, Spring
 
 SCHEME = explicit_slow(3)
@@ -282,15 +281,39 @@ def test_ends_of_runs(fpu):
 
 
 def test_lengths_of_runs_share_a_program(fpu):
-    def run(num_steps):
-        return simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=num_steps)
+    """Six step sizes, all nodes saved: one program. A node is the same whatever the length of its run."""
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
+    )
+    scheme = fully_implicit(2)
+    simulate(fpu, scheme, macro_dt=0.05, num_steps=3)
+    compiled.clear()
+    for num_steps in (10, 20, 40, 80, 160, 320):
+        run = simulate(fpu, scheme, macro_dt=1 / num_steps, num_steps=num_steps)
+        assert len(run) == num_steps + 1 == len(run.info.iterations) + 1
+    assert not compiled
+    longest = simulate(fpu, scheme, macro_dt=0.05, num_steps=36)
+    for num_steps in (33, 34, 35):
+        run = simulate(fpu, scheme, macro_dt=0.05, num_steps=num_steps)
+        np.testing.assert_array_equal(run.q_f, longest.q_f[: num_steps + 1])
+    jax.monitoring.clear_event_listeners()
 
-    longest, known = run(36), engine.cache_info().misses
-    runs = [run(n) for n in (33, 34, 35)]
-    assert engine.cache_info().misses == known
-    assert [len(run.t) for run in runs] == [34, 35, 36]
-    assert all(np.array_equal(run.q_f, longest.q_f[: len(run.t)]) for run in runs)
-    assert all(len(run.info.iterations) == len(run.t) - 1 for run in runs)
+
+def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
+    """Short pieces: the same nodes, to the last bit, micro nodes too; and after a failure in one of them NaN to the end."""
+    whole = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save_every=2, save_micro=True)
+    monkeypatch.setattr("vmri_jax.running.saved.NUMBERS", 100)
+    pieces = simulate(fpu, fully_implicit(2), macro_dt=0.05, num_steps=36, save_every=2, save_micro=True)
+    jax.tree.map(np.testing.assert_array_equal, whole, pieces)
+
+    steep = fpu.system.replace(fast_potential=lambda q_f, params: jnp.log(1.2 - q_f[0]) - 1e2 * q_f[0])
+    failed = simulate(steep, fully_explicit(1), fpu.state(), macro_dt=0.01, num_steps=60, throw=False)
+    assert 5 < failed.failed_at < 55
+    known = np.isfinite(np.asarray(failed.energy))
+    assert known[: int(failed.failed_at)].all()
+    assert not known[int(failed.failed_at) + 1 :].any()
+    np.testing.assert_allclose(failed.t, 0.01 * np.arange(61), rtol=1e-15)
 
 
 def test_a_failure_says_what_to_ask_next(fpu):

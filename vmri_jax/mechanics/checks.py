@@ -113,6 +113,23 @@ def check_system(system: System, q_s, q_f) -> None:
             _check_float64("force", part)
 
 
+def check_closures(system: System, q_s, q_f) -> None:
+    """Refuse functions that use numbers which a transformation of JAX traces: a program compiled with them would be of no use later."""
+
+    def all_functions():
+        zero = jnp.zeros(())
+        energies = [system.kinetic(q_s, q_f, q_s, q_f, system.params)]
+        energies += [] if system.slow_potential is None else [system.slow_potential(q_s, q_f, system.params)]
+        energies += [] if system.fast_potential is None else [system.fast_potential(q_f, system.params)]
+        return energies, system.constraints(zero, q_s, q_f), system.forces(zero, q_s, q_f, q_s, q_f)
+
+    if not is_concrete(jax.make_jaxpr(all_functions)().consts):
+        raise ValueError(
+            "simulate: a function of the system uses a number that jax.grad, vmap or jvp traces, and that is not among its arguments. "
+            "Hand it over in the params: System(..., params={'k': k}), and params['k'] in the function."
+        )
+
+
 def shape_of(what: str, function, *args):
     """What a user's function returns, without its numbers; it must have two derivatives in forward mode, by everything but the params.
 

@@ -1,7 +1,7 @@
 """The engine of all runs: a loop of macro steps inside a scan over saved nodes, compiled once per structure."""
 
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +16,7 @@ from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.loops import PLAIN, WHOLE, Loops, Recursive, Stored
+from vmri_jax.running.saved import Node, Saved
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
@@ -41,7 +42,7 @@ class Engine:
     def whole(self):
         """``whole(leaves, state, macro_dt, save_every, saves)``: a run from its first step, as the arrays of its `Trajectory`.
 
-        Only the first `saves` of the saved intervals are computed, so that one program does for many lengths.
+        Only the first `saves` of the saved intervals are computed.
         """
         return jax.jit(lambda *run: jax.tree.leaves(self.trajectory(*run)))
 
@@ -65,100 +66,143 @@ class Engine:
         return jax.jit(checkpointed, static_argnums=3)
 
     @cached_property
-    def start(self):
-        """``start(leaves, state, macro_dt)``: what the stepper takes along into the first step."""
-        return jax.jit(
-            lambda leaves, state, macro_dt: self.stepper(leaves, State(*state)).init(State(*state), macro_dt)
-        )
+    def piece(self):
+        """``piece(saved, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves)``: a run of any length, by pieces.
 
-    @cached_property
-    def onwards(self):
-        """``onwards(leaves, state, own, t_start, macro_dt, step, save_every, saves)``: the next part of a run.
-
-        The arrays of its trajectory, of which the first `saves` saved intervals are computed, and state and own at its end.
+        Computes the first `saves` saved intervals into the arrays `saved`, whose memory it takes over, and returns `_Counted`. `memory`
+        is what the stepper takes along from the piece before; where `starts` is true, that of a first step instead.
         """
 
-        def onwards(leaves, state, own, t_start, macro_dt, step, save_every, saves):
-            stepper = self.stepper(leaves, State(*state))
-            piece, *end = self._run(stepper, State(*state), own, t_start, macro_dt, step, save_every, saves)
-            return jax.tree.leaves(piece), *end
+        def piece(saved, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves):
+            start = State(*state)
+            stepper = self.stepper(leaves, start)
+            memory = jax.tree.map(partial(jnp.where, starts), stepper.init(start, macro_dt), memory)
+            return self._counted(stepper, _At.before(start, memory, step), saved, t_start, macro_dt, save_every, saves)
 
-        return jax.jit(onwards)
+        return jax.jit(piece, donate_argnums=0)
+
+    def next_piece(
+        self, leaves, state, memory, starts, t_start, macro_dt, step: int, save_every: int, saves: int
+    ) -> tuple[Trajectory, State, Any]:
+        """`piece` with its trajectory in arrays of NumPy, and the state and memory at its end."""
+        scheme = jax.tree.unflatten(self.structure, leaves)[1]
+        room = self._free.pop() if self._free else self._nothing(State(*state), scheme.num_micro)
+        done = self.piece(room, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves)
+        saved = done.saved.first(saves, int(done.number))
+        self._free.append(done.saved)
+        times = np.asarray(t_start) + (step + np.arange(saves + 1) * save_every) * np.asarray(macro_dt)
+        return self._trajectory(scheme, done._replace(saved=saved), times, macro_dt), done.at.state, done.at.own
+
+    @cached_property
+    def _free(self) -> list[Saved]:
+        """Arrays for saved nodes that no piece uses at present."""
+        return []
+
+    def blank_memory(self, leaves, state):
+        """What `piece` takes as memory where it starts: zeros."""
+        return _blank_memory(self, tuple((a.shape, a.dtype) for a in (*leaves, *state)))
 
     def trajectory(
-        self, leaves, state, macro_dt, save_every, saves=None, loops: Loops = PLAIN, once: bool = False
+        self, leaves, state, macro_dt, save_every, saves=None, loops: Loops | None = None, once: bool = False
     ) -> Trajectory:
         """A run from its first step, not compiled; of all saved intervals, or of the first `saves` of them.
 
         Args:
+            loops: to be differentiated; None for the fastest.
             once: as of `plan`.
         """
         start = State(*state)
         stepper = self.stepper(leaves, start, once)
-        own = stepper.init(start, macro_dt)
-        return self._run(stepper, start, own, start.t, macro_dt, 0, save_every, saves, loops)[0]
+        at = _At.before(start, stepper.init(start, macro_dt), 0)
+        if loops is not None:
+            return self._scanned(stepper, at, macro_dt, save_every, loops)
+        nothing = self._nothing(start, stepper.scheme.num_micro)
+        done = self._counted(stepper, at, nothing, start.t, macro_dt, save_every, saves)
+        times = start.t + jnp.arange(self.num_saves + 1) * save_every * macro_dt
+        return self._trajectory(stepper.scheme, done, times, macro_dt)
 
     def stepper(self, leaves, state: State, once: bool = False) -> Plan:
         """How its steps are taken."""
         newton, scheme, system = jax.tree.unflatten(self.structure, leaves)
         return plan(system, scheme, state, newton, fallback=False, once=once)
 
-    def _run(
-        self, stepper: Plan, state: State, own, t_start, macro_dt, step, save_every, saves=None, loops: Loops = PLAIN
-    ):
-        """`num_saves * save_every` macro steps from step number `step`, or `saves * save_every` of them."""
-        system, tolerance, num_micro = stepper.system, stepper.newton.tolerance, stepper.scheme.num_micro
+    def _counted(self, stepper: Plan, at: "_At", saved: Saved, t_start, macro_dt, save_every, saves) -> "_Counted":
+        """`saves * save_every` macro steps; with `saves` None all that there is room for, whether or not steps fail: lanes go on together."""
+        interval = self._interval(stepper, at.state, t_start, macro_dt, PLAIN)
+
+        def goes_on(done: _Counted):
+            return done.number <= self.num_saves if saves is None else (done.number <= saves) & (done.at.failed_at < 0)
+
+        def save(done: _Counted) -> _Counted:
+            number, at, saved = done
+            is_later = number > 0  # the first node is the start: in this place the code for nodes is compiled once
+            moved, info, micro = interval(at, jnp.where(is_later, save_every, 0))
+            at = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, at)
+            node, at = _node(stepper.system, stepper.newton.tolerance, at)
+            return _Counted(number + 1, at, saved.write(number, node, info, micro))
+
+        return jax.lax.while_loop(goes_on, save, _Counted(jnp.asarray(0), at, saved))
+
+    def _scanned(self, stepper: Plan, at: "_At", macro_dt, save_every: int, loops: Loops) -> Trajectory:
+        """All of a run from its first step, by loops that can be differentiated."""
+        system, tolerance = stepper.system, stepper.newton.tolerance
+        interval = self._interval(stepper, at.state, at.state.t, macro_dt, loops)
+
+        def save(at: _At, _):
+            at, info, micro = interval(at, save_every)
+            node, at = _node(system, tolerance, at)
+            return at, (node, info, micro)
+
+        first, at = _node(system, tolerance, at)
+        at, (nodes, info, micros) = loops.scan(save, at, self.num_saves)
+        nodes = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, nodes)
+        t_micro = None if micros is None else nodes.t[1:, None] - _before_end(stepper.scheme, macro_dt)
+        status = {"result": at.result, "failed_at": at.failed_at}
+        return Trajectory(*nodes, info=info, **status, t_micro=t_micro, q_f_micro=micros)
+
+    def _interval(self, stepper: Plan, state: State, t_start, macro_dt, loops: Loops):
+        """``at, info, micro = interval(at, count)``: the macro steps between two saved nodes."""
         no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
-        no_micro = jnp.zeros((num_micro, state.q_f.shape[0])) if self.save_micro else None
-        first = step
+        no_micro = jnp.zeros((stepper.scheme.num_micro, state.q_f.shape[0])) if self.save_micro else None
         take = _step_of(stepper, t_start, macro_dt, self.save_micro)
 
-        def interval(at: _At):
-            at, worst, micro = loops.repeat(save_every, take, (at, no_info, no_micro))
+        def interval(at: _At, count):
+            at, info, micro = loops.repeat(count, take, (at, no_info, no_micro))
             if stepper.projects_rarely:
                 state, own = stepper.project(at.state, at.own)
                 at = at._replace(state=state, own=own)
-            return at, worst, micro
+            return at, info, micro
 
-        def nothing(at: _At):
-            micro = None if no_micro is None else jnp.where(at.failed_at < 0, no_micro, jnp.nan)
-            return at, no_info, micro
+        return interval
 
-        def save(at: _At, number):
-            if number is None:
-                at, worst, micro = interval(at)
-            else:
-                moves = number > 0
-                if saves is not None:  # one run: after a failure no step is tried, only the clock goes on
-                    moves &= (number <= saves) & (at.failed_at < 0)
-                at, worst, micro = jax.lax.cond(moves, interval, nothing, at)
-                t = t_start + (first + number * save_every) * macro_dt
-                at = at._replace(state=replace(at.state, t=jnp.where(at.failed_at < 0, at.state.t, t)))
-            node, at = _node(system, tolerance, at)
-            return at, (node, worst, micro)
+    def _nothing(self, state: State, num_micro: int) -> Saved:
+        return Saved.none(state, self.num_saves, num_micro if self.save_micro else None)
 
-        at = _At(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
-        if loops is PLAIN:  # one place for the first node and all others: compiled once
-            at, (nodes, *between) = jax.lax.scan(save, at, np.arange(self.num_saves + 1))
-            worst, micro = jax.tree.map(lambda a: a[1:], between)
-        else:  # derivatives of that would take twice as long to compile
-            first, at = _node(system, tolerance, at)
-            at, (nodes, worst, micro) = loops.scan(save, at, self.num_saves)
-            nodes = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, nodes)
-        t_micro = None if micro is None else nodes[0][1:, None] - macro_dt * (1 - stepper.scheme.micro_times)
-        status = {"result": at.result, "failed_at": at.failed_at}
-        trajectory = Trajectory(*nodes, info=worst, **status, t_micro=t_micro, q_f_micro=micro)
-        return trajectory, at.state, at.own
-
-
-def room_for(saves: int) -> int:
-    """The next number with at most four leading binary digits, so that many lengths of runs share few programs."""
-    unit = 2 ** max(saves.bit_length() - 4, 0)
-    return -(-saves // unit) * unit
+    def _trajectory(self, scheme, done: "_Counted", times, macro_dt) -> Trajectory:
+        status = {"result": done.at.result, "failed_at": done.at.failed_at}
+        before_end = _before_end(scheme, macro_dt) if self.save_micro else None
+        return done.saved.trajectory(done.at.state.q_s.shape[0], times, status, before_end)
 
 
 engine = lru_cache(maxsize=32)(Engine)
 """The engine with these attributes. Thousands of programs would exhaust the memory maps that a process may have."""
+
+
+def _before_end(scheme, macro_dt):
+    """(num_micro,) by how much the micro nodes of a macro step are earlier than its end."""
+    return macro_dt * (1 - scheme.micro_times)
+
+
+@lru_cache(maxsize=256)
+def _blank_memory(engine: Engine, shapes: tuple):
+    """Zeros in the shapes of what a stepper takes along; `shapes` and types of the leaves and of the five arrays of a state."""
+
+    def memory(*arrays):
+        start = State(*arrays[-5:])
+        return engine.stepper(list(arrays[:-5]), start).init(start, 1.0)
+
+    blank = jax.eval_shape(memory, *(jax.ShapeDtypeStruct(*shape) for shape in shapes))
+    return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
 
 
 class _At(NamedTuple):
@@ -169,6 +213,19 @@ class _At(NamedTuple):
     step: Int[Numbers, ""]
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
+
+    @classmethod
+    def before(cls, state: State, own, step) -> "_At":
+        """A step, without failures so far."""
+        return cls(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
+
+
+class _Counted(NamedTuple):
+    """Number of the next node to be saved, where the run is, and what is saved."""
+
+    number: Int[Numbers, ""]
+    at: _At
+    saved: Saved
 
 
 def _step_of(stepper: Plan, t_start, macro_dt, save_micro: bool):
@@ -191,8 +248,8 @@ def _step_of(stepper: Plan, t_start, macro_dt, save_micro: bool):
     return step
 
 
-def _node(system: System, tolerance, at: _At):
-    """What is saved of a node, the first seven fields of a `Trajectory`; and the status after a look at it.
+def _node(system: System, tolerance, at: _At) -> tuple[Node, _At]:
+    """What is saved of a node, and the status after a look at it.
 
     A potential may be NaN where its gradient is not (a logarithm beyond its pole), a lane of a batch may start off its
     constraints, and rows that were left out may not follow from them: such nodes are no result either.
@@ -211,4 +268,4 @@ def _node(system: System, tolerance, at: _At):
     result = jnp.where(breaks, cause, at.result)
     failed_at = jnp.where(breaks, jnp.maximum(at.step - 1, 0), at.failed_at)
     values = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))
-    return (jnp.asarray(state.t), *values), at._replace(result=result, failed_at=failed_at)
+    return Node(jnp.asarray(state.t), *values), at._replace(result=result, failed_at=failed_at)

@@ -53,7 +53,7 @@ def lost_energy(run: Trajectory, macro_dt: float) -> str:
     if not change[worst] > ROUNDOFF * np.max(at_nodes(_size_of_terms, run.origin, _states(run, nodes))):
         return ""
     return (
-        f"the computed motion is wrong: the energy, which the system keeps, has changed by {change[worst]:.3g} at t = {run.t[worst]:.4g}, "
+        f"the computed motion is wrong: the energy, which the system keeps, has changed by {change[worst]:.3g} at t = {np.asarray(run.t)[worst]:.4g}, "
         f"and the largest kinetic energy is {kinetic:.3g}. Take smaller steps, or ask vmri_jax.stability.advise(problem, "
         "scheme, macro_dt=...) which are stable."
     )
@@ -68,7 +68,8 @@ def _kinetic(mass, p: np.ndarray) -> np.ndarray:
 
 def _kinetic_of_roundoff(run: Trajectory, macro_dt: float) -> float:
     """Kinetic energy of velocities that round-off of the positions makes in the steps of a run."""
-    mass, steps = run.origin.known_system.kinetic, float(run.t[-1] - run.t[0]) / macro_dt
+    mass, t = run.origin.known_system.kinetic, np.asarray(run.t)
+    steps = float(t[-1] - t[0]) / macro_dt
     position = max(np.abs(q).max(initial=0.0) for q in (np.asarray(run.q_s), np.asarray(run.q_f)))
     total = sum(float(jnp.trace(part.matrix)) for part in (mass.slow_mass, mass.fast_mass))
     return total * steps * (DIGITS * position / macro_dt) ** 2 / 2

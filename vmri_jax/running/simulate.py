@@ -12,20 +12,21 @@ import numpy as np
 
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_flags, check_params, check_system
+from vmri_jax.mechanics.checks import check_closures, check_flags, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.adjoints import check_adjoint
 from vmri_jax.running.arguments import check_run, check_vectors, nothing_fast
-from vmri_jax.running.engine import Engine, engine, room_for
+from vmri_jax.running.engine import Engine, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import Working, progress_shown
+from vmri_jax.running.saved import room_of_a_piece
 from vmri_jax.running.summaries import summary_of_prepared
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
@@ -64,8 +65,8 @@ def simulate(
 
         run = vm.simulate(problem, vm.fully_implicit(10), macro_dt=0.01, t_end=10.0)
 
-    Compiled once per system structure and scheme structure, and for every eighth or so of the number of saved nodes: step sizes,
-    parameters, rule weights, initial states and `save_every` may vary without compiling again. Works under ``jax.vmap`` over state,
+    Compiled once per system structure and scheme structure: step sizes, parameters, rule weights, initial states, numbers of steps and of
+    saved nodes may vary without compiling again. Works under ``jax.vmap`` over state,
     params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised, and names
     work inside of the function that is transformed: ``run.position("load")``.
     Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "nested".
@@ -81,8 +82,7 @@ def simulate(
         newton: how implicit equations are solved.
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN from the failure on.
-        progress: show a progress bar; the run is then compiled for a part of its saved nodes. Without it a run that takes more than
-            two seconds says so by a line now and then.
+        progress: show a progress bar. Without it a run that takes more than two seconds says so by a line now and then.
         adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
             "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
 
@@ -105,7 +105,7 @@ def simulate(
         return know(traced_run(run, adjoint), run.origin)
     run.check()
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
-    trajectory = run.in_parts() if progress else run(throw=False)
+    trajectory = run.in_pieces(progress)
     if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
         check_constraints(run.system, run.state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
@@ -151,7 +151,7 @@ def prepare(
     run.check()
     check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
     leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
-    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start, room=run.num_saves)
+    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start)
     with Working("prepare: compiling the run"):
         jax.block_until_ready(
             run._program(False)(leaves, run.start_arrays, macro_dt, 0, 0)
@@ -165,26 +165,27 @@ class Checkpoint(NamedTuple):
     step: macro steps done.
     state, memory: at the node reached, and what the last step hands on.
     fell_back: whether the first method has given way to exact matrices.
+    starts: whether no step is remembered, so that `memory` is blank.
     """
 
     step: int
     state: State
     memory: Any
     fell_back: bool = False
+    starts: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A run whose arguments have been checked: at once by a call, or piece by piece from a `Checkpoint`.
+    """A run whose arguments have been checked: at once by a call, with a program of its own, or in pieces that all lengths share.
 
-    A run is made with the first method of its plan. The fallback is a policy of the run: a run in which that method fails is made again
-    with exact matrices, by a program that is compiled then.
+    A run is made with the first method of its plan. The fallback is a policy of the run: a run or a piece in which that method fails is
+    made again with exact matrices, by a program that is compiled then.
 
     Attributes:
         system, scheme, newton, state, num_steps, save_every, save_micro: as of `simulate`.
         macro_dt: an array of shape ().
         names: of bodies and constraints, None if there are none.
-        room: saved intervals that the program has room for.
         may_fall_back: whether a run that the first method does not solve is made again with exact matrices, else it fails.
     """
 
@@ -196,7 +197,6 @@ class Simulation:
     num_steps: int
     save_every: int
     save_micro: bool
-    room: int
     names: Names | None
     leaves: list = field(repr=False)
     structure: Any = field(repr=False)
@@ -218,17 +218,12 @@ class Simulation:
         origin = self.origin if params is None else self.origin._replace(params=params)
         with Working(STEPPING):
             arrays = self._program(False)(*arguments)
-        if not is_concrete(arrays):
-            raise ValueError(
-                "simulate: a function of the system uses a number that jax.grad, vmap or jvp traces, and that is not among its arguments. "
-                "Hand it over in the params: System(..., params={'k': k}), and params['k'] in the function."
-            )
-        trajectory = know(from_arrays(arrays, self.num_saves), origin)
+        trajectory = know(from_arrays(arrays), origin)
         if int(trajectory.failed_at) < 0:
             return trajectory
         if self._fallback_helps(trajectory):
             with Working(FALLING_BACK):
-                trajectory = know(from_arrays(self._program(True)(*arguments), self.num_saves), origin)
+                trajectory = know(from_arrays(self._program(True)(*arguments)), origin)
         if throw and int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, arguments[2], arguments[3], self.scheme.num_micro)
         return trajectory
@@ -279,7 +274,7 @@ class Simulation:
 
     def _program(self, falls_back: bool):
         """The compiled run, see `Engine.whole`."""
-        return self.engine_for(falls_back, self.room).whole
+        return self.engine_for(falls_back, self.num_saves).whole
 
     def __repr__(self) -> str:
         return summary_of_prepared(self)
@@ -338,22 +333,29 @@ class Simulation:
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """Before the first step; or from a state before step number `step`, as if that was the first one."""
         start = self.start_arrays if state is None else _arrays(state)
-        memory = self.engine_for(fell_back, 1).start(self.leaves, start, self.macro_dt)
-        return Checkpoint(step, State(*start), memory, fell_back)
+        memory = self._piece_engine(fell_back).blank_memory(self.leaves, start)
+        return Checkpoint(step, State(*start), memory, fell_back, starts=True)
 
-    def advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
-        """The next `saves` saved intervals, at most `room`; again with the fallback if the first method fails."""
-        piece, end = self._advance(at, saves)
-        if not at.fell_back and self._fallback_helps(piece):
-            with Working(FALLING_BACK):
-                return self._advance(self.start(at.state, at.step, fell_back=True), saves)
-        return piece, end
+    def _piece_engine(self, is_exact: bool) -> Engine:
+        return self.engine_for(is_exact, room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro))
+
+    def advance(self, at: Checkpoint, saves: int) -> tuple[list[Trajectory], Checkpoint]:
+        """The next `saves` saved intervals, in pieces; again with exact matrices from a piece on that the first method does not solve."""
+        pieces, room, has_failed = [], self._piece_engine(at.fell_back).num_saves, False
+        for done in range(0, saves, room):  # after a failure too: the nodes to the end are NaN
+            size = min(room, saves - done)
+            piece, after = self._advance(at, size)
+            if not (has_failed or at.fell_back) and self._fallback_helps(piece):
+                with Working(FALLING_BACK):
+                    piece, after = self._advance(self.start(at.state, at.step, fell_back=True), size)
+            pieces.append(piece)
+            at, has_failed = after, int(piece.failed_at) >= 0
+        return pieces, at
 
     def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
-        program = self.engine_for(at.fell_back, self.room).onwards
         numbers = self.start_arrays[0], self.macro_dt, at.step, self.save_every, saves
-        arrays, state, memory = program(self.leaves, tuple(vars(at.state).values()), at.memory, *numbers)
-        piece = from_arrays(arrays, saves)
+        given = self.leaves, tuple(vars(at.state).values()), at.memory, at.starts
+        piece, state, memory = self._piece_engine(at.fell_back).next_piece(*given, *numbers)
         return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
@@ -361,19 +363,20 @@ class Simulation:
         failed = self.may_fall_back and int(piece.failed_at) >= 0 and int(piece.result) != Result.NOT_IMPLIED
         return failed and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
 
-    def in_parts(self) -> Trajectory:
-        """The whole run with a progress bar; Ctrl-C raises `Interrupted` with what was computed."""
-        size = -(-self.num_saves // SHOWN)
-        parts = replace(self, room=room_for(size))
-        at, pieces = parts.start(), []
+    def in_pieces(self, progress: bool = False) -> Trajectory:
+        """The whole run; with a progress bar Ctrl-C raises `Interrupted` with what was computed."""
+        if not progress:
+            with Working(STEPPING):
+                return know(join(self.advance(self.start(), self.num_saves)[0]), self.origin)
+        size, at, pieces = -(-self.num_saves // SHOWN), self.start(), []
         with interrupts_noted() as interrupted, progress_shown() as tell:
             for done in range(0, self.num_saves, size):
                 tell("simulating", done, self.num_saves)
-                piece, at = parts.advance(at, min(size, self.num_saves - done))
-                pieces.append(piece)
+                more, at = self.advance(at, min(size, self.num_saves - done))
+                pieces += more
                 if interrupted():
                     raise Interrupted(join(pieces).of(self.origin), at.step, self.num_steps)
-        return join(pieces).of(self.origin)
+        return know(join(pieces), self.origin)
 
 
 def simulation(
@@ -392,10 +395,9 @@ def simulation(
     newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
     leaves, structure = jax.tree.flatten((newton, scheme, system))
     state = State(*_arrays(state))
-    room = room_for(num_steps // save_every)
     macro_dt, names = _float(macro_dt), names_of(problem)
     return Simulation(
-        system, scheme, newton, state, macro_dt, num_steps, save_every, save_micro, room, names, leaves, structure
+        system, scheme, newton, state, macro_dt, num_steps, save_every, save_micro, names, leaves, structure
     )
 
 
@@ -422,6 +424,7 @@ class _Known:
 @lru_cache(maxsize=256)
 def _check_once(known: _Known) -> None:
     check_system(known.system, known.state.q_s, known.state.q_f)
+    check_closures(known.system, known.state.q_s, known.state.q_f)
     check_mass(known.system, known.state.q_s, known.state.q_f)
     if known.constraints:
         check_constraints(known.system, known.state, known.what)

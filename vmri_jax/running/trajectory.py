@@ -280,9 +280,9 @@ def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
 
 
 def join(pieces: list[Trajectory]) -> Trajectory:
-    """Consecutive trajectories, each starting where the one before ends, as one."""
+    """Consecutive trajectories, each starting where the one before ends, as one, with arrays of JAX."""
     if len(pieces) == 1:
-        return pieces[0]
+        return jax.device_put(pieces[0])
     flat = [named_arrays(piece) for piece in pieces]
     failed = [f for f in flat if int(f["failed_at"]) >= 0]
     status = failed[0] if failed else max(flat, key=lambda f: int(f["result"]))
@@ -292,9 +292,9 @@ def join(pieces: list[Trajectory]) -> Trajectory:
         if first is None or name in STATUS:
             return status[name]
         skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
-        return jnp.asarray(np.concatenate([first, *(f[name][skip:] for f in flat[1:])]))
+        return np.concatenate([first, *(f[name][skip:] for f in flat[1:])])
 
-    return from_named_arrays({name: joined(name) for name in flat[0]})
+    return jax.device_put(from_named_arrays({name: joined(name) for name in flat[0]}))  # jnp.asarray compiles for every shape
 
 
 def named_arrays(trajectory: Trajectory) -> dict:
@@ -309,16 +309,9 @@ def from_named_arrays(arrays: dict) -> Trajectory:
     return Trajectory(**arrays, info=info)
 
 
-def from_arrays(arrays: list, saves: int | None = None) -> Trajectory:
-    """The trajectory with these leaves, or the first `saves` saved intervals of it."""
-    whole = jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
-    if saves is None or len(whole.t) == saves + 1:
-        return whole
-
-    def first(name: str, value):
-        return value if value is None or name in STATUS else jnp.asarray(np.asarray(value)[: saves + (name in NODES)])
-
-    return from_named_arrays({name: first(name, value) for name, value in named_arrays(whole).items()})
+def from_arrays(arrays: list) -> Trajectory:
+    """The trajectory with these leaves."""
+    return jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
 
 
 _FIELDS = {field.name for field in dataclasses.fields(Trajectory)} - {"info"} | set(RunInfo._fields)

@@ -75,7 +75,7 @@ class Record(NamedTuple):
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
-        return Checkpoint(self.step, state, memory, self.fell_back)
+        return Checkpoint(self.step, state, memory, self.fell_back, starts=self.step == 0)
 
 
 def create(path: Path, attributes: dict[str, Any], record: Record) -> None:

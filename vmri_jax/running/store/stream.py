@@ -4,14 +4,12 @@ import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
-from vmri_jax.running.engine import room_for
 from vmri_jax.running.files import check_writable, clear_partial
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, Working, progress_shown
@@ -20,6 +18,7 @@ from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import changed_conditions, differences, environment, identity
 from vmri_jax.running.store.layout import Record
 from vmri_jax.running.store.stored import StoredTrajectory
+from vmri_jax.running.trajectory import join
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
@@ -123,7 +122,6 @@ def _go_on(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iterato
     rows = stored.num_steps // run.save_every
     if record.saved == rows or not stored.success:
         return
-    run = replace(run, room=room_for(chunk))  # one program for all parts
     try:
         at = record.checkpoint(like=run.start(fell_back=record.fell_back))
     except ValueError as error:
@@ -133,7 +131,8 @@ def _go_on(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iterato
     sizes = [end - begin for begin, end in pairwise([record.saved + 1, *nodes])]
     for size in sizes:
         tell("simulating", record.saved, rows)
-        piece, at = run.advance(at, size)
+        pieces, at = run.advance(at, size)
+        piece = join(pieces)
         with _explained(path, at.step - size * run.save_every):
             writer.append(piece, record.saved)
             result = max(record.result, int(piece.result))  # failures are larger
