@@ -294,7 +294,9 @@ def join(pieces: list[Trajectory]) -> Trajectory:
         skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
         return np.concatenate([first, *(f[name][skip:] for f in flat[1:])])
 
-    return jax.device_put(from_named_arrays({name: joined(name) for name in flat[0]}))  # jnp.asarray compiles for every shape
+    return jax.device_put(
+        from_named_arrays({name: joined(name) for name in flat[0]})
+    )  # jnp.asarray compiles for every shape
 
 
 def named_arrays(trajectory: Trajectory) -> dict:
