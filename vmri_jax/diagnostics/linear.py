@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import null_space
 
 from vmri_jax.mechanics.invariants import all_constraints, potentials, velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
@@ -144,6 +143,8 @@ def null_space_condition(system: Movable, scheme: Scheme, state: State | None = 
     Args:
         system, scheme, state, macro_dt: as in `simulate`.
     """
+    from scipy.linalg import null_space  # here: its import takes a tenth of a second
+
     system, state = start_of("null_space_condition", system, state)
     whole = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
     n, r = scheme.num_micro, scheme.degree

@@ -14,8 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from vmri_jax import kernels
 from vmri_jax.kernels.saddle import regularized
@@ -159,6 +157,12 @@ def sparsity(pattern: np.ndarray, nodes: int = 1) -> Sparsity:
         nodes: r; the matrix consists of r x r blocks with this pattern.
     """
     n = len(pattern)
+    if n <= 1:
+        return Full(n * nodes)
+
+    from scipy.sparse import csr_array  # here: its import takes a tenth of a second
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
     order = np.asarray(reverse_cuthill_mckee(csr_array(pattern), symmetric_mode=True))
     at = np.nonzero(pattern[np.ix_(order, order)])
     width = int(np.max(np.abs(at[0] - at[1]), initial=0))

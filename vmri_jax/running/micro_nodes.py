@@ -8,7 +8,6 @@ an approximation of order 4.
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 
 class Nodes(NamedTuple):
@@ -50,6 +49,8 @@ def with_micro_nodes(nodes: Nodes, t_micro, q_f_micro) -> Nodes:
         nodes: the macro nodes, all of them finite.
         t_micro, q_f_micro: (k - 1, num_micro), (k - 1, num_micro, n_f).
     """
+    from scipy.interpolate import CubicHermiteSpline, CubicSpline  # here: its import takes a fifth of a second
+
     t_micro, q_f_micro = np.asarray(t_micro, dtype=float), np.asarray(q_f_micro, dtype=float)
     steps, num_micro = t_micro.shape
     t = np.append(nodes.t[:1], t_micro)

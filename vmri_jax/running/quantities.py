@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from scipy.integrate import cumulative_simpson, cumulative_trapezoid
 
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import is_concrete
@@ -187,6 +186,8 @@ class Quantities(ABC):
         Raises:
             ValueError: the run does not know its system, or it is a batch.
         """
+        from scipy.integrate import cumulative_simpson, cumulative_trapezoid  # here: its import takes a fifth of a second
+
         run = _known("work", self.whole())
         if np.ndim(run.t) != 1:
             raise ValueError("work: the run is a batch; take one lane of it, run.lane(i).")
