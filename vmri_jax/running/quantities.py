@@ -186,7 +186,10 @@ class Quantities(ABC):
         Raises:
             ValueError: the run does not know its system, or it is a batch.
         """
-        from scipy.integrate import cumulative_simpson, cumulative_trapezoid  # here: its import takes a fifth of a second
+        from scipy.integrate import (  # here: its import takes a fifth of a second
+            cumulative_simpson,
+            cumulative_trapezoid,
+        )
 
         run = _known("work", self.whole())
         if np.ndim(run.t) != 1:
