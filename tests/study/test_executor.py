@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from benchmarks import fuzz
 from tests.user_systems import two_oscillators
 from vmri_jax.stability import stability_map
 from vmri_jax.study import convergence_study, work_precision
@@ -46,10 +45,3 @@ def test_work_precision(client):
         (row.scheme, row.num_steps, row.error_q) for row in there.rows
     ]
     assert all(row.seconds > 0 for row in there.rows)
-
-
-def test_fuzzing(client, tmp_path):
-    here = fuzz.fuzz(1, 1, tmp_path / "here.jsonl", 300.0)
-    there = fuzz.fuzz(1, 1, tmp_path / "there.jsonl", 300.0, executor=client)
-    assert here == there
-    assert not fuzz.wrong(there)
