@@ -64,6 +64,10 @@ def drive(t, q_s, q_f, v_s, v_f, params):
 PARAMS = {"soft": 4.0, "stiff": STIFF}
 SLOW, FAST = jnp.array([1.0, 0.0]), jnp.array([0.02, -0.01])
 """Starts; the slow one lies on the circle."""
+ANGLE = 0.1
+HANGING = SLOW - jnp.array([jnp.cos(ANGLE), jnp.sin(ANGLE)])
+ACROSS = 0.5 * jnp.array([jnp.sin(ANGLE), -jnp.cos(ANGLE)])
+"""The fast end of a rod from the slow point, near the rest of its spring, and a velocity across the rod: a gentle motion."""
 
 
 def _system(masses, *potentials, **parts) -> vm.System:
@@ -90,7 +94,7 @@ def no_constraint() -> vm.Problem:
 
 
 def constraint() -> vm.Problem:
-    return vm.Problem(_system(BOTH, soft, stiff, constraint=rod), SLOW, [1.0, -1.0], [0.0, 0.0], [1.0, 0.0])
+    return vm.Problem(_system(BOTH, soft, stiff, constraint=rod), SLOW, HANGING, [0.0, 0.0], ACROSS)
 
 
 def slow_constraint() -> vm.Problem:
@@ -99,14 +103,14 @@ def slow_constraint() -> vm.Problem:
 
 def both_constraints() -> vm.Problem:
     system = _system(BOTH, soft, stiff, constraint=rod, slow_constraint=circle)
-    return vm.Problem(system, SLOW, [1.0, -1.0], [0.0, 0.0], [1.0, 0.0])
+    return vm.Problem(system, SLOW, HANGING, [0.0, 0.0], ACROSS)
 
 
 def moving_constraints() -> vm.Problem:
     system = _system(
         BOTH, soft, stiff, constraint=vm.Rheonomic(moving_rod), slow_constraint=vm.Rheonomic(moving_circle)
     )
-    return vm.Problem(system, SLOW, [1.0, -1.0], [0.3, 0.0], [1.0, 0.0])
+    return vm.Problem(system, SLOW, HANGING, [0.3, 0.0], jnp.array([0.6, 0.0]) + ACROSS)
 
 
 def damped() -> vm.Problem:

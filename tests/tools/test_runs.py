@@ -20,8 +20,8 @@ def simulate(cell: Cell) -> None:
 
 def prepare(cell: Cell) -> None:
     run = vm.prepare(cell.moving, SCHEME, **STEPPING)()
-    np.testing.assert_array_equal(run.q_s, cell.run.q_s)
-    np.testing.assert_array_equal(run.q_f, cell.run.q_f)
+    np.testing.assert_allclose(run.q_s, cell.run.q_s, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(run.q_f, cell.run.q_f, rtol=0, atol=1e-13)
 
 
 def simulate_batch(cell: Cell) -> None:

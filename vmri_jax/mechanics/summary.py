@@ -80,4 +80,5 @@ def _short(value) -> str:
     leaves = jax.tree.leaves(value)
     if len(leaves) > 1:
         return f"{len(leaves)} arrays"
+    [value] = leaves or [value]
     return f"{float(value):.6g}" if has_values(value) and np.ndim(value) == 0 else eqx.tree_pformat(value, width=1000)
