@@ -312,5 +312,5 @@ class Collocation(Solver):
         status = status_of(equations, last.result, Method.COLLOCATION, last.iterations, *left, newton.tolerance)
         return Solution(unknowns, end, status), memory
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["one interval of high degree: all variables at once, in modes of time"]

@@ -34,7 +34,7 @@ class Composed(Stepper):
         stages = jax.vmap(lambda c: self.stage.init(state, c * macro_dt))(jnp.asarray(self.coefficients))
         return ComposedState(jax.tree.map(lambda a: a[0], stages), stages)
 
-    def move(self, state: State, memory: ComposedState, macro_dt) -> tuple[State, StepInfo, ComposedState]:
+    def advance(self, state: State, memory: ComposedState, macro_dt) -> tuple[State, StepInfo, ComposedState]:
         def stage(carry, at):
             (state, last), (c, memory) = carry, at
             memory = self.stage.continued(memory, last, state, c * macro_dt)
@@ -51,8 +51,8 @@ class Composed(Stepper):
         state, last = self.stage.project(state, memory.last)
         return state, memory._replace(last=last)
 
-    def lines(self) -> list[str]:
-        return [f"composition of {len(self.coefficients)} stages, each:", *indented(self.stage.lines())]
+    def describe(self) -> list[str]:
+        return [f"composition of {len(self.coefficients)} stages, each:", *indented(self.stage.describe())]
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,13 @@ class Projected(Stepper):
     def renew(self, state: State, memory, macro_dt):
         return self.inner.renew(state, memory, macro_dt)
 
-    def move(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
-        state, info, memory = self.inner.move(state, memory, macro_dt)
+    def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
+        state, info, memory = self.inner.advance(state, memory, macro_dt)
         state, memory = self.inner.project(state, memory)
         return state, info, memory
 
     def continued(self, memory, last, state: State, macro_dt):
         return self.inner.continued(memory, last, state, macro_dt)
 
-    def lines(self) -> list[str]:
-        return [*self.inner.lines(), "momenta projected onto the hidden constraints"]
+    def describe(self) -> list[str]:
+        return [*self.inner.describe(), "momenta projected onto the hidden constraints"]

@@ -90,7 +90,7 @@ class Coupled(Solver):
             done = done._replace(result=jnp.where(done.result == RUNNING, Result.STAGNATED, done.result))
         return done.x, done.result, done.iterations
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["all unknowns of the step at once: Newton's iteration, dense"]
 
 

@@ -40,10 +40,10 @@ class Decoupled(Stepper):
             self.slow.renew(slow, memory.slow, macro_dt), self.fast.renew(fast, memory.fast, micro_dt)
         )
 
-    def move(self, state: State, memory: DecoupledState, macro_dt) -> tuple[State, StepInfo, DecoupledState]:
+    def advance(self, state: State, memory: DecoupledState, macro_dt) -> tuple[State, StepInfo, DecoupledState]:
         slow, fast = apart(state)
-        slow, slow_info, slow_memory = self.slow.move(slow, memory.slow, macro_dt)
-        fast, info, fast_memory = self.fast.move_many(fast, memory.fast, macro_dt / self.num_micro, self.num_micro)
+        slow, slow_info, slow_memory = self.slow.advance(slow, memory.slow, macro_dt)
+        fast, info, fast_memory = self.fast.advance_many(fast, memory.fast, macro_dt / self.num_micro, self.num_micro)
         status = slow_info.status.worse(info.status)
         end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
         info = StepInfo(*status, info.q_f_micro, info.multiplier, slow_info.multiplier[0])
@@ -62,12 +62,12 @@ class Decoupled(Stepper):
             self.fast.continued(memory.fast, last.fast, fast, macro_dt / self.num_micro),
         )
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return [
             "slow variables, one step:",
-            *indented(self.slow.lines()),
+            *indented(self.slow.describe()),
             f"fast variables, {self.num_micro} micro step{'s' * (self.num_micro > 1)}:",
-            *indented(self.fast.lines()),
+            *indented(self.fast.describe()),
         ]
 
 

@@ -25,7 +25,7 @@ class Linear(Stepper):
     def init(self, state: State, macro_dt) -> Matrix:
         return self.interval.matrix(StepEquations.of(self.system, self.scheme, state, macro_dt))
 
-    def move(self, state: State, memory: Matrix, macro_dt) -> tuple[State, StepInfo, Matrix]:
+    def advance(self, state: State, memory: Matrix, macro_dt) -> tuple[State, StepInfo, Matrix]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         h, rest = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
         path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), rest[None])
@@ -39,5 +39,5 @@ class Linear(Stepper):
         info = StepInfo(*Status.direct(Method.LINEAR), q_f[None], *none)
         return State(state.t + macro_dt, state.q_s, q_f, state.p_s, p_f), info, memory
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["linear equations: one product with a matrix computed once"]

@@ -209,7 +209,7 @@ class Marched(Solver):
         fast = memory.fast.after_step(passed.x)
         return MarchMemory(memory.slow.add(passed.z, march.num_slow), fast, done.matrices, done.rate)
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         head = f"march over the micro intervals with exact matrices, {self.linear_solver.replace('_', ' ')}"
         if self.linear_solver != "null_space" or self.sizes is None:
             return [head]

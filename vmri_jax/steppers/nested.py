@@ -161,7 +161,7 @@ class Nested(Solver):
         bend = memory.predictors.bend.continued(last.predictors.bend)
         return memory._replace(predictors=FastPredictors(multiplier, bend))
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         inside = "the multipliers alone" if self.interval.is_explicit else "fast increments and multipliers"
         return [
             "nested march: the slow path outside, micro intervals in order inside",

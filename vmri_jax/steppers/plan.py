@@ -96,7 +96,7 @@ class Plan:
         has |= {"g": system.constraint, "g_s": system.slow_constraint}
         scheme = self.scheme.describe()
         scheme = replace(scheme, rules={name: rule for name, rule in scheme.rules.items() if has[name] is not None})
-        return "\n".join([str(scheme), "a step:", *indented(self.stepper.lines())])
+        return "\n".join([str(scheme), "a step:", *indented(self.stepper.describe())])
 
     def __str__(self) -> str:
         return str(self.stepper)

@@ -131,5 +131,5 @@ class Rattle(Solver):
     def projected(self, memory: RattleState) -> RattleState:
         return memory._replace(before=jnp.zeros_like(memory.before))
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["drift along the constraints (RATTLE): Newton's iteration on the multipliers"]

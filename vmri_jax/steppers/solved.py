@@ -69,7 +69,7 @@ class Solver(ABC):
         return memory
 
     @abstractmethod
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         """In words, one line each."""
 
 
@@ -118,7 +118,7 @@ class Solved(Stepper):
             solver=self.solver.renew(StepEquations.of(self.system, self.scheme, state, macro_dt), memory.solver)
         )
 
-    def move(self, state: State, memory: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
+    def advance(self, state: State, memory: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         v_s, v_f = memory.velocity
         if self.system.has_constant_mass:
@@ -147,8 +147,8 @@ class Solved(Stepper):
     def continued(self, memory: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:
         return last._replace(solver=self.solver.continued(memory.solver, last.solver))
 
-    def lines(self) -> list[str]:
-        return self.solver.lines()
+    def describe(self) -> list[str]:
+        return self.solver.describe()
 
 
 @dataclass(frozen=True)
@@ -180,8 +180,8 @@ class Fallback(Solver):
     def projected(self, memory) -> Any:
         return self.first.projected(memory)
 
-    def lines(self) -> list[str]:
-        return [*self.first.lines(), "where that does not converge:", *indented(self.exact.lines())]
+    def describe(self) -> list[str]:
+        return [*self.first.describe(), "where that does not converge:", *indented(self.exact.describe())]
 
 
 def status_of(equations: StepEquations, result, method, iterations, rows, g, tolerance) -> Status:

@@ -75,12 +75,12 @@ class Stepper(ABC):
         return memory
 
     @abstractmethod
-    def move(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
+    def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
         """The step itself; its momenta are those of the discrete Legendre transform."""
 
     def step(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
-        """A macro step: `renew`, then `move`; NON_FINITE where a momentum is, since positions follow momenta."""
-        state, info, memory = self.move(state, self.renew(state, memory, macro_dt), macro_dt)
+        """A macro step: `renew`, then `advance`; NON_FINITE where a momentum is, since positions follow momenta."""
+        state, info, memory = self.advance(state, self.renew(state, memory, macro_dt), macro_dt)
         finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))
         stands = finite | (info.result > Result.CONVERGED_AT_ROUNDOFF)  # a failure has been named already
         return state, replace(info, result=jnp.where(stands, info.result, Result.NON_FINITE)), memory
@@ -94,11 +94,11 @@ class Stepper(ABC):
         return memory
 
     @abstractmethod
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         """This stepper and what is inside of it in words, one line each."""
 
     def __str__(self) -> str:
-        return "\n".join(self.lines())
+        return "\n".join(self.describe())
 
 
 def indented(lines: list[str]) -> list[str]:
