@@ -52,11 +52,11 @@ STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 def slopes(function, directions: np.ndarray, step: float = 0.01) -> np.ndarray:
     """Derivatives at zero of a function along directions, the last axis, by differences of order 8, which compile nothing."""
 
-    def along(direction):
+    def slope(direction):
         differences = ((k, function(k * step * direction) - function(-k * step * direction)) for k in STENCIL)
         return sum(STENCIL[k] / step * difference for k, difference in differences)
 
-    return np.stack([along(direction) for direction in directions], axis=-1)
+    return np.stack([slope(direction) for direction in directions], axis=-1)
 
 
 NAMES = "q_s", "q_f", "p_s", "p_f"

@@ -21,7 +21,7 @@ def acceleration(case: Case):
     def constraints(q):
         return system.constraints(0.0, q[:n_s], q[n_s:])
 
-    def along(q, v):
+    def centripetal(q, v):
         """``(d/dt G) v``: the second derivative of the constraints in the direction of v."""
         return jax.jvp(lambda q: jax.jvp(constraints, (q,), (v,))[1], (q,), (v,))[1]
 
@@ -31,7 +31,7 @@ def acceleration(case: Case):
     def held(q, v):
         g = jax.jacfwd(constraints)(q)
         matrix = jnp.block([[mass, g.T], [g, jnp.zeros((len(g), len(g)))]])
-        return jnp.linalg.solve(matrix, jnp.concatenate([force(q), -along(q, v)]))[: q.size]
+        return jnp.linalg.solve(matrix, jnp.concatenate([force(q), -centripetal(q, v)]))[: q.size]
 
     return held if system.is_constrained else free
 

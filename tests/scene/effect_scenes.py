@@ -13,7 +13,7 @@ BASE = sc.Scene(
 )
 
 
-def along(q, params):
+def pull_along_x(q, params):
     return q[0][0] * params["f"]
 
 
@@ -73,7 +73,7 @@ EFFECTS = [
     sc.PlaneContact(point=[0, 0, 0], normal=[0, 0, 1], stiffness=1e3, smoothing=0.01),
     sc.SphereContact(center=[0, 0, 0], sphere_radius=1.0, stiffness=1e3, smoothing=0.01),
     sc.MagneticField([0.0, 0.0, 1.0], 1.0, "b"),
-    sc.Potential(along, "b", {"f": 1.0}),
+    sc.Potential(pull_along_x, "b", {"f": 1.0}),
     sc.Constraint(sphere, "b", {"point": jnp.zeros(3), "half": 34.0}),
     sc.Kinetic(rotor, "b", {"f": 1.0}),
     sc.Force(wind, "b", {"f": 1.0}),

@@ -67,7 +67,7 @@ def gradient_program(case: str):
     return jax.jit(jax.value_and_grad(function, argnums=(0, 1, 2, 3))), at
 
 
-def along(case: str, argument: int, entry: int | None = None):
+def value_by_argument(case: str, argument: int, entry: int | None = None):
     """The value as a function of one argument, or of one of its entries, alone."""
     program, at = gradient_program(case)
 
@@ -81,7 +81,7 @@ def along(case: str, argument: int, entry: int | None = None):
 @pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.full if c in LONG else ()) for c in CASES])
 def test_gradient_with_respect_to_a_stiffness(case):
     program, at = gradient_program(case)
-    expected = central_difference(along(case, 0), at[0], 1e-3 * at[0])
+    expected = central_difference(value_by_argument(case, 0), at[0], 1e-3 * at[0])
     assert abs(expected) > 1e-9
     assert float(program(*at)[1][0]) == pytest.approx(expected, rel=2e-7)  # measured 1.6e-8, 1e-6 wanted
 
@@ -90,7 +90,7 @@ def test_gradient_with_respect_to_the_initial_velocities():
     """Through the projection of the momenta onto the constraints."""
     case = "cart, fully implicit"
     program, at = gradient_program(case)
-    expected = [central_difference(along(case, 1, i), at[1][i], 1e-2) for i in range(3)]
+    expected = [central_difference(value_by_argument(case, 1, i), at[1][i], 1e-2) for i in range(3)]
     assert np.abs(expected).max() > 0.01
     assert np.allclose(program(*at)[1][1], expected, rtol=1e-6, atol=1e-9)
 
@@ -99,9 +99,9 @@ def test_gradient_with_respect_to_a_state_and_the_step():
     case = FALLS_BACK
     program, at = gradient_program(case)
     _, _, by_position, by_step = program(*at)[1]
-    expected = [central_difference(along(case, 2, i), at[2][i], 1e-3) for i in range(at[2].size)]
+    expected = [central_difference(value_by_argument(case, 2, i), at[2][i], 1e-3) for i in range(at[2].size)]
     assert np.allclose(by_position, expected, rtol=1e-6, atol=1e-9)
-    assert float(by_step) == pytest.approx(central_difference(along(case, 3), at[3], 1e-4), rel=1e-5)
+    assert float(by_step) == pytest.approx(central_difference(value_by_argument(case, 3), at[3], 1e-4), rel=1e-5)
 
 
 def test_both_methods_agree():

@@ -115,11 +115,11 @@ def _apart(function: Callable, points: np.ndarray) -> tuple[float, float, float]
 def _differences(f: Callable, z, directions, size: float):
     """Differences of f along every direction for every h, (STEPS, DIRECTIONS, ...)."""
 
-    def along(h, d):
+    def difference(h, d):
         one, two = (f(z + k * h * d) - f(z - k * h * d) for k in (1, 2))
         return (8 * one - two) / (12 * h)
 
-    return jax.lax.map(lambda h: jax.lax.map(lambda d: along(h, d), directions), jnp.asarray(STEPS * size))
+    return jax.lax.map(lambda h: jax.lax.map(lambda d: difference(h, d), directions), jnp.asarray(STEPS * size))
 
 
 def _nearest(own, differences, per_size):

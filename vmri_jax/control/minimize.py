@@ -121,7 +121,7 @@ def minimize(
                     raise
                 break
             nu, rho = change.nu, max(rho, 2 * steepest)
-            point, told = search.along(point._replace(gaps=stages.c, goal=final.g), change, rho)
+            point, told = search.line_search(point._replace(gaps=stages.c, goal=final.g), change, rho)
             history.append(told)
             tell(f"cost {told['cost']:.6g}, goal {told['miss']:.1e}, steps {told['gap']:.1e}", count, max_iterations)
             if max(told["update"], told["gap"]) <= tolerance or told["part"] == 0.0:

@@ -63,7 +63,7 @@ class Search:
         change = by_sweep(stages, final)
         return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
 
-    def along(self, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict[str, float]]:
+    def line_search(self, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict[str, float]]:
         """The first point along an update whose merit ``cost + rho (sum |gaps| + sum |goal| + sum of what is above the limits)``
         is small enough, and what there is to say of it.
 

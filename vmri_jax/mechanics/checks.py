@@ -142,7 +142,7 @@ def shape_of(what: str, function, *args):
         ValueError: it cannot be traced, differentiated, or evaluated.
     """
 
-    def along(*args):
+    def differentiated_twice(*args):
         *moving, params = args
 
         def tangent(*moving):
@@ -152,7 +152,7 @@ def shape_of(what: str, function, *args):
         return value
 
     try:
-        shape = jax.eval_shape(along, *args)
+        shape = jax.eval_shape(differentiated_twice, *args)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
             f"{what} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "

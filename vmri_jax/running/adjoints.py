@@ -183,9 +183,9 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_no
         return [real.get(i, leaf) for i, leaf in enumerate(leaves)]
 
     def step(real, state: State, macro_dt):
-        stepper = engine.stepper(complete(real), state, once=True)
-        state, info, own = stepper.step(state, stepper.init(state, macro_dt), macro_dt)
-        return stepper.project(state, own)[0], info.q_f_micro
+        stepper = engine.stepper(complete(real), state, reverse_only=True)
+        state, info, memory = stepper.step(state, stepper.init(state, macro_dt), macro_dt)
+        return stepper.project(state, memory)[0], info.q_f_micro
 
     def node(real, state: State):
         system = engine.stepper(complete(real), state).system
@@ -199,16 +199,16 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_no
         by_real, by_state = _plus((by_real, by_state), jax.vjp(node, real, at.end)[1](at.at_end))
 
         def one(number, carry):
-            (state, own), by_real, by_state, by_dt = carry
+            (state, memory), by_real, by_state, by_dt = carry
             if save_every == 1:
                 state = at.start
             else:
-                state, info, own = back.step(state, own, -macro_dt)
-                state, own = back.project(state, own)
+                state, info, memory = back.step(state, memory, -macro_dt)
+                state, memory = back.project(state, memory)
                 state = _where_solved(info.result, state)
             by_micro = jnp.where(number == 0, at.q_f_micro, 0.0)
             more, by_state, more_dt = jax.vjp(step, real, state, macro_dt)[1]((by_state, by_micro))
-            return (state, own), *_plus((by_real,), (more,)), by_state, by_dt + more_dt
+            return (state, memory), *_plus((by_real,), (more,)), by_state, by_dt + more_dt
 
         carry = (at.end, back.init(at.end, -macro_dt)), by_real, by_state, by_dt
         (state, _), *carry = jax.lax.fori_loop(0, save_every, one, carry)
@@ -300,11 +300,11 @@ def _run_and_jacobian(run, arrays):
         trajectory = run(jax.tree.unflatten(structure, [wanted.get(i, value) for i, value in enumerate(values)]))
         return list(filter(_is_real, jax.tree.leaves(trajectory))), trajectory
 
-    def along(direction):
+    def directional_derivative(direction):
         _, tangents, trajectory = jax.jvp(real_outputs, (wanted,), (apart(direction),), has_aux=True)
         return tangents, trajectory
 
-    derivatives, trajectory = jax.vmap(along, out_axes=(0, None))(jnp.eye(flat.size))
+    derivatives, trajectory = jax.vmap(directional_derivative, out_axes=(0, None))(jnp.eye(flat.size))
     by_leaf = apart(jnp.arange(flat.size, dtype=float))
     places = [by_leaf[i].astype(int) if i in by_leaf else None for i in range(len(values))]
     return trajectory, (jax.tree.unflatten(structure, values), places, derivatives)

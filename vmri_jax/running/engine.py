@@ -61,7 +61,7 @@ class Engine:
 
         def checkpointed(leaves, state, macro_dt, save_every):
             loops = Stored() if self.num_saves * save_every <= WHOLE else Recursive(save_every)
-            return self.trajectory(leaves, state, macro_dt, save_every, loops=loops, once=True)
+            return self.trajectory(leaves, state, macro_dt, save_every, loops=loops, reverse_only=True)
 
         return jax.jit(checkpointed, static_argnums=3)
 
@@ -91,7 +91,7 @@ class Engine:
         saved = done.saved.first(saves, int(done.number))
         self._free.append(done.saved)
         times = np.asarray(t_start) + (step + np.arange(saves + 1) * save_every) * np.asarray(macro_dt)
-        return self._trajectory(scheme, done._replace(saved=saved), times, macro_dt), done.at.state, done.at.own
+        return self._trajectory(scheme, done._replace(saved=saved), times, macro_dt), done.at.state, done.at.memory
 
     @cached_property
     def _free(self) -> list[Saved]:
@@ -103,16 +103,16 @@ class Engine:
         return _blank_memory(self, tuple((a.shape, a.dtype) for a in (*leaves, *state)))
 
     def trajectory(
-        self, leaves, state, macro_dt, save_every, saves=None, loops: Loops | None = None, once: bool = False
+        self, leaves, state, macro_dt, save_every, saves=None, loops: Loops | None = None, reverse_only: bool = False
     ) -> Trajectory:
         """A run from its first step, not compiled; of all saved intervals, or of the first `saves` of them.
 
         Args:
             loops: to be differentiated; None for the fastest.
-            once: as of `plan`.
+            reverse_only: as of `plan`.
         """
         start = State(*state)
-        stepper = self.stepper(leaves, start, once)
+        stepper = self.stepper(leaves, start, reverse_only)
         at = _At.before(start, stepper.init(start, macro_dt), 0)
         if loops is not None:
             return self._scanned(stepper, at, macro_dt, save_every, loops)
@@ -121,10 +121,10 @@ class Engine:
         times = start.t + jnp.arange(self.num_saves + 1) * save_every * macro_dt
         return self._trajectory(stepper.scheme, done, times, macro_dt)
 
-    def stepper(self, leaves, state: State, once: bool = False) -> Plan:
+    def stepper(self, leaves, state: State, reverse_only: bool = False) -> Plan:
         """How its steps are taken."""
         newton, scheme, system = jax.tree.unflatten(self.structure, leaves)
-        return plan(system, scheme, state, newton, fallback=False, once=once)
+        return plan(system, scheme, state, newton, fallback=False, reverse_only=reverse_only)
 
     def _counted(self, stepper: Plan, at: "_At", saved: Saved, t_start, macro_dt, save_every, saves) -> "_Counted":
         """`saves * save_every` macro steps; with `saves` None all that there is room for, whether or not steps fail: lanes go on together."""
@@ -168,9 +168,9 @@ class Engine:
 
         def interval(at: _At, count):
             at, info, micro = loops.repeat(count, take, (at, no_info, no_micro))
-            if stepper.projects_rarely:
-                state, own = stepper.project(at.state, at.own)
-                at = at._replace(state=state, own=own)
+            if stepper.defers_projection:
+                state, memory = stepper.project(at.state, at.memory)
+                at = at._replace(state=state, memory=memory)
             return at, info, micro
 
         return interval
@@ -209,15 +209,15 @@ class _At(NamedTuple):
     """Where a run is: before macro step `step`, with the worst `result` so far and the step that failed, -1 if none did."""
 
     state: State
-    own: Any
+    memory: Any
     step: Int[Numbers, ""]
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
 
     @classmethod
-    def before(cls, state: State, own, step) -> "_At":
+    def before(cls, state: State, memory, step) -> "_At":
         """A step, without failures so far."""
-        return cls(state, own, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
+        return cls(state, memory, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
 
 
 class _Counted(NamedTuple):
@@ -234,7 +234,7 @@ def _step_of(stepper: Plan, t_start, macro_dt, save_micro: bool):
     def step(_, carry):
         at, worst, _ = carry
         alive = at.failed_at < 0
-        state, info, own = stepper.step(at.state, at.own, macro_dt)
+        state, info, memory = stepper.step(at.state, at.memory, macro_dt)
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
         now = RunInfo(info.method, info.iterations, info.residual)
         worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, now)
@@ -243,7 +243,7 @@ def _step_of(stepper: Plan, t_start, macro_dt, save_micro: bool):
         result = jnp.where(alive, jnp.maximum(at.result, info.result), at.result)
         failed_at = jnp.where(alive & ~ok, at.step, at.failed_at)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
-        return _At(state, own, at.step + 1, result, failed_at), worst, micro
+        return _At(state, memory, at.step + 1, result, failed_at), worst, micro
 
     return step
 

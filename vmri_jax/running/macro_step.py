@@ -43,5 +43,5 @@ def macro_step(
 @jax.jit
 def _macro_step(system, scheme, state, macro_dt, newton):
     planned = plan(system, scheme, state, newton)
-    state, info, own = planned.step(state, planned.init(state, macro_dt), macro_dt)
-    return planned.project(state, own)[0] if planned.projects_rarely else state, info
+    state, info, memory = planned.step(state, planned.init(state, macro_dt), macro_dt)
+    return planned.project(state, memory)[0] if planned.defers_projection else state, info

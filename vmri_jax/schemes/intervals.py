@@ -116,7 +116,7 @@ class IntervalNodes:
     def sample(self, path: IntervalPath, equations: StepEquations, m, names: tuple[str, ...]) -> list:
         """By name, of the path at the nodes of interval m: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
 
-        def along(name: str):
+        def values_at_nodes(name: str):
             if name == "t":
                 return equations.t + equations.macro_dt * of_interval(self.theta, m)
             start, increments = (path.slow_start, path.slow) if name[2] == "s" else (path.fast_start, path.fast)
@@ -125,7 +125,7 @@ class IntervalNodes:
                 return start + moved
             return moved / (equations.macro_dt if name[2] == "s" else equations.micro_dt)
 
-        return [along(name) for name in names]
+        return [values_at_nodes(name) for name in names]
 
 
 def _padded(group: NodeGroup, num_micro: int):

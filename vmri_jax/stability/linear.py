@@ -237,7 +237,7 @@ def _expansion(system: System, state: State) -> dict:
     def constraints(q):
         return system.constraints(state.t, q[:n_s], q[n_s:])
 
-    def along(s):  # straight motion through the state
+    def constraints_in_motion(s):  # straight motion through the state
         return system.constraints(state.t + s, q[:n_s] + s * v[:n_s], q[n_s:] + s * v[n_s:])
 
     def force(q, v):
@@ -253,7 +253,7 @@ def _expansion(system: System, state: State) -> dict:
         "fast": jax.hessian(fast)(q),
         "jacobian": jax.jacrev(constraints)(q),
         "curvature": jax.jacfwd(jax.jacrev(constraints))(q),
-        "centripetal": jax.jacfwd(jax.jacfwd(along))(0.0),
+        "centripetal": jax.jacfwd(jax.jacfwd(constraints_in_motion))(0.0),
         "force_q": force_q,
         "force_v": force_v,
         "impetus": slope[: q.size] - turn[q.size :] - jax.grad(lambda q: slow(q) + fast(q))(q) + force(q, v),

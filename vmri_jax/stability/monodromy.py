@@ -110,7 +110,7 @@ def _product(system, scheme, state, macro_dt, newton, num_steps: int):
         z = phase_vector(end)
         return z, (z, info.result)
 
-    def along(carry, k):
+    def step_with_derivative(carry, k):
         z, basis, matrix = carry
         t = state.t + k * macro_dt
         derivative, (z, result) = jax.jacfwd(lambda z: step(z, t), has_aux=True)(z)
@@ -119,5 +119,7 @@ def _product(system, scheme, state, macro_dt, newton, num_steps: int):
 
     z = phase_vector(state)
     basis = tangents(system, state.t, z, splits)
-    (z, end_basis, matrix), results = jax.lax.scan(along, (z, basis, jnp.eye(len(basis))), jnp.arange(num_steps))
+    (z, end_basis, matrix), results = jax.lax.scan(
+        step_with_derivative, (z, basis, jnp.eye(len(basis))), jnp.arange(num_steps)
+    )
     return z, matrix, basis, end_basis, results

@@ -272,7 +272,7 @@ class Collocation(Solver):
 
     newton: Newton
 
-    def solve(self, equations: StepEquations, guess: Unknowns, own: tuple) -> tuple[Solution, tuple]:
+    def solve(self, equations: StepEquations, guess: Unknowns, memory: tuple) -> tuple[Solution, tuple]:
         newton = self.newton
         joined, modes = JoinedEquations(equations), TimeModes.of(equations.scheme)
         n_s, (n_g, _) = joined.n_s, equations.system.num_constraints(equations.q_s, equations.q_f)
@@ -310,7 +310,7 @@ class Collocation(Solver):
         end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
         left = max_abs(rows), max_abs(forces.g)
         status = status_of(equations, last.result, Method.COLLOCATION, last.iterations, *left, newton.tolerance)
-        return Solution(unknowns, end, status), own
+        return Solution(unknowns, end, status), memory
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["one interval of high degree: all variables at once, in modes of time"]

@@ -13,10 +13,10 @@ from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 
 class ComposedState(NamedTuple):
-    """last: what the last stage hands on. own: what every stage carries to its next turn, stacked."""
+    """last: what the last stage hands on. stages: the memory of every stage, stacked."""
 
     last: Any
-    own: Any
+    stages: Any
 
 
 @dataclass(frozen=True)
@@ -31,28 +31,28 @@ class Composed(Stepper):
     stage: Stepper
 
     def init(self, state: State, macro_dt) -> ComposedState:
-        own = jax.vmap(lambda c: self.stage.init(state, c * macro_dt))(jnp.asarray(self.coefficients))
-        return ComposedState(jax.tree.map(lambda a: a[0], own), own)
+        stages = jax.vmap(lambda c: self.stage.init(state, c * macro_dt))(jnp.asarray(self.coefficients))
+        return ComposedState(jax.tree.map(lambda a: a[0], stages), stages)
 
-    def move(self, state: State, own: ComposedState, macro_dt) -> tuple[State, StepInfo, ComposedState]:
+    def advance(self, state: State, memory: ComposedState, macro_dt) -> tuple[State, StepInfo, ComposedState]:
         def stage(carry, at):
-            (state, last), (c, own) = carry, at
-            own = self.stage.continued(own, last, state, c * macro_dt)
-            state, info, own = self.stage.step(state, own, c * macro_dt)
-            return (state, own), (own, info)
+            (state, last), (c, memory) = carry, at
+            memory = self.stage.continued(memory, last, state, c * macro_dt)
+            state, info, memory = self.stage.step(state, memory, c * macro_dt)
+            return (state, memory), (memory, info)
 
-        stages = jnp.asarray(self.coefficients), own.own
-        (state, last), (own_stages, infos) = jax.lax.scan(stage, (state, own.last), stages)
+        stages = jnp.asarray(self.coefficients), memory.stages
+        (state, last), (stage_memories, infos) = jax.lax.scan(stage, (state, memory.last), stages)
         worst = jax.tree.map(jnp.max, infos.status)
         along = map(jnp.concatenate, (infos.q_f_micro, infos.multiplier, infos.slow_multiplier))
-        return state, StepInfo(*worst, *along), ComposedState(last, own_stages)
+        return state, StepInfo(*worst, *along), ComposedState(last, stage_memories)
 
-    def project(self, state: State, own: ComposedState) -> tuple[State, ComposedState]:
-        state, last = self.stage.project(state, own.last)
-        return state, own._replace(last=last)
+    def project(self, state: State, memory: ComposedState) -> tuple[State, ComposedState]:
+        state, last = self.stage.project(state, memory.last)
+        return state, memory._replace(last=last)
 
-    def lines(self) -> list[str]:
-        return [f"composition of {len(self.coefficients)} stages, each:", *indented(self.stage.lines())]
+    def describe(self) -> list[str]:
+        return [f"composition of {len(self.coefficients)} stages, each:", *indented(self.stage.describe())]
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,16 @@ class Projected(Stepper):
     def init(self, state: State, macro_dt):
         return self.inner.init(state, macro_dt)
 
-    def renew(self, state: State, own, macro_dt):
-        return self.inner.renew(state, own, macro_dt)
+    def renew(self, state: State, memory, macro_dt):
+        return self.inner.renew(state, memory, macro_dt)
 
-    def move(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
-        state, info, own = self.inner.move(state, own, macro_dt)
-        state, own = self.inner.project(state, own)
-        return state, info, own
+    def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
+        state, info, memory = self.inner.advance(state, memory, macro_dt)
+        state, memory = self.inner.project(state, memory)
+        return state, info, memory
 
-    def continued(self, own, last, state: State, macro_dt):
-        return self.inner.continued(own, last, state, macro_dt)
+    def continued(self, memory, last, state: State, macro_dt):
+        return self.inner.continued(memory, last, state, macro_dt)
 
-    def lines(self) -> list[str]:
-        return [*self.inner.lines(), "momenta projected onto the hidden constraints"]
+    def describe(self) -> list[str]:
+        return [*self.inner.describe(), "momenta projected onto the hidden constraints"]

@@ -35,7 +35,7 @@ class Coupled(Solver):
 
     newton: Newton
 
-    def solve(self, equations: StepEquations, guess: Unknowns, own) -> tuple[Solution, Any]:
+    def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
         x, result, iterations = self._root(equations, guess)
         residual, (p_s, p_f) = equations.evaluate(x)
         rows = jnp.maximum(max_abs(residual.slow), max_abs(residual.fast))
@@ -46,7 +46,7 @@ class Coupled(Solver):
             never = partial(jnp.asarray, False)
             dependent = jax.lax.cond(failed, partial(has_dependent_constraints, equations), never)
             status = status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))
-        return Solution(x, (equations.q_f + x.fast[:, -1].sum(0), p_s, p_f), status), own
+        return Solution(x, (equations.q_f + x.fast[:, -1].sum(0), p_s, p_f), status), memory
 
     def _root(self, equations: StepEquations, guess: Unknowns):
         """(x, `Result`, iterations)."""
@@ -90,7 +90,7 @@ class Coupled(Solver):
             done = done._replace(result=jnp.where(done.result == RUNNING, Result.STAGNATED, done.result))
         return done.x, done.result, done.iterations
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["all unknowns of the step at once: Newton's iteration, dense"]
 
 

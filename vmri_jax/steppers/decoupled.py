@@ -33,39 +33,41 @@ class Decoupled(Stepper):
         slow, fast = apart(state)
         return DecoupledState(self.slow.init(slow, macro_dt), self.fast.init(fast, macro_dt / self.num_micro))
 
-    def renew(self, state: State, own: DecoupledState, macro_dt) -> DecoupledState:
+    def renew(self, state: State, memory: DecoupledState, macro_dt) -> DecoupledState:
         slow, fast = apart(state)
         micro_dt = macro_dt / self.num_micro
-        return DecoupledState(self.slow.renew(slow, own.slow, macro_dt), self.fast.renew(fast, own.fast, micro_dt))
+        return DecoupledState(
+            self.slow.renew(slow, memory.slow, macro_dt), self.fast.renew(fast, memory.fast, micro_dt)
+        )
 
-    def move(self, state: State, own: DecoupledState, macro_dt) -> tuple[State, StepInfo, DecoupledState]:
+    def advance(self, state: State, memory: DecoupledState, macro_dt) -> tuple[State, StepInfo, DecoupledState]:
         slow, fast = apart(state)
-        slow, slow_info, own_slow = self.slow.move(slow, own.slow, macro_dt)
-        fast, info, own_fast = self.fast.move_many(fast, own.fast, macro_dt / self.num_micro, self.num_micro)
+        slow, slow_info, slow_memory = self.slow.advance(slow, memory.slow, macro_dt)
+        fast, info, fast_memory = self.fast.advance_many(fast, memory.fast, macro_dt / self.num_micro, self.num_micro)
         status = slow_info.status.worse(info.status)
         end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
         info = StepInfo(*status, info.q_f_micro, info.multiplier, slow_info.multiplier[0])
-        return end, info, DecoupledState(own_slow, own_fast)
+        return end, info, DecoupledState(slow_memory, fast_memory)
 
-    def project(self, state: State, own: DecoupledState) -> tuple[State, DecoupledState]:
+    def project(self, state: State, memory: DecoupledState) -> tuple[State, DecoupledState]:
         slow, fast = apart(state)
-        slow, own_slow = self.slow.project(slow, own.slow)
-        fast, own_fast = self.fast.project(fast, own.fast)
-        return State(state.t, state.q_s, state.q_f, slow.p_f, fast.p_f), DecoupledState(own_slow, own_fast)
+        slow, slow_memory = self.slow.project(slow, memory.slow)
+        fast, fast_memory = self.fast.project(fast, memory.fast)
+        return State(state.t, state.q_s, state.q_f, slow.p_f, fast.p_f), DecoupledState(slow_memory, fast_memory)
 
-    def continued(self, own: DecoupledState, last: DecoupledState, state: State, macro_dt) -> DecoupledState:
+    def continued(self, memory: DecoupledState, last: DecoupledState, state: State, macro_dt) -> DecoupledState:
         slow, fast = apart(state)
         return DecoupledState(
-            self.slow.continued(own.slow, last.slow, slow, macro_dt),
-            self.fast.continued(own.fast, last.fast, fast, macro_dt / self.num_micro),
+            self.slow.continued(memory.slow, last.slow, slow, macro_dt),
+            self.fast.continued(memory.fast, last.fast, fast, macro_dt / self.num_micro),
         )
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return [
             "slow variables, one step:",
-            *indented(self.slow.lines()),
+            *indented(self.slow.describe()),
             f"fast variables, {self.num_micro} micro step{'s' * (self.num_micro > 1)}:",
-            *indented(self.fast.lines()),
+            *indented(self.fast.describe()),
         ]
 
 

@@ -17,11 +17,11 @@ class FreeFlight(Stepper):
 
     system: System
 
-    def move(self, state: State, own: tuple, macro_dt) -> tuple[State, StepInfo, tuple]:
+    def advance(self, state: State, memory: tuple, macro_dt) -> tuple[State, StepInfo, tuple]:
         v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)
         q_s, q_f = state.q_s + macro_dt * v_s, state.q_f + macro_dt * v_f
         info = StepInfo(*Status.direct(Method.EXPLICIT), q_f[None], jnp.zeros((1, 1, 0)), jnp.zeros((1, 0)))
-        return State(state.t + macro_dt, q_s, q_f, state.p_s, state.p_f), info, own
+        return State(state.t + macro_dt, q_s, q_f, state.p_s, state.p_f), info, memory
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["free flight: q + H v, nothing to solve"]

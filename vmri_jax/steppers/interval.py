@@ -24,7 +24,7 @@ SMALL = 16
 """Matrices of micro intervals up to this size are renewed with every macro step."""
 
 
-def along(weights, increments):
+def weighted_sum(weights, increments):
     """``sum_i weights_i increments_i`` over the last axis of weights and the first of increments."""
     return jnp.sum(weights[..., None] * increments, axis=-2)
 

@@ -44,44 +44,46 @@ class Kicked(Stepper):
     def init(self, state: State, macro_dt) -> KickedState:
         return KickedState(self._gradients(state, macro_dt), self.inner.init(state, macro_dt))
 
-    def renew(self, state: State, own: KickedState, macro_dt) -> KickedState:
-        return own._replace(inner=self.inner.renew(state, own.inner, macro_dt))
+    def renew(self, state: State, memory: KickedState, macro_dt) -> KickedState:
+        return memory._replace(inner=self.inner.renew(state, memory.inner, macro_dt))
 
-    def move(self, state: State, own: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
-        state = kicked(state, self.kicks, own.gradients, macro_dt, ("start",))
-        state, info, inner = self.inner.move(state, own.inner, macro_dt)
+    def advance(self, state: State, memory: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
+        state = kicked(state, self.kicks, memory.gradients, macro_dt, ("start",))
+        state, info, inner = self.inner.advance(state, memory.inner, macro_dt)
         gradients = self._gradients(state, macro_dt)
         return kicked(state, self.kicks, gradients, macro_dt, ("end",)), info, KickedState(gradients, inner)
 
-    def move_many(self, state: State, own: KickedState, macro_dt, count: int) -> tuple[State, StepInfo, KickedState]:
+    def advance_many(
+        self, state: State, memory: KickedState, macro_dt, count: int
+    ) -> tuple[State, StepInfo, KickedState]:
         """`count` steps; the kicks of two steps at the node they share are merged into one."""
 
-        def move(state, inner, ends):
-            state, info, inner = self.inner.move(state, inner, macro_dt)
+        def advance(state, inner, ends):
+            state, info, inner = self.inner.advance(state, inner, macro_dt)
             gradients = self._gradients(state, macro_dt)
             return kicked(state, self.kicks, gradients, macro_dt, ends), info, KickedState(gradients, inner)
 
         def between(carry, _):
             state, inner, worst = carry
-            state, info, own = move(state, inner, ("end", "start"))
+            state, info, memory = advance(state, inner, ("end", "start"))
             along = info.q_f_micro[0], info.multiplier[0]
-            return (state, own.inner, worst.worse(info.status)), along
+            return (state, memory.inner, worst.worse(info.status)), along
 
-        state = kicked(state, self.kicks, own.gradients, macro_dt, ("start",))
+        state = kicked(state, self.kicks, memory.gradients, macro_dt, ("start",))
         none = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
-        (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, own.inner, none), length=count - 1)
-        state, last, own = move(state, inner, ("end",))
+        (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, memory.inner, none), length=count - 1)
+        state, last, memory = advance(state, inner, ("end",))
         status = last.status if is_concrete(last.status) else worst.worse(last.status)  # known ones are all alike
         q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
-        return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), own
+        return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), memory
 
-    def project(self, state: State, own: KickedState) -> tuple[State, KickedState]:
-        state, inner = self.inner.project(state, own.inner)
-        return state, own._replace(inner=inner)
+    def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
+        state, inner = self.inner.project(state, memory.inner)
+        return state, memory._replace(inner=inner)
 
-    def continued(self, own: KickedState, last: KickedState, state: State, macro_dt) -> KickedState:
+    def continued(self, memory: KickedState, last: KickedState, state: State, macro_dt) -> KickedState:
         gradients = last.gradients if self.average is None else self._gradients(state, macro_dt)
-        return KickedState(gradients, self.inner.continued(own.inner, last.inner, state, macro_dt))
+        return KickedState(gradients, self.inner.continued(memory.inner, last.inner, state, macro_dt))
 
     def _gradients(self, state: State, macro_dt):
         q_s, q_f = state.q_s, state.q_f
@@ -96,12 +98,12 @@ class Kicked(Stepper):
 
         return tuple(map(gradient, self.kicks))
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         if not self.kicks:
-            return self.inner.lines()
+            return self.inner.describe()
         names = ", ".join(term.name for term in self.kicks)
         averaged = ", at averaged fast positions" if self.average is not None else ""
-        return [f"kicks of {names} at both ends{averaged}", *indented(self.inner.lines())]
+        return [f"kicks of {names} at both ends{averaged}", *indented(self.inner.describe())]
 
 
 def kicked(state: State, kicks: tuple[Term, ...], gradients, macro_dt, ends: tuple[str, ...]) -> State:
@@ -131,8 +133,8 @@ def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
         def averaged(q_s, q_f):
             stepper, micro_dt, none = stepper_of(q_s, q_f), macro_dt / num_micro, jnp.zeros(0)
             start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
-            own = stepper.renew(start, stepper.init(start, micro_dt), micro_dt)
-            _, info, _ = stepper.move_many(start, own, micro_dt, num_micro)
+            memory = stepper.renew(start, stepper.init(start, micro_dt), micro_dt)
+            _, info, _ = stepper.advance_many(start, memory, micro_dt, num_micro)
             x = info.q_f_micro
             a = (q_f / 2 + jnp.sum(x[:-1], axis=0) + x[-1] / 2) / num_micro
             return jnp.where(info.result <= Result.CONVERGED_AT_ROUNDOFF, a, jnp.nan)

@@ -25,19 +25,19 @@ class Linear(Stepper):
     def init(self, state: State, macro_dt) -> Matrix:
         return self.interval.matrix(StepEquations.of(self.system, self.scheme, state, macro_dt))
 
-    def move(self, state: State, own: Matrix, macro_dt) -> tuple[State, StepInfo, Matrix]:
+    def advance(self, state: State, memory: Matrix, macro_dt) -> tuple[State, StepInfo, Matrix]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         h, rest = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
         path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), rest[None])
         d = jax.grad(equations.without_kinetic)(path, path)
         rows = jnp.concatenate([d.fast_start - d.fast[0].sum(0) + h * state.p_f, d.fast[0, :-1]])
-        increments = -own.solve(rows)
+        increments = -memory.solve(rows)
 
-        p_f = (d.fast[0, -1] + own.outgoing(increments)) / h
+        p_f = (d.fast[0, -1] + memory.outgoing(increments)) / h
         q_f = state.q_f + increments[-1]
         none = jnp.zeros((1, self.scheme.degree, 0)), jnp.zeros((self.scheme.degree, 0))
         info = StepInfo(*Status.direct(Method.LINEAR), q_f[None], *none)
-        return State(state.t + macro_dt, state.q_s, q_f, state.p_s, p_f), info, own
+        return State(state.t + macro_dt, state.q_s, q_f, state.p_s, p_f), info, memory
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["linear equations: one product with a matrix computed once"]

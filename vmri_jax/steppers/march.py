@@ -151,12 +151,12 @@ class MarchEquations:
             answers: how what arrives at them changes with the slow increments, one column for each.
         """
 
-        def along(dz, answer: Handed):
+        def slow_residual_change(dz, answer: Handed):
             return jax.jvp(lambda z, a: self.slow_equations(z, a)[0], (z, arriving), (dz, answer))[1]
 
         # multipliers of the slow constraints change nothing that arrives
         answers = jax.tree.map(lambda a: jnp.pad(a, [(0, 0), (0, z.size - self.num_slow)]), answers)
-        matrix = jax.vmap(along, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)
+        matrix = jax.vmap(slow_residual_change, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)
         return self.inverse(matrix, self.num_slow)
 
     def inverse(self, matrix, size: int):
@@ -273,10 +273,10 @@ def exact_pass(march: MarchEquations, z, x, past, from_past) -> tuple[Matrices, 
         inverse = march.inverse(by_x, march.num_fast)
 
         # how the interval answers to the slow increments: at fixed x, and by its own unknowns
-        def along(answer: Handed, dslow):
+        def interval_change(answer: Handed, dslow):
             return jax.jvp(lambda a, s: march.interval(m, x, a, s), (arriving, slow), (answer, dslow))[1]
 
-        rows, rests = jax.vmap(along, in_axes=-1, out_axes=-1)(answers, unit)
+        rows, rests = jax.vmap(interval_change, in_axes=-1, out_axes=-1)(answers, unit)
         response = -matmul(inverse, rows)
         answers = Handed(answers.position + march.last_increment(response), rests + matmul(hands_on, response))
 

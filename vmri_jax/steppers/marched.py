@@ -97,15 +97,15 @@ class Marched(Solver):
             PolynomialPredictor.constant(z), Parabola.constant(x[0]), march.no_matrices(), jnp.asarray(jnp.inf)
         )
 
-    def solve(self, equations: StepEquations, guess: Unknowns, own: MarchMemory) -> tuple[Solution, MarchMemory]:
+    def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
         march = self._march(equations)
         z, x = march.rows(guess)
         zero, infinite = jnp.zeros(()), jnp.asarray(jnp.inf)
         start = Progress(
             passed=Passed(z, x, z, x, march.start(), equations.p_s, Worst.none()),
-            matrices=own.matrices,
+            matrices=memory.matrices,
             size=infinite,
-            rate=own.rate,
+            rate=memory.rate,
             curvature=zero,
             exact_size=infinite,
             still_moves=zero,
@@ -113,31 +113,31 @@ class Marched(Solver):
             result=jnp.asarray(RUNNING),
         )
         if self.newton.fixed_iterations is not None:
-            done = self._iterate(march, guess, start, own, None)
+            done = self._iterate(march, guess, start, memory, None)
             result = jnp.where(done.result == RUNNING, Result.STAGNATED, done.result)
-            return self._solution(march, done, result, done.passes), self._learned(march, own, done)
+            return self._solution(march, done, result, done.passes), self._learned(march, memory, done)
 
         def part(equations, guess, limit, is_first):
-            done = self._iterate(self._march(equations), guess, start, own, limit, is_first)
+            done = self._iterate(self._march(equations), guess, start, memory, limit, is_first)
             return done, march.by_name(done.passed.z, done.passed.x), done.result, done.passes
 
         parts = solve_in_parts(equations, guess, start, part, self.newton.max_iterations, PLAIN_PASSES)
         done = parts.solution
-        return self._solution(march, done, parts.result, parts.iterations), self._learned(march, own, done)
+        return self._solution(march, done, parts.result, parts.iterations), self._learned(march, memory, done)
 
     def _march(self, equations: StepEquations) -> MarchEquations:
         return MarchEquations(equations, INVERSES[self.linear_solver])
 
     def _iterate(
-        self, march: MarchEquations, guess: Unknowns, start: Progress, own: MarchMemory, limit, is_first: Any = True
+        self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first: Any = True
     ) -> Progress:
         """Passes, at most `limit`: of the first attempt from what the steps before lead to, of others from the guess."""
         accepted, fixed = Accepted.of(march.equations, self.newton), self.newton.fixed_iterations
         z, x = march.rows(guess)
-        z = jnp.where(is_first, own.slow.next(march.num_slow), z)
+        z = jnp.where(is_first, memory.slow.next(march.num_slow), z)
         at = start._replace(
             passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
-            rate=jnp.where(is_first, own.rate, jnp.inf),
+            rate=jnp.where(is_first, memory.rate, jnp.inf),
         )
 
         def judged(now: Passed, before: Progress) -> Progress:
@@ -159,7 +159,7 @@ class Marched(Solver):
 
         def unknowns(at: Progress) -> tuple:
             passed = at.passed
-            return passed.z + passed.dz, passed.x + passed.dx, own.fast, is_first & (at.passes == 0)
+            return passed.z + passed.dz, passed.x + passed.dx, memory.fast, is_first & (at.passes == 0)
 
         def exact(at: Progress) -> Progress:
             matrices, now = exact_pass(march, *unknowns(at))
@@ -205,12 +205,12 @@ class Marched(Solver):
             status = status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))
         return Solution(x, end, status)
 
-    def _learned(self, march: MarchEquations, own: MarchMemory, done: Progress) -> MarchMemory:
+    def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:
         passed = done.passed
-        fast = own.fast.after_step(passed.x)
-        return MarchMemory(own.slow.add(passed.z, march.num_slow), fast, done.matrices, done.rate)
+        fast = memory.fast.after_step(passed.x)
+        return MarchMemory(memory.slow.add(passed.z, march.num_slow), fast, done.matrices, done.rate)
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         head = f"march over the micro intervals with exact matrices, {self.linear_solver.replace('_', ' ')}"
         if self.linear_solver != "null_space" or self.sizes is None:
             return [head]

@@ -12,11 +12,11 @@ from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import Matrix, along, constant_mass, interval_problem
+from vmri_jax.steppers.interval import Matrix, constant_mass, interval_problem, weighted_sum
 from vmri_jax.steppers.predictors import LinearPredictor
 
 
-class Left(NamedTuple):
+class SweepTotals(NamedTuple):
     """What a pass leaves, or what arrives at a micro interval in it.
 
     q_f, p_f: position and momentum times h at the end of the last interval.
@@ -32,7 +32,7 @@ class Left(NamedTuple):
     moved: Float[Array, ""]
 
 
-class Lines(NamedTuple):
+class FastPredictors(NamedTuple):
     """Where the unknowns of the micro intervals go on.
 
     multiplier: (r, n_g) multipliers lambda.
@@ -43,12 +43,12 @@ class Lines(NamedTuple):
     bend: LinearPredictor
 
 
-class Fast(NamedTuple):
+class FastUnknowns(NamedTuple):
     """Unknowns of the micro intervals and what is kept of them, with the intervals as first axis.
 
     increments, multiplier: the unknowns, multipliers scaled.
     nodes: positions at the nodes 1..r.
-    bends: see `Lines`.
+    bends: see `FastPredictors`.
     schur: inverses of ``G K^-1 G^T`` from the first pass.
     """
 
@@ -59,7 +59,7 @@ class Fast(NamedTuple):
     schur: FullInverse | BandInverse
 
 
-class March(NamedTuple):
+class MicroSweep(NamedTuple):
     """What is the same in all passes of a macro step.
 
     equations: of the macro step.
@@ -75,52 +75,56 @@ class March(NamedTuple):
     scale: Float[Numbers, "num_micro r 1"]
     sparsity: Sparsity
 
-    def first_pass(self, slow, lines: Lines) -> tuple[Fast, Left]:
+    def first_pass(self, slow, predictors: FastPredictors) -> tuple[FastUnknowns, SweepTotals]:
         """With fast unknowns from where the intervals before lead to, for slow increments (r, n_s)."""
         r = self.equations.scheme.degree
         velocity = constant_mass(self.equations.system).fast_mass.inverse().times
 
         def interval(carry, at):
-            (arriving, lines), (m, basis, scale) = carry, at
+            (arriving, predictors), (m, basis, scale) = carry, at
             straight = control_nodes(r)[1:, None] * velocity(arriving.p_f)
-            mu, increments = scale * lines.multiplier.next(m), straight
+            mu, increments = scale * predictors.multiplier.next(m), straight
             if not self.is_explicit:
-                increments = straight + self.equations.micro_dt**2 * lines.bend.next(m)
-            done, left = self._corrected(slow, arriving, m, basis, straight, increments, mu, self.sparsity)
-            lines = Lines(lines.multiplier.add(m, done.multiplier / scale), lines.bend.add(m, done.bends))
-            return (left, lines), done
+                increments = straight + self.equations.micro_dt**2 * predictors.bend.next(m)
+            done, totals = self._corrected(slow, arriving, m, basis, straight, increments, mu, self.sparsity)
+            predictors = FastPredictors(
+                predictors.multiplier.add(m, done.multiplier / scale), predictors.bend.add(m, done.bends)
+            )
+            return (totals, predictors), done
 
-        (left, _), fast = jax.lax.scan(interval, (self._start(slow), lines), (*self._intervals(), self.scale))
-        return fast, left
+        (totals, _), fast = jax.lax.scan(interval, (self._start(slow), predictors), (*self._intervals(), self.scale))
+        return fast, totals
 
-    def next_pass(self, slow, fast: Fast) -> tuple[Fast, Left]:
+    def next_pass(self, slow, fast: FastUnknowns) -> tuple[FastUnknowns, SweepTotals]:
         """With fast unknowns and small matrices of the pass before."""
 
         def interval(arriving, at):
             m, basis, before = at
             straight = control_nodes(len(slow))[1:, None] * velocity(arriving.p_f)
             known = before.increments, before.multiplier, before.schur
-            done, left = self._corrected(slow, arriving, m, basis, straight, *known)
-            return left, done
+            done, totals = self._corrected(slow, arriving, m, basis, straight, *known)
+            return totals, done
 
         velocity = constant_mass(self.equations.system).fast_mass.inverse().times
-        left, fast = jax.lax.scan(interval, self._start(slow), (*self._intervals(), fast))
-        return fast, left
+        totals, fast = jax.lax.scan(interval, self._start(slow), (*self._intervals(), fast))
+        return fast, totals
 
     def _intervals(self):
         """Numbers of the intervals, and (n, r + 1, r) the slow positions at their nodes by slow increments."""
         n, r = self.equations.scheme.num_micro, self.equations.scheme.degree
         return jnp.arange(n), jnp.asarray(slow_basis_at_control_nodes(n, r)[..., 1:])
 
-    def _start(self, slow) -> Left:
+    def _start(self, slow) -> SweepTotals:
         equations = self.equations
         zero = jnp.zeros_like(equations.q_s), jnp.zeros_like(slow), jnp.zeros(())
-        return Left(equations.q_f, equations.micro_dt * equations.p_f, *zero)
+        return SweepTotals(equations.q_f, equations.micro_dt * equations.p_f, *zero)
 
-    def _corrected(self, slow, arriving: Left, m, basis, straight, increments, mu, schur) -> tuple[Fast, Left]:
+    def _corrected(
+        self, slow, arriving: SweepTotals, m, basis, straight, increments, mu, schur
+    ) -> tuple[FastUnknowns, SweepTotals]:
         """Interval m, corrected once by a Newton step on its exact residual, and what it leaves."""
         equations, h, n = self.equations, self.equations.micro_dt, self.equations.scheme.num_micro
-        q_s, steps = equations.q_s + along(basis[0], slow), along(basis[1:] - basis[0], slow)
+        q_s, steps = equations.q_s + weighted_sum(basis[0], slow), weighted_sum(basis[1:] - basis[0], slow)
         system, scheme = interval_problem(equations.system, equations.scheme)
         at_rest = jnp.zeros_like(q_s), jnp.zeros_like(arriving.q_f)
         local = StepEquations(system, scheme, equations.t + m * h, q_s, arriving.q_f, *at_rest, h)
@@ -132,14 +136,14 @@ class March(NamedTuple):
         q_f, p_f = arriving.q_f + done.increments[-1], done.p_f
         for term in lagrangian(system, scheme).kicks if n > 1 else ():  # where two micro intervals meet
             weight = jnp.where(m < n - 1, h * kick_weight(term, h), 0.0)
-            d_s, d_f = term.gradient(equations.q_s + along(basis[-1], slow), q_f)
+            d_s, d_f = term.gradient(equations.q_s + weighted_sum(basis[-1], slow), q_f)
             start, p_f = start + weight * d_s, p_f + weight * d_f
             rows += basis[-1][:, None] * (weight * d_s)
 
-        left = Left(q_f, p_f, start, rows, jnp.maximum(arriving.moved, done.moved))
+        totals = SweepTotals(q_f, p_f, start, rows, jnp.maximum(arriving.moved, done.moved))
         nodes = arriving.q_f + done.increments
         bends = jnp.zeros((len(slow), 0)) if self.is_explicit else (done.increments - straight) / h**2
-        return Fast(done.increments, done.multiplier, nodes, bends, done.schur), left
+        return FastUnknowns(done.increments, done.multiplier, nodes, bends, done.schur), totals
 
 
 def kick_weight(term: Term, h):

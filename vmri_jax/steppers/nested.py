@@ -28,13 +28,13 @@ from vmri_jax.kernels import max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
-from vmri_jax.steppers.interval import SMALL, Interval, Matrix, along, constant_mass
-from vmri_jax.steppers.micro_intervals import Fast, Left, Lines, March
+from vmri_jax.steppers.interval import SMALL, Interval, Matrix, constant_mass, weighted_sum
+from vmri_jax.steppers.micro_intervals import FastPredictors, FastUnknowns, MicroSweep, SweepTotals
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.secant import SIZE, Pairs
-from vmri_jax.steppers.slow_equations import SlowEquations, Tied
+from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
 NOISE = 75.0
@@ -51,16 +51,16 @@ class NestedState(NamedTuple):
 
     matrix: K of the micro intervals.
     slow: slow increments and slow multipliers of the last steps.
-    lines: multipliers and bends of the last micro intervals.
-    missed: what the cheap matrix of the slow equations misses: secant pairs with constraints, else the part of an update
+    predictors: multipliers and bends of the last micro intervals.
+    slow_model_error: what the cheap matrix of the slow equations misses: secant pairs with constraints, else the part of an update
         that it leaves to the next one.
     passes: fewest of a step with this matrix (UNKNOWN before one), and those of the last step.
     """
 
     matrix: Matrix
     slow: PolynomialPredictor
-    lines: Lines
-    missed: Pairs | Float[Array, ""]
+    predictors: FastPredictors
+    slow_model_error: Pairs | Float[Array, ""]
     passes: Int[Array, "2"]
 
 
@@ -68,18 +68,18 @@ class Pass(NamedTuple):
     """Unknowns of a pass, what it left, and how the iteration stands.
 
     d: the update of the slow unknowns by the cheap matrix.
-    tied: masses that constraints tie to the slow variables, from the first pass.
+    inertia: masses that constraints tie to the slow variables, from the first pass.
     impulse: on the slow variables over the step, times h.
     residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
     """
 
     slow: Float[Array, "r n_s"]
     slow_multiplier: Float[Array, "r n_gs"]
-    fast: Fast
-    left: Left
+    fast: FastUnknowns
+    totals: SweepTotals
     d: Float[Array, "r*(n_s+n_gs)"]
-    tied: Tied | None
-    missed: Pairs | Float[Array, ""]
+    inertia: ConstraintInertia | None
+    slow_model_error: Pairs | Float[Array, ""]
     impulse: Float[Array, "n_s"]
     residual: tuple[Float[Array, ""], Float[Array, ""]]
     passes: Int[Array, ""]
@@ -108,56 +108,60 @@ class Nested(Solver):
         increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity[0])
         slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
         bends = (r, 0 if self.interval.is_explicit else n_f)
-        lines = Lines(LinearPredictor.zero((r, n_g)), LinearPredictor.zero(bends))
-        missed = jnp.ones(())
+        predictors = FastPredictors(LinearPredictor.zero((r, n_g)), LinearPredictor.zero(bends))
+        slow_model_error = jnp.ones(())
         if system.is_constrained:
-            missed = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
-        return NestedState(matrix(equations), slow, lines, missed, jnp.array([0, 2 * MORE]))
+            slow_model_error = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
+        return NestedState(matrix(equations), slow, predictors, slow_model_error, jnp.array([0, 2 * MORE]))
 
-    def renew(self, equations: StepEquations, own: NestedState) -> NestedState:
+    def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
         """With a new matrix K, unless it is constant.
 
         A large one is kept for as long as it costs no passes; a number of passes that is fixed needs a new one.
         """
         if self.interval.is_constant:
-            return own
-        if self.interval.is_diagonal or len(own.matrix.inverse) <= SMALL or self.newton.fixed_iterations:
-            return own._replace(matrix=self.interval.matrix(equations))
-        stale = own.passes[1] > own.passes[0] + MORE
-        matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: own.matrix)
-        return own._replace(matrix=matrix, passes=own.passes.at[0].set(jnp.where(stale, UNKNOWN, own.passes[0])))
+            return memory
+        if self.interval.is_diagonal or len(memory.matrix.inverse) <= SMALL or self.newton.fixed_iterations:
+            return memory._replace(matrix=self.interval.matrix(equations))
+        stale = memory.passes[1] > memory.passes[0] + MORE
+        matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: memory.matrix)
+        return memory._replace(
+            matrix=matrix, passes=memory.passes.at[0].set(jnp.where(stale, UNKNOWN, memory.passes[0]))
+        )
 
-    def solve(self, equations: StepEquations, guess: Unknowns, own: NestedState) -> tuple[Solution, NestedState]:
+    def solve(self, equations: StepEquations, guess: Unknowns, memory: NestedState) -> tuple[Solution, NestedState]:
         scheme, newton = equations.scheme, self.newton
         scale, _ = multiplier_scales(scheme, equations.macro_dt)
-        march = March(equations, self.interval.is_explicit, own.matrix, scale, self.interval.sparsity)
-        passes = _Passes(equations, own, march, newton)
+        sweep = MicroSweep(equations, self.interval.is_explicit, memory.matrix, scale, self.interval.sparsity)
+        passes = _Passes(equations, memory, sweep, newton)
         done = newton.iterate(passes.next, passes.first(), done=1)
 
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
         per_h = 1 / equations.micro_dt
-        end = done.left.q_f, equations.p_s + per_h * done.impulse, per_h * done.left.p_f
+        end = done.totals.q_f, equations.p_s + per_h * done.impulse, per_h * done.totals.p_f
         rows, g = done.residual
         if x.multiplier.size:
             g = jnp.maximum(max_abs(_constraints(equations, done)), g)
         status = status_of(equations, done.result, Method.NESTED, done.passes, rows, g, newton.tolerance)
-        return Solution(x, end, status), self._learned(equations, own, done, scale)
+        return Solution(x, end, status), self._learned(equations, memory, done, scale)
 
-    def _learned(self, equations: StepEquations, own: NestedState, done: Pass, scale) -> NestedState:
+    def _learned(self, equations: StepEquations, memory: NestedState, done: Pass, scale) -> NestedState:
         several = equations.scheme.num_micro > 1
         shared = equations.system.constraint is not None  # two macro steps share the constraint force of their node
-        lambdas = own.lines.multiplier.after_step(done.fast.multiplier / scale, several and self.has_kicks)
-        bend = own.lines.bend.after_step(done.fast.bends, several and (self.has_kicks or shared))
-        before = own.passes[0]
+        lambdas = memory.predictors.multiplier.after_step(done.fast.multiplier / scale, several and self.has_kicks)
+        bend = memory.predictors.bend.after_step(done.fast.bends, several and (self.has_kicks or shared))
+        before = memory.passes[0]
         fewest = jnp.where(before == UNKNOWN, done.passes, jnp.minimum(before, done.passes))
-        slow = own.slow.add(_joined(done), done.slow.size)
-        return NestedState(own.matrix, slow, Lines(lambdas, bend), done.missed, jnp.stack([fewest, done.passes]))
+        slow = memory.slow.add(_joined(done), done.slow.size)
+        predictors, passes = FastPredictors(lambdas, bend), jnp.stack([fewest, done.passes])
+        return NestedState(memory.matrix, slow, predictors, done.slow_model_error, passes)
 
-    def continued(self, own: NestedState, last: NestedState) -> NestedState:
-        multiplier = own.lines.multiplier.continued(last.lines.multiplier)
-        return own._replace(lines=Lines(multiplier, own.lines.bend.continued(last.lines.bend)))
+    def continued(self, memory: NestedState, last: NestedState) -> NestedState:
+        multiplier = memory.predictors.multiplier.continued(last.predictors.multiplier)
+        bend = memory.predictors.bend.continued(last.predictors.bend)
+        return memory._replace(predictors=FastPredictors(multiplier, bend))
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         inside = "the multipliers alone" if self.interval.is_explicit else "fast increments and multipliers"
         return [
             "nested march: the slow path outside, micro intervals in order inside",
@@ -172,8 +176,8 @@ class Nested(Solver):
 class _Passes:
     """The iteration over passes of one macro step."""
 
-    def __init__(self, equations: StepEquations, own: NestedState, march: March, newton: Newton):
-        self.equations, self.own, self.march, self.newton = equations, own, march, newton
+    def __init__(self, equations: StepEquations, memory: NestedState, sweep: MicroSweep, newton: Newton):
+        self.equations, self.memory, self.sweep, self.newton = equations, memory, sweep, newton
         self.slow_equations = SlowEquations.of(equations)
         self.accepted = Accepted.of(equations, newton)
         self.mass = constant_mass(equations.system)
@@ -181,10 +185,10 @@ class _Passes:
 
     def first(self) -> Pass:
         """From the predicted unknowns."""
-        slow, slow_multiplier = self._apart(self.own.slow.next(self.r * self.n_s))
-        fast, left = self.march.first_pass(slow, self.own.lines)
-        tied = self.slow_equations.tied(jax.tree.map(lambda a: a[0], fast.schur))
-        return self._judged(slow, slow_multiplier, fast, left, tied, self.own.missed, left.moved, 1)
+        slow, slow_multiplier = self._apart(self.memory.slow.next(self.r * self.n_s))
+        fast, totals = self.sweep.first_pass(slow, self.memory.predictors)
+        inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur))
+        return self._judged(slow, slow_multiplier, fast, totals, inertia, self.memory.slow_model_error, totals.moved, 1)
 
     def next(self, last: Pass) -> Pass:
         """With slow unknowns corrected by what the last pass left."""
@@ -193,43 +197,48 @@ class _Passes:
         return self._with_pairs(last) if self.equations.system.is_constrained else self._with_forces(last)
 
     def _with_pairs(self, last: Pass) -> Pass:
-        known, size = last.missed, self.r * self.n_s
+        known, size = last.slow_model_error, self.r * self.n_s
         assert isinstance(known, Pairs)
-        is_hard = (self.own.passes[1] > EASY) | (last.passes >= EASY)
+        is_hard = (self.memory.passes[1] > EASY) | (last.passes >= EASY)
         d = jax.lax.cond(is_hard, lambda: known.corrected(last.d, size), lambda: last.d)
         now = self._moved_by(d, last)
         noise = NOISE * (self.accepted.slow[1] + jnp.finfo(float).eps * max_abs(last.slow))
         pairs = jax.lax.cond(is_hard, lambda: known.add(d, now.d - last.d, noise, size), lambda: known)
-        return now._replace(missed=pairs)
+        return now._replace(slow_model_error=pairs)
 
     def _with_forces(self, last: Pass) -> Pass:
-        assert not isinstance(last.missed, Pairs)
-        part = jnp.where(last.passes == 1, last.missed**2, last.missed)  # the fast unknowns take three passes anyway
+        known = last.slow_model_error
+        assert not isinstance(known, Pairs)
+        part = jnp.where(last.passes == 1, known**2, known)  # the fast unknowns take three passes anyway
         is_hard = part * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
         wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part
         x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
         d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
         now = self._moved_by(d, last)
-        missed, of = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
-        return now._replace(missed=max_abs(missed) / (max_abs(of) + jnp.finfo(float).tiny))
+        error, of = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
+        return now._replace(slow_model_error=max_abs(error) / (max_abs(of) + jnp.finfo(float).tiny))
 
     def _moved_by(self, d, last: Pass) -> Pass:
         slow, slow_multiplier = self._apart(_joined(last) + d)
-        fast, left = self.march.next_pass(slow, last.fast)
-        still_moves = expected(left.moved, last.left.moved)
-        return self._judged(slow, slow_multiplier, fast, left, last.tied, last.missed, still_moves, last.passes + 1)
+        fast, totals = self.sweep.next_pass(slow, last.fast)
+        still_moves = expected(totals.moved, last.totals.moved)
+        return self._judged(
+            slow, slow_multiplier, fast, totals, last.inertia, last.slow_model_error, still_moves, last.passes + 1
+        )
 
-    def _judged(self, slow, slow_multiplier, fast: Fast, left: Left, tied, missed, still_moves, passes) -> Pass:
+    def _judged(
+        self, slow, slow_multiplier, fast: FastUnknowns, totals: SweepTotals, inertia, model_error, still_moves, passes
+    ) -> Pass:
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
         x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
-        d, (rows, g), impulse = self.slow_equations.update(x, left.start, left.increments, tied)
-        arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(left.p_f)
+        d, (rows, g), impulse = self.slow_equations.update(x, totals.start, totals.increments, inertia)
+        arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
         motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
         changes = max_abs(d[: self.r * self.n_s]), still_moves
         result = self.newton.status(self.accepted.over(changes, (max_abs(slow), motion), passes), passes)
         residual = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves), max_abs(g)
         passes = jnp.asarray(passes)
-        return Pass(slow, slow_multiplier, fast, left, d, tied, missed, impulse, residual, passes, result)
+        return Pass(slow, slow_multiplier, fast, totals, d, inertia, model_error, impulse, residual, passes, result)
 
     def _apart(self, z):
         """Slow increments (r, n_s) and slow multipliers (r, n_gs)."""
@@ -245,6 +254,6 @@ def _joined(at: Pass):
 def _constraints(equations: StepEquations, done: Pass):
     """(num_micro, r, n_g) values of g at the nodes 1..r of the micro intervals."""
     n, r = equations.scheme.num_micro, equations.scheme.degree
-    slow_nodes = equations.q_s + along(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], done.slow)
+    slow_nodes = equations.q_s + weighted_sum(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], done.slow)
     times = equations.t + equations.micro_dt * (np.arange(n)[:, None] + control_nodes(r)[1:])
     return jax.vmap(jax.vmap(equations.system.g))(times, slow_nodes, done.fast.nodes)

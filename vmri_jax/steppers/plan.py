@@ -38,10 +38,10 @@ from vmri_jax.steppers.linear import Linear
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.nested import Nested
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.parts import fast_alone, fast_part, slow_part
 from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Fallback, Solved, Solver
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
+from vmri_jax.steppers.subsystems import fast_part, frozen_slow, slow_part
 
 
 @dataclass(frozen=True)
@@ -50,19 +50,19 @@ class _Choice:
 
     newton: Newton
     falls_back: bool
-    once: bool
+    reverse_only: bool
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A stepper with what it was planned for: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)``.
+    """A stepper with what it was planned for: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)``.
 
     ``print`` shows it in words, ``print(plan.describe())`` with the rules of the scheme.
 
     Attributes:
         system, scheme, newton: as they were given.
         stepper: the tree of steppers.
-        projects_rarely: momenta are on the hidden constraints only after `project`, which is needed where they are looked at;
+        defers_projection: momenta are on the hidden constraints only after `project`, which is needed where they are looked at;
             else every step ends with it.
     """
 
@@ -70,19 +70,19 @@ class Plan:
     scheme: Scheme | Composition
     newton: Newton
     stepper: Stepper
-    projects_rarely: bool
+    defers_projection: bool
 
     def init(self, state: State, macro_dt):
         """What the first step starts from besides the state."""
         return self.stepper.init(state, macro_dt)
 
-    def step(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
+    def step(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
         """One macro step."""
-        return self.stepper.step(state, own, macro_dt)
+        return self.stepper.step(state, memory, macro_dt)
 
-    def project(self, state: State, own) -> tuple[State, Any]:
+    def project(self, state: State, memory) -> tuple[State, Any]:
         """Momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
-        return self.stepper.project(state, own)
+        return self.stepper.project(state, memory)
 
     @property
     def has_fallback(self) -> bool:
@@ -96,7 +96,7 @@ class Plan:
         has |= {"g": system.constraint, "g_s": system.slow_constraint}
         scheme = self.scheme.describe()
         scheme = replace(scheme, rules={name: rule for name, rule in scheme.rules.items() if has[name] is not None})
-        return "\n".join([str(scheme), "a step:", *indented(self.stepper.lines())])
+        return "\n".join([str(scheme), "a step:", *indented(self.stepper.describe())])
 
     def __str__(self) -> str:
         return str(self.stepper)
@@ -109,7 +109,7 @@ def plan(
     newton: Newton | None = None,
     *,
     fallback: bool = True,
-    once: bool = False,
+    reverse_only: bool = False,
 ) -> Plan:
     """How macro steps of a system under a scheme are taken; ``print`` shows it in words.
 
@@ -118,24 +118,24 @@ def plan(
         state: any state of the system; only the shapes of its arrays matter.
         newton: how implicit equations are solved.
         fallback: whether a step that the first choice does not solve is solved by the march with exact matrices, in the same program.
-        once: whether steps are differentiated in reverse mode only, once, in half the time.
+        reverse_only: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:
         ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
     """
     system, state = start_of("plan", system, state)
     newton = newton or Newton()
-    choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None, once)
+    choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None, reverse_only)
     stepper: Stepper = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
-    rarely = _projects_rarely(stepper)
-    if not rarely and system.is_constrained:
+    defers = _defers_projection(stepper)
+    if not defers and system.is_constrained:
         stepper = Projected(stepper)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
-    return Plan(system, scheme, newton, stepper, rarely)
+    return Plan(system, scheme, newton, stepper, defers)
 
 
-def _projects_rarely(stepper: Stepper) -> bool:
+def _defers_projection(stepper: Stepper) -> bool:
     """Whether momenta have to be projected only where they are looked at.
 
     A projection is a shift by ``G^T mu``, which the multipliers of the next step take back where nothing but drifts move along
@@ -184,14 +184,14 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
         sizes = q_s.size, n_gs, q_f.size, n_g, scheme.degree
         linear_solver = "null_space" if newton.method == "null_space" else "arrowhead"
         solver = Coupled(newton) if newton.method == "dense" else Marched(newton, linear_solver, sizes)
-        return Solved(system, scheme, solver, rows, choice.once)
+        return Solved(system, scheme, solver, rows, choice.reverse_only)
     interval = Interval.of(system, scheme, q_s, q_f)
     if _is_linear(system, scheme, interval, q_s):
         return Linear(system, scheme, interval)
     solver = _first_choice(system, scheme, newton, interval, rows, q_s, q_f)
     if choice.falls_back:
         solver = Fallback(solver, Marched(newton, "arrowhead"))
-    return Solved(system, scheme, solver, rows, choice.once)
+    return Solved(system, scheme, solver, rows, choice.reverse_only)
 
 
 def _first_choice(
@@ -280,7 +280,7 @@ def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None
         )
 
     def stepper_of(q_s, q_f) -> Kicked:
-        alone, rules = fast_alone(system, scheme, q_s)
+        alone, rules = frozen_slow(system, scheme, q_s)
         return _whole_step(alone, rules, choice, jnp.zeros(0), q_f)
 
     return average_over_fast_motion(stepper_of, scheme.num_micro)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import Full, Sparsity, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.steppers.accept import Accepted
-from vmri_jax.steppers.interval import along, constant_mass
+from vmri_jax.steppers.interval import constant_mass, weighted_sum
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
@@ -65,7 +65,7 @@ class Rattle(Solver):
         count = sum(equations.system.num_constraints(equations.q_s, equations.q_f))
         return RattleState(jnp.zeros((2, count)), jnp.zeros(()))
 
-    def solve(self, equations: StepEquations, guess: Unknowns, own: RattleState) -> tuple[Solution, RattleState]:
+    def solve(self, equations: StepEquations, guess: Unknowns, memory: RattleState) -> tuple[Solution, RattleState]:
         system, h, newton = equations.system, equations.macro_dt, self.newton
         q, n_s = jnp.concatenate([equations.q_s, equations.q_f]), equations.q_s.size
         kinetic = constant_mass(system)
@@ -82,12 +82,12 @@ class Rattle(Solver):
         forces = jax.vmap(lambda seed: pull(seed)[0])(seeds)
         columns = moves(forces)
         if isinstance(self.sparsity, Full):  # few rows: these are all of them
-            force, move = partial(along, increments=forces), partial(along, increments=columns)
+            force, move = partial(weighted_sum, increments=forces), partial(weighted_sum, increments=columns)
         else:
             force, move = (lambda mu: pull(mu)[0]), (lambda mu: moves(pull(mu)[0]))
         straight = h * velocity_s(equations.p_s), h * velocity_f(equations.p_f)
-        scale = self._scale(equations, own)
-        mu = scale * (2 * own.multiplier[0] - own.multiplier[1])
+        scale = self._scale(equations, memory)
+        mu = scale * (2 * memory.multiplier[0] - memory.multiplier[1])
         x = jnp.concatenate(straight) - move(mu)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
         schur = self.sparsity.inverse(jax.vmap(push)(columns))
@@ -115,21 +115,21 @@ class Rattle(Solver):
         x, mu = done.x[None], done.mu[None]
         unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
         tells = jnp.abs(scale) > LEAST * h**2
-        multiplier = jnp.where(tells, done.mu / jnp.where(tells, scale, 1.0), own.multiplier[0])
-        multipliers = jnp.stack([multiplier, own.multiplier[0]])
+        multiplier = jnp.where(tells, done.mu / jnp.where(tells, scale, 1.0), memory.multiplier[0])
+        multipliers = jnp.stack([multiplier, memory.multiplier[0]])
         return Solution(unknowns, end, status), RattleState(multipliers, jnp.asarray(h, dtype=float))
 
-    def _scale(self, equations: StepEquations, own: RattleState):
+    def _scale(self, equations: StepEquations, memory: RattleState):
         """What turns multipliers (n_g + n_gs,) into unknowns."""
         counts = equations.system.num_constraints(equations.q_s, equations.q_f)
-        scales = multiplier_scales(equations.scheme, equations.macro_dt, own.before)
+        scales = multiplier_scales(equations.scheme, equations.macro_dt, memory.before)
         return jnp.concatenate([jnp.broadcast_to(a.reshape(-1)[:1], n) for a, n in zip(scales, counts, strict=True)])
 
-    def continued(self, own: RattleState, last: RattleState) -> RattleState:
+    def continued(self, memory: RattleState, last: RattleState) -> RattleState:
         return last
 
-    def projected(self, own: RattleState) -> RattleState:
-        return own._replace(before=jnp.zeros_like(own.before))
+    def projected(self, memory: RattleState) -> RattleState:
+        return memory._replace(before=jnp.zeros_like(memory.before))
 
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         return ["drift along the constraints (RATTLE): Newton's iteration on the multipliers"]

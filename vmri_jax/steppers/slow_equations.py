@@ -33,7 +33,7 @@ ENOUGH = 1e-5
 """Part of an update that may be left by them."""
 
 
-class Tied(NamedTuple):
+class ConstraintInertia(NamedTuple):
     """The masses K_s of the slow variables and those tied to them have the inverse ``(1 - U P) K_s^-1``.
 
     responses: U, slow increments by each multiplier of the first micro interval.
@@ -59,7 +59,7 @@ class SlowEquations(NamedTuple):
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
         return cls(equations, kinetic, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
 
-    def tied(self, schur: FullInverse | BandInverse) -> Tied | None:
+    def constraint_inertia(self, schur: FullInverse | BandInverse) -> ConstraintInertia | None:
         """The masses tied by the constraints of the first micro interval, with its matrix S (r n_g, r n_g)."""
         equations, r, n_s = self.equations, self.equations.scheme.degree, self.equations.q_s.shape[0]
         jacobian = jax.jacrev(equations.system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
@@ -71,9 +71,9 @@ class SlowEquations(NamedTuple):
         responses = jax.vmap(self._by_masses)(forces.reshape(-1, r, n_s))
         multipliers = jax.vmap(schur.times, 1, 1)(values.reshape(-1, r * n_s))
         both = np.eye(len(multipliers)) + matmul(multipliers, responses.reshape(-1, r * n_s).T)
-        return Tied(responses, solve(both, multipliers).reshape(responses.shape))
+        return ConstraintInertia(responses, solve(both, multipliers).reshape(responses.shape))
 
-    def update(self, x: Unknowns, start, increments, tied: Tied | None):
+    def update(self, x: Unknowns, start, increments, inertia: ConstraintInertia | None):
         """Update of the slow unknowns, residuals of their equations, impulse on them over the step times h.
 
         Args:
@@ -89,7 +89,7 @@ class SlowEquations(NamedTuple):
         pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
         d = increments + self.kinetic.rows(x.slow, x.fast)[0] / n
         rows = jnp.concatenate([(start - d.sum(0) + equations.micro_dt * equations.p_s)[None], d[:-1]]) - pull
-        dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, tied), jacobian, push, rows, g)
+        dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
         return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), start - pull.sum(0)
 
     def with_forces(self, d, x: Unknowns):
@@ -130,13 +130,13 @@ class SlowEquations(NamedTuple):
 
         return minimal_residuals(operator, d.reshape(x.slow.shape)).reshape(-1)
 
-    def _by_masses(self, rows, tied: Tied | None = None):
+    def _by_masses(self, rows, inertia: ConstraintInertia | None = None):
         """Slow increments (r, n_s) for given rows (r, n_s)."""
         dx = matmul(self.inverse_form, self.inverse_mass(rows))
-        if tied is None:
+        if inertia is None:
             return dx
-        mu = jnp.sum(tied.multipliers * dx, axis=(1, 2))
-        return dx - jnp.sum(mu[:, None, None] * tied.responses, axis=0)
+        mu = jnp.sum(inertia.multipliers * dx, axis=(1, 2))
+        return dx - jnp.sum(mu[:, None, None] * inertia.responses, axis=0)
 
 
 def minimal_residuals(operator, b):

@@ -19,7 +19,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.equations import StepEquations, Unknowns, physical_multipliers
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
-from vmri_jax.steppers.newton.implicit import differentiable, differentiable_once
+from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
 
@@ -37,7 +37,10 @@ class Solution(NamedTuple):
 
 @dataclass(frozen=True)
 class Solver(ABC):
-    """Solves the equations of a step: ``own = init(equations, velocity)``, then ``solution, own = solve(equations, guess, own)``."""
+    """Solves the equations of a step.
+
+    First ``memory = init(equations, velocity)``, then ``solution, memory = solve(equations, guess, memory)`` for every step.
+    """
 
     def init(self, equations: StepEquations, velocity) -> Any:
         """What the first step starts from; velocity (v_s, v_f) at the start of the run."""
@@ -49,24 +52,24 @@ class Solver(ABC):
         """What a step starts from that has no other past than a guess."""
         return ()
 
-    def renew(self, equations: StepEquations, own) -> Any:
-        """`own` with what is computed once for a whole macro step."""
-        return own
+    def renew(self, equations: StepEquations, memory) -> Any:
+        """`memory` with what is computed once for a whole macro step."""
+        return memory
 
     @abstractmethod
-    def solve(self, equations: StepEquations, guess: Unknowns, own) -> tuple[Solution, Any]:
+    def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
         """The root of ``equations.residual``, found from a guess and what the last step handed on."""
 
-    def continued(self, own, last) -> Any:
+    def continued(self, memory, last) -> Any:
         """For a stage of a composition, see `Stepper.continued`."""
-        return own
+        return memory
 
-    def projected(self, own) -> Any:
+    def projected(self, memory) -> Any:
         """After the momenta have been projected."""
-        return own
+        return memory
 
     @abstractmethod
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         """In words, one line each."""
 
 
@@ -92,14 +95,14 @@ class Solved(Stepper):
     The derivative is that of the root, ``dx = -(dR/dx)^-1 dR``, so that iterations are never differentiated.
 
     sparsity: of ``G M^-1 G^T`` with all constraints.
-    once: differentiable in reverse mode only, once, in half the time.
+    reverse_only: differentiable in reverse mode only, once, in half the time.
     """
 
     system: System
     scheme: Scheme
     solver: Solver
     sparsity: Sparsity
-    once: bool = False
+    reverse_only: bool = False
 
     def init(self, state: State, macro_dt) -> SolvedState:
         if self.system.has_constant_mass:
@@ -110,20 +113,20 @@ class Solved(Stepper):
         solver = self.solver.init(StepEquations.of(self.system, self.scheme, state, macro_dt), velocity)
         return SolvedState(velocity, jnp.zeros(n_g), jnp.zeros(n_gs), solver)
 
-    def renew(self, state: State, own: SolvedState, macro_dt) -> SolvedState:
-        return own._replace(
-            solver=self.solver.renew(StepEquations.of(self.system, self.scheme, state, macro_dt), own.solver)
+    def renew(self, state: State, memory: SolvedState, macro_dt) -> SolvedState:
+        return memory._replace(
+            solver=self.solver.renew(StepEquations.of(self.system, self.scheme, state, macro_dt), memory.solver)
         )
 
-    def move(self, state: State, own: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
+    def advance(self, state: State, memory: SolvedState, macro_dt) -> tuple[State, StepInfo, SolvedState]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
-        v_s, v_f = own.velocity
+        v_s, v_f = memory.velocity
         if self.system.has_constant_mass:
             v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)  # with the kicks
-        guess = equations.guess(v_s, v_f, own.multiplier, own.slow_multiplier)
-        found, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, own.solver)))
+        guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
+        found, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, memory.solver)))
         root, status = checkpoint_name(((found.x, found.end), found.status), ROOT)
-        derivative = differentiable_once if self.once else differentiable
+        derivative = differentiable_reverse_only if self.reverse_only else differentiable
         x, (q_f, p_s, p_f) = derivative(equations, *root)
 
         lambdas = physical_multipliers(self.scheme, macro_dt, x.multiplier, x.slow_multiplier)
@@ -131,21 +134,21 @@ class Solved(Stepper):
         result, method, iterations, left = status
         info = StepInfo(result, method, iterations, left, q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
-        velocity = own.velocity
+        velocity = memory.velocity
         if not self.system.has_constant_mass:  # the mean over the last interval, as a guess for the next step
             velocity = jax.lax.stop_gradient((x.slow[-1] / macro_dt, x.fast[-1, -1] / equations.micro_dt))
         return end, info, SolvedState(velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
 
-    def project(self, state: State, own: SolvedState) -> tuple[State, SolvedState]:
-        p_s, p_f, v_s, v_f = project_momentum(self.system, state, own.velocity, self.sparsity)
-        own = own._replace(velocity=(v_s, v_f), solver=self.solver.projected(own.solver))
-        return State(state.t, state.q_s, state.q_f, p_s, p_f), own
+    def project(self, state: State, memory: SolvedState) -> tuple[State, SolvedState]:
+        p_s, p_f, v_s, v_f = project_momentum(self.system, state, memory.velocity, self.sparsity)
+        memory = memory._replace(velocity=(v_s, v_f), solver=self.solver.projected(memory.solver))
+        return State(state.t, state.q_s, state.q_f, p_s, p_f), memory
 
-    def continued(self, own: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:
-        return last._replace(solver=self.solver.continued(own.solver, last.solver))
+    def continued(self, memory: SolvedState, last: SolvedState, state: State, macro_dt) -> SolvedState:
+        return last._replace(solver=self.solver.continued(memory.solver, last.solver))
 
-    def lines(self) -> list[str]:
-        return self.solver.lines()
+    def describe(self) -> list[str]:
+        return self.solver.describe()
 
 
 @dataclass(frozen=True)
@@ -158,27 +161,27 @@ class Fallback(Solver):
     def init(self, equations: StepEquations, velocity) -> Any:
         return self.first.init(equations, velocity)
 
-    def renew(self, equations: StepEquations, own) -> Any:
-        return self.first.renew(equations, own)
+    def renew(self, equations: StepEquations, memory) -> Any:
+        return self.first.renew(equations, memory)
 
-    def solve(self, equations: StepEquations, guess: Unknowns, own) -> tuple[Solution, Any]:
-        found, learned = self.first.solve(equations, guess, own)
+    def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
+        found, learned = self.first.solve(equations, guess, memory)
         converged = found.status.result <= Result.CONVERGED_AT_ROUNDOFF
-        own = jax.tree.map(partial(jnp.where, converged), learned, own)  # nothing is learned from a failure
+        memory = jax.tree.map(partial(jnp.where, converged), learned, memory)  # nothing is learned from a failure
         return jax.lax.cond(
             converged,
             lambda: found,
             lambda: self.exact.solve(equations, guess, self.exact.remembers(equations, guess))[0],
-        ), own
+        ), memory
 
-    def continued(self, own, last) -> Any:
-        return self.first.continued(own, last)
+    def continued(self, memory, last) -> Any:
+        return self.first.continued(memory, last)
 
-    def projected(self, own) -> Any:
-        return self.first.projected(own)
+    def projected(self, memory) -> Any:
+        return self.first.projected(memory)
 
-    def lines(self) -> list[str]:
-        return [*self.first.lines(), "where that does not converge:", *indented(self.exact.lines())]
+    def describe(self) -> list[str]:
+        return [*self.first.describe(), "where that does not converge:", *indented(self.exact.describe())]
 
 
 def status_of(equations: StepEquations, result, method, iterations, rows, g, tolerance) -> Status:

@@ -60,9 +60,9 @@ class Status(NamedTuple):
 
 @dataclass(frozen=True)
 class Stepper(ABC):
-    """Takes macro steps: ``own = init(state, dt)``, then ``state, info, own = step(state, own, dt)`` again and again.
+    """Takes macro steps: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)`` again and again.
 
-    Arguments of its methods are the `State` at the start of a step, `own`, which is what a stepper carries from step to step, a
+    Arguments of its methods are the `State` at the start of a step, `memory`, which is what a stepper carries from step to step, a
     NamedTuple that its file documents, and the length of the step.
     """
 
@@ -70,35 +70,35 @@ class Stepper(ABC):
         """What the first step starts from besides the state."""
         return ()
 
-    def renew(self, state: State, own, macro_dt) -> Any:
-        """`own` with what is computed once for a whole macro step, however many micro steps share it."""
-        return own
+    def renew(self, state: State, memory, macro_dt) -> Any:
+        """`memory` with what is computed once for a whole macro step, however many micro steps share it."""
+        return memory
 
     @abstractmethod
-    def move(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
+    def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
         """The step itself; its momenta are those of the discrete Legendre transform."""
 
-    def step(self, state: State, own, macro_dt) -> tuple[State, StepInfo, Any]:
-        """A macro step: `renew`, then `move`; NON_FINITE where a momentum is, since positions follow momenta."""
-        state, info, own = self.move(state, self.renew(state, own, macro_dt), macro_dt)
+    def step(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
+        """A macro step: `renew`, then `advance`; NON_FINITE where a momentum is, since positions follow momenta."""
+        state, info, memory = self.advance(state, self.renew(state, memory, macro_dt), macro_dt)
         finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))
         stands = finite | (info.result > Result.CONVERGED_AT_ROUNDOFF)  # a failure has been named already
-        return state, replace(info, result=jnp.where(stands, info.result, Result.NON_FINITE)), own
+        return state, replace(info, result=jnp.where(stands, info.result, Result.NON_FINITE)), memory
 
-    def project(self, state: State, own) -> tuple[State, Any]:
+    def project(self, state: State, memory) -> tuple[State, Any]:
         """Momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
-        return state, own
+        return state, memory
 
-    def continued(self, own, last, state: State, macro_dt) -> Any:
+    def continued(self, memory, last, state: State, macro_dt) -> Any:
         """For a stage of a composition: what it learned in the macro step before, going on where the last stage ended."""
-        return own
+        return memory
 
     @abstractmethod
-    def lines(self) -> list[str]:
+    def describe(self) -> list[str]:
         """This stepper and what is inside of it in words, one line each."""
 
     def __str__(self) -> str:
-        return "\n".join(self.lines())
+        return "\n".join(self.describe())
 
 
 def indented(lines: list[str]) -> list[str]:

@@ -66,7 +66,7 @@ def _implicit_derivative(primals, tangents):
 
 
 @jax.custom_vjp
-def differentiable_once(equations: StepEquations, x: Unknowns, end):
+def differentiable_reverse_only(equations: StepEquations, x: Unknowns, end):
     """The same in reverse mode only, once: half the work. Another derivative is refused."""
     return x, end
 
@@ -92,7 +92,7 @@ def _sum(a, b):
     return a if a.dtype == jax.dtypes.float0 else a + b
 
 
-differentiable_once.defvjp(_kept, _pulled_back)
+differentiable_reverse_only.defvjp(_kept, _pulled_back)
 
 
 @jax.custom_jvp

@@ -100,7 +100,7 @@ class ConstraintAtRest:
         return self.constraint(at[1], q, at[0])
 
 
-def fast_alone(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
+def frozen_slow(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     """The fast variables under W and g with the slow ones at rest in q_s, and the scheme of one micro interval of them."""
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).fast),
