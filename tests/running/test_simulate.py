@@ -283,9 +283,12 @@ def test_ends_of_runs(fpu):
 def test_lengths_of_runs_share_a_program(fpu):
     """Six step sizes, all nodes saved: one program. A node is the same whatever the length of its run."""
     compiled = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda name, *_, **__: compiled.append(name) if "backend_compile" in name else None
-    )
+
+    def note(event: str, duration_secs: float, **_: str | int) -> None:
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
     scheme = fully_implicit(2)
     simulate(fpu, scheme, macro_dt=0.05, num_steps=3)
     compiled.clear()
