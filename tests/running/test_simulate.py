@@ -319,6 +319,22 @@ def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):
     np.testing.assert_allclose(failed.t, 0.01 * np.arange(61), rtol=1e-15)
 
 
+def springs(q_s, q_f, params):
+    return jnp.sum(q_s**2) / 2 + jnp.sum(q_f**2) / 2 + jnp.sum(q_s) * jnp.sum(q_f) / 10
+
+
+def test_systems_of_the_same_functions_and_other_sizes(monkeypatch):
+    """Pieces with room for as many nodes, which are of other sizes."""
+    monkeypatch.setattr("vmri_jax.running.saved.NUMBERS", 1)
+    for n_s, n_f in ((1, 2), (2, 1), (2, 2), (1, 2)):
+        system = vm.System(vm.ConstantMass([1.0] * n_s, [1.0] * n_f), springs, None)
+        problem = vm.Problem(system, q_s=[0.1] * n_s, q_f=[0.2] * n_f)
+        run = simulate(problem, fully_implicit(2), macro_dt=0.01, num_steps=4, save_micro=True)
+        assert (run.q_s.shape, run.q_f.shape, run.q_f_micro.shape) == ((5, n_s), (5, n_f), (4, 2, n_f))
+        np.testing.assert_allclose(run.q_s[-1], 0.1, atol=1e-3)
+        np.testing.assert_allclose(run.q_f[-1], 0.2, atol=1e-3)
+
+
 def test_a_failure_says_what_to_ask_next(fpu):
     with pytest.raises(SimulationError) as caught:
         simulate(fpu, fully_explicit(1), macro_dt=1.0, num_steps=400)

@@ -1,5 +1,6 @@
 """The engine of all runs: a loop of macro steps inside a scan over saved nodes, compiled once per structure."""
 
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
@@ -86,17 +87,18 @@ class Engine:
     ) -> tuple[Trajectory, State, Any]:
         """`piece` with its trajectory in arrays of NumPy, and the state and memory at its end."""
         scheme = jax.tree.unflatten(self.structure, leaves)[1]
-        room = self._free.pop() if self._free else self._nothing(State(*state), scheme.num_micro)
+        free = self._free[tuple(a.shape for a in state)]
+        room = free.pop() if free else self._nothing(State(*state), scheme.num_micro)
         done = self.piece(room, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves)
         saved = done.saved.first(saves, int(done.number))
-        self._free.append(done.saved)
+        free.append(done.saved)
         times = np.asarray(t_start) + (step + np.arange(saves + 1) * save_every) * np.asarray(macro_dt)
         return self._trajectory(scheme, done._replace(saved=saved), times, macro_dt), done.at.state, done.at.memory
 
     @cached_property
-    def _free(self) -> list[Saved]:
-        """Arrays for saved nodes that no piece uses at present."""
-        return []
+    def _free(self) -> defaultdict[tuple, list[Saved]]:
+        """Arrays for saved nodes that no piece uses at present, by the shapes of states."""
+        return defaultdict(list)
 
     def blank_memory(self, leaves, state):
         """What `piece` takes as memory where it starts: zeros."""
