@@ -7,7 +7,6 @@ from typing import NamedTuple, overload
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
