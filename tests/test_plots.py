@@ -217,6 +217,15 @@ def test_a_cost_study_draws_itself():
     np.testing.assert_array_equal(y_data(axes.lines[0]), [9.0, 3.0, 6.0])
 
 
+def test_an_axis_of_costs_around_one_power_of_ten_has_several_labels():
+    figure = plots.plot_cost({"FPU": cost((1.5, 2.5, 75.0))})
+    figure.canvas.draw()
+    low, high = figure.axes[0].get_ylim()
+    labels = figure.axes[0].get_yticklabels()
+    shown = [text.get_text() for text in labels if low <= text.get_position()[1] <= high]
+    assert shown == ["2", "5", "10", "20", "50"]
+
+
 def test_cost_leaves_failed_runs_out():
     figure = plots.plot_cost({"FPU": cost((np.nan, np.nan, np.nan))})
     assert len(figure.axes[0].lines) == 1
@@ -279,7 +288,7 @@ def test_convergence_without_a_positive_error_is_drawn(errors):
         ConvergenceRow("impulse", "", 2, 1, step, error, error, iterations=1, method="EXPLICIT", result="", **numbers)
         for step, error in zip((0.1, 0.05), errors, strict=True)
     )
-    assert is_drawn(ConvergenceStudy(rows, {"": EXACT}).plot([2]))
+    assert is_drawn(ConvergenceStudy(rows, {"": EXACT}).plot("errors", [2]))
 
 
 def test_costs_of_runs_that_all_failed_are_drawn():

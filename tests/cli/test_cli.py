@@ -113,6 +113,34 @@ def test_simulate_runs_a_users_own_problem(vmri, name):
     assert "nothing; give --out" in text
 
 
+@pytest.mark.parametrize("out", ["run.npz", "run.zarr"])
+def test_a_saved_run_keeps_the_names_of_its_problem(vmri, tmp_path, out):
+    names = 'vm.Names(slow={"trolley": 1}, fast={"bell": 1})'
+    (tmp_path / "named.py").write_text(
+        USER_FILE.replace("one, one)\n\ndef make", f"one, one, names={names})\n\ndef make")
+    )
+    code, text = vmri("simulate", "named.py:my_problem", *RUN, "--out", out)
+    assert code == 0, text
+    run = vm.Trajectory.load(out) if out.endswith(".npz") else vm.StoredTrajectory.open(out)[:]
+    assert run.position("bell").shape == (5, 1)
+    assert run.names.slow_coordinates == ["trolley"]
+
+
+def test_what_a_figure_compiles_is_no_part_of_the_run(vmri, tmp_path):
+    """The work of the force is compiled for the figure, after the run: the compilation is not taken from the time of the run."""
+    forced = (
+        "vm.System(vm.ConstantMass(one, one), soft, stiff, force=lambda t, q_s, q_f, v_s, v_f, params: (-v_s, 0 * v_f))"
+    )
+    plain = "vm.System(vm.ConstantMass(one, one), soft, stiff)"
+    (tmp_path / "forced.py").write_text(USER_FILE.replace(plain, forced))
+    code, text = vmri("simulate", "forced.py:my_problem", *RUN, "--plot", "run.png")
+    assert code == 0, text
+    times = re.search(r"wall time (\S+) s, of which (\S+) s compiling", text)
+    assert times is not None, text
+    whole, compiling = map(float, times.groups())
+    assert compiling <= whole
+
+
 def test_constraints_are_reported(vmri):
     arguments = ["--scheme", "fully-explicit", "--macro-dt", "0.01", "--steps", 2, "--num-micro", 1]
     code, text = vmri("simulate", "tsp", *arguments)

@@ -77,6 +77,14 @@ def test_trajectories_have_bands_of_runs_that_did_not_fail(grid):
     assert np.allclose(middle, good)
 
 
+def test_the_legend_of_one_panel_of_bands_is_inside_the_figure(grid):
+    figure = plots.plot_ensemble(grid, "node_energy")
+    figure.draw_without_rendering()
+    box, page = figure.legends[0].get_window_extent(), figure.bbox
+    assert page.x0 <= box.x0 <= box.x1 <= page.x1
+    assert page.y0 <= box.y0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -39,6 +39,12 @@ def test_what_has_been_asked_for_is_said_in_a_pipe_without_news(quick, capsys):
     assert "50%  simulating" in capsys.readouterr().err
 
 
+def test_lines_have_words_before_the_first_piece_of_work(quick, capsys):
+    with progress_shown():
+        time.sleep(0.3)
+    assert capsys.readouterr().err.splitlines()[0].split() == ["0", "s", "starting"]
+
+
 def test_a_bar_says_it_alone(quick, capsys):
     with Working("", shown=False), Working("simulate"):
         time.sleep(0.3)

@@ -209,6 +209,7 @@ def test_cost_report(tmp_path):
     text = report.path.read_text()
     assert [answer.error for answer in report.answers] == [1e-3, 1e-5]
     assert "What accuracy costs" in text
+    assert "Runs to t = 1, with errors of the positions there. The reference solution is good to" in str(report)
     setting = report.answers[1].setting
     assert setting is not None
     assert setting.command("spring") in text.replace("&#34;", '"')

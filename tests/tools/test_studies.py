@@ -18,7 +18,7 @@ def convergence_study(cell: Cell) -> None:
     )
     assert all(np.isfinite(row.error_q) for row in rows.rows)
     assert str(rows)
-    plots.save(rows.plot([2]), cell.folder / "orders.png")
+    plots.save(rows.plot("orders", [2]), cell.folder / "orders.png")
     rows.to_csv(cell.folder / "orders.csv")
     rows.to_json(cell.folder / "orders.json")
     rows.to_xarray()

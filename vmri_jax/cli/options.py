@@ -9,7 +9,10 @@ MacroStep = Annotated[float | None, typer.Option(help="Macro step H; or give --m
 MicroStep = Annotated[float | None, typer.Option(help="Micro step h = H / num_micro.")]
 Scheme = Annotated[str, typer.Option(help="See [bold]vmri schemes[/bold].")]
 NumMicro = Annotated[int, typer.Option(help="Micro steps per macro step.")]
-Alpha = Annotated[float | None, typer.Option(help="Weight of the left node, explicit schemes. [dim]0.5[/dim]")]
+Alpha = Annotated[
+    float | None,
+    typer.Option(help="Part of a kick at the start of its step, 0 to 1, of explicit schemes. [dim]0.5[/dim]"),
+]
 Degree = Annotated[int | None, typer.Option(help="Degree of the path, galerkin.")]
 Rule = Annotated[str | None, typer.Option(help="gauss or lobatto, galerkin. [dim]gauss[/dim]")]
 Compose = Annotated[str | None, typer.Option(help="Compose the scheme to a higher order, e.g. suzuki4, kahan-li8.")]

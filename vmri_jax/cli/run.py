@@ -92,7 +92,7 @@ def simulate(
         compiling = _compile_clock()
         start = time.perf_counter()
         trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
-        seconds = time.perf_counter() - start
+        seconds, compiled = time.perf_counter() - start, sum(compiling)
         saved = [str(out)] if streamed else []
         try:  # what was computed is told whatever happens to its files
             if out is not None and isinstance(trajectory, Trajectory):
@@ -111,8 +111,8 @@ def simulate(
                     {
                         "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
                         "": nothing_fast(chosen, problem.q_f.size),
-                        "wall time": f"{seconds:.2f} s, of which {sum(compiling):.2f} s compiling",
-                        "per micro step": f"{1e6 * max(seconds - sum(compiling), 0.0) / done:.3g} µs" if done else "",
+                        "wall time": f"{seconds:.2f} s, of which {compiled:.2f} s compiling",
+                        "per micro step": f"{1e6 * max(seconds - compiled, 0.0) / done:.3g} µs" if done else "",
                         **_summary(trajectory, problem.system.is_constrained),
                         "saved": ", ".join(saved)
                         or "nothing" + ("" if out or plot else "; give --out run.npz or --plot run.png"),
@@ -139,7 +139,7 @@ def _print_named(texts: dict[str, str]) -> None:
 def _run(run, problem, scheme, arguments: dict):
     """The trajectory, and what stopped the run before its end, if anything did."""
     try:
-        return jax.block_until_ready(run(problem.system, scheme, problem.state(), **arguments)), None
+        return jax.block_until_ready(run(problem, scheme, **arguments)), None
     except (SimulationError, Interrupted) as stopped:
         return stopped.trajectory, stopped
 

@@ -40,7 +40,7 @@ def explain(
     with refusals():
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         moving = find_scene_or_problem(system)
-        with status("compiling and timing" if measure else "looking"):
+        with status("compiling and timing a macro step, and frequencies" if measure else "frequencies"):
             if isinstance(moving, Problem):
                 ledger = ledger_of_functions(moving, chosen, macro_dt, measure)
             else:

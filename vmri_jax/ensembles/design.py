@@ -1,8 +1,8 @@
 """Designs: which runs an ensemble has. A design is a table with a row for each run, of which only parts are ever made.
 
     Product({"omega": [10, 50], "num_micro": [1, 5]})          all combinations, the last axis varies first
-    Table({"omega": [10, 50], "v_s[0]": [0.1, 0.2]})           rows as they are given
-    Draws(1000, {"omega": ("uniform", 10, 50)}, seed=1)        random rows
+    Table({"omega": [10, 50], "v_s[0]": [0.1, 0.2]})           a run for each row: 10 with 0.1, 50 with 0.2
+    Draws(1000, {"omega": ("uniform", 10, 50)}, seed=1)        1000 runs with random values
 
 Rows are numbered from 0, and every row can be made alone: random ones depend on the seed and on their number only.
 """

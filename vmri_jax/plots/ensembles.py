@@ -7,7 +7,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
-from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, legend_beside, log_ticks, new_figure, panel_grid
+from vmri_jax.plots.theme import (
+    LIGHT,
+    NotebookFigure,
+    Theme,
+    legend_below,
+    legend_beside,
+    log_ticks,
+    new_figure,
+    panel_grid,
+)
 from vmri_jax.steppers.results import Result
 
 if TYPE_CHECKING:
@@ -225,8 +234,7 @@ def _plot_bands(data, values, title: str, theme: Theme) -> NotebookFigure:
             axes.set_title(name if others else _label(values))
         for axes in grid[-columns:]:
             axes.set(xlabel="time")
-        shown = grid[0].get_legend_handles_labels()
-        figure.legend(*shown, loc="outside lower center", ncols=3)
+        legend_below(figure)
     return figure
 
 

@@ -200,7 +200,7 @@ def positive(values: Any) -> np.ndarray:
 
 
 def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
-    """A logarithmic axis with labels at powers of ten, or at 1, 2, 5 if the values span little more than one of them.
+    """A logarithmic axis with labels at powers of ten, or at 1, 2, 5 if only one of them or little more is among the values.
 
     Args:
         axis: of a panel with or without curves.
@@ -210,6 +210,7 @@ def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
         (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
     finite = [value for value in values if np.isfinite(value) and value > 0]
     axis.set_minor_formatter(NullFormatter())
-    if finite and max(finite) < 30 * min(finite):
+    powers = math.floor(math.log10(max(finite))) - math.ceil(math.log10(min(finite))) + 1 if finite else 2
+    if finite and (powers < 2 or max(finite) < 30 * min(finite)):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")

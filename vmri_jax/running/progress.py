@@ -100,6 +100,7 @@ def progress_shown() -> Iterator[Progress]:
     console = Console(stderr=True)
     if not (console.is_terminal or console.is_jupyter):
         with Working("") as tell:
+            tell("starting", 0, 1)  # else a line without words comes before the first piece of work
             yield tell
         return
     columns = BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}")

@@ -186,8 +186,8 @@ def affine(alpha) -> Rule:
     """``alpha * left + (1 - alpha) * right``; order 2 for alpha = 1/2, else 1.
 
     Args:
-        alpha: weight of the start of the interval, 1 - alpha is that of its end; may be traced. At 1/2 it is the trapezoidal
-            rule, at 1 and 0 only one end is left. See `vmri_jax.schemes.scheme` for what this means for a step.
+        alpha: weight of the start of the interval, 1 - alpha is that of its end; may be traced, and then it is not checked. At
+            1/2 it is the trapezoidal rule, at 1 and 0 only one end is left. See `vmri_jax.schemes.scheme` for what this means for a step.
 
     Raises:
         ValueError: alpha is not from 0 to 1.
@@ -196,7 +196,7 @@ def affine(alpha) -> Rule:
     if is_concrete(value) and not 0 <= value <= 1:
         raise ValueError(
             f"affine: alpha is {alpha}; it must be from 0 to 1: it is the part of a kick that is given at the start of an interval, and "
-            "1 - alpha at its end. Beyond, one of the two points backwards, and momenta at the nodes are off by more than half a kick."
+            "1 - alpha at its end. With other numbers one of these parts points backwards, and momenta at the nodes are off by more than half a kick."
         )
     return alpha * left + (1 - alpha) * right
 

@@ -177,8 +177,8 @@ class ConvergenceStudy(ResultTable):
         references = {case: {"error_q": r.error_q, "error_p": r.error_p} for case, r in self.references.items()}
         return {"references": references, **super().content()}
 
-    def plot(self, orders: Sequence[int] = (), title: str = ""):
-        """Errors against the macro step, see `vmri_jax.plots.plot_convergence`."""
+    def plot(self, title: str = "", orders: Sequence[int] = ()):
+        """Errors against the macro step, with guides of the slopes `orders`, see `vmri_jax.plots.plot_convergence`."""
         return plots.plot_convergence(self, orders, title)
 
     def to_xarray(self):

@@ -92,6 +92,17 @@ class CostReport(ResultTable):
         """The answers."""
         return self.answers
 
+    @property
+    def caption(self) -> str:
+        """The simulated time, and the errors that the reference solution lets be told: smaller ones are not asked for by default."""
+        least = self.runs.reference.error_q
+        told = (
+            f" The reference solution is good to {least:.0e}: errors below {MARGIN * least:.0e} cannot be told."
+            if least
+            else ""
+        )
+        return f"Runs to t = {self.t_end:g}, with errors of the positions there.{told}"
+
     def records(self) -> list[dict[str, Any]]:
         """Errors and the runs that answer them."""
         return [{"error": a.error, **(asdict(a.setting.row) if a.setting else {})} for a in self.answers]
