@@ -27,7 +27,7 @@ from vmri_jax.study import (
     families,
 )
 from vmri_jax.study.advisor import Setting
-from vmri_jax.study.cost_report import Answer, _draw_num_micro, _draw_shares
+from vmri_jax.study.cost_report import Answer, _draw_num_micro, _draw_shares, _fastest_that_keep
 
 
 def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
@@ -305,6 +305,13 @@ def test_the_panels_of_a_cost_page_are_drawn_whatever_they_hold(count):
     report = CostReport(Path("cost.html"), "", 1.0, answers, WorkPrecision((), 1.0, EXACT), {})
     assert is_drawn(_draw_num_micro(report, plots.LIGHT))
     assert is_drawn(_draw_shares(report, plots.LIGHT))
+
+
+def test_no_answer_of_a_cost_page_is_slower_than_that_for_a_smaller_error():
+    slow, fast, slowest = (Setting(families()[0], 1, 4, work_row(1e-3, seconds)) for seconds in (2.0, 1.0, 3.0))
+    answers = [Answer(1e-2, slow), Answer(1e-4, None), Answer(1e-6, fast), Answer(1e-7, slowest), Answer(1e-8, None)]
+    assert [answer.setting for answer in _fastest_that_keep(answers)] == [fast, fast, fast, slowest, None]
+    assert [answer.error for answer in _fastest_that_keep(answers)] == [1e-2, 1e-4, 1e-6, 1e-7, 1e-8]
 
 
 def test_a_single_node_and_a_run_that_failed_at_once_are_drawn():

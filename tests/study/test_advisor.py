@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from importlib import import_module
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -209,6 +210,7 @@ def test_cost_report(tmp_path):
     text = report.path.read_text()
     assert [answer.error for answer in report.answers] == [1e-3, 1e-5]
     assert "What accuracy costs" in text
+    assert not report.not_tried
     assert "Runs to t = 1, with errors of the positions there. The reference solution is good to" in str(report)
     setting = report.answers[1].setting
     assert setting is not None
@@ -218,6 +220,15 @@ def test_cost_report(tmp_path):
     assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)
     with pytest.raises(ValueError, match="positive"):
         cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))
+
+
+def test_a_cost_report_names_the_schemes_that_it_had_no_time_for(tmp_path, monkeypatch):
+    """Once a scheme has kept the error, a search without time compiles no other one."""
+    monkeypatch.setattr(import_module("vmri_jax.study.cost_report"), "BUDGET", -1.0)
+    report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-3,), menu=SHORT_MENU)
+    assert 0 < len(report.not_tried) < len(SHORT_MENU)
+    for text in (str(report), report.path.read_text()):
+        assert f"not tried: {', '.join(report.not_tried)}. For one error vmri tune tries all" in text
 
 
 def test_another_start_fits_constraints_that_move():

@@ -237,6 +237,11 @@ class Search:
         except KeyboardInterrupt:
             raise StudyInterrupted(self.rows()) from None
 
+    def not_tried(self) -> list[str]:
+        """Families of which nothing has been run, as where the time of the search was over before."""
+        tried = {s.family.name for s in self.settings.values()}
+        return [family.name for family in self.menu if family.name not in tried]
+
     def rows(self) -> WorkPrecision:
         """All runs so far."""
         order = sorted(self.settings.values(), key=lambda s: (s.family.name, s.num_micro, s.num_steps))

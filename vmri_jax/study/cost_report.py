@@ -71,6 +71,7 @@ class CostReport(ResultTable):
     answers: by error, the largest first.
     runs: every run of the search.
     shares: parts of the time of the middle answer by what it is spent on.
+    not_tried: schemes that the search had no time to compile.
     """
 
     columns = (
@@ -86,6 +87,7 @@ class CostReport(ResultTable):
     answers: tuple[Answer, ...]
     runs: WorkPrecision
     shares: dict[str, float]
+    not_tried: tuple[str, ...] = ()
 
     @property
     def rows(self) -> tuple[Answer, ...]:
@@ -101,7 +103,19 @@ class CostReport(ResultTable):
             if least
             else ""
         )
-        return f"Runs to t = {self.t_end:g}, with errors of the positions there.{told}"
+        return " ".join(
+            filter(None, (f"Runs to t = {self.t_end:g}, with errors of the positions there.{told}", self.cut_short))
+        )
+
+    @property
+    def cut_short(self) -> str:
+        """Which schemes the search had no time to compile; empty if it tried all."""
+        if not self.not_tried:
+            return ""
+        return (
+            f"After {BUDGET:g} s no more schemes are compiled, so that these were not tried: {', '.join(self.not_tried)}. For one error "
+            "vmri tune tries all."
+        )
 
     def records(self) -> list[dict[str, Any]]:
         """Errors and the runs that answer them."""
@@ -194,8 +208,10 @@ def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float
 
 def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: str, out: Path) -> CostReport:
     """The page of what is known so far."""
+    answers = _fastest_that_keep(answers)
     runs, shares = search.rows(), _shares(problem, answers[len(answers) // 2].setting)
-    report = CostReport(out / "cost.html", name, search.t_end, tuple(answers), runs, shares)
+    not_tried = tuple(search.not_tried())
+    report = CostReport(out / "cost.html", name, search.t_end, tuple(answers), runs, shares, not_tried)
     labels = _shown(answers)
     runs.to_csv(out / "cost.csv")
     try:
@@ -203,6 +219,19 @@ def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: st
     except Exception as error:
         raise PageFailed(report) from error
     return report
+
+
+def _fastest_that_keep(answers: Sequence[Answer]) -> list[Answer]:
+    """The answers, the largest error first, none slower than that for a smaller error: its setting keeps the larger error as well.
+
+    Schemes that are compiled for a small error are not tried again at the larger ones before it.
+    """
+    best, made = None, []
+    for answer in reversed(answers):
+        known = [setting for setting in (answer.setting, best) if setting is not None]
+        best = min(known, key=lambda setting: setting.row.seconds, default=None)
+        made.append(replace(answer, setting=best))
+    return made[::-1]
 
 
 def _draw(report: CostReport, problem: Problem, labels: Sequence[str]) -> None:
