@@ -1,4 +1,4 @@
-"""Random runs on workers give what they give here."""
+"""Random runs end on workers as they do in this process."""
 
 import pytest
 

@@ -280,7 +280,7 @@ def test_ends_of_runs(fpu):
         simulate(fpu.system, fully_implicit(2), macro_dt=0.1, num_steps=1)
 
 
-def test_lengths_of_runs_share_a_program(fpu):
+def test_lengths_of_runs_share_a_program(fpu, request):
     """Six step sizes, all nodes saved: one program. A node is the same whatever the length of its run."""
     compiled = []
 
@@ -289,8 +289,11 @@ def test_lengths_of_runs_share_a_program(fpu):
             compiled.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(note)
+    request.addfinalizer(lambda: jax.monitoring.unregister_event_duration_listener(note))
     scheme = fully_implicit(2)
     simulate(fpu, scheme, macro_dt=0.05, num_steps=3)
+    jax.jit(lambda x: 2 * x)(1.0)
+    assert compiled  # the listener hears
     compiled.clear()
     for num_steps in (10, 20, 40, 80, 160, 320):
         run = simulate(fpu, scheme, macro_dt=1 / num_steps, num_steps=num_steps)
@@ -300,7 +303,6 @@ def test_lengths_of_runs_share_a_program(fpu):
     for num_steps in (33, 34, 35):
         run = simulate(fpu, scheme, macro_dt=0.05, num_steps=num_steps)
         np.testing.assert_array_equal(run.q_f, longest.q_f[: num_steps + 1])
-    jax.monitoring.clear_event_listeners()
 
 
 def test_pieces_of_a_run_make_the_whole(fpu, monkeypatch):

@@ -1,4 +1,4 @@
-"""The engine of all runs: a loop of macro steps inside a scan over saved nodes, compiled once per structure."""
+"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -70,8 +70,8 @@ class Engine:
     def piece(self):
         """``piece(saved, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves)``: a run of any length, by pieces.
 
-        Computes the first `saves` saved intervals into the arrays `saved`, whose memory it takes over, and returns `_Counted`. `memory`
-        is what the stepper takes along from the piece before; where `starts` is true, that of a first step instead.
+        Computes the first `saves` saved intervals into the arrays `saved`, whose memory it takes over, and returns `_Counted`. The
+        `memory` of the stepper comes from the piece before; where `starts` is true, the memory of a first step takes its place.
         """
 
         def piece(saved, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves):
@@ -88,7 +88,10 @@ class Engine:
         """`piece` with its trajectory in arrays of NumPy, and the state and memory at its end."""
         scheme = jax.tree.unflatten(self.structure, leaves)[1]
         free = self._free[tuple(a.shape for a in state)]
-        room = free.pop() if free else self._nothing(State(*state), scheme.num_micro)
+        try:
+            room = free.pop()
+        except IndexError:  # the first piece, or all arrays are in use by other threads
+            room = self._nothing(State(*state), scheme.num_micro)
         done = self.piece(room, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves)
         saved = done.saved.first(saves, int(done.number))
         free.append(done.saved)
@@ -101,7 +104,7 @@ class Engine:
         return defaultdict(list)
 
     def blank_memory(self, leaves, state):
-        """What `piece` takes as memory where it starts: zeros."""
+        """The memory that `piece` is given where it starts: zeros."""
         return _blank_memory(self, tuple((a.shape, a.dtype) for a in (*leaves, *state)))
 
     def trajectory(
@@ -197,7 +200,7 @@ def _before_end(scheme, macro_dt):
 
 @lru_cache(maxsize=256)
 def _blank_memory(engine: Engine, shapes: tuple):
-    """Zeros in the shapes of what a stepper takes along; `shapes` and types of the leaves and of the five arrays of a state."""
+    """Zeros in the shapes of the memory of a stepper; `shapes` and types of the leaves and of the five arrays of a state."""
 
     def memory(*arrays):
         start = State(*arrays[-5:])
@@ -223,7 +226,7 @@ class _At(NamedTuple):
 
 
 class _Counted(NamedTuple):
-    """Number of the next node to be saved, where the run is, and what is saved."""
+    """Number of the next node to be saved, where the run is, and the nodes that are saved."""
 
     number: Int[Numbers, ""]
     at: _At

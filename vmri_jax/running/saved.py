@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
@@ -17,8 +17,12 @@ NUMBERS = 2**17
 runs are called for more often, which takes some 30 microseconds each time."""
 
 
+OTHERS, DONE = 4, len(RunInfo._fields)
+"""Numbers of a node besides positions and momenta (time, energy, two constraint residuals), and of the solver's work before it."""
+
+
 class Node(NamedTuple):
-    """What is saved of a node: fields of a `Trajectory`."""
+    """Fields of a `Trajectory` at a node."""
 
     t: Float[Numbers, "*k"]
     q_s: Float[Numbers, "*k n_s"]
@@ -30,21 +34,20 @@ class Node(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Room for nodes.
+    """Room for nodes, arrays of JAX or of NumPy.
 
-    rows: each a `Node` and what the solver did since the one before.
+    rows: each a `Node` and the `RunInfo` since the one before.
     micros: fast positions at micro nodes, None unless asked for.
     """
 
-    rows: Float[Array, "room+1 numbers"]
-    micros: Float[Array, "room num_micro n_f"] | None
+    rows: Float[Numbers, "room+1 numbers"]
+    micros: Float[Numbers, "room num_micro n_f"] | None
 
     @classmethod
     def none(cls, state: State, room: int, num_micro: int | None) -> "Saved":
-        """Before anything is saved: NaN, and nothing done. `num_micro` is None unless micro nodes are saved."""
-        n_s, n_f = state.q_s.shape[0], state.q_f.shape[0]
-        row = np.concatenate([np.full(2 * (n_s + n_f) + 4, np.nan), np.zeros(len(RunInfo._fields))])
-        micros = None if num_micro is None else jnp.full((room, num_micro, n_f), jnp.nan)
+        """Before anything is saved. `num_micro` is None unless micro nodes are saved."""
+        row = _unknown(_numbers(state))
+        micros = None if num_micro is None else jnp.full((room, num_micro, state.q_f.shape[0]), jnp.nan)
         return cls(jnp.broadcast_to(row, (room + 1, row.size)), micros)
 
     def write(self, number, node: Node, info: RunInfo, micro) -> "Saved":
@@ -59,15 +62,15 @@ class Saved(NamedTuple):
     def first(self, saves: int, written: int) -> "Saved":
         """The first `saves` saved intervals as arrays of NumPy, of which only the first `written` nodes are known."""
         rows = np.array(np.asarray(self.rows)[: saves + 1])
-        rows[written:] = np.append(np.full(rows.shape[1] - 3, np.nan), np.zeros(3))
+        rows[written:] = _unknown(rows.shape[1])
         if self.micros is None:
-            return Saved(rows, None)  # pyright: ignore[reportArgumentType]
+            return Saved(rows, None)
         micros = np.array(np.asarray(self.micros)[:saves])
         micros[max(written - 1, 0) :] = np.nan
-        return Saved(rows, micros)  # pyright: ignore[reportArgumentType]
+        return Saved(rows, micros)
 
     def trajectory(self, num_slow: int, times, status: dict[str, Any], before_end) -> Trajectory:
-        """All nodes as a trajectory, arrays of JAX or of NumPy.
+        """All nodes as a trajectory.
 
         Args:
             num_slow: n_s.
@@ -75,22 +78,30 @@ class Saved(NamedTuple):
             status: `result` and `failed_at`.
             before_end: (num_micro,) by how much the micro nodes of a step are earlier than its end.
         """
-        num_fast = (self.rows.shape[1] - 7 - 2 * num_slow) // 2
-        ends = accumulate((1, num_slow, num_fast, num_slow, num_fast, 1, 2))
-        starts = [0, *ends]
-        columns = [self.rows[:, a:b] for a, b in zip(starts, [*starts[1:], None], strict=True)]
-        t, q_s, q_f, p_s, p_f, energy, residual, info = columns
-        where = jnp.where if isinstance(t, jax.Array) else np.where
-        t = where(t[:, 0] == t[:, 0], t[:, 0], times)
-        method, iterations, left = info[1:].T
-        did = RunInfo(method.astype(int), iterations.astype(int), left)
+        module = jnp if isinstance(self.rows, jax.Array) else np
+        num_fast = (self.rows.shape[1] - OTHERS - DONE) // 2 - num_slow
+        ends = list(accumulate((1, num_slow, num_fast, num_slow, num_fast, 1, 2)))
+        t, q_s, q_f, p_s, p_f, energy, residual, did = module.split(self.rows, ends, axis=1)
+        t = module.where(module.isnan(t[:, 0]), times, t[:, 0])
+        method, iterations, left = did[1:].T
+        info = RunInfo(method.astype(int), iterations.astype(int), left)
         t_micro = None if self.micros is None else t[1:, None] - before_end
         return Trajectory(
-            t, q_s, q_f, p_s, p_f, energy[:, 0], residual, info=did, **status, t_micro=t_micro, q_f_micro=self.micros
+            t, q_s, q_f, p_s, p_f, energy[:, 0], residual, info, **status, t_micro=t_micro, q_f_micro=self.micros
         )
+
+
+def _numbers(state: State) -> int:
+    """Numbers in the row of a node."""
+    return 2 * (state.q_s.size + state.q_f.size) + OTHERS + DONE
+
+
+def _unknown(numbers: int) -> np.ndarray:
+    """The row of a node that no step has reached: NaN, and no work of the solver before it."""
+    return np.append(np.full(numbers - DONE, np.nan), np.zeros(DONE))
 
 
 def room_of_a_piece(state: State, num_micro: int, save_micro: bool) -> int:
     """Saved intervals of a piece of a run: the same for all lengths, so that they share one program."""
-    numbers = 2 * (state.q_s.size + state.q_f.size) + 7 + (num_micro * (state.q_f.size + 1) if save_micro else 0)
+    numbers = _numbers(state) + (num_micro * (state.q_f.size + 1) if save_micro else 0)
     return max(NUMBERS // numbers, 1)

@@ -341,15 +341,17 @@ class Simulation:
 
     def advance(self, at: Checkpoint, saves: int) -> tuple[list[Trajectory], Checkpoint]:
         """The next `saves` saved intervals, in pieces; again with exact matrices from a piece on that the first method does not solve."""
-        pieces, room, has_failed = [], self._piece_engine(at.fell_back).num_saves, False
-        for done in range(0, saves, room):  # after a failure too: the nodes to the end are NaN
+        pieces, room = [], self._piece_engine(at.fell_back).num_saves
+        for done in range(
+            0, saves, room
+        ):  # after a failure, too: pieces that start from NaN end at once, without a method that failed
             size = min(room, saves - done)
             piece, after = self._advance(at, size)
-            if not (has_failed or at.fell_back) and self._fallback_helps(piece):
+            if not at.fell_back and self._fallback_helps(piece):
                 with Working(FALLING_BACK):
                     piece, after = self._advance(self.start(at.state, at.step, fell_back=True), size)
             pieces.append(piece)
-            at, has_failed = after, int(piece.failed_at) >= 0
+            at = after
         return pieces, at
 
     def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
@@ -367,7 +369,7 @@ class Simulation:
         """The whole run; with a progress bar Ctrl-C raises `Interrupted` with what was computed."""
         if not progress:
             with Working(STEPPING):
-                return know(join(self.advance(self.start(), self.num_saves)[0]), self.origin)
+                return self._joined(self.advance(self.start(), self.num_saves)[0])
         size, at, pieces = -(-self.num_saves // SHOWN), self.start(), []
         with interrupts_noted() as interrupted, progress_shown() as tell:
             for done in range(0, self.num_saves, size):
@@ -375,8 +377,12 @@ class Simulation:
                 more, at = self.advance(at, min(size, self.num_saves - done))
                 pieces += more
                 if interrupted():
-                    raise Interrupted(join(pieces).of(self.origin), at.step, self.num_steps)
-        return know(join(pieces), self.origin)
+                    raise Interrupted(self._joined(pieces), at.step, self.num_steps)
+        return self._joined(pieces)
+
+    def _joined(self, pieces: list[Trajectory]) -> Trajectory:
+        """One run, as arrays of JAX; `jax.numpy.asarray` would compile a program for every length."""
+        return know(jax.device_put(join(pieces)), self.origin)
 
 
 def simulation(

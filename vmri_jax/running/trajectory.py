@@ -279,9 +279,9 @@ def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
 
 
 def join(pieces: list[Trajectory]) -> Trajectory:
-    """Consecutive trajectories, each starting where the one before ends, as one, with arrays of JAX."""
+    """Consecutive trajectories, each starting where the one before ends, as one, with arrays of NumPy."""
     if len(pieces) == 1:
-        return jax.device_put(pieces[0])
+        return pieces[0]
     flat = [named_arrays(piece) for piece in pieces]
     failed = [f for f in flat if int(f["failed_at"]) >= 0]
     status = failed[0] if failed else max(flat, key=lambda f: int(f["result"]))
@@ -293,9 +293,7 @@ def join(pieces: list[Trajectory]) -> Trajectory:
         skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
         return np.concatenate([first, *(f[name][skip:] for f in flat[1:])])
 
-    return jax.device_put(
-        from_named_arrays({name: joined(name) for name in flat[0]})
-    )  # jnp.asarray compiles for every shape
+    return from_named_arrays({name: joined(name) for name in flat[0]})
 
 
 def named_arrays(trajectory: Trajectory) -> dict:

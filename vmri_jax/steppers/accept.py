@@ -75,7 +75,7 @@ class Accepted(NamedTuple):
         return slow, fast
 
     def at_floor(self, size, before, floor=FLOOR):
-        """Whether corrections have stopped shrinking at so many units of round-off of the positions: more cannot be had."""
+        """Whether corrections have stopped shrinking at or below `floor` units of round-off of the positions."""
         return (size > before / 2) & (size <= floor / ROUNDOFF * jnp.maximum(self.slow[0], self.fast[0]))
 
     def over(self, changes, motions, iterations):

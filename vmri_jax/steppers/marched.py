@@ -175,8 +175,10 @@ class Marched(Solver):
             return now._replace(rate=rate, curvature=jnp.maximum(at.curvature, rate / at.exact_size))
 
         def passes(at: Progress) -> Progress:
-            """Passes with the matrices that are kept, and exact ones where they are not enough: loops, which cost lanes nothing
-            that need none, where a branch of `jax.lax.cond` is computed for all lanes."""
+            """Passes with the matrices that are kept, and exact ones where they are not enough.
+
+            Both are loops: in a batch, a branch of `jax.lax.cond` would be computed in every turn, whether or not a lane takes it.
+            """
             at = jax.lax.while_loop(lambda at: (at.result == RUNNING) & (at.rate <= CONTRACTION), further, at)
             return jax.lax.while_loop(lambda at: (at.result == RUNNING) & ~(at.rate <= CONTRACTION), exact, at)
 

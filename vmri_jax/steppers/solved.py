@@ -53,7 +53,7 @@ class Solver(ABC):
         return ()
 
     def renew(self, equations: StepEquations, memory) -> Any:
-        """`memory` with what is computed once for a whole macro step."""
+        """`memory` with the matrices that are computed once for a whole macro step."""
         return memory
 
     @abstractmethod

@@ -71,7 +71,7 @@ class Stepper(ABC):
         return ()
 
     def renew(self, state: State, memory, macro_dt) -> Any:
-        """`memory` with what is computed once for a whole macro step, however many micro steps share it."""
+        """`memory` with the matrices that are computed once for a whole macro step, however many micro steps share them."""
         return memory
 
     @abstractmethod
