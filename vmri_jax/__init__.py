@@ -1,7 +1,7 @@
 """Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories."""
 
 from importlib import import_module
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from vmri_jax import diagnostics
@@ -37,7 +37,10 @@ from vmri_jax.steppers.stepper import StepInfo
 
 from vmri_jax import systems  # isort: skip  (written with the names above)
 
-__version__ = version("vmri_jax")
+try:
+    __version__ = version("vmri_jax")
+except PackageNotFoundError:  # a checkout on PYTHONPATH, as on a machine where nothing can be installed
+    __version__ = "unknown"
 
 
 if TYPE_CHECKING:
