@@ -38,13 +38,13 @@ def positions(run):
 @pytest.mark.parametrize(
     ("name", "scheme", "macro_dt", "passes"),
     [
-        ("fpu", galerkin(4, 2), 0.1, 6),  # measured 5.1
+        ("fpu", galerkin(4, 2), 0.1, 7),  # measured 6.2
         ("fpu", explicit_slow(4), 0.04, 2),
-        ("tsp", galerkin(3, 2, "lobatto"), 0.006, 4.5),  # measured 3.9
-        ("tsp", galerkin(2, 3), 0.006, 5),  # measured 4.3
-        ("tsp", fully_explicit(5), 0.02, 4),  # measured 3.4
-        ("pendulum", explicit_slow(5), 0.01, 6),  # measured 5.3
-        pytest.param("sam", explicit_slow(5), 0.01, 5, marks=pytest.mark.full),  # measured 4.3
+        ("tsp", galerkin(3, 2, "lobatto"), 0.006, 5.5),  # measured 4.8
+        ("tsp", galerkin(2, 3), 0.006, 5.5),  # measured 4.8
+        ("tsp", fully_explicit(5), 0.02, 4.2),  # measured 3.8
+        ("pendulum", explicit_slow(5), 0.01, 6.5),  # measured 5.9
+        pytest.param("sam", explicit_slow(5), 0.01, 5.5, marks=pytest.mark.full),  # measured 5.0
         pytest.param("sam", galerkin(2, 2), 0.002, 9, marks=pytest.mark.full),
     ],
 )
@@ -63,21 +63,21 @@ def test_few_passes_and_errors_within_the_tolerance(name, scheme, macro_dt, pass
 
 
 def test_few_passes_where_the_slow_motion_is_smooth(tsp):
-    """Were micro intervals to start straight, without the bends of those before, it would be 2.6."""
+    """Were the slow increments to start from those of the last step, it would be 3."""
     for scheme, micro_dt, num_steps, passes in (
-        (fully_explicit(10), 2e-4, 500, 2.3),  # measured 2.1
-        (fully_implicit(10), 2e-4, 1000, 2.1),  # measured 2.04
-        (explicit_slow(10), 2e-4, 1000, 2.1),
+        (fully_explicit(10), 2e-4, 500, 2.4),  # measured 2.2
+        (fully_implicit(10), 2e-4, 1000, 2.7),  # measured 2.5
+        (explicit_slow(10), 2e-4, 1000, 2.7),
     ):
         run = simulate(tsp.system, scheme, tsp.state(), micro_dt=micro_dt, num_steps=num_steps)
         assert run.info.iterations.mean() < passes
 
 
 def test_light_slow_bodies_that_constraints_tie_to_fast_ones():
-    """Were the slow equations solved with the slow masses alone, it would be 5.8."""
+    """Were the slow equations solved with the slow masses alone, no step would converge."""
     problem = systems.triple_spherical_pendulum(masses=(1.0, 1.0, 1.0))
     run = simulate(problem.system, fully_explicit(10), problem.state(), macro_dt=0.01, num_steps=300)
-    assert run.info.iterations.mean() < 5.5  # measured 4.6
+    assert run.info.iterations.mean() < 6  # measured 5.5
 
 
 def drag(t, q_s, q_f, v_s, v_f, params):

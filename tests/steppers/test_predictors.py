@@ -1,13 +1,10 @@
-"""Extrapolation of unknowns, secant pairs and minimal residuals: pure mathematics, on numbers whose answer is known."""
+"""Extrapolation of unknowns: pure mathematics, on numbers whose answer is known."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tests.support import largest_difference
-from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor
-from vmri_jax.steppers.secant import Pairs
-from vmri_jax.steppers.slow_equations import ENOUGH, minimal_residuals
+from vmri_jax.steppers.predictors import PolynomialPredictor
 
 
 def test_extrapolation_takes_the_order_that_was_best():
@@ -26,40 +23,3 @@ def test_extrapolation_takes_the_order_that_was_best():
     assert np.mean(missed) < 1.5  # measured 1.2; 2.3 if the last step alone decided on the order
     gap = past.add(jnp.asarray([jnp.nan]), 1).add(jnp.asarray([7.0]), 1)
     assert gap.next(1)[0] == 7.0  # a step that failed leaves no trace in the ones after
-
-
-def test_a_line_expects_what_stands_out():
-    """A line with a jump at the start of every macro step goes on exactly."""
-    line, value = LinearPredictor.zero(()), lambda k: 3.0 + 0.5 * k + 7.0 * (k % 4 == 0)
-    missed = []
-    for first in range(0, 20, 4):
-        within = line
-        for m in range(4):
-            missed.append(abs(float(within.next(m)) - value(first + m)))
-            within = within.add(m, value(first + m))
-        line = line.after_step(jnp.stack([value(first + m) for m in range(4)]), stands_out=True)
-    assert max(missed[:8]) > 5.0
-    assert max(missed[12:]) < 1e-12
-
-
-def test_minimal_residuals_solve_a_linear_problem():
-    """Not symmetric, and close to one."""
-    matrix = jnp.eye(5) + 0.03 * jnp.asarray(np.random.default_rng(0).normal(size=(5, 5)))
-    b = jnp.arange(1.0, 6.0)
-    x = minimal_residuals(lambda x: matrix @ x, b)
-    assert largest_difference(matrix @ x, b) < 5 * ENOUGH  # of the largest entry of b
-    assert np.array_equal(minimal_residuals(lambda x: matrix @ x, 0 * b), 0 * b)
-
-
-def test_secant_pairs_solve_a_linear_problem():
-    """After as many pairs as dimensions the update is exact."""
-    matrix = jnp.array([[1.0, 0.4, 0.0], [0.1, 0.7, 0.2], [0.0, 0.3, 1.2]])
-    target = jnp.array([1.0, -2.0, 0.5])
-    x, pairs, last = jnp.zeros(3), Pairs.none(3), None
-    for _ in range(5):
-        d = target - matrix @ x
-        if last is not None:
-            pairs = pairs.add(x - last[0], d - last[1], 1e-14, 3)
-        last = x, d
-        x = x + pairs.corrected(d, 3)
-    assert largest_difference(matrix @ x, target) < 1e-12  # measured 3e-16

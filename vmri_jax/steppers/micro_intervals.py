@@ -13,7 +13,6 @@ from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.interval import Matrix, constant_mass, interval_problem, weighted_sum
-from vmri_jax.steppers.predictors import LinearPredictor
 
 
 class SweepTotals(NamedTuple):
@@ -32,30 +31,17 @@ class SweepTotals(NamedTuple):
     moved: Float[Array, ""]
 
 
-class FastPredictors(NamedTuple):
-    """Where the unknowns of the micro intervals go on.
-
-    multiplier: (r, n_g) multipliers lambda.
-    bend: (r, n_f) by how much fast increments leave the straight line, over h^2; (r, 0) where increments follow from the multipliers.
-    """
-
-    multiplier: LinearPredictor
-    bend: LinearPredictor
-
-
 class FastUnknowns(NamedTuple):
     """Unknowns of the micro intervals and what is kept of them, with the intervals as first axis.
 
     increments, multiplier: the unknowns, multipliers scaled.
     nodes: positions at the nodes 1..r.
-    bends: see `FastPredictors`.
     schur: inverses of ``G K^-1 G^T`` from the first pass.
     """
 
     increments: Float[Array, "num_micro r n_f"]
     multiplier: Float[Array, "num_micro r n_g"]
     nodes: Float[Numbers, "num_micro r n_f"]
-    bends: Float[Array, "num_micro r n_f"] | Float[Array, "num_micro r 0"]
     schur: FullInverse | BandInverse
 
 
@@ -75,24 +61,23 @@ class MicroSweep(NamedTuple):
     scale: Float[Numbers, "num_micro r 1"]
     sparsity: Sparsity
 
-    def first_pass(self, slow, predictors: FastPredictors) -> tuple[FastUnknowns, SweepTotals]:
-        """With fast unknowns from where the intervals before lead to, for slow increments (r, n_s)."""
+    def first_pass(self, slow, multiplier) -> tuple[FastUnknowns, SweepTotals]:
+        """With each interval's fast unknowns from a guess: straight motion, and the multipliers of the interval before.
+
+        Args:
+            slow: (r, n_s) increments of the slow path.
+            multiplier: (r, n_g) multipliers lambda of the last interval of the step before.
+        """
         r = self.equations.scheme.degree
         velocity = constant_mass(self.equations.system).fast_mass.inverse().times
 
         def interval(carry, at):
-            (arriving, predictors), (m, basis, scale) = carry, at
+            (arriving, multiplier), (m, basis, scale) = carry, at
             straight = control_nodes(r)[1:, None] * velocity(arriving.p_f)
-            mu, increments = scale * predictors.multiplier.next(m), straight
-            if not self.is_explicit:
-                increments = straight + self.equations.micro_dt**2 * predictors.bend.next(m)
-            done, totals = self._corrected(slow, arriving, m, basis, straight, increments, mu, self.sparsity)
-            predictors = FastPredictors(
-                predictors.multiplier.add(m, done.multiplier / scale), predictors.bend.add(m, done.bends)
-            )
-            return (totals, predictors), done
+            done, totals = self._corrected(slow, arriving, m, basis, straight, scale * multiplier, self.sparsity)
+            return (totals, done.multiplier / scale), done
 
-        (totals, _), fast = jax.lax.scan(interval, (self._start(slow), predictors), (*self._intervals(), self.scale))
+        (totals, _), fast = jax.lax.scan(interval, (self._start(slow), multiplier), (*self._intervals(), self.scale))
         return fast, totals
 
     def next_pass(self, slow, fast: FastUnknowns) -> tuple[FastUnknowns, SweepTotals]:
@@ -100,12 +85,10 @@ class MicroSweep(NamedTuple):
 
         def interval(arriving, at):
             m, basis, before = at
-            straight = control_nodes(len(slow))[1:, None] * velocity(arriving.p_f)
             known = before.increments, before.multiplier, before.schur
-            done, totals = self._corrected(slow, arriving, m, basis, straight, *known)
+            done, totals = self._corrected(slow, arriving, m, basis, *known)
             return totals, done
 
-        velocity = constant_mass(self.equations.system).fast_mass.inverse().times
         totals, fast = jax.lax.scan(interval, self._start(slow), (*self._intervals(), fast))
         return fast, totals
 
@@ -120,7 +103,7 @@ class MicroSweep(NamedTuple):
         return SweepTotals(equations.q_f, equations.micro_dt * equations.p_f, *zero)
 
     def _corrected(
-        self, slow, arriving: SweepTotals, m, basis, straight, increments, mu, schur
+        self, slow, arriving: SweepTotals, m, basis, increments, mu, schur
     ) -> tuple[FastUnknowns, SweepTotals]:
         """Interval m, corrected once by a Newton step on its exact residual, and what it leaves."""
         equations, h, n = self.equations, self.equations.micro_dt, self.equations.scheme.num_micro
@@ -142,8 +125,7 @@ class MicroSweep(NamedTuple):
 
         totals = SweepTotals(q_f, p_f, start, rows, jnp.maximum(arriving.moved, done.moved))
         nodes = arriving.q_f + done.increments
-        bends = jnp.zeros((len(slow), 0)) if self.is_explicit else (done.increments - straight) / h**2
-        return FastUnknowns(done.increments, done.multiplier, nodes, bends, done.schur), totals
+        return FastUnknowns(done.increments, done.multiplier, nodes, done.schur), totals
 
 
 def kick_weight(term: Term, h):

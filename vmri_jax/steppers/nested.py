@@ -7,13 +7,12 @@ increments and slow multipliers are corrected from what is left of their equatio
 * micro interval: ``[K, -G^T; G, 0]`` with K from the start of the macro step, or of one before it while that costs no passes
   (the mass alone where the fast equations are explicit, so that only the multipliers are solved for), and
   ``G K^-1 G^T`` from the first pass;
-* slow equations: masses, with those that constraints tie to the slow ones, and slow constraint (`SlowEquations`). What they
-  miss is learned from steps with many passes where there are constraints (`Pairs`); elsewhere it is the derivative of the slow
-  forces, which is taken where updates by the masses alone would cost a pass (`SlowEquations.with_forces`).
+* slow equations: masses, with those that constraints tie to the slow ones, and the slow constraint (`SlowEquations`).
 
-The slow unknowns start from what the steps before extrapolate to (`PolynomialPredictor`), the fast ones from the micro intervals
-before (`LinearPredictor`). The residual is exact, so all of this decides only how many passes there are: two where the slow
-motion is smooth. A pass costs one gradient of each term at each of its nodes; nothing is stored but the path and those small matrices.
+The slow unknowns start from the polynomial through those of the steps before (`PolynomialPredictor`); the fast increments from
+straight motion, and the multipliers from those of the interval before. The residual is exact, so all of this decides only how many
+passes there are: two where the slow motion is smooth. A pass costs one gradient of each term at each of its nodes; nothing is stored but
+the path and those small matrices.
 """
 
 from dataclasses import dataclass
@@ -29,21 +28,18 @@ from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scale
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import SMALL, Interval, Matrix, constant_mass, weighted_sum
-from vmri_jax.steppers.micro_intervals import FastPredictors, FastUnknowns, MicroSweep, SweepTotals
+from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.predictors import LinearPredictor, PolynomialPredictor
+from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import Method
-from vmri_jax.steppers.secant import SIZE, Pairs
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
-NOISE = 75.0
-"""Secant pairs shorter than so many times the round-off of the slow positions are not kept."""
-MORE = 1
-"""A matrix is renewed after a step with more than so many passes above the fewest with it."""
-EASY = 2
-"""Steps with so few passes do without secant pairs."""
+EXTRA_PASSES = 1
+"""A step that needs more passes than this above the fewest with its matrix K renews K. With more, steps with an old K take more passes; with
+none, K is computed for every fluctuation of the passes."""
 UNKNOWN = -1
+"""Fewest passes with a matrix that no step has used."""
 
 
 class NestedState(NamedTuple):
@@ -51,23 +47,20 @@ class NestedState(NamedTuple):
 
     matrix: K of the micro intervals.
     slow: slow increments and slow multipliers of the last steps.
-    predictors: multipliers and bends of the last micro intervals.
-    slow_model_error: what the cheap matrix of the slow equations misses: secant pairs with constraints, else the part of an update
-        that it leaves to the next one.
+    multiplier: multipliers lambda of the last micro interval.
     passes: fewest of a step with this matrix (UNKNOWN before one), and those of the last step.
     """
 
     matrix: Matrix
     slow: PolynomialPredictor
-    predictors: FastPredictors
-    slow_model_error: Pairs | Float[Array, ""]
+    multiplier: Float[Array, "r n_g"]
     passes: Int[Array, "2"]
 
 
 class Pass(NamedTuple):
     """Unknowns of a pass, what it left, and how the iteration stands.
 
-    d: the update of the slow unknowns by the cheap matrix.
+    d: the update of the slow unknowns that their equations ask for.
     inertia: masses that constraints tie to the slow variables, from the first pass.
     impulse: on the slow variables over the step, times h.
     residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
@@ -79,7 +72,6 @@ class Pass(NamedTuple):
     totals: SweepTotals
     d: Float[Array, "r*(n_s+n_gs)"]
     inertia: ConstraintInertia | None
-    slow_model_error: Pairs | Float[Array, ""]
     impulse: Float[Array, "n_s"]
     residual: tuple[Float[Array, ""], Float[Array, ""]]
     passes: Int[Array, ""]
@@ -90,29 +82,20 @@ class Pass(NamedTuple):
 class Nested(Solver):
     """Passes until one more would change neither the slow increments nor those of the micro intervals.
 
-    What it would change the slow ones by is known from the residual, and the others from how their corrections shrink, as in
+    The next change of the slow increments is known from the residual, that of the fast ones from how their corrections shrink, as in
     stiff solvers (Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8). Accepted are changes of
     ``newton.tolerance`` relative to the motion over the macro step and over a micro interval, and round-off of the positions.
-
-    has_kicks: whether a potential acts at the macro nodes.
     """
 
     newton: Newton
     interval: Interval
-    has_kicks: bool
 
     def init(self, equations: StepEquations, velocity) -> NestedState:
-        system, n_s, n_f = equations.system, equations.q_s.size, equations.q_f.size
-        r, (n_g, n_gs) = equations.scheme.degree, system.num_constraints(equations.q_s, equations.q_f)
+        r, (n_g, n_gs) = equations.scheme.degree, equations.system.num_constraints(equations.q_s, equations.q_f)
         matrix = self.interval.matrix if self.interval.is_constant else self.interval.no_matrix
         increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity[0])
         slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
-        bends = (r, 0 if self.interval.is_explicit else n_f)
-        predictors = FastPredictors(LinearPredictor.zero((r, n_g)), LinearPredictor.zero(bends))
-        slow_model_error = jnp.ones(())
-        if system.is_constrained:
-            slow_model_error = Pairs.none(r * (n_s + n_gs), min(SIZE, r * n_s))  # no more of them are independent
-        return NestedState(matrix(equations), slow, predictors, slow_model_error, jnp.array([0, 2 * MORE]))
+        return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.array([0, 2 * EXTRA_PASSES]))
 
     def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
         """With a new matrix K, unless it is constant.
@@ -123,7 +106,7 @@ class Nested(Solver):
             return memory
         if self.interval.is_diagonal or len(memory.matrix.inverse) <= SMALL or self.newton.fixed_iterations:
             return memory._replace(matrix=self.interval.matrix(equations))
-        stale = memory.passes[1] > memory.passes[0] + MORE
+        stale = memory.passes[1] > memory.passes[0] + EXTRA_PASSES
         matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: memory.matrix)
         return memory._replace(
             matrix=matrix, passes=memory.passes.at[0].set(jnp.where(stale, UNKNOWN, memory.passes[0]))
@@ -143,23 +126,19 @@ class Nested(Solver):
         if x.multiplier.size:
             g = jnp.maximum(max_abs(_constraints(equations, done)), g)
         status = status_of(equations, done.result, Method.NESTED, done.passes, rows, g, newton.tolerance)
-        return Solution(x, end, status), self._learned(equations, memory, done, scale)
 
-    def _learned(self, equations: StepEquations, memory: NestedState, done: Pass, scale) -> NestedState:
-        several = equations.scheme.num_micro > 1
-        shared = equations.system.constraint is not None  # two macro steps share the constraint force of their node
-        lambdas = memory.predictors.multiplier.after_step(done.fast.multiplier / scale, several and self.has_kicks)
-        bend = memory.predictors.bend.after_step(done.fast.bends, several and (self.has_kicks or shared))
         before = memory.passes[0]
         fewest = jnp.where(before == UNKNOWN, done.passes, jnp.minimum(before, done.passes))
-        slow = memory.slow.add(_joined(done), done.slow.size)
-        predictors, passes = FastPredictors(lambdas, bend), jnp.stack([fewest, done.passes])
-        return NestedState(memory.matrix, slow, predictors, done.slow_model_error, passes)
+        learned = NestedState(
+            memory.matrix,
+            memory.slow.add(_joined(done), done.slow.size),
+            (done.fast.multiplier / scale)[-1],
+            jnp.stack([fewest, done.passes]),
+        )
+        return Solution(x, end, status), learned
 
     def continued(self, memory: NestedState, last: NestedState) -> NestedState:
-        multiplier = memory.predictors.multiplier.continued(last.predictors.multiplier)
-        bend = memory.predictors.bend.continued(last.predictors.bend)
-        return memory._replace(predictors=FastPredictors(multiplier, bend))
+        return memory._replace(multiplier=last.multiplier)
 
     def describe(self) -> list[str]:
         inside = "the multipliers alone" if self.interval.is_explicit else "fast increments and multipliers"
@@ -185,51 +164,24 @@ class _Passes:
 
     def first(self) -> Pass:
         """From the predicted unknowns."""
-        slow, slow_multiplier = self._apart(self.memory.slow.next(self.r * self.n_s))
-        fast, totals = self.sweep.first_pass(slow, self.memory.predictors)
+        z = self.memory.slow.next(self.r * self.n_s)
+        fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
         inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur))
-        return self._judged(slow, slow_multiplier, fast, totals, inertia, self.memory.slow_model_error, totals.moved, 1)
+        return self._judged(z, fast, totals, inertia, totals.moved, 1)
 
     def next(self, last: Pass) -> Pass:
         """With slow unknowns corrected by what the last pass left."""
-        if not self.n_s:
-            return self._moved_by(last.d, last)
-        return self._with_pairs(last) if self.equations.system.is_constrained else self._with_forces(last)
-
-    def _with_pairs(self, last: Pass) -> Pass:
-        known, size = last.slow_model_error, self.r * self.n_s
-        assert isinstance(known, Pairs)
-        is_hard = (self.memory.passes[1] > EASY) | (last.passes >= EASY)
-        d = jax.lax.cond(is_hard, lambda: known.corrected(last.d, size), lambda: last.d)
-        now = self._moved_by(d, last)
-        noise = NOISE * (self.accepted.slow[1] + jnp.finfo(float).eps * max_abs(last.slow))
-        pairs = jax.lax.cond(is_hard, lambda: known.add(d, now.d - last.d, noise, size), lambda: known)
-        return now._replace(slow_model_error=pairs)
-
-    def _with_forces(self, last: Pass) -> Pass:
-        known = last.slow_model_error
-        assert not isinstance(known, Pairs)
-        part = jnp.where(last.passes == 1, known**2, known)  # the fast unknowns take three passes anyway
-        is_hard = part * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
-        wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part
-        x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
-        d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
-        now = self._moved_by(d, last)
-        error, of = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
-        return now._replace(slow_model_error=max_abs(error) / (max_abs(of) + jnp.finfo(float).tiny))
-
-    def _moved_by(self, d, last: Pass) -> Pass:
-        slow, slow_multiplier = self._apart(_joined(last) + d)
-        fast, totals = self.sweep.next_pass(slow, last.fast)
+        z = _joined(last) + last.d
+        fast, totals = self.sweep.next_pass(self._apart(z)[0], last.fast)
         still_moves = expected(totals.moved, last.totals.moved)
-        return self._judged(
-            slow, slow_multiplier, fast, totals, last.inertia, last.slow_model_error, still_moves, last.passes + 1
-        )
+        return self._judged(z, fast, totals, last.inertia, still_moves, last.passes + 1)
 
     def _judged(
-        self, slow, slow_multiplier, fast: FastUnknowns, totals: SweepTotals, inertia, model_error, still_moves, passes
+        self, z, fast: FastUnknowns, totals: SweepTotals, inertia: ConstraintInertia | None, still_moves, passes
     ) -> Pass:
+        """A pass with slow unknowns z, the next update of these, and whether what is still to come is accepted."""
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
+        slow, slow_multiplier = self._apart(z)
         x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
         d, (rows, g), impulse = self.slow_equations.update(x, totals.start, totals.increments, inertia)
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
@@ -237,8 +189,7 @@ class _Passes:
         changes = max_abs(d[: self.r * self.n_s]), still_moves
         result = self.newton.status(self.accepted.over(changes, (max_abs(slow), motion), passes), passes)
         residual = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves), max_abs(g)
-        passes = jnp.asarray(passes)
-        return Pass(slow, slow_multiplier, fast, totals, d, inertia, model_error, impulse, residual, passes, result)
+        return Pass(slow, slow_multiplier, fast, totals, d, inertia, impulse, residual, jnp.asarray(passes), result)
 
     def _apart(self, z):
         """Slow increments (r, n_s) and slow multipliers (r, n_gs)."""

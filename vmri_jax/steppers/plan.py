@@ -203,9 +203,7 @@ def _first_choice(
     small = (q_f.size or q_s.size) <= SMALL  # a large matrix is better kept for many steps, which the march does
     if single and small and system.force is None and not interval.is_diagonal:
         return Collocation(newton)
-    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
-    has_kicks = any(f is not None and placed.grid == "macro" for f, placed in potentials)
-    return Nested(newton, interval, has_kicks)
+    return Nested(newton, interval)
 
 
 def _can_be_nested(system: System, scheme: Scheme) -> bool:

@@ -52,47 +52,6 @@ class PolynomialPredictor(NamedTuple):
         return jnp.maximum(jnp.max(misses, axis=1, initial=0.0), self.misses)
 
 
-class LinearPredictor(NamedTuple):
-    """Values of the micro intervals one after the other, extrapolated by the line through the last two.
-
-    A kick at the macro nodes, or half of their constraint force, lets the first value of every macro step stand out from
-    its neighbours.
-
-    last: of the last two intervals, the last one first, without what stands out.
-    jump: by how much the first one of a macro step stands out.
-    """
-
-    last: Float[Array, "2 r n"]
-    jump: Float[Array, "r n"]
-
-    @classmethod
-    def zero(cls, shape: tuple[int, ...]) -> "LinearPredictor":
-        """The start of a run."""
-        return cls(jnp.zeros((2, *shape)), jnp.zeros(shape))
-
-    def next(self, m):
-        """The value that is expected in interval m of a macro step."""
-        return 2 * self.last[0] - self.last[1] + jnp.where(m == 0, self.jump, 0.0)
-
-    def add(self, m, value) -> "LinearPredictor":
-        """With the value of interval m."""
-        value = value - jnp.where(m == 0, self.jump, 0.0)
-        return self._replace(last=jnp.stack([value, self.last[0]]))
-
-    def after_step(self, values, stands_out: bool) -> "LinearPredictor":
-        """With the values (num_micro, ...) of a macro step, and the jump at its start if there is one."""
-        line, n = self, len(values)
-        if stands_out:
-            line = self._replace(jump=values[0] - (self.last[0] + values[1]) / 2)
-        for m in range(max(n - 2, 0), n):
-            line = line.add(m, values[m])
-        return line
-
-    def continued(self, other: "LinearPredictor") -> "LinearPredictor":
-        """Going on where another line ended."""
-        return self._replace(last=other.last)
-
-
 class Parabola(NamedTuple):
     """Unknowns of the micro intervals one after the other; they go on as the parabola through the last three does.
 

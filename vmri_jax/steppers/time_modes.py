@@ -15,9 +15,6 @@ from vmri_jax.schemes.path import lagrange_basis, lagrange_derivative
 from vmri_jax.schemes.quadrature import interpolatory_weights
 from vmri_jax.schemes.scheme import Scheme
 
-FEW_MODES = 4
-"""Parts of no mode are added to more pairs of modes than that, if they are odd: half a vector register costs as much as a full one."""
-
 
 class TimeModes(NamedTuple):
     """Eigenvectors of ``A^-1 B``, one of every complex pair.
@@ -52,17 +49,16 @@ class TimeModes(NamedTuple):
         pairs, distinct = int(np.sum(np.imag(gamma) > 0)), int(np.sum(np.imag(gamma) >= 0))
         half = (pairs + distinct + 1) // 2
         first, second = np.arange(half), np.concatenate([np.arange(pairs), np.arange(half, distinct)])
-        width = half + (half % 2 if half > FEW_MODES else 0)
 
         def parts(z):
             """Of modes (r, m), those of no mode zero."""
             imaginary = np.where(np.imag(gamma)[:, None] == 0, z.real, z.imag)
             some = z.real[first], imaginary[second]
-            return np.concatenate([np.pad(a, [(0, width - len(a)), (0, 0)]) for a in some])
+            return np.concatenate([np.pad(a, [(0, half - len(a)), (0, 0)]) for a in some])
 
         to = np.linalg.inv(vectors)
         back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T  # a mode and its conjugate: the real part
-        mode = np.concatenate([np.pad(a, (0, width - len(a)), mode="edge") for a in (first, second)])
+        mode = np.concatenate([np.pad(a, (0, half - len(a)), mode="edge") for a in (first, second)])
         eigenvalues = np.stack([np.real(gamma), np.imag(gamma)])[:, :distinct]
         return cls(eigenvalues, mode, np.linalg.inv(a).T, parts(to).T, parts(back), parts(back @ a.T))
 
