@@ -1,10 +1,12 @@
-"""Extrapolation of unknowns: pure mathematics, on numbers whose answer is known."""
+"""Extrapolation of unknowns, and minimal residuals: pure mathematics, on numbers whose answer is known."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tests.support import largest_difference
 from vmri_jax.steppers.predictors import PolynomialPredictor
+from vmri_jax.steppers.slow_equations import LEFT_OVER, minimal_residuals
 
 
 def test_extrapolation_takes_the_order_that_was_best():
@@ -23,3 +25,12 @@ def test_extrapolation_takes_the_order_that_was_best():
     assert np.mean(missed) < 1.5  # measured 1.2; 2.3 if the last step alone decided on the order
     gap = past.add(jnp.asarray([jnp.nan]), 1).add(jnp.asarray([7.0]), 1)
     assert gap.next(1)[0] == 7.0  # a step that failed leaves no trace in the ones after
+
+
+def test_minimal_residuals_solve_a_linear_problem():
+    """Not symmetric, and close to one."""
+    matrix = jnp.eye(5) + 0.03 * jnp.asarray(np.random.default_rng(0).normal(size=(5, 5)))
+    b = jnp.arange(1.0, 6.0)
+    x = minimal_residuals(lambda x: matrix @ x, b)
+    assert largest_difference(matrix @ x, b) < 5 * LEFT_OVER  # of the largest entry of b
+    assert np.array_equal(minimal_residuals(lambda x: matrix @ x, 0 * b), 0 * b)

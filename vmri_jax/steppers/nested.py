@@ -7,7 +7,8 @@ increments and slow multipliers are corrected from what is left of their equatio
 * micro interval: ``[K, -G^T; G, 0]`` with K from the start of the macro step, or of one before it while that costs no passes
   (the mass alone where the fast equations are explicit, so that only the multipliers are solved for), and
   ``G K^-1 G^T`` from the first pass;
-* slow equations: masses, with those that constraints tie to the slow ones, and the slow constraint (`SlowEquations`).
+* slow equations: masses, with those that constraints tie to the slow ones, and the slow constraint (`SlowEquations`). Where nothing is
+  constrained, the derivative of the slow forces is added where updates by the masses alone would cost a pass.
 
 The slow unknowns start from the polynomial through those of the steps before (`PolynomialPredictor`); the fast increments from
 straight motion, and the multipliers from those of the interval before. The residual is exact, so all of this decides only how many
@@ -48,12 +49,14 @@ class NestedState(NamedTuple):
     matrix: K of the micro intervals.
     slow: slow increments and slow multipliers of the last steps.
     multiplier: multipliers lambda of the last micro interval.
+    slow_model_error: part of an update of the slow unknowns by the masses alone that the next pass finds missing.
     passes: fewest of a step with this matrix (UNKNOWN before one), and those of the last step.
     """
 
     matrix: Matrix
     slow: PolynomialPredictor
     multiplier: Float[Array, "r n_g"]
+    slow_model_error: Float[Array, ""]
     passes: Int[Array, "2"]
 
 
@@ -72,6 +75,7 @@ class Pass(NamedTuple):
     totals: SweepTotals
     d: Float[Array, "r*(n_s+n_gs)"]
     inertia: ConstraintInertia | None
+    slow_model_error: Float[Array, ""]
     impulse: Float[Array, "n_s"]
     residual: tuple[Float[Array, ""], Float[Array, ""]]
     passes: Int[Array, ""]
@@ -95,7 +99,7 @@ class Nested(Solver):
         matrix = self.interval.matrix if self.interval.is_constant else self.interval.no_matrix
         increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity[0])
         slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
-        return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.array([0, 2 * EXTRA_PASSES]))
+        return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), jnp.array([0, 2 * EXTRA_PASSES]))
 
     def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
         """With a new matrix K, unless it is constant.
@@ -133,6 +137,7 @@ class Nested(Solver):
             memory.matrix,
             memory.slow.add(_joined(done), done.slow.size),
             (done.fast.multiplier / scale)[-1],
+            done.slow_model_error,
             jnp.stack([fewest, done.passes]),
         )
         return Solution(x, end, status), learned
@@ -167,17 +172,30 @@ class _Passes:
         z = self.memory.slow.next(self.r * self.n_s)
         fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
         inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur))
-        return self._judged(z, fast, totals, inertia, totals.moved, 1)
+        return self._judged(z, fast, totals, inertia, self.memory.slow_model_error, totals.moved, 1)
 
     def next(self, last: Pass) -> Pass:
         """With slow unknowns corrected by what the last pass left."""
-        z = _joined(last) + last.d
+        if self.equations.system.is_constrained or not self.n_s:
+            return self._moved_by(last.d, last)
+        known = last.slow_model_error
+        part = jnp.where(last.passes == 1, known**2, known)  # the fast unknowns take three passes anyway
+        is_hard = part * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
+        wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part
+        x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
+        d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
+        now = self._moved_by(d, last)
+        missing, of = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
+        return now._replace(slow_model_error=max_abs(missing) / (max_abs(of) + jnp.finfo(float).tiny))
+
+    def _moved_by(self, d, last: Pass) -> Pass:
+        z = _joined(last) + d
         fast, totals = self.sweep.next_pass(self._apart(z)[0], last.fast)
         still_moves = expected(totals.moved, last.totals.moved)
-        return self._judged(z, fast, totals, last.inertia, still_moves, last.passes + 1)
+        return self._judged(z, fast, totals, last.inertia, last.slow_model_error, still_moves, last.passes + 1)
 
     def _judged(
-        self, z, fast: FastUnknowns, totals: SweepTotals, inertia: ConstraintInertia | None, still_moves, passes
+        self, z, fast: FastUnknowns, totals: SweepTotals, inertia: ConstraintInertia | None, error, still_moves, passes
     ) -> Pass:
         """A pass with slow unknowns z, the next update of these, and whether what is still to come is accepted."""
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
@@ -189,7 +207,8 @@ class _Passes:
         changes = max_abs(d[: self.r * self.n_s]), still_moves
         result = self.newton.status(self.accepted.over(changes, (max_abs(slow), motion), passes), passes)
         residual = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves), max_abs(g)
-        return Pass(slow, slow_multiplier, fast, totals, d, inertia, impulse, residual, jnp.asarray(passes), result)
+        passes = jnp.asarray(passes)
+        return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, residual, passes, result)
 
     def _apart(self, z):
         """Slow increments (r, n_s) and slow multipliers (r, n_gs)."""

@@ -5,11 +5,12 @@ them keep it. So a change dx of the slow increments changes the multipliers of t
 small matrix and G the Jacobian by the slow variables, and those of the others hardly. That is the inertia of what is tied to
 the slow variables; the rest of what the fast ones answer is small.
 
-What this matrix leaves out is the derivative of the slow forces by the slow path, H^2 times their curvature beside the masses: it
-costs passes where the macro step is long for the slow motion.
+Where nothing is constrained, what masses leave out is the derivative of the slow forces by the slow path: over a long macro
+step it is as large as they are, and an update can be solved for with it (`SlowEquations.with_forces`).
 """
 
 from collections.abc import Callable
+from itertools import accumulate
 from typing import NamedTuple
 
 import jax
@@ -17,11 +18,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import BandInverse, FullInverse, inverse, matmul, solve
+from vmri_jax.kernels import BandInverse, FullInverse, inverse, matmul, max_abs, solve
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, lagrangian
 from vmri_jax.schemes.equations import StepEquations, Unknowns, slow_basis_at_control_nodes
-from vmri_jax.schemes.path import control_nodes
-from vmri_jax.steppers.interval import constant_mass, solve_saddle
+from vmri_jax.schemes.path import control_nodes, lagrange_basis, lagrange_derivative
+from vmri_jax.schemes.quadrature import gauss
+from vmri_jax.steppers.interval import constant_mass, interval_problem, solve_saddle
+
+NODES = 4
+"""Gauss nodes of a macro step at which the slow forces are linearised. With more, a solve costs more; with fewer, steps in which slow forces
+turn over take more passes."""
+ITERATIONS = 6
+"""Most iterations of `minimal_residuals`. With more, a solve costs as much as a pass."""
+LEFT_OVER = 1e-5
+"""Part of an update that `minimal_residuals` may leave. With more, the update costs another pass."""
 
 
 class ConstraintInertia(NamedTuple):
@@ -83,6 +93,44 @@ class SlowEquations(NamedTuple):
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
         return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), start - pull.sum(0)
 
+    def with_forces(self, d, x: Unknowns):
+        """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces.
+
+            ``(C dx)_i = h H sum_k w_k l_i(c_k) dF_s(sum_j l_j(c_k) dx_j, sum_j l_j'(c_k) dx_j / H)``
+
+        on a few Gauss nodes c_k, ``F_s = F - dV/dq_s`` of V and F on the micro grid, with the fast path as it is.
+
+        Args:
+            d: (r n_s,) update.
+            x: the path.
+        """
+        equations, H, r, n = self.equations, self.equations.macro_dt, len(x.slow), len(x.fast)
+        system, _ = interval_problem(equations.system, equations.scheme)
+        rule = gauss(min(n, NODES))
+        c, basis, slopes = np.array(rule.nodes), lagrange_basis(r, rule.nodes), lagrange_derivative(r, rule.nodes)
+        weights = equations.micro_dt * H * (np.array(rule.weights)[:, None] * basis[:, :-1]).T
+
+        m = (c * n).astype(int)  # the micro intervals that the nodes are in
+        moved = [jnp.sum(part, axis=0) for part in jnp.split(x.fast[:, -1], m)[:-1]]
+        q_f, v_f = equations.q_f + jnp.stack(list(accumulate(moved))), x.fast[m, -1] / equations.micro_dt
+
+        def sample(increments):
+            return matmul(basis[:, 1:], increments), matmul(slopes[:, 1:], increments) / H
+
+        def forces(q_s, v_s):
+            total = jax.vmap(system.forces)(equations.t + c * H, q_s, q_f, v_s, v_f)[0]
+            if system.slow_potential is not None:
+                total -= jax.vmap(jax.grad(system.slow_potential), (0, 0, None))(q_s, q_f, system.params)
+            return total
+
+        q_s, v_s = sample(x.slow)
+        path = equations.q_s + q_s, v_s
+
+        def operator(dx):
+            return dx + self._by_masses(matmul(weights, jax.jvp(forces, path, sample(dx))[1]))
+
+        return minimal_residuals(operator, d.reshape(x.slow.shape)).reshape(-1)
+
     def _by_masses(self, rows, inertia: ConstraintInertia | None = None):
         """Slow increments (r, n_s) for given rows (r, n_s)."""
         dx = matmul(self.inverse_form, self.inverse_mass(rows))
@@ -90,3 +138,27 @@ class SlowEquations(NamedTuple):
             return dx
         mu = jnp.sum(inertia.multipliers * dx, axis=(1, 2))
         return dx - jnp.sum(mu[:, None, None] * inertia.responses, axis=0)
+
+
+def minimal_residuals(operator, b):
+    """x with ``operator(x) = b`` to `LEFT_OVER` of b or after `ITERATIONS`, for an operator close to one.
+
+    By Orthomin(1) (Vinsome 1976; Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20, 1983): along the residual, with what
+    it has in common with the move before taken out, to where the next residual is least.
+    """
+
+    def goes_on(at):
+        i, _, rest, *_ = at
+        return (i < ITERATIONS) & (max_abs(rest) > LEFT_OVER * max_abs(b))
+
+    def move_on(at):
+        i, x, rest, move, change, squared = at
+        change_of_rest = operator(rest)
+        part = jnp.sum(change_of_rest * change) / squared
+        move, change = rest - part * move, change_of_rest - part * change
+        squared = jnp.sum(change**2) + jnp.finfo(float).tiny
+        part = jnp.sum(rest * change) / squared
+        return i + 1, x + part * move, rest - part * change, move, change, squared
+
+    none = jnp.zeros_like(b)
+    return jax.lax.while_loop(goes_on, move_on, (0, none, b, none, none, 1.0))[1]
