@@ -1,4 +1,4 @@
-"""What each tuned function of the kernels buys, against its plain form."""
+"""What each tuned function of the kernels, and each thing that steppers remember or know, buys against its plain form."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -26,6 +26,14 @@ CASES = [
     for system, (macro_dt, schemes) in SCHEMES.items()
     for scheme in schemes
     if kind == "single" or scheme != "fully_implicit 10"
+]
+CASES += [
+    Case("single", "FPU l=3", "fully_implicit 10", 0.2),  # slow forces change much within a step
+    *(Case("single", system, "fully_explicit 1", 0.0002) for system in ("TSP", "SAM")),  # drifts along constraints
+    *(
+        Case("single", *of, method="arrowhead")
+        for of in (("TSP", "fully_implicit 5", 0.002), ("SAM", "fully_implicit 5", 0.01))
+    ),
 ]
 BATCH = ", batch"
 COLUMNS = ("trick", *SCHEMES, *(f"{system}{BATCH}" for system in SCHEMES), "most", "keep")
@@ -72,6 +80,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         workers = {seat: stack.enter_context(Worker(of)) for seat, of in seats.items()}
         for case in size.cases:
             head = f"{case.system}, {case.scheme}" + (f", {case.lanes} lanes" if case.lanes > 1 else "")
+            head += f", {case.method}" if case.method != "auto" else ""
             tell(head)
             outcome = take_turns(workers, replace(case, seconds=size.seconds), size.repeats)
             notes += [f"{head}: {seat} was left out: {why}." for seat, why in outcome.refused.items()]

@@ -48,6 +48,7 @@ class Case:
         ``"kahan-li8 of fully_explicit 2"``.
     num_steps: macro steps; 0 to find how many take `seconds`.
     lanes: of a batch.
+    method: of `vmri_jax.Newton`.
     """
 
     kind: str
@@ -57,6 +58,7 @@ class Case:
     num_steps: int = 0
     seconds: float = 0.1
     lanes: int = 1
+    method: str = "auto"
 
     def problem(self):
         """System and start."""
@@ -99,7 +101,10 @@ def simulator(case: Case):
     """``simulate(num_steps)`` by `vm.simulate`."""
     problem, scheme = case.problem(), case.made_scheme()
     state = problem.state()
-    return lambda n: vm.simulate(problem.system, scheme, state, **last_node(case.macro_dt, n), throw=False)
+    newton = vm.Newton(case.method)  # pyright: ignore[reportArgumentType]
+    return lambda n: vm.simulate(
+        problem.system, scheme, state, **last_node(case.macro_dt, n), newton=newton, throw=False
+    )
 
 
 class Single(Timed):
@@ -277,7 +282,7 @@ def starts(problem, lanes: int):
 
 
 def use_plain(name: str) -> None:
-    """Take this function of ``vmri_jax.kernels`` from its plain form, wherever it has been imported."""
+    """Take this function or constant of ``vmri_jax.kernels`` from its plain form, wherever it has been imported."""
     tuned, plain = (getattr(importlib.import_module(f"vmri_jax.kernels.{form}"), name) for form in ("cpu", "plain"))
     for module in [m for key, m in sys.modules.items() if key.split(".")[0] == "vmri_jax"]:
         if getattr(module, name, None) is tuned:

@@ -1,4 +1,4 @@
-"""Small dense algebra: the one place for what is written for speed alone.
+"""Small dense algebra, and what steppers remember: the one place for what is written for speed alone.
 
 Two modules have the same names: `plain`, what a reader expects, and `cpu`, the tuned form. The environment variable
 VMRI_KERNELS (``plain`` or ``cpu``, the default) chooses one when the package is imported. `band` inverts matrices with many zeros.
@@ -25,8 +25,29 @@ matvec = _chosen.matvec
 max_abs = _chosen.max_abs
 solve = _chosen.solve
 
+COLLOCATES = _chosen.COLLOCATES
+CONTRACTION = _chosen.CONTRACTION
+DEFERS_PROJECTION = _chosen.DEFERS_PROJECTION
+DIAGONAL_MATRICES = _chosen.DIAGONAL_MATRICES
+DRIFTS = _chosen.DRIFTS
+FAST_ORDER = _chosen.FAST_ORDER
+LARGEST_RENEWED = _chosen.LARGEST_RENEWED
+LINEARISES_FORCES = _chosen.LINEARISES_FORCES
+MERGES_KICKS = _chosen.MERGES_KICKS
+SLOW_ORDER = _chosen.SLOW_ORDER
+
 __all__ = [
+    "COLLOCATES",
+    "CONTRACTION",
+    "DEFERS_PROJECTION",
+    "DIAGONAL_MATRICES",
+    "DRIFTS",
+    "FAST_ORDER",
+    "LARGEST_RENEWED",
+    "LINEARISES_FORCES",
+    "MERGES_KICKS",
     "REGULARIZATION",
+    "SLOW_ORDER",
     "Band",
     "BandInverse",
     "Full",

@@ -1,4 +1,4 @@
-"""Small dense algebra as elementwise operations: the names of `plain`, tuned for small systems on CPUs.
+"""Small dense algebra as elementwise operations, and what steppers remember: the names of `plain`, tuned for small systems on CPUs.
 
 XLA compiles a loop without library calls into one kernel; a LAPACK call or a matrix product inside it costs about a
 microsecond each. Up to `ELEMENTWISE` rows systems are therefore eliminated by elementwise operations, beyond by LAPACK.
@@ -15,6 +15,32 @@ REGISTER = 4
 """Numbers in a vector register: rows of so many fill them."""
 ELEMENTWISE = 16
 """Largest system that is eliminated by elementwise operations."""
+
+# What steppers remember from step to step, and which special cases they know. The results are the same without.
+
+SLOW_ORDER = 10
+"""Highest order of the polynomial through the slow unknowns of the last steps, from which the next step starts. With less, small steps take
+more passes; a higher one is never the best."""
+FAST_ORDER = 2
+"""Order of the polynomial through the unknowns of the last micro intervals, from which the march with exact matrices starts the next one."""
+CONTRACTION = 0.03
+"""Largest ratio of the corrections of two passes with which exact matrices are kept. An exact pass costs about as much as four others. With a
+larger ratio steps take more passes, with a smaller one more exact passes; run times change little between 0.01 and 0.1."""
+LARGEST_RENEWED = 16
+"""Rows of the matrix K of a micro interval up to which it is computed in every macro step; a larger one is kept while the number of passes
+does not rise. With more, macro steps of large systems spend their time on it."""
+DIAGONAL_MATRICES = True
+"""Whether K is taken for every coordinate alone where W is a sum over the coordinates."""
+LINEARISES_FORCES = True
+"""Whether an update of the slow unknowns is solved for with the derivative of the slow forces where the masses alone would cost a pass."""
+COLLOCATES = True
+"""Whether one interval of high degree is solved for all variables at once, in modes of time."""
+DRIFTS = True
+"""Whether a drift along constraints is solved for its multipliers alone (RATTLE)."""
+DEFERS_PROJECTION = True
+"""Whether momenta are projected onto the hidden constraints only where they are looked at, after drifts."""
+MERGES_KICKS = True
+"""Whether the kicks of two micro steps at the node they share are one."""
 
 
 def matmul(a, b):

@@ -1,6 +1,15 @@
-"""Small dense algebra as a reader expects it: NumPy's names and LAPACK. What `cpu` is held against."""
+"""Small dense algebra as a reader expects it, NumPy's names and LAPACK, and steppers that remember nothing. What `cpu` is held against."""
 
 import jax.numpy as jnp
+
+SLOW_ORDER = FAST_ORDER = 0
+"""Unknowns start from their last values."""
+CONTRACTION = -1.0
+"""Matrices are never kept: the ratio of two corrections is not below zero."""
+LARGEST_RENEWED = 10**9
+"""All are renewed."""
+DIAGONAL_MATRICES = LINEARISES_FORCES = COLLOCATES = DRIFTS = DEFERS_PROJECTION = MERGES_KICKS = False
+"""No special cases."""
 
 
 def matmul(a, b):

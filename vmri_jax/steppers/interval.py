@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import Full, Sparsity, inverse, matvec, regularized, solve
+from vmri_jax.kernels import DIAGONAL_MATRICES, Full, Sparsity, inverse, matvec, regularized, solve
 from vmri_jax.mechanics.constraint_pattern import fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
@@ -21,7 +21,8 @@ from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
 SMALL = 16
-"""Matrices of micro intervals up to this size are renewed with every macro step."""
+"""Fast variables up to which an interval of high degree is solved with one matrix for all of them. For more, matrices that are taken apart
+or kept are cheaper."""
 
 
 def weighted_sum(weights, increments):
@@ -120,7 +121,7 @@ class Interval:
         sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
         straight = all(is_linear(partial(_of_fast, term, q_s), q_f) for term in terms)
         straight &= scheme.degree == 1 or q_f.size > SMALL  # few of high degree are taken together
-        is_diagonal = isinstance(constant_mass(system).fast_mass, Diagonal) and (straight or sums)
+        is_diagonal = DIAGONAL_MATRICES and isinstance(constant_mass(system).fast_mass, Diagonal) and (straight or sums)
         is_constant = True
         if is_diagonal:
             terms = of_fast

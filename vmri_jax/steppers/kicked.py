@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from vmri_jax.kernels import MERGES_KICKS
 from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import State
 from vmri_jax.schemes.discrete_lagrangian import Term
@@ -57,6 +58,8 @@ class Kicked(Stepper):
         self, state: State, memory: KickedState, macro_dt, count: int
     ) -> tuple[State, StepInfo, KickedState]:
         """`count` steps; the kicks of two steps at the node they share are merged into one."""
+        if not MERGES_KICKS:
+            return self._advance_one_by_one(state, memory, macro_dt, count)
 
         def advance(state, inner, ends):
             state, info, inner = self.inner.advance(state, inner, macro_dt)
@@ -76,6 +79,20 @@ class Kicked(Stepper):
         status = last.status if is_concrete(last.status) else worst.worse(last.status)  # known ones are all alike
         q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
         return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), memory
+
+    def _advance_one_by_one(
+        self, state: State, memory: KickedState, macro_dt, count: int
+    ) -> tuple[State, StepInfo, KickedState]:
+        """`advance_many`, with all kicks."""
+
+        def step(carry, _):
+            state, info, memory = self.advance(*carry, macro_dt)
+            return (state, memory), info
+
+        (state, memory), infos = jax.lax.scan(step, (state, memory), length=count)
+        worst = jax.tree.map(jnp.max, infos.status)
+        along = infos.q_f_micro[:, 0], infos.multiplier[:, 0], infos.slow_multiplier[-1]
+        return state, StepInfo(*worst, *along), memory
 
     def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
         state, inner = self.inner.project(state, memory.inner)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import max_abs
+from vmri_jax.kernels import CONTRACTION, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, Accepted, expected
 from vmri_jax.steppers.continuation import has_dependent_constraints, solve_in_parts, starts_finite
@@ -27,9 +27,6 @@ from vmri_jax.steppers.predictors import Parabola, PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method, Result
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
-CONTRACTION = 0.03
-"""Largest ratio of the corrections of two passes with which matrices are kept. An exact pass costs about as much as four others. With a
-larger ratio steps take more passes, with a smaller one more exact passes; run times change little between 0.01 and 0.1."""
 PLAIN_PASSES = 30
 """Most passes of an attempt at the whole step, before parts of it are tried. Newton's method needs at most 15 from a good guess, and half of
 the passes are exact ones. With more, runs that fail take longer; with fewer, parts are tried where they are not needed."""

@@ -24,11 +24,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import max_abs
+from vmri_jax.kernels import LARGEST_RENEWED, LINEARISES_FORCES, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
-from vmri_jax.steppers.interval import SMALL, Interval, Matrix, constant_mass, weighted_sum
+from vmri_jax.steppers.interval import Interval, Matrix, constant_mass, weighted_sum
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.predictors import PolynomialPredictor
@@ -108,7 +108,7 @@ class Nested(Solver):
         """
         if self.interval.is_constant:
             return memory
-        if self.interval.is_diagonal or len(memory.matrix.inverse) <= SMALL or self.newton.fixed_iterations:
+        if self.interval.is_diagonal or len(memory.matrix.inverse) <= LARGEST_RENEWED or self.newton.fixed_iterations:
             return memory._replace(matrix=self.interval.matrix(equations))
         stale = memory.passes[1] > memory.passes[0] + EXTRA_PASSES
         matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: memory.matrix)
@@ -176,7 +176,7 @@ class _Passes:
 
     def next(self, last: Pass) -> Pass:
         """With slow unknowns corrected by what the last pass left."""
-        if self.equations.system.is_constrained or not self.n_s:
+        if self.equations.system.is_constrained or not (self.n_s and LINEARISES_FORCES):
             return self._moved_by(last.d, last)
         known = last.slow_model_error
         part = jnp.where(last.passes == 1, known**2, known)  # the fast unknowns take three passes anyway

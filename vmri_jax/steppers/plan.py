@@ -19,7 +19,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from vmri_jax.kernels import Sparsity
+from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS, Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
@@ -142,7 +142,7 @@ def _defers_projection(stepper: Stepper) -> bool:
     constraints.
     """
     solvers = [_first(solver) for solver in _solvers(stepper, constrained=True)]
-    return bool(solvers) and all(isinstance(solver, Rattle) for solver in solvers)
+    return DEFERS_PROJECTION and bool(solvers) and all(isinstance(solver, Rattle) for solver in solvers)
 
 
 def _solvers(stepper: Stepper, constrained: bool = False) -> list[Solver]:
@@ -197,9 +197,9 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
 def _first_choice(
     system: System, scheme: Scheme, newton: Newton, interval: Interval, rows: Sparsity, q_s, q_f
 ) -> Solver:
-    if _is_drift(system, scheme):
+    if DRIFTS and _is_drift(system, scheme):
         return Rattle(newton, rows)
-    single = scheme.num_micro == 1 and scheme.degree > 1
+    single = COLLOCATES and scheme.num_micro == 1 and scheme.degree > 1
     small = (q_f.size or q_s.size) <= SMALL  # a large matrix is better kept for many steps, which the march does
     if single and small and system.force is None and not interval.is_diagonal:
         return Collocation(newton)

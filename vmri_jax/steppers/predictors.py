@@ -6,12 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vmri_jax.kernels import matmul
+from vmri_jax.kernels import FAST_ORDER, SLOW_ORDER, matmul
 
-ORDER = 10
-"""Highest order of the polynomials."""
 FADING = 0.84
-"""By this a miss counts less with every step."""
+"""Factor by which a miss counts less with every step. Nearer to one, the order follows slowly; smaller, one lucky step decides."""
 
 
 class PolynomialPredictor(NamedTuple):
@@ -23,30 +21,30 @@ class PolynomialPredictor(NamedTuple):
     misses: the worst miss of every order in the steps before, fading: one lucky step is not to decide.
     """
 
-    differences: Float[Array, "ORDER+2 n"]
-    misses: Float[Array, "ORDER+1"]
+    differences: Float[Array, "SLOW_ORDER+2 n"]
+    misses: Float[Array, "SLOW_ORDER+1"]
 
     @classmethod
     def constant(cls, x) -> "PolynomialPredictor":
         """A past in which nothing changed."""
-        return cls(jnp.zeros((ORDER + 2, x.size)).at[0].set(x), jnp.zeros(ORDER + 1))
+        return cls(jnp.zeros((SLOW_ORDER + 2, x.size)).at[0].set(x), jnp.zeros(SLOW_ORDER + 1))
 
     def next(self, measured: int):
         """Where the values go on, by the lowest order that has missed the first `measured` entries least."""
-        missed, orders = self._missed(measured), jnp.arange(ORDER + 1)
-        best = jnp.min(jnp.where(missed <= jnp.min(missed), orders, ORDER))
-        taken = jnp.arange(ORDER + 2) <= best
+        missed, orders = self._missed(measured), jnp.arange(SLOW_ORDER + 1)
+        best = jnp.min(jnp.where(missed <= jnp.min(missed), orders, SLOW_ORDER))
+        taken = jnp.arange(SLOW_ORDER + 2) <= best
         return jnp.sum(jnp.where(taken[:, None], self.differences, 0.0), axis=0)
 
     def add(self, x, measured: int) -> "PolynomialPredictor":
         """With one more step."""
-        sums = matmul(np.tri(ORDER + 1), self.differences[:-1])
+        sums = matmul(np.tri(SLOW_ORDER + 1), self.differences[:-1])
         differences = jnp.concatenate([x[None], x - sums])
         missed = self._missed(measured)
         return PolynomialPredictor(differences, jnp.where(jnp.isfinite(missed), FADING * missed, 0.0))
 
     def _missed(self, measured: int):
-        """(ORDER + 1,) by how much each order has missed, infinite where a step had failed."""
+        """(SLOW_ORDER + 1,) by how much each order has missed, infinite where a step had failed."""
         misses = jnp.abs(self.differences[1:, :measured])
         misses = jnp.where(misses < jnp.inf, misses, jnp.inf)
         return jnp.maximum(jnp.max(misses, axis=1, initial=0.0), self.misses)
@@ -72,6 +70,8 @@ class Parabola(NamedTuple):
 
     def next(self, m):
         """The value that is expected in interval m of a macro step."""
+        if FAST_ORDER == 0:
+            return self.last[0]
         return 3 * (self.last[0] - self.last[1]) + self.last[2] + jnp.where(m == 0, self.jump, 0.0)
 
     def add(self, m, x) -> "Parabola":
@@ -82,7 +82,7 @@ class Parabola(NamedTuple):
     def after_step(self, x) -> "Parabola":
         """With the values (num_micro, k) of a macro step."""
         after = self
-        if len(x) > 1:
+        if len(x) > 1 and FAST_ORDER:
             after = self._replace(jump=x[0] - (self.last[0] + x[1]) / 2)
         for m in range(max(len(x) - 3, 0), len(x)):
             after = after.add(m, x[m])
