@@ -86,13 +86,14 @@ class Kicked(Stepper):
         """`advance_many`, with all kicks."""
 
         def step(carry, _):
-            state, info, memory = self.advance(*carry, macro_dt)
+            state, memory = carry
+            state, info, memory = self.advance(state, memory, macro_dt)
             return (state, memory), info
 
         (state, memory), infos = jax.lax.scan(step, (state, memory), length=count)
         worst = jax.tree.map(jnp.max, infos.status)
-        along = infos.q_f_micro[:, 0], infos.multiplier[:, 0], infos.slow_multiplier[-1]
-        return state, StepInfo(*worst, *along), memory
+        q_f, multiplier = infos.q_f_micro[:, 0], infos.multiplier[:, 0]
+        return state, StepInfo(*worst, q_f, multiplier, infos.slow_multiplier[-1]), memory
 
     def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
         state, inner = self.inner.project(state, memory.inner)
