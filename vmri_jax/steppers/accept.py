@@ -1,12 +1,15 @@
-"""When the corrections of a step are small enough: one test, with one meaning of `Newton.tolerance`.
+"""When the corrections of a step are small enough: one test for all solvers, with one meaning of `Newton.tolerance`.
 
-A correction of the slow or of the fast increments is accepted if its largest entry is at most
+The next correction c of the slow (or of the fast) increments need not be made if
 
-    tolerance / 10 * (largest increment)  +  4 eps (largest position)  +  rest
+    max |c|  <=  tolerance / 10 * max |increments|  +  4 eps max |positions|  +  eps max |all increments|
 
-The error of a step is the sum of the corrections that were not made, and the errors of all steps add up: hence the tenth. Positions
-cannot be known better than their round-off. The rest, eps times the largest increment of all, is for variables at rest, which have
-no size of their own.
+each with its own increments and positions: those of the slow variables over the macro step, those of the fast ones over a micro
+interval. The error of a step is the sum of the corrections that were not made, and the errors of all steps add up: hence the tenth.
+Positions cannot be known better than their round-off. The last term is for variables at rest, whose increments have no size of
+their own.
+
+Solvers know the next correction from the residual, or expect it from how the last ones shrank (`expected`).
 """
 
 from typing import Any, NamedTuple
@@ -29,11 +32,13 @@ FLOOR = 100.0
 """Units of round-off of the positions below which corrections that no longer shrink are accepted. Nearly dependent constraints
 let corrections wander there; with more, steps that converge slowly would be cut off."""
 FLOOR_OF_NEWTON = 1e5
-"""The same for a correction with exact matrices. So near to a solution it shrinks, unless nothing but round-off of the constraints is left
-of the residual, which rows that hardly see the fast variables magnify. With more, singular solutions are taken for regular ones."""
+"""The same for a pass with exact matrices. Near a regular solution its correction shrinks, unless the residual is nothing but round-off
+of the constraints, which rows that hardly depend on the fast variables magnify. With more, singular solutions are taken for regular ones."""
 SAFETY = 10.0
-"""Factor below the tolerance, since errors of steps add up, and margin on the contraction that is expected of the next correction. A
-larger one costs passes."""
+"""Factor between the tolerance of a run and that of a correction, since errors of steps add up. A larger one costs passes."""
+MARGIN = 10.0
+"""Factor on the contraction of the last two corrections that is expected of the next one. A larger one costs passes; with a smaller one an
+iteration that shrinks by luck ends too early."""
 
 
 class Accepted(NamedTuple):
@@ -76,7 +81,11 @@ class Accepted(NamedTuple):
 
     def at_floor(self, size, before, floor=FLOOR):
         """Whether corrections have stopped shrinking at or below `floor` units of round-off of the positions."""
-        return (size > before / 2) & (size <= floor / ROUNDOFF * jnp.maximum(self.slow[0], self.fast[0]))
+        return (size > before / 2) & self.is_roundoff(size, floor)
+
+    def is_roundoff(self, size, floor=FLOOR):
+        """Whether a correction is at most `floor` units of round-off of the positions."""
+        return size <= floor / ROUNDOFF * jnp.maximum(self.slow[0], self.fast[0])
 
     def over(self, changes, motions, iterations):
         """Changes (slow, fast) over what is accepted of them, see `sizes`; the larger of the two."""
@@ -84,5 +93,5 @@ class Accepted(NamedTuple):
 
 
 def expected(moved, before):
-    """The next correction, with a margin, after this one and the one before."""
-    return jnp.minimum(SAFETY * moved / (before + jnp.finfo(float).tiny), 1.0) * moved
+    """The correction ``min(MARGIN moved / before, 1) moved`` that is expected after the corrections `before` and `moved`."""
+    return jnp.minimum(MARGIN * moved / (before + jnp.finfo(float).tiny), 1.0) * moved

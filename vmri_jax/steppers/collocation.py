@@ -161,7 +161,7 @@ class Saddles(NamedTuple):
     ``M x - gamma L^T w z - G^T nu = M y`` is ``x = y + gamma Q z + M^-1 G^T nu`` and ``(1 - gamma L Q) z = L y + L M^-1 G^T nu``, so
     that only d rows, and those of the constraints, are solved for each mode.
 
-    modes: as which everything below but `push` and `pull` is.
+    modes: of time; everything below except `push` and `pull` is given for each of their parts.
     gamma: eigenvalues, for every part of a mode.
     push: L and G, of the variables.
     pull: ``Q = M^-1 L^T w`` and ``M^-1 G^T``, with ``w = h^2 W''``.

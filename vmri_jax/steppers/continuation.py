@@ -45,15 +45,15 @@ class Part(NamedTuple):
     iterations: Int[Array, ""]
     attempts: Int[Array, ""]
 
-    def after(self, solution, x: Unknowns, result, iterations, left) -> "Part":
-        """The part to try next, after this one gave x; `left` iterations were left for it."""
+    def after(self, solution, x: Unknowns, result, iterations, most) -> "Part":
+        """The part to try next, after this one gave x; it might have taken `most` iterations."""
         good, is_first = result <= Result.CONVERGED_AT_ROUNDOFF, self.attempts == 0
         solved = jnp.where(good, self.length, self.length - self.stride)
         stride = (
             jnp.where(good, 2.0, jnp.where(is_first, 1.0, 0.5)) * self.stride
         )  # the second attempt is the whole step, too
         rates = jax.tree.map(partial(jnp.where, good), stretched(x, 1 / self.length), self.rates)
-        goes_on = jnp.where(good, self.length < 1, (stride >= SHORTEST_PART) & (iterations < left))
+        goes_on = jnp.where(good, self.length < 1, (stride >= SHORTEST_PART) & (iterations < most))
         result = jnp.where(goes_on, RUNNING, result)
         length = jnp.minimum(solved + stride, 1.0)
         return Part(length, length - solved, rates, solution, result, self.iterations + iterations, self.attempts + 1)
@@ -77,11 +77,11 @@ def solve_in_parts(
 
     def attempt(at: Part) -> Part:
         shorter = eqx.tree_at(lambda e: e.macro_dt, equations, at.length * equations.macro_dt)
-        left = max_iterations - at.iterations
-        limit = jnp.where(at.attempts < 2, jnp.minimum(left, plain_iterations), left)
+        most = max_iterations - at.iterations
+        limit = jnp.where(at.attempts < 2, jnp.minimum(most, plain_iterations), most)
         found = iterate(shorter, stretched(at.rates, at.length), limit, at.attempts == 0)
         solution, x, result, iterations = found
-        return at.after(solution, x, result, iterations, left)
+        return at.after(solution, x, result, iterations, most)
 
     tried = jnp.where(starts_finite(equations), RUNNING, Result.NON_FINITE)  # after a failure nothing is tried
     whole = Part(jnp.ones(()), jnp.ones(()), guess, solution, tried, jnp.asarray(0), jnp.asarray(0))

@@ -11,15 +11,15 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Number
 from vmri_jax.schemes.equations import StepEquations, Unknowns
+from vmri_jax.steppers.accept import Accepted
 from vmri_jax.steppers.continuation import has_dependent_constraints, solve_in_parts, starts_finite
 from vmri_jax.steppers.newton import Newton, dense
 from vmri_jax.steppers.results import RUNNING, Method, Result
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
-SAFETY = 100.0
-"""Margin on the quadratic convergence that is expected of Newton's iteration."""
-ROUNDOFF_FLOOR = 100.0
-"""Updates below this many units of round-off of the positions that no longer shrink are at the floor."""
+MARGIN = 100.0
+"""Factor on the contraction that quadratic convergence promises for the next update. With more, most steps take one more iteration; with
+less, an update that shrinks by luck is trusted."""
 PLAIN_ITERATIONS = 15
 """Newton iterations of the first attempt, after which parts of the step are tried."""
 LEAST_DAMPING = 1 / 64
@@ -64,22 +64,24 @@ class Coupled(Solver):
     def _iterate(self, equations: StepEquations, guess: Unknowns, limit, damped):
         """Newton's iteration from a guess: (x, `Result`, iterations).
 
-        Converged when the predicted size of all further updates is below ``tolerance`` times the increments, or round-off
-        of the positions. With the contraction ``theta = |d_k| / |d_(k-1)|`` the next update is expected to be
-        ``|d_k| theta min(1, SAFETY theta)``: quadratic convergence with a margin, linear convergence at worst.
+        Converged when the updates that are still to come are accepted (`Accepted`). With the contraction
+        ``theta = |d_k| / |d_(k-1)|`` the next one is expected to be ``|d_k| theta min(1, MARGIN theta)``: quadratic
+        convergence with a margin, linear convergence at worst.
 
         Where `damped`, an update that leads to a larger next one is taken back and halved (natural monotonicity test).
         """
-        newton = self.newton
+        newton, accepted = self.newton, Accepted.of(equations, self.newton)
 
         def iterate(at: Iterate) -> Iterate:
             residual = equations.residual(at.x)
             d = dense.solve(dense.factor(equations, at.x), residual)
             x = jax.tree.map(jnp.add, at.x, d)
-            update = _size(equations, d, x, newton.tolerance)
+            changes, motions = _slow_and_fast(d), _slow_and_fast(x)
+            update = accepted.over(changes, motions, at.iterations + 1)
             back = damped & ~(update < (1 - at.damping / 4) * at.update)
             damping = jnp.where(back, at.damping / 2, jnp.minimum(2 * at.damping, 1.0))
-            result = _result(equations, at, d, update, damping, residual, at.iterations + 1 >= limit, back)
+            is_roundoff = accepted.is_roundoff(jnp.maximum(*changes))
+            result = _result(at, update, is_roundoff, damping, residual, at.iterations + 1 >= limit, back)
             before, d = jax.tree.map(partial(jnp.where, back), (at.before, at.direction), (at.x, d))
             x = jax.tree.map(lambda a, b: a + damping * b, before, d)
             return Iterate(x, before, d, jnp.where(back, at.update, update), damping, at.iterations + 1, result)
@@ -106,34 +108,31 @@ class Iterate(NamedTuple):
     result: Int[Array, ""]
 
 
-def _size(equations: StepEquations, d: Unknowns, x: Unknowns, tolerance):
-    """Largest update over what is accepted, slow and fast each by its own measure.
+def _slow_and_fast(x: Unknowns):
+    """Largest slow and largest fast increment."""
+    return max_abs(x.slow), max_abs(x.fast)
 
-    Variables that only see round-off of the others (a centre of mass at rest) have no size of their own.
+
+def _result(at: Iterate, update, is_roundoff, damping, residual: Unknowns, is_last, back):
+    """`Result` of an iteration, or RUNNING.
+
+    Args:
+        at: the iteration before.
+        update: largest change of an increment over the change that is accepted.
+        is_roundoff: whether that change is round-off of the positions.
+        damping: of the next update.
+        is_last: whether no iterations are left.
+        back: whether the update has been taken back.
     """
-    eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
-    others = eps * jnp.maximum(max_abs(x.slow), max_abs(x.fast)) + tiny
-    slow = max_abs(d.slow) / (tolerance * max_abs(x.slow) + eps * max_abs(equations.q_s) + others)
-    fast = max_abs(d.fast) / (tolerance * max_abs(x.fast) + eps * max_abs(equations.q_f) + others)
-    return jnp.maximum(slow, fast)
-
-
-def _result(equations: StepEquations, at: Iterate, d: Unknowns, update, damping, residual: Unknowns, is_last, back):
-    """`Result` of an iteration that made the update d, or RUNNING."""
-    eps, tiny = jnp.finfo(float).eps, jnp.finfo(float).tiny
-    contraction = update / jnp.maximum(at.update, tiny)
-    shrink = contraction * jnp.minimum(1.0, SAFETY * contraction)
+    contraction = update / jnp.maximum(at.update, jnp.finfo(float).tiny)
+    shrink = contraction * jnp.minimum(1.0, MARGIN * contraction)
     predicted = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
     error = jnp.where((at.iterations == 0) | (at.damping < 1), update, predicted)
-
-    positions = jnp.maximum(max_abs(equations.q_s), max_abs(equations.q_f))
-    step = jnp.maximum(max_abs(d.slow), max_abs(d.fast))
-    at_floor = (contraction > 0.5) & (step <= ROUNDOFF_FLOOR * eps * positions)
 
     last = jnp.where(update > at.update, Result.DIVERGED, Result.STAGNATED)
     result = jnp.where(is_last, last, RUNNING)
     result = jnp.where(damping < LEAST_DAMPING, Result.DIVERGED, result)
-    result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, result)
+    result = jnp.where((contraction > 0.5) & is_roundoff, Result.CONVERGED_AT_ROUNDOFF, result)
     result = jnp.where(error <= 1, Result.CONVERGED, result)
 
     functions_finite = jnp.isfinite(max_abs(residual.slow) + max_abs(residual.fast))

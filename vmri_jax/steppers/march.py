@@ -16,7 +16,7 @@ In an *exact* pass the matrices are computed: those of the intervals by `jax.jac
 intervals to the slow path, since the pass carries along how x_m and what is handed on change with z. Further passes, also those of
 the next steps, keep all matrices while the corrections shrink, and cost one gradient of the action each.
 
-Nothing here remembers a step before: the guess comes from outside.
+Nothing here remembers a step before: the guess and the matrices that are kept come from `vmri_jax.steppers.marched`.
 """
 
 from typing import Any, NamedTuple
@@ -63,7 +63,8 @@ class Matrices(NamedTuple):
 class Handed(NamedTuple):
     """What arrives at an interval, as vectors or as matrices with one column for each direction.
 
-    position: q_f. rest: momentum p_f times h, then the gradients of the action by start and increments of the slow path.
+    position: q_f.
+    rest: momentum p_f times h, then the gradients of h times the action by the start and by the increments of the slow path.
     """
 
     position: Float[Array, "n_f ..."]

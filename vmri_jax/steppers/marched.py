@@ -58,7 +58,7 @@ class Progress(NamedTuple):
     matrices: of the last exact pass.
     size: its largest correction, of slow and fast increments.
     rate: by which the next pass is expected to make the corrections smaller if it keeps the matrices.
-    curvature: rate of passes after an exact one over the size of that one.
+    curvature: kappa in ``|d_next| = kappa |d|^2`` for passes after an exact one with the correction d.
     exact_size: size of the last exact pass.
     still_moves: largest correction of fast increments that is expected of another pass.
     passes, result: how many passes there were, and `Result`.
@@ -192,10 +192,10 @@ class Marched(Solver):
             g_fast = jax.vmap(equations.system.g)(path.control_times()[1:], q_s[1:], q_f[1:])
             g_slow = jax.vmap(equations.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:])
             g = jnp.maximum(max_abs(g_fast), max_abs(g_slow))
-        left = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
+        shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
         method = Method[self.linear_solver.upper()]
         status = status_of(
-            equations, result, method, passes, passed.worst.rows * jnp.minimum(left, 1.0), g, self.newton.tolerance
+            equations, result, method, passes, passed.worst.rows * jnp.minimum(shrinks, 1.0), g, self.newton.tolerance
         )
         if equations.system.is_constrained:
             failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & starts_finite(equations)

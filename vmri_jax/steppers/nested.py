@@ -4,9 +4,9 @@ A pass takes the slow path as known. It marches over the micro intervals; each c
 multipliers once, by a Newton step on its exact residual, and adds its impulse to the slow equations. Then the slow
 increments and slow multipliers are corrected from what is left of their equations. The matrices are cheap ones:
 
-* micro interval: ``[K, -G^T; G, 0]`` with K from the start of the macro step, or of one before it while that costs no passes
-  (the mass alone where the fast equations are explicit, so that only the multipliers are solved for), and
-  ``G K^-1 G^T`` from the first pass;
+* micro interval: ``[K, -G^T; G, 0]``, with ``K = -(M + h^2 W'' / 4)`` for the implicit midpoint rule, from the start of the macro step, or of
+  one before it while that costs no passes. Where the fast equations are explicit K is ``-M``, and only the multipliers are solved for.
+  ``G K^-1 G^T`` is that of the first pass;
 * slow equations: masses, with those that constraints tie to the slow ones, and the slow constraint (`SlowEquations`). Where nothing is
   constrained, the derivative of the slow forces is added where updates by the masses alone would cost a pass.
 
@@ -49,8 +49,10 @@ class NestedState(NamedTuple):
     matrix: K of the micro intervals.
     slow: slow increments and slow multipliers of the last steps.
     multiplier: multipliers lambda of the last micro interval.
-    slow_model_error: part of an update of the slow unknowns by the masses alone that the next pass finds missing.
-    passes: fewest of a step with this matrix (UNKNOWN before one), and those of the last step.
+    slow_model_error: ``|next update| / |update|`` of the slow unknowns by the masses alone; once the derivative of the slow forces has been
+        taken, ``|update with it - update by the masses| / |update with it|``.
+    passes: fewest of a step with this matrix (UNKNOWN before one), and those of the last step; in the beginning numbers with which the
+        first step computes the matrix.
     """
 
     matrix: Matrix
@@ -63,7 +65,7 @@ class NestedState(NamedTuple):
 class Pass(NamedTuple):
     """Unknowns of a pass, what it left, and how the iteration stands.
 
-    d: the update of the slow unknowns that their equations ask for.
+    d: the next update of the slow unknowns, with which their equations, linearised, are zero.
     inertia: masses that constraints tie to the slow variables, from the first pass.
     impulse: on the slow variables over the step, times h.
     residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
@@ -178,15 +180,17 @@ class _Passes:
         """With slow unknowns corrected by what the last pass left."""
         if self.equations.system.is_constrained or not (self.n_s and LINEARISES_FORCES):
             return self._moved_by(last.d, last)
-        known = last.slow_model_error
-        part = jnp.where(last.passes == 1, known**2, known)  # the fast unknowns take three passes anyway
-        is_hard = part * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
+        # After the update d by the masses alone the next one is slow_model_error |d|. It must be accepted, or d is solved for with the
+        # derivative of the slow forces. After the first pass it is the one after next: the fast unknowns take three passes anyway.
+        error = last.slow_model_error
+        still_missing = jnp.where(last.passes == 1, error**2, error)
+        is_hard = still_missing * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
         wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part
         x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
         d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
         now = self._moved_by(d, last)
-        missing, of = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
-        return now._replace(slow_model_error=max_abs(missing) / (max_abs(of) + jnp.finfo(float).tiny))
+        missing, update = jnp.where(is_hard, jnp.stack([d - last.d, d]), jnp.stack([now.d, last.d]))
+        return now._replace(slow_model_error=max_abs(missing) / (max_abs(update) + jnp.finfo(float).tiny))
 
     def _moved_by(self, d, last: Pass) -> Pass:
         z = _joined(last) + d

@@ -21,8 +21,9 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
 
-LEAST = 0.1
-"""Where two steps of a composition undo each other but for so much, their common multiplier says nothing about the force."""
+LEAST_SCALE = 0.1
+"""If the forward and the backward step of a composition cancel to less than this part of h^2, their common multiplier is round-off: it is
+skipped as a prediction. With more, predictions are lost; with less, round-off is multiplied."""
 
 
 class RattleState(NamedTuple):
@@ -114,7 +115,7 @@ class Rattle(Solver):
         n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
         x, mu = done.x[None], done.mu[None]
         unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
-        tells = jnp.abs(scale) > LEAST * h**2
+        tells = jnp.abs(scale) > LEAST_SCALE * h**2
         multiplier = jnp.where(tells, done.mu / jnp.where(tells, scale, 1.0), memory.multiplier[0])
         multipliers = jnp.stack([multiplier, memory.multiplier[0]])
         return Solution(unknowns, end, status), RattleState(multipliers, jnp.asarray(h, dtype=float))

@@ -94,11 +94,12 @@ RUNNING = -1
 
 
 class Method(IntEnum):
-    """Which stepper took a step, in order of cost; of several the most expensive one is reported.
+    """Which stepper took a step; of several the one with the largest number is reported, mostly the most expensive one.
 
     EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. RATTLE: the multipliers of a drift along the
     constraints. NESTED: the slow path outside, micro intervals in order inside. COLLOCATION: one interval of high degree,
-    in modes of time. ARROWHEAD, DENSE: Newton's iteration on all unknowns of the macro step.
+    in modes of time. ARROWHEAD, NULL_SPACE: the march with exact matrices, with and without
+    multipliers. DENSE: Newton's iteration on all unknowns of the macro step.
     """
 
     EXPLICIT = 0

@@ -1,8 +1,8 @@
 """The slow equations of a macro step, linearised by a cheap matrix: masses, tied masses and the slow constraint.
 
 In the first micro interval the constraints give the fast variables the velocity that the slow path asks for, and later ones let
-them keep it. So a change dx of the slow increments changes the multipliers of the first interval by ``-S G dx``, with S its
-small matrix and G the Jacobian by the slow variables, and those of the others hardly. That is the inertia of what is tied to
+them keep it. So a change dx of the slow increments changes the multipliers of the first interval by ``-S G_s dx``, with
+``S = (G K^-1 G^T)^-1`` of that interval and G_s the Jacobian by the slow variables, and those of the others hardly. That is the inertia of what is tied to
 the slow variables; the rest of what the fast ones answer is small.
 
 Where nothing is constrained, what masses leave out is the derivative of the slow forces by the slow path: over a long macro
@@ -76,6 +76,11 @@ class SlowEquations(NamedTuple):
 
     def update(self, x: Unknowns, start, increments, inertia: ConstraintInertia | None):
         """Update of the slow unknowns, residuals of their equations, impulse on them over the step times h.
+
+        With the rows R of the slow equations, their masses K_s and the slow constraint with the Jacobians G_0 at the start of a slot
+        and G_1 at its end,
+
+            K_s dx - G_0^T dnu = -R        G_1 dx = -g_s
 
         Args:
             start, increments: gradient (n_s,), (r, n_s) of h times the action without the slow kinetic energy and the slow

@@ -58,7 +58,13 @@ class Solver(ABC):
 
     @abstractmethod
     def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
-        """The root of ``equations.residual``, found from a guess and what the last step handed on."""
+        """The root of ``equations.residual``.
+
+        Args:
+            equations: of the step.
+            guess: straight motion with the multipliers of the last step; solvers that predict unknowns from `memory` do without.
+            memory: from `init`, or what the last step handed on.
+        """
 
     def continued(self, memory, last) -> Any:
         """For a stage of a composition, see `Stepper.continued`."""
@@ -131,8 +137,7 @@ class Solved(Stepper):
 
         lambdas = physical_multipliers(self.scheme, macro_dt, x.multiplier, x.slow_multiplier)
         q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])
-        result, method, iterations, left = status
-        info = StepInfo(result, method, iterations, left, q_f_micro, *lambdas)
+        info = StepInfo(*status, q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
         velocity = memory.velocity
         if not self.system.has_constant_mass:  # the mean over the last interval, as a guess for the next step

@@ -18,7 +18,7 @@ class StepInfo(eqx.Module):
     """What a macro step did.
 
     result: status code, see `Result`.
-    method: code of the stepper that ran, see `Method`; with "auto" ARROWHEAD says that the first choice did not converge.
+    method: code of the stepper that ran, see `Method`; with "auto" ARROWHEAD says that the cheaper choices are not possible, or did not converge.
     iterations: Newton iterations or passes, the most that any of its solves took; 0 for explicit steps.
     residual: largest residual left, relative to the momentum, and of the constraints; 0 where equations are linear.
     q_f_micro: fast positions at the micro nodes, the start excluded.

@@ -22,16 +22,19 @@ class Newton(eqx.Module):
     | "null_space" | the same without multipliers: matrices of the free motions alone | |
     | "dense" | exact, one dense factorisation, O(num_micro^2): baseline and oracle | highest |
 
+    A correction that is still to come is accepted if it is below a tenth of `tolerance` times the motion (that of the slow variables
+    over the macro step, that of the fast ones over a micro step), or round-off of the positions: the formula is that of `vmri_jax.steppers.accept`.
+
     "auto" takes "nested" where the terms can be cut into micro intervals (constant masses, potentials on the micro grid
     or kicks at the macro nodes), and "arrowhead" where they cannot; a run in which "nested" does not converge is made again by
-    "arrowhead". Which one it was is in ``StepInfo.method`` and ``Trajectory.info.method``. ``print(vm.plan(system, scheme, state))`` shows it beforehand.
+    "arrowhead", from where it failed; under a transformation of JAX the step that fails is solved again. Which one it was is in ``StepInfo.method`` and ``Trajectory.info.method``. ``print(vm.plan(system, scheme, state))`` shows it beforehand.
     "nested" includes its special cases: a single drift along the constraints between kicks (RATTLE), and a single interval
     of higher degree (``galerkin(1, degree)``), which is solved for all variables at once in modes of time.
 
     Args:
         method: as above.
-        tolerance: accepted error of the increments of the step, relative to their size. Errors of the positions at
-            the level of round-off are always accepted.
+        tolerance: error of the increments of a step that is accepted, relative to the largest of them, slow and fast apart. Round-off of
+            the positions is always accepted.
         max_iterations: after so many iterations the step fails; with "nested", so many passes.
         fixed_iterations: do exactly so many iterations and check the result afterwards, without a loop that depends
             on the data; a step that has not converged then has failed, whatever the method.
