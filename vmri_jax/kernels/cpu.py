@@ -39,8 +39,6 @@ DRIFTS = True
 """Whether a drift along constraints is solved for its multipliers alone (RATTLE)."""
 DEFERS_PROJECTION = True
 """Whether momenta are projected onto the hidden constraints only where they are looked at, after drifts."""
-MERGES_KICKS = True
-"""Whether the kicks of two micro steps at the node they share are one."""
 
 
 def matmul(a, b):

@@ -8,7 +8,7 @@ CONTRACTION = -1.0
 """Matrices are never kept: the ratio of two corrections is not below zero."""
 LARGEST_RENEWED = 10**9
 """All are renewed."""
-DIAGONAL_MATRICES = LINEARISES_FORCES = COLLOCATES = DRIFTS = DEFERS_PROJECTION = MERGES_KICKS = False
+DIAGONAL_MATRICES = LINEARISES_FORCES = COLLOCATES = DRIFTS = DEFERS_PROJECTION = False
 """No special cases."""
 
 

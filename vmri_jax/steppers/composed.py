@@ -53,27 +53,3 @@ class Composed(Stepper):
 
     def describe(self) -> list[str]:
         return [f"composition of {len(self.coefficients)} stages, each:", *indented(self.stage.describe())]
-
-
-@dataclass(frozen=True)
-class Projected(Stepper):
-    """A stepper whose momenta are projected onto the hidden constraints at the end of every step."""
-
-    inner: Stepper
-
-    def init(self, state: State, macro_dt):
-        return self.inner.init(state, macro_dt)
-
-    def renew(self, state: State, memory, macro_dt):
-        return self.inner.renew(state, memory, macro_dt)
-
-    def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
-        state, info, memory = self.inner.advance(state, memory, macro_dt)
-        state, memory = self.inner.project(state, memory)
-        return state, info, memory
-
-    def continued(self, memory, last, state: State, macro_dt):
-        return self.inner.continued(memory, last, state, macro_dt)
-
-    def describe(self) -> list[str]:
-        return [*self.inner.describe(), "momenta projected onto the hidden constraints"]

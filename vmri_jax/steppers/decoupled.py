@@ -33,13 +33,6 @@ class Decoupled(Stepper):
         slow, fast = apart(state)
         return DecoupledState(self.slow.init(slow, macro_dt), self.fast.init(fast, macro_dt / self.num_micro))
 
-    def renew(self, state: State, memory: DecoupledState, macro_dt) -> DecoupledState:
-        slow, fast = apart(state)
-        micro_dt = macro_dt / self.num_micro
-        return DecoupledState(
-            self.slow.renew(slow, memory.slow, macro_dt), self.fast.renew(fast, memory.fast, micro_dt)
-        )
-
     def advance(self, state: State, memory: DecoupledState, macro_dt) -> tuple[State, StepInfo, DecoupledState]:
         slow, fast = apart(state)
         slow, slow_info, slow_memory = self.slow.advance(slow, memory.slow, macro_dt)

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from vmri_jax.kernels import MERGES_KICKS
 from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import State
 from vmri_jax.schemes.discrete_lagrangian import Term
@@ -36,64 +35,56 @@ class Kicked(Stepper):
     kicks: the terms that have nodes at the ends, maybe none.
     inner: what happens between the kicks.
     average: the filter of mollified kicks, ``average(macro_dt)(q_s, q_f) -> q_f``; None if there is no such kick.
+    projects: whether a step ends with momenta on the hidden constraints.
     """
 
     kicks: tuple[Term, ...]
     inner: Stepper
     average: Callable | None = None
+    projects: bool = False
 
     def init(self, state: State, macro_dt) -> KickedState:
         return KickedState(self._gradients(state, macro_dt), self.inner.init(state, macro_dt))
 
-    def renew(self, state: State, memory: KickedState, macro_dt) -> KickedState:
-        return memory._replace(inner=self.inner.renew(state, memory.inner, macro_dt))
-
     def advance(self, state: State, memory: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
-        state = kicked(state, self.kicks, memory.gradients, macro_dt, ("start",))
-        state, info, inner = self.inner.advance(state, memory.inner, macro_dt)
+        inner = self.inner.renew(state, memory.inner, macro_dt)
+        state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
+        state, info, inner = self.inner.advance(state, inner, macro_dt)
         gradients = self._gradients(state, macro_dt)
-        return kicked(state, self.kicks, gradients, macro_dt, ("end",)), info, KickedState(gradients, inner)
+        memory = KickedState(gradients, inner)
+        state = kicked(state, self.kicks, gradients, macro_dt, end=1.0)
+        if self.projects:
+            state, memory = self.project(state, memory)
+        return state, info, memory
 
     def advance_many(
         self, state: State, memory: KickedState, macro_dt, count: int
     ) -> tuple[State, StepInfo, KickedState]:
-        """`count` steps; the kicks of two steps at the node they share are merged into one."""
-        if not MERGES_KICKS:
-            return self._advance_one_by_one(state, memory, macro_dt, count)
+        """`count` steps; the kicks of two steps at the node they share are one, and so are the matrices of all."""
 
-        def advance(state, inner, ends):
+        def step(state, inner, start: float):
             state, info, inner = self.inner.advance(state, inner, macro_dt)
             gradients = self._gradients(state, macro_dt)
-            return kicked(state, self.kicks, gradients, macro_dt, ends), info, KickedState(gradients, inner)
+            state = kicked(state, self.kicks, gradients, macro_dt, start=start, end=1.0)
+            return state, info, KickedState(gradients, inner)
 
         def between(carry, _):
             state, inner, worst = carry
-            state, info, memory = advance(state, inner, ("end", "start"))
-            along = info.q_f_micro[0], info.multiplier[0]
-            return (state, memory.inner, worst.worse(info.status)), along
+            state, info, memory = step(state, inner, 1.0)
+            return (state, memory.inner, worst.worse(info.status)), (info.q_f_micro[0], info.multiplier[0])
 
-        state = kicked(state, self.kicks, memory.gradients, macro_dt, ("start",))
+        inner = self.inner.renew(state, memory.inner, macro_dt)
+        state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
         none = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
-        (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, memory.inner, none), length=count - 1)
-        state, last, memory = advance(state, inner, ("end",))
-        status = last.status if is_concrete(last.status) else worst.worse(last.status)  # known ones are all alike
+        (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, inner, none), length=count - 1)
+        state, last, memory = step(
+            state, inner, 0.0
+        )  # apart: in the loop its weights and gradients would cost half of a short step
+        status = (
+            last.status if is_concrete(last.status) else worst.worse(last.status)
+        )  # a concrete one is that of all steps
         q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
         return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), memory
-
-    def _advance_one_by_one(
-        self, state: State, memory: KickedState, macro_dt, count: int
-    ) -> tuple[State, StepInfo, KickedState]:
-        """`advance_many`, with all kicks."""
-
-        def step(carry, _):
-            state, memory = carry
-            state, info, memory = self.advance(state, memory, macro_dt)
-            return (state, memory), info
-
-        (state, memory), infos = jax.lax.scan(step, (state, memory), length=count)
-        worst = jax.tree.map(jnp.max, infos.status)
-        q_f, multiplier = infos.q_f_micro[:, 0], infos.multiplier[:, 0]
-        return state, StepInfo(*worst, q_f, multiplier, infos.slow_multiplier[-1]), memory
 
     def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
         state, inner = self.inner.project(state, memory.inner)
@@ -117,18 +108,19 @@ class Kicked(Stepper):
         return tuple(map(gradient, self.kicks))
 
     def describe(self) -> list[str]:
+        projected = ["momenta projected onto the hidden constraints"] if self.projects else []
         if not self.kicks:
-            return self.inner.describe()
+            return [*self.inner.describe(), *projected]
         names = ", ".join(term.name for term in self.kicks)
         averaged = ", at averaged fast positions" if self.average is not None else ""
-        return [f"kicks of {names} at both ends{averaged}", *indented(self.inner.describe())]
+        return [f"kicks of {names} at both ends{averaged}", *indented(self.inner.describe()), *projected]
 
 
-def kicked(state: State, kicks: tuple[Term, ...], gradients, macro_dt, ends: tuple[str, ...]) -> State:
-    """A state after kicks with these gradients, with the weights that they have at these ends of the interval."""
+def kicked(state: State, kicks: tuple[Term, ...], gradients, macro_dt, start: float = 0.0, end: float = 0.0) -> State:
+    """A state after kicks with these gradients, `start` and `end` times those at the ends of an interval."""
     p_s, p_f = state.p_s, state.p_f
     for term, (d_s, d_f) in zip(kicks, gradients, strict=True):
-        weights = [w for w in (getattr(term, end) for end in ends) if w is not None]
+        weights = [part * w for part, w in ((start, term.start), (end, term.end)) if part and w is not None]
         if weights:
             impulse = term.times_step(macro_dt) * sum(weights)
             p_s, p_f = p_s + impulse * d_s, p_f + impulse * d_f
@@ -151,7 +143,7 @@ def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
         def averaged(q_s, q_f):
             stepper, micro_dt, none = stepper_of(q_s, q_f), macro_dt / num_micro, jnp.zeros(0)
             start = State(jnp.zeros(()), none, q_f, none, jnp.zeros_like(q_f))
-            memory = stepper.renew(start, stepper.init(start, micro_dt), micro_dt)
+            memory = stepper.init(start, micro_dt)
             _, info, _ = stepper.advance_many(start, memory, micro_dt, num_micro)
             x = info.q_f_micro
             a = (q_f / 2 + jnp.sum(x[:-1], axis=0) + x[-1] / 2) / num_micro

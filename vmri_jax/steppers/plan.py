@@ -28,7 +28,7 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
-from vmri_jax.steppers.composed import Composed, Projected
+from vmri_jax.steppers.composed import Composed
 from vmri_jax.steppers.coupled import Coupled
 from vmri_jax.steppers.decoupled import Decoupled
 from vmri_jax.steppers.free_flight import FreeFlight
@@ -126,10 +126,9 @@ def plan(
     system, state = start_of("plan", system, state)
     newton = newton or Newton()
     choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None, reverse_only)
-    stepper: Stepper = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
-    defers = _defers_projection(stepper)
-    if not defers and system.is_constrained:
-        stepper = Projected(stepper)
+    kicked = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
+    defers = _defers_projection(kicked)
+    stepper: Stepper = replace(kicked, projects=not defers and system.is_constrained)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
     return Plan(system, scheme, newton, stepper, defers)

@@ -137,7 +137,7 @@ class Solved(Stepper):
 
         lambdas = physical_multipliers(self.scheme, macro_dt, x.multiplier, x.slow_multiplier)
         q_f_micro = jnp.concatenate([equations.path(x).fast_start[1:], q_f[None]])
-        info = StepInfo(*status, q_f_micro, *lambdas)
+        info = StepInfo(*Status(*status), q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
         velocity = memory.velocity
         if not self.system.has_constant_mass:  # the mean over the last interval, as a guess for the next step

@@ -71,7 +71,7 @@ class Stepper(ABC):
         return ()
 
     def renew(self, state: State, memory, macro_dt) -> Any:
-        """`memory` with the matrices that are computed once for a whole macro step, however many micro steps share them."""
+        """`memory` with the matrices that all steps until the next `renew` share. Whoever kicks a stepper calls it before the first kick."""
         return memory
 
     @abstractmethod
@@ -79,8 +79,8 @@ class Stepper(ABC):
         """The step itself; its momenta are those of the discrete Legendre transform."""
 
     def step(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
-        """A macro step: `renew`, then `advance`; NON_FINITE where a momentum is, since positions follow momenta."""
-        state, info, memory = self.advance(state, self.renew(state, memory, macro_dt), macro_dt)
+        """A macro step: `advance`, and NON_FINITE where a momentum is, since positions follow momenta."""
+        state, info, memory = self.advance(state, memory, macro_dt)
         finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))
         stands = finite | (info.result > Result.CONVERGED_AT_ROUNDOFF)  # a failure has been named already
         return state, replace(info, result=jnp.where(stands, info.result, Result.NON_FINITE)), memory
