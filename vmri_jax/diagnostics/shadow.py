@@ -164,11 +164,11 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     """A step with all its control points: the state at its end, its discrete Lagrangian and its `Result`."""
     terms = lagrangian(system, scheme)
 
-    def with_kicks(state: State, end: str) -> State:
+    def with_kicks(state: State, **ends: float) -> State:
         gradients = [term.gradient(state.q_s, state.q_f) for term in terms.kicks]
-        return kicked(state, terms.kicks, gradients, macro_dt, (end,))
+        return kicked(state, terms.kicks, gradients, macro_dt, **ends)
 
-    start = with_kicks(state, "start")
+    start = with_kicks(state, start=1.0)
     equations = StepEquations.of(system, scheme, start, macro_dt)
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     v_s, v_f = velocity(system, start.q_s, start.q_f, start.p_s, start.p_f)
@@ -176,7 +176,7 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
     solver = Marched(Newton(), "arrowhead")
     solution, _ = solver.solve(equations, guess, solver.remembers(equations, guess))
     q_s, (q_f, p_s, p_f) = state.q_s + solution.x.slow[-1], solution.end
-    end = with_kicks(State(state.t + macro_dt, q_s, q_f, p_s, p_f), "end")
+    end = with_kicks(State(state.t + macro_dt, q_s, q_f, p_s, p_f), end=1.0)
     return end, terms(equations.path(solution.x)), solution.status.result
 
 

@@ -21,6 +21,7 @@ from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.constraints import is_rank_deficient
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.results import RUNNING, Result
+from vmri_jax.steppers.stepper import Status
 
 SHORTEST_PART = 1 / 64
 """Continuation gives up where it would have to advance by less than this part of the step."""
@@ -108,3 +109,12 @@ def has_dependent_constraints(equations: StepEquations):
     g_s, g_f = jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f)
     g_slow = jax.jacrev(system.g_slow, argnums=1)(equations.t, q_s)
     return is_rank_deficient(g_f, g_s, RANK) | is_rank_deficient(g_slow, tolerance=RANK)
+
+
+def with_dependent_constraints(equations: StepEquations, status: Status) -> Status:
+    """The status of a step, RANK_DEFICIENT where it failed and constraints are dependent."""
+    if not equations.system.is_constrained:
+        return status
+    failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & starts_finite(equations)
+    dependent = jax.lax.cond(failed, lambda: has_dependent_constraints(equations), lambda: jnp.asarray(False))
+    return status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))

@@ -12,10 +12,10 @@ from vmri_jax.kernels import max_abs
 from vmri_jax.mechanics.arrays import Number
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import Accepted
-from vmri_jax.steppers.continuation import has_dependent_constraints, solve_in_parts, starts_finite
+from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
 from vmri_jax.steppers.newton import Newton, dense
 from vmri_jax.steppers.results import RUNNING, Method, Result
-from vmri_jax.steppers.solved import Solution, Solver, status_of
+from vmri_jax.steppers.solved import Solution, Solver, ended, status_of
 
 MARGIN = 100.0
 """Factor on the contraction that quadratic convergence promises for the next update. With more, most steps take one more iteration; with
@@ -41,11 +41,7 @@ class Coupled(Solver):
         rows = jnp.maximum(max_abs(residual.slow), max_abs(residual.fast))
         g = jnp.maximum(max_abs(residual.multiplier), max_abs(residual.slow_multiplier))
         status = status_of(equations, result, Method.DENSE, iterations, rows, g, self.newton.tolerance)
-        if equations.system.is_constrained:
-            failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & starts_finite(equations)
-            never = partial(jnp.asarray, False)
-            dependent = jax.lax.cond(failed, partial(has_dependent_constraints, equations), never)
-            status = status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))
+        status = with_dependent_constraints(equations, status)
         return Solution(x, (equations.q_f + x.fast[:, -1].sum(0), p_s, p_f), status), memory
 
     def _root(self, equations: StepEquations, guess: Unknowns):
@@ -89,7 +85,7 @@ class Coupled(Solver):
         start = Iterate(guess, guess, guess, jnp.inf, jnp.ones(()), jnp.asarray(0), jnp.asarray(RUNNING))
         done = newton.iterate(iterate, start)
         if newton.fixed_iterations is not None:
-            done = done._replace(result=jnp.where(done.result == RUNNING, Result.STAGNATED, done.result))
+            done = done._replace(result=ended(done.result))
         return done.x, done.result, done.iterations
 
     def describe(self) -> list[str]:

@@ -162,8 +162,6 @@ class MarchEquations:
 
     def inverse(self, matrix, size: int):
         """Of a matrix whose first `size` unknowns are increments, the others multipliers."""
-        if len(matrix) == size:
-            return self.inverted(matrix, matrix[:, :0], matrix[:0], self.r)
         return self.inverted(matrix[:size, :size], matrix[:size, size:], matrix[size:, :size], self.r)
 
     def answer(self, matrices: IntervalMatrices, residual, arriving: Handed, slow):

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import CONTRACTION, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, Accepted, expected
-from vmri_jax.steppers.continuation import has_dependent_constraints, solve_in_parts, starts_finite
+from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
 from vmri_jax.steppers.march import (
     MarchEquations,
     Matrices,
@@ -25,7 +24,7 @@ from vmri_jax.steppers.march import (
 from vmri_jax.steppers.newton import Newton, null_space
 from vmri_jax.steppers.predictors import Parabola, PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method, Result
-from vmri_jax.steppers.solved import Solution, Solver, status_of
+from vmri_jax.steppers.solved import Solution, Solver, ended, largest_constraint, status_of
 
 PLAIN_PASSES = 30
 """Most passes of an attempt at the whole step, before parts of it are tried. Newton's method needs at most 15 from a good guess, and half of
@@ -57,7 +56,7 @@ class Progress(NamedTuple):
     passed: the last pass.
     matrices: of the last exact pass.
     size: its largest correction, of slow and fast increments.
-    rate: by which the next pass is expected to make the corrections smaller if it keeps the matrices.
+    rate: expected ratio of the next correction to this one with the matrices that are kept.
     curvature: kappa in ``|d_next| = kappa |d|^2`` for passes after an exact one with the correction d.
     exact_size: size of the last exact pass.
     still_moves: largest correction of fast increments that is expected of another pass.
@@ -111,8 +110,7 @@ class Marched(Solver):
         )
         if self.newton.fixed_iterations is not None:
             done = self._iterate(march, guess, start, memory, None)
-            result = jnp.where(done.result == RUNNING, Result.STAGNATED, done.result)
-            return self._solution(march, done, result, done.passes), self._learned(march, memory, done)
+            return self._solution(march, done, ended(done.result), done.passes), self._learned(march, memory, done)
 
         def part(equations, guess, limit, is_first):
             done = self._iterate(self._march(equations), guess, start, memory, limit, is_first)
@@ -148,7 +146,9 @@ class Marched(Solver):
             if limit is not None:
                 failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
                 result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
-            lost = is_first & (size > before.size)  # what was predicted is no guess: the next attempt starts elsewhere
+            lost = is_first & (
+                size > before.size
+            )  # the prediction was poor: the next attempt starts from straight motion
             result = jnp.where(lost & (result == RUNNING), Result.DIVERGED, result)
             broken = jnp.where(now.worst.is_singular, Result.SINGULAR, Result.NON_FINITE)
             result = jnp.where(jnp.isfinite(over), result, broken)
@@ -185,24 +185,11 @@ class Marched(Solver):
         equations, passed = march.equations, done.passed
         x = march.by_name(passed.z, passed.x)
         end = passed.end.position, passed.p_s, passed.end.rest[: march.n_f] / equations.micro_dt
-        g = jnp.zeros(())
-        if equations.system.is_constrained:
-            path = equations.path(x)
-            q_s, q_f = path.control_points()
-            g_fast = jax.vmap(equations.system.g)(path.control_times()[1:], q_s[1:], q_f[1:])
-            g_slow = jax.vmap(equations.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:])
-            g = jnp.maximum(max_abs(g_fast), max_abs(g_slow))
         shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
+        rows, g = passed.worst.rows * jnp.minimum(shrinks, 1.0), largest_constraint(equations, x)
         method = Method[self.linear_solver.upper()]
-        status = status_of(
-            equations, result, method, passes, passed.worst.rows * jnp.minimum(shrinks, 1.0), g, self.newton.tolerance
-        )
-        if equations.system.is_constrained:
-            failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & starts_finite(equations)
-            never = partial(jnp.asarray, False)
-            dependent = jax.lax.cond(failed, partial(has_dependent_constraints, equations), never)
-            status = status._replace(result=jnp.where(dependent, Result.RANK_DEFICIENT, status.result))
-        return Solution(x, end, status)
+        status = status_of(equations, result, method, passes, rows, g, self.newton.tolerance)
+        return Solution(x, end, with_dependent_constraints(equations, status))
 
     def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:
         passed = done.passed

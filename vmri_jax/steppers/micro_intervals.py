@@ -35,13 +35,11 @@ class FastUnknowns(NamedTuple):
     """Unknowns of the micro intervals and what is kept of them, with the intervals as first axis.
 
     increments, multiplier: the unknowns, multipliers scaled.
-    nodes: positions at the nodes 1..r.
     schur: inverses of ``G K^-1 G^T`` from the first pass.
     """
 
     increments: Float[Array, "num_micro r n_f"]
     multiplier: Float[Array, "num_micro r n_g"]
-    nodes: Float[Numbers, "num_micro r n_f"]
     schur: FullInverse | BandInverse
 
 
@@ -124,8 +122,7 @@ class MicroSweep(NamedTuple):
             rows += basis[-1][:, None] * (weight * d_s)
 
         totals = SweepTotals(q_f, p_f, start, rows, jnp.maximum(arriving.moved, done.moved))
-        nodes = arriving.q_f + done.increments
-        return FastUnknowns(done.increments, done.multiplier, nodes, done.schur), totals
+        return FastUnknowns(done.increments, done.multiplier, done.schur), totals
 
 
 def kick_weight(term: Term, h):
@@ -161,7 +158,7 @@ def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_
         p_f: momentum times h that arrives.
         increments, mu: (r, n_f), (r, n_g) its unknowns so far; explicit increments follow from mu.
         matrix: K.
-        schur: inverse of ``G_1 K^-1 G_0^T``; or its sparsity, to compute it here.
+        schur: inverse of ``G_1 K^-1 G_0^T``; or its sparsity, with which the inverse is computed here.
     """
     system, (r, n_g) = local.system, mu.shape
     times = local.t + local.macro_dt * control_nodes(r)

@@ -21,26 +21,25 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vmri_jax.kernels import LARGEST_RENEWED, LINEARISES_FORCES, max_abs
-from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales, slow_basis_at_control_nodes
+from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
-from vmri_jax.steppers.interval import Interval, Matrix, constant_mass, weighted_sum
+from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
-from vmri_jax.steppers.solved import Solution, Solver, status_of
+from vmri_jax.steppers.solved import Solution, Solver, largest_constraint, status_of
 
 EXTRA_PASSES = 1
 """A step that needs more passes than this above the fewest with its matrix K renews K. With more, steps with an old K take more passes; with
 none, K is computed for every fluctuation of the passes."""
-UNKNOWN = -1
-"""Fewest passes with a matrix that no step has used."""
+UNKNOWN = 10**6
+"""Fewest passes with a matrix that no step has used: more than any step takes."""
 
 
 class NestedState(NamedTuple):
@@ -68,7 +67,7 @@ class Pass(NamedTuple):
     d: the next update of the slow unknowns, with which their equations, linearised, are zero.
     inertia: masses that constraints tie to the slow variables, from the first pass.
     impulse: on the slow variables over the step, times h.
-    residual: largest row of the momentum equations (times h) and largest value of the slow constraint.
+    rows: largest row of the momentum equations, times h.
     """
 
     slow: Float[Array, "r n_s"]
@@ -79,7 +78,7 @@ class Pass(NamedTuple):
     inertia: ConstraintInertia | None
     slow_model_error: Float[Array, ""]
     impulse: Float[Array, "n_s"]
-    residual: tuple[Float[Array, ""], Float[Array, ""]]
+    rows: Float[Array, ""]
     passes: Int[Array, ""]
     result: Int[Array, ""]
 
@@ -128,13 +127,10 @@ class Nested(Solver):
         x = Unknowns(done.slow, done.slow_multiplier, done.fast.increments, done.fast.multiplier)
         per_h = 1 / equations.micro_dt
         end = done.totals.q_f, equations.p_s + per_h * done.impulse, per_h * done.totals.p_f
-        rows, g = done.residual
-        if x.multiplier.size:
-            g = jnp.maximum(max_abs(_constraints(equations, done)), g)
-        status = status_of(equations, done.result, Method.NESTED, done.passes, rows, g, newton.tolerance)
+        g = largest_constraint(equations, x)
+        status = status_of(equations, done.result, Method.NESTED, done.passes, done.rows, g, newton.tolerance)
 
-        before = memory.passes[0]
-        fewest = jnp.where(before == UNKNOWN, done.passes, jnp.minimum(before, done.passes))
+        fewest = jnp.minimum(memory.passes[0], done.passes)
         learned = NestedState(
             memory.matrix,
             memory.slow.add(_joined(done), done.slow.size),
@@ -205,14 +201,14 @@ class _Passes:
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
         slow, slow_multiplier = self._apart(z)
         x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
-        d, (rows, g), impulse = self.slow_equations.update(x, totals.start, totals.increments, inertia)
+        d, rows, impulse = self.slow_equations.update(x, totals.start, totals.increments, inertia)
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
         motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
         changes = max_abs(d[: self.r * self.n_s]), still_moves
         result = self.newton.status(self.accepted.over(changes, (max_abs(slow), motion), passes), passes)
-        residual = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves), max_abs(g)
+        rows = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves)
         passes = jnp.asarray(passes)
-        return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, residual, passes, result)
+        return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, rows, passes, result)
 
     def _apart(self, z):
         """Slow increments (r, n_s) and slow multipliers (r, n_gs)."""
@@ -223,11 +219,3 @@ class _Passes:
 def _joined(at: Pass):
     """Slow increments and slow multipliers in a row."""
     return jnp.concatenate([at.slow.reshape(-1), at.slow_multiplier.reshape(-1)])
-
-
-def _constraints(equations: StepEquations, done: Pass):
-    """(num_micro, r, n_g) values of g at the nodes 1..r of the micro intervals."""
-    n, r = equations.scheme.num_micro, equations.scheme.degree
-    slow_nodes = equations.q_s + weighted_sum(slow_basis_at_control_nodes(n, r)[:, 1:, 1:], done.slow)
-    times = equations.t + equations.micro_dt * (np.arange(n)[:, None] + control_nodes(r)[1:])
-    return jax.vmap(jax.vmap(equations.system.g))(times, slow_nodes, done.fast.nodes)

@@ -75,7 +75,7 @@ class SlowEquations(NamedTuple):
         return ConstraintInertia(responses, solve(both, multipliers).reshape(responses.shape))
 
     def update(self, x: Unknowns, start, increments, inertia: ConstraintInertia | None):
-        """Update of the slow unknowns, residuals of their equations, impulse on them over the step times h.
+        """Update of the slow unknowns, residual of their momentum equations, impulse on them over the step times h.
 
         With the rows R of the slow equations, their masses K_s and the slow constraint with the Jacobians G_0 at the start of a slot
         and G_1 at its end,
@@ -96,7 +96,7 @@ class SlowEquations(NamedTuple):
         d = increments + self.kinetic.rows(x.slow, x.fast)[0] / n
         rows = jnp.concatenate([(start - d.sum(0) + equations.micro_dt * equations.p_s)[None], d[:-1]]) - pull
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
-        return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), (rows, g), start - pull.sum(0)
+        return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), rows, start - pull.sum(0)
 
     def with_forces(self, d, x: Unknowns):
         """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces.

@@ -20,7 +20,7 @@ from vmri_jax.schemes.equations import StepEquations, Unknowns, physical_multipl
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
 from vmri_jax.steppers.newton.implicit import differentiable, differentiable_reverse_only
-from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.results import RUNNING, Result
 from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
 
 ROOT = "root"
@@ -205,3 +205,19 @@ def status_of(equations: StepEquations, result, method, iterations, rows, g, tol
     momentum = jnp.maximum(max_abs(equations.p_s), max_abs(equations.p_f)) * equations.micro_dt
     residual = jnp.maximum(rows / jnp.where(momentum > 0, momentum, 1.0), g)
     return Status(result, jnp.asarray(int(method)), iterations, residual)
+
+
+def ended(result):
+    """The `Result` of an iteration that is over: STAGNATED where it would have gone on."""
+    return jnp.where(result == RUNNING, Result.STAGNATED, result)
+
+
+def largest_constraint(equations: StepEquations, x: Unknowns):
+    """Largest absolute value of g and g_s along the step, its start excluded."""
+    if not equations.system.is_constrained:
+        return jnp.zeros(())
+    path = equations.path(x)
+    q_s, q_f = path.control_points()
+    g = jax.vmap(equations.system.g)(path.control_times()[1:], q_s[1:], q_f[1:])
+    g_slow = jax.vmap(equations.system.g_slow)(path.slow_control_times()[1:], path.slow_control_points()[1:])
+    return jnp.maximum(max_abs(g), max_abs(g_slow))
