@@ -21,8 +21,6 @@ ELEMENTWISE = 16
 SLOW_ORDER = 10
 """Highest order of the polynomial through the slow unknowns of the last steps, from which the next step starts. With less, small steps take
 more passes; a higher one is never the best."""
-FAST_ORDER = 2
-"""Order of the polynomial through the unknowns of the last micro intervals, from which the march with exact matrices starts the next one."""
 CONTRACTION = 0.03
 """Largest ratio of the corrections of two passes with which exact matrices are kept. An exact pass costs about as much as four others. With a
 larger ratio steps take more passes, with a smaller one more exact passes; run times change little between 0.01 and 0.1."""

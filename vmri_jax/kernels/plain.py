@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 
-SLOW_ORDER = FAST_ORDER = 0
-"""Unknowns start from their last values."""
+SLOW_ORDER = 0
+"""Slow unknowns start from their last values."""
 CONTRACTION = -1.0
 """Matrices are never kept: the ratio of two corrections is not below zero."""
 LARGEST_RENEWED = 10**9

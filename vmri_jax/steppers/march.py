@@ -252,21 +252,21 @@ class Passed(NamedTuple):
     worst: Worst
 
 
-def exact_pass(march: MarchEquations, z, x, past, from_past) -> tuple[Matrices, Passed]:
+def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, Passed]:
     """A pass that computes all matrices, each interval at what the intervals before it hand on after their correction.
 
     Args:
         march: the equations.
         z, x: unknowns.
-        past: of the unknowns of earlier intervals.
-        from_past: whether x starts from where the intervals before lead to, instead of the x that is given.
+        last: (k,) unknowns of the last interval of the step before.
+        from_last: whether each interval starts from the unknowns of the interval before, instead of those in x.
     """
     slow, unit = z[: march.num_slow], jnp.eye(march.num_slow)
 
     def interval(carry, given):
-        arriving, answers, past, worst = carry
+        arriving, answers, last, worst = carry
         m, x = given
-        x = jnp.where(from_past, past.next(m), x)
+        x = jnp.where(from_last, last, x)
         (residual, rest), push = jax.linearize(lambda x: march.interval(m, x, arriving, slow), x)
         by_x, hands_on = jax.vmap(push, out_axes=-1)(jnp.eye(x.size))
         inverse = march.inverse(by_x, march.num_fast)
@@ -280,32 +280,32 @@ def exact_pass(march: MarchEquations, z, x, past, from_past) -> tuple[Matrices, 
         answers = Handed(answers.position + march.last_increment(response), rests + matmul(hands_on, response))
 
         d, on = march.corrected(inverse, hands_on, x, residual, arriving, rest)
-        carry = on, answers, past.add(m, x + d), worst.add(residual, d, max_abs(d[: march.num_fast]))
+        carry = on, answers, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))
         return carry, (x + d, inverse, hands_on, response)
 
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_slow)) for a in start))
-    carry = start, none, past, Worst.none()
+    carry = start, none, last, Worst.none()
     (end, answers, _, worst), kept = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
     x, inverse, hands_on, response = kept
     matrices = Matrices(inverse, hands_on, response, march.slow_inverse(z, end, answers))
     return matrices, march.passed(matrices, z, x, worst, end)
 
 
-def further_pass(march: MarchEquations, matrices: Matrices, z, x, past, from_past) -> Passed:
+def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
     """A pass with the matrices of an earlier one, of this step or of one before. Arguments as of `exact_pass`."""
     slow = z[: march.num_slow]
 
     def interval(carry, given):
-        arriving, past, worst = carry
+        arriving, last, worst = carry
         m, x, inverse, hands_on = given
-        x = jnp.where(from_past, past.next(m), x)
+        x = jnp.where(from_last, last, x)
         residual, rest = march.interval(m, x, arriving, slow)
         d, on = march.corrected(inverse, hands_on, x, residual, arriving, rest)
-        return (on, past.add(m, x + d), worst.add(residual, d, max_abs(d[: march.num_fast]))), x + d
+        return (on, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))), x + d
 
     given = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
-    (end, _, worst), x = jax.lax.scan(interval, (march.start(), past, Worst.none()), given)
+    (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), given)
     return march.passed(matrices, z, x, worst, end)
 
 

@@ -22,7 +22,7 @@ from vmri_jax.steppers.march import (
     inverse_with_multipliers,
 )
 from vmri_jax.steppers.newton import Newton, null_space
-from vmri_jax.steppers.predictors import Parabola, PolynomialPredictor
+from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method, Result
 from vmri_jax.steppers.solved import Solution, Solver, ended, largest_constraint, status_of
 
@@ -39,13 +39,14 @@ INVERSES: dict[str, Callable] = {
 class MarchMemory(NamedTuple):
     """What a macro step hands to the next one.
 
-    slow, fast: the past of the slow unknowns, step by step, and of the fast ones, micro interval by micro interval.
+    slow: the past of the slow unknowns, step by step.
+    fast: unknowns of the last micro interval.
     matrices: of the last exact pass.
     rate: by which passes with them made the corrections smaller, the last time; infinite where there are no matrices.
     """
 
     slow: PolynomialPredictor
-    fast: Parabola
+    fast: Float[Array, "k"]
     matrices: Matrices
     rate: Float[Array, ""]
 
@@ -89,9 +90,7 @@ class Marched(Solver):
     def remembers(self, equations: StepEquations, guess: Unknowns) -> MarchMemory:
         march = self._march(equations)
         z, x = march.rows(guess)
-        return MarchMemory(
-            PolynomialPredictor.constant(z), Parabola.constant(x[0]), march.no_matrices(), jnp.asarray(jnp.inf)
-        )
+        return MarchMemory(PolynomialPredictor.constant(z), x[0], march.no_matrices(), jnp.asarray(jnp.inf))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
         march = self._march(equations)
@@ -193,8 +192,7 @@ class Marched(Solver):
 
     def _learned(self, march: MarchEquations, memory: MarchMemory, done: Progress) -> MarchMemory:
         passed = done.passed
-        fast = memory.fast.after_step(passed.x)
-        return MarchMemory(memory.slow.add(passed.z, march.num_slow), fast, done.matrices, done.rate)
+        return MarchMemory(memory.slow.add(passed.z, march.num_slow), passed.x[-1], done.matrices, done.rate)
 
     def describe(self) -> list[str]:
         head = f"march over the micro intervals with exact matrices, {self.linear_solver.replace('_', ' ')}"
