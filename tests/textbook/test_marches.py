@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.support import needs_special_cases
 from tests.textbook.agreement import SPRINGS, assert_agrees
 from tests.verification import random_systems as rs
 from vmri_jax import Method
@@ -45,6 +46,7 @@ STRUCTURES = {
 }
 
 
+@needs_special_cases
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_steppers_solve_the_equations_of_the_textbook(name):
     method, structure = STRUCTURES[name]
