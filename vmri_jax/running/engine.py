@@ -140,7 +140,7 @@ class Engine:
 
         def save(done: _Counted) -> _Counted:
             number, at, saved = done
-            is_later = number > 0  # the first node is the start: in this place the code for nodes is compiled once
+            is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
             moved, info, micro = interval(at, jnp.where(is_later, save_every, 0))
             at = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, at)
             node, at = _node(stepper.system, stepper.newton.tolerance, at)

@@ -245,7 +245,7 @@ class Increments(NamedTuple):
 
 
 class Evaluated(NamedTuple):
-    """An iterate, forces of it or of the one before, and RUNNING or, with its own forces, the result."""
+    """An iterate with forces; `result` is final only if the forces are those of this iterate, else it is RUNNING."""
 
     last: Increments
     forces: Forces

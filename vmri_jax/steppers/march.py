@@ -167,7 +167,7 @@ class MarchEquations:
     def answer(self, matrices: IntervalMatrices, residual, arriving: Handed, slow):
         """To a change of the residual, of what arrives, and of the slow increments: (dx, change of what is handed on).
 
-        All have one column for each direction. The unknowns cancel the change of the residual.
+        All have one column for each direction. With dx the linearised residual is zero.
         """
         rows = residual + matmul(matrices.by_position, arriving.position) + matmul(matrices.by_slow, slow)
         rows = rows.at[: self.n_f].add(arriving.rest[: self.n_f])  # the momentum that arrives

@@ -19,15 +19,15 @@ class SweepTotals(NamedTuple):
     """What a pass leaves, or what arrives at a micro interval in it.
 
     q_f, p_f: position and momentum times h at the end of the last interval.
-    start, increments: gradient of h times the action by the start and the increments of the slow path, without their
+    d_start, d_increments: gradients of h times the action by the start and by the increments of the slow path, without their
         kinetic energy.
     moved: largest correction of an increment.
     """
 
     q_f: Float[Numbers, "n_f"]
     p_f: Float[Numbers, "n_f"]
-    start: Float[Array, "n_s"]
-    increments: Float[Array, "r n_s"]
+    d_start: Float[Array, "n_s"]
+    d_increments: Float[Array, "r n_s"]
     moved: Float[Array, ""]
 
 
@@ -35,12 +35,12 @@ class FastUnknowns(NamedTuple):
     """Unknowns of the micro intervals and what is kept of them, with the intervals as first axis.
 
     increments, multiplier: the unknowns, multipliers scaled.
-    schur: inverses of ``G K^-1 G^T`` from the first pass.
+    schur_inverse: of ``G K^-1 G^T`` in the first pass.
     """
 
     increments: Float[Array, "num_micro r n_f"]
     multiplier: Float[Array, "num_micro r n_g"]
-    schur: FullInverse | BandInverse
+    schur_inverse: FullInverse | BandInverse
 
 
 class MicroSweep(NamedTuple):
@@ -83,7 +83,7 @@ class MicroSweep(NamedTuple):
 
         def interval(arriving, at):
             m, basis, before = at
-            known = before.increments, before.multiplier, before.schur
+            known = before.increments, before.multiplier, before.schur_inverse
             done, totals = self._corrected(slow, arriving, m, basis, *known)
             return totals, done
 
@@ -111,18 +111,18 @@ class MicroSweep(NamedTuple):
         local = StepEquations(system, scheme, equations.t + m * h, q_s, arriving.q_f, *at_rest, h)
         done = correct(local, steps, arriving.p_f, increments, mu, self.matrix, schur, self.is_explicit)
 
-        start = arriving.start + done.start
-        rows = arriving.increments + basis[0][:, None] * done.start
-        rows += jnp.sum((basis[1:] - basis[0])[..., None] * done.steps[:, None], axis=0)
+        d_start = arriving.d_start + done.d_start
+        d_increments = arriving.d_increments + basis[0][:, None] * done.d_start
+        d_increments += jnp.sum((basis[1:] - basis[0])[..., None] * done.d_steps[:, None], axis=0)
         q_f, p_f = arriving.q_f + done.increments[-1], done.p_f
         for term in lagrangian(system, scheme).kicks if n > 1 else ():  # where two micro intervals meet
             weight = jnp.where(m < n - 1, h * kick_weight(term, h), 0.0)
             d_s, d_f = term.gradient(equations.q_s + weighted_sum(basis[-1], slow), q_f)
-            start, p_f = start + weight * d_s, p_f + weight * d_f
-            rows += basis[-1][:, None] * (weight * d_s)
+            d_start, p_f = d_start + weight * d_s, p_f + weight * d_f
+            d_increments += basis[-1][:, None] * (weight * d_s)
 
-        totals = SweepTotals(q_f, p_f, start, rows, jnp.maximum(arriving.moved, done.moved))
-        return FastUnknowns(done.increments, done.multiplier, done.schur), totals
+        totals = SweepTotals(q_f, p_f, d_start, d_increments, jnp.maximum(arriving.moved, done.moved))
+        return FastUnknowns(done.increments, done.multiplier, done.schur_inverse), totals
 
 
 def kick_weight(term: Term, h):
@@ -135,22 +135,26 @@ class Corrected(NamedTuple):
 
     increments, multiplier: its unknowns.
     p_f: momentum times h that it hands on.
-    start, steps: gradient of h times its action by the start and the increments of its slow path.
+    d_start, d_steps: gradients of h times its action by the start and by the increments of its slow path.
     moved: largest correction of an increment.
-    schur: inverse of ``G K^-1 G^T``.
+    schur_inverse: of ``G_1 K^-1 G_0^T``.
     """
 
     increments: Float[Array, "r n_f"]
     multiplier: Float[Array, "r n_g"]
     p_f: Float[Array, "n_f"]
-    start: Float[Array, "n_s"]
-    steps: Float[Array, "r n_s"]
+    d_start: Float[Array, "n_s"]
+    d_steps: Float[Array, "r n_s"]
     moved: Float[Array, ""]
-    schur: FullInverse | BandInverse
+    schur_inverse: FullInverse | BandInverse
 
 
 def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_explicit: bool) -> Corrected:
-    """One Newton step ``[K, -G_0^T; G_1, 0]`` on the equations of one micro interval.
+    """One Newton step on the equations of one micro interval, with the residual R of its momentum equations,
+
+        K dx - G_0^T dmu = -(R - G_0^T mu)        G_1 dx = -g
+
+    by the Schur complement: first dx without dmu, then ``G_1 K^-1 G_0^T dmu = -(g + G_1 dx)``, then the part of dx that dmu makes.
 
     Args:
         local: its problem, from the positions at its start.
@@ -196,8 +200,8 @@ def correct(local: StepEquations, steps, p_f, increments, mu, matrix, schur, is_
         increments + dx,
         mu + dmu,
         p_f=d_fast[-1] + matrix.outgoing(dx),
-        start=d.slow_start + coupling.slow_start + impulse.sum(0),
-        steps=d.slow + coupling.slow + later,
+        d_start=d.slow_start + coupling.slow_start + impulse.sum(0),
+        d_steps=d.slow + coupling.slow + later,
         moved=max_abs(dx),
-        schur=schur,
+        schur_inverse=schur,
     )

@@ -50,15 +50,16 @@ class NestedState(NamedTuple):
     multiplier: multipliers lambda of the last micro interval.
     slow_model_error: ``|next update| / |update|`` of the slow unknowns by the masses alone; once the derivative of the slow forces has been
         taken, ``|update with it - update by the masses| / |update with it|``.
-    passes: fewest of a step with this matrix (UNKNOWN before one), and those of the last step; in the beginning numbers with which the
-        first step computes the matrix.
+    fewest_passes: of a step with this matrix, UNKNOWN before one.
+    last_passes: of the last step.
     """
 
     matrix: Matrix
     slow: PolynomialPredictor
     multiplier: Float[Array, "r n_g"]
     slow_model_error: Float[Array, ""]
-    passes: Int[Array, "2"]
+    fewest_passes: Int[Array, ""]
+    last_passes: Int[Array, ""]
 
 
 class Pass(NamedTuple):
@@ -100,7 +101,8 @@ class Nested(Solver):
         matrix = self.interval.matrix if self.interval.is_constant else self.interval.no_matrix
         increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity[0])
         slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
-        return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), jnp.array([0, 2 * EXTRA_PASSES]))
+        fewest, last = jnp.asarray(0), jnp.asarray(2 * EXTRA_PASSES)  # with these the first step computes the matrix
+        return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), fewest, last)
 
     def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
         """With a new matrix K, unless it is constant.
@@ -111,11 +113,9 @@ class Nested(Solver):
             return memory
         if self.interval.is_diagonal or len(memory.matrix.inverse) <= LARGEST_RENEWED or self.newton.fixed_iterations:
             return memory._replace(matrix=self.interval.matrix(equations))
-        stale = memory.passes[1] > memory.passes[0] + EXTRA_PASSES
+        stale = memory.last_passes > memory.fewest_passes + EXTRA_PASSES
         matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: memory.matrix)
-        return memory._replace(
-            matrix=matrix, passes=memory.passes.at[0].set(jnp.where(stale, UNKNOWN, memory.passes[0]))
-        )
+        return memory._replace(matrix=matrix, fewest_passes=jnp.where(stale, UNKNOWN, memory.fewest_passes))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: NestedState) -> tuple[Solution, NestedState]:
         scheme, newton = equations.scheme, self.newton
@@ -130,13 +130,13 @@ class Nested(Solver):
         g = largest_constraint(equations, x)
         status = status_of(equations, done.result, Method.NESTED, done.passes, done.rows, g, newton.tolerance)
 
-        fewest = jnp.minimum(memory.passes[0], done.passes)
         learned = NestedState(
             memory.matrix,
             memory.slow.add(_joined(done), done.slow.size),
             (done.fast.multiplier / scale)[-1],
             done.slow_model_error,
-            jnp.stack([fewest, done.passes]),
+            jnp.minimum(memory.fewest_passes, done.passes),
+            done.passes,
         )
         return Solution(x, end, status), learned
 
@@ -169,7 +169,7 @@ class _Passes:
         """From the predicted unknowns."""
         z = self.memory.slow.next(self.r * self.n_s)
         fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
-        inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur))
+        inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
         return self._judged(z, fast, totals, inertia, self.memory.slow_model_error, totals.moved, 1)
 
     def next(self, last: Pass) -> Pass:
@@ -201,7 +201,7 @@ class _Passes:
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
         slow, slow_multiplier = self._apart(z)
         x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
-        d, rows, impulse = self.slow_equations.update(x, totals.start, totals.increments, inertia)
+        d, rows, impulse = self.slow_equations.update(x, totals.d_start, totals.d_increments, inertia)
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
         motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
         changes = max_abs(d[: self.r * self.n_s]), still_moves

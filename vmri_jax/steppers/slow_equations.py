@@ -46,7 +46,7 @@ class ConstraintInertia(NamedTuple):
 
 
 class SlowEquations(NamedTuple):
-    """inverse_form, inverse_mass: K_s^-1 is one on the slots times the other on the coordinates."""
+    """inverse_form, inverse_mass: ``K_s^-1 = inverse_form x inverse_mass``, a matrix for the slots and an operator for the coordinates."""
 
     equations: StepEquations
     kinetic: QuadraticKinetic

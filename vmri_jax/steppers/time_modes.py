@@ -44,7 +44,7 @@ class TimeModes(NamedTuple):
             for basis, placed in ((lagrange_derivative, scheme.kinetic), (lagrange_basis, scheme.fast))
         )
         gamma, vectors = np.linalg.eig(np.linalg.solve(a, b))
-        order = np.argsort(-np.sign(np.imag(gamma)), kind="stable")  # of pairs, real ones, the others of pairs
+        order = np.argsort(-np.sign(np.imag(gamma)), kind="stable")  # Im > 0, Im = 0, Im < 0
         gamma, vectors = gamma[order], vectors[:, order]
         pairs, distinct = int(np.sum(np.imag(gamma) > 0)), int(np.sum(np.imag(gamma) >= 0))
         half = (pairs + distinct + 1) // 2
