@@ -9,7 +9,8 @@ interval. The error of a step is the sum of the corrections that were not made, 
 Positions cannot be known better than their round-off. The last term is for variables at rest, whose increments have no size of
 their own.
 
-Solvers know the next correction from the residual, or expect it from how the last ones shrank (`expected`).
+Solvers know the next correction from the residual, or expect it from how the last ones shrank (`expected`). Corrections that have stopped
+shrinking near round-off are accepted, too (`Accepted.at_floor`).
 """
 
 from typing import Any, NamedTuple

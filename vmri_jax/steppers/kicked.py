@@ -77,12 +77,10 @@ class Kicked(Stepper):
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
         none = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
         (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, inner, none), length=count - 1)
-        state, last, memory = step(
-            state, inner, 0.0
-        )  # apart: in the loop its weights and gradients would cost half of a short step
-        status = (
-            last.status if is_concrete(last.status) else worst.worse(last.status)
-        )  # a concrete one is that of all steps
+        # the last step apart: in the loop, its other weight and its gradients would cost half of a short step
+        state, last, memory = step(state, inner, 0.0)
+        is_same = is_concrete(last.status)  # a status that is known before the step is that of all steps
+        status = last.status if is_same else worst.worse(last.status)
         q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
         return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), memory
 

@@ -145,9 +145,8 @@ class Marched(Solver):
             if limit is not None:
                 failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
                 result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
-            lost = is_first & (
-                size > before.size
-            )  # the prediction was poor: the next attempt starts from straight motion
+            # the prediction was poor: the next attempt starts from straight motion
+            lost = is_first & (size > before.size)
             result = jnp.where(lost & (result == RUNNING), Result.DIVERGED, result)
             broken = jnp.where(now.worst.is_singular, Result.SINGULAR, Result.NON_FINITE)
             result = jnp.where(jnp.isfinite(over), result, broken)
