@@ -103,8 +103,8 @@ class Interval:
     is_explicit: its fast increment is the momentum that arrives plus the constraint force.
     is_diagonal: its matrix K, the derivative of its fast equations (r n_f rows, times h) by its increments without constraints,
         negative definite where the mass dominates, is taken for every fast coordinate alone: fast equations are explicit, or W is a
-        sum over the coordinates. V is then left out: it is the
-        soft potential, and h^2 times its curvature is small beside the mass.
+        sum over the coordinates. V is then left out: it is the soft potential, and h^2 times its curvature is small beside the
+        mass.
     is_constant: K is the same for a whole run.
     sparsity: of ``G K^-1 G^T``.
     """

@@ -164,21 +164,18 @@ class MarchEquations:
         """Of a matrix whose first `size` unknowns are increments, the others multipliers."""
         return self.inverted(matrix[:size, :size], matrix[:size, size:], matrix[size:, :size], self.r)
 
-    def answer(self, matrices: IntervalMatrices, residual, arriving: Handed, slow):
-        """To a change of the residual, of what arrives, and of the slow increments: (dx, change of what is handed on).
+    def answer(self, matrices: IntervalMatrices, residual, arriving: Handed, slow=None):
+        """To a change of the residual, of what arrives, and (unless None) of the slow increments: (dx, change of what is handed on).
 
         All have one column for each direction. With dx the linearised residual is zero.
         """
-        rows = residual + matmul(matrices.by_position, arriving.position) + matmul(matrices.by_slow, slow)
+        rows = residual + matmul(matrices.by_position, arriving.position)
+        rest = matmul(matrices.hands_on_by_position, arriving.position)
+        if slow is not None:
+            rows, rest = rows + matmul(matrices.by_slow, slow), rest + matmul(matrices.hands_on_by_slow, slow)
         rows = rows.at[: self.n_f].add(arriving.rest[: self.n_f])  # the momentum that arrives
         dx = -matmul(matrices.inverse, rows)
-        return dx, self.handed(
-            arriving,
-            dx,
-            matmul(matrices.hands_on, dx)
-            + matmul(matrices.hands_on_by_position, arriving.position)
-            + matmul(matrices.hands_on_by_slow, slow),
-        )
+        return dx, self.handed(arriving, dx, matmul(matrices.hands_on, dx) + rest)
 
     def last_increment(self, x):
         """(n_f, ...) of the unknowns (k, ...): from the start of the interval to its end."""
@@ -344,7 +341,7 @@ def solve(march: MarchEquations, factors: Factors, rows_z, rows_x):
 
     def interval(arriving, given):
         matrices, rows = given
-        dx, arriving = march.answer(matrices, rows[:, None], arriving, jnp.zeros((march.num_slow, 1)))
+        dx, arriving = march.answer(matrices, rows[:, None], arriving)
         return arriving, dx[:, 0]
 
     none = Handed(*(jnp.zeros((a.size, 1)) for a in march.start()))
