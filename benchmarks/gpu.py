@@ -83,7 +83,7 @@ def of_peers(name: str) -> Callable | None:
 
 
 def systems_of(names: tuple[str, ...]) -> Iterator[System]:
-    """Those with these names. A long step of high degree suits a card best: every pass of a step launches some hundred kernels one after the other."""
+    """The systems with these names. Long steps of high degree suit a card: kernels of a step start one after the other, for any number of lanes."""
     if "FPU" in names:
         yield System("FPU", problem("FPU l=3"), vm.fully_explicit(10), 100, of_peers("FPU l=3"))
     if "TSP" in names:

@@ -5,9 +5,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from vmri_jax import Newton, State, initial_state, kernels, macro_step, simulate, systems
+from vmri_jax import Newton, State, initial_state, macro_step, simulate, systems
 from vmri_jax.schemes.composition import stage_scheme
 
 DATA = Path(__file__).parent / "data"
@@ -21,11 +20,6 @@ PROBLEMS = {
 NUM_SAVES = 50
 """Saved intervals of most runs: of one number, so that tests share compiled runs."""
 
-
-needs_special_cases = pytest.mark.skipif(
-    not kernels.DRIFTS, reason="with VMRI_KERNELS=plain steppers know no special cases"
-)
-"""Of tests that ask which stepper took a step."""
 
 compiled_step = jax.jit(macro_step)
 """``(system, scheme, state, macro_dt, newton) -> (state, info)``, compiled once per structure."""

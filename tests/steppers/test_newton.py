@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import pytest
 
-from tests.support import compiled_step, largest_difference, needs_special_cases
-from vmri_jax import ConstantMass, Newton, Result, State, System, fully_implicit, initial_state, simulate
+from tests.support import compiled_step, largest_difference
+from vmri_jax import ConstantMass, Newton, Result, State, System, fully_implicit, initial_state, kernels, simulate
 from vmri_jax.steppers.marched import PLAIN_PASSES
 
 EXACT = Newton(method="arrowhead")
@@ -112,11 +112,11 @@ def test_huge_steps_end_at_the_solution_that_is_meant(tsp):
     assert float(run.constraint_residual.max()) < 1e-11
 
 
-@needs_special_cases  # with exact matrices in every pass nothing is missed
 def test_continuation_finds_the_solution_that_plain_newton_misses(tsp):
     """The whole step, from what the steps before lead to and from straight motion, has no solution that passes find."""
     run = simulate(tsp.system, fully_implicit(10), tsp.state(), macro_dt=0.4, num_steps=40, newton=EXACT)
-    assert int(run.info.iterations.max()) > PLAIN_PASSES
+    if kernels.CONTRACTION > 0:  # with exact matrices in every pass nothing is missed
+        assert int(run.info.iterations.max()) > PLAIN_PASSES
     assert float(jnp.abs(run.energy - run.energy[0]).max()) < 800.0  # measured 613, of 12 000 that are exchanged
     assert float(run.constraint_residual.max()) < 1e-11
 

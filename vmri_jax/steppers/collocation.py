@@ -245,7 +245,7 @@ class Increments(NamedTuple):
 
 
 class Evaluated(NamedTuple):
-    """An iterate with forces; `result` is final only if the forces are those of this iterate, else it is RUNNING."""
+    """An iterate with forces; `result` is final only if the forces belong to this iterate, else RUNNING."""
 
     last: Increments
     forces: Forces

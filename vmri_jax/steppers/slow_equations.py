@@ -2,8 +2,8 @@
 
 In the first micro interval the constraints give the fast variables the velocity that the slow path asks for, and later ones let
 them keep it. So a change dx of the slow increments changes the multipliers of the first interval by ``-S G_s dx``, with
-``S = (G K^-1 G^T)^-1`` of that interval and G_s the Jacobian by the slow variables, and those of the others hardly. That is the inertia of what is tied to
-the slow variables; the rest of what the fast ones answer is small.
+``S = (G K^-1 G^T)^-1`` of that interval and G_s the Jacobian by the slow variables, and the multipliers of other intervals hardly.
+That is the inertia of the fast masses that are tied to the slow variables; the rest of their answer is small.
 
 Where nothing is constrained, what masses leave out is the derivative of the slow forces by the slow path: over a long macro
 step it is as large as they are, and an update can be solved for with it (`SlowEquations.with_forces`).
@@ -77,7 +77,7 @@ class SlowEquations(NamedTuple):
     def update(self, x: Unknowns, start, increments, inertia: ConstraintInertia | None):
         """Update of the slow unknowns, residual of their momentum equations, impulse on them over the step times h.
 
-        With the rows R of the slow equations, their masses K_s and the slow constraint with the Jacobians G_0 at the start of a slot
+        With the residual R of the slow momentum equations, the masses K_s and the slow constraint with the Jacobians G_0 at the start of a slot
         and G_1 at its end,
 
             K_s dx - G_0^T dnu = -R        G_1 dx = -g_s
