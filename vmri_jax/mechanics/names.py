@@ -3,24 +3,16 @@
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.mechanics.system import System
-
-Part = Literal["s", "f"]
 
 AXES = "xyz"
 """Coordinates of a point of two or three dimensions."""
-
-
-class Place(NamedTuple):
-    """Coordinates ``q_part[start : start + size]`` of a body."""
-
-    part: Part
-    start: int
-    size: int
 
 
 @dataclass(frozen=True)
@@ -34,6 +26,8 @@ class Names:
         constraint, slow_constraint: constraints in the order of the values of these functions, with their numbers of rows.
         numbered: bodies whose coordinates are general ones: they are called "name[0]", "name[1]", not "name x", "name y".
         rigid: bodies whose coordinates are a centre and directors: "name x", "name y", "name z", "name d1 x" and so on.
+        carried: bodies that are functions of the coordinates, by name their places in Q_s and Q_f.
+        kinematics: the map to these, see `vmri_jax.mechanics.kinematics`; None without such bodies.
 
     Raises:
         TypeError: no mapping from names to whole numbers.
@@ -46,6 +40,8 @@ class Names:
     slow_constraint: Mapping[str, int] = field(default_factory=dict)
     numbered: Sequence[str] = ()
     rigid: Sequence[str] = ()
+    carried: Mapping[str, Place] = field(default_factory=dict)
+    kinematics: Kinematics | None = None
 
     def __post_init__(self):
         for what in ("slow", "fast", "constraint", "slow_constraint"):
@@ -103,7 +99,7 @@ class Names:
             ValueError: no body of this name.
         """
         if body not in self.bodies:
-            raise ValueError(unknown("body", body, self.bodies))
+            raise ValueError(unknown("body", body, {**self.bodies, **self.carried}))
         return self.bodies[body]
 
     def of(self, system: System, n_s: int, n_f: int) -> "Names":
@@ -159,6 +155,19 @@ class Names:
     def to_dict(self) -> dict[str, Any]:
         """As plain data, which keep their order in JSON."""
         return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Names":
+        """The inverse of `to_dict`, also of what JSON makes of it.
+
+        Args:
+            data: from `to_dict`; what is absent there has its default.
+        """
+        found = dict(data)
+        found["carried"] = {name: Place(*place) for name, place in data.get("carried", {}).items()}
+        if data.get("kinematics") is not None:
+            found["kinematics"] = Kinematics.from_dict(data["kinematics"])
+        return cls(**found)
 
 
 def unknown(kind: str, name: Any, known: Iterable[str]) -> str:

@@ -39,7 +39,7 @@ class Origin(NamedTuple):
     @classmethod
     def named(cls, names: dict | None) -> "Origin":
         """That of a run of which only the names are known, from plain data."""
-        return cls(None if names is None else Names(**names))
+        return cls(None if names is None else Names.from_dict(names))
 
     @property
     def known_system(self) -> System:

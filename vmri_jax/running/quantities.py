@@ -1,6 +1,7 @@
 """What follows from the positions and momenta of a run: velocities, multipliers, reaction forces, work, by name."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.kinematics import JOINTS, Kinematics
 from vmri_jax.mechanics.motion import motion, powers, reaction_force
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.projection import legendre
@@ -109,7 +111,7 @@ class Quantities(ABC):
             ValueError: no body of this name.
         """
         run = self.whole()
-        return _of_body(run.names, body, run.q_s, run.q_f)
+        return _of_body(run, body, _bodies, run.q_s, run.q_f)
 
     def momentum(self, body: str):
         """Momenta of a body at the saved nodes, (..., k, size).
@@ -121,7 +123,7 @@ class Quantities(ABC):
             ValueError: no body of this name.
         """
         run = self.whole()
-        return _of_body(run.names, body, run.p_s, run.p_f)
+        return _of_body(run, body, _body_momenta, run.p_s, run.p_f)
 
     def velocity(self, body: str):
         """Velocities (..., k, size) of a body, or of a coordinate that has a name.
@@ -133,7 +135,7 @@ class Quantities(ABC):
             ValueError: no body of this name, or the run does not know its system.
         """
         run = self.whole()
-        return _of_body(run.names, body, *_velocities(run))
+        return _of_body(run, body, _body_rates, *(() if body in run.names.carried else _velocities(run)))
 
     def multipliers(self, micro: bool = False) -> dict:
         """Lagrange multipliers of the equations of motion at the saved nodes, (..., k, rows) for each constraint by name.
@@ -227,9 +229,32 @@ def _known(what: str, run: "Trajectory") -> "Trajectory":
     return run
 
 
-def _of_body(names: Names, body: str, slow, fast):
-    part, start, size = names.place(body)
+def _of_body(run: "Trajectory", body: str, carried: Callable, slow=None, fast=None):
+    """Values (..., k, size) of a body.
+
+    Args:
+        carried: what gives the values of bodies that are functions of the coordinates, at one node.
+        slow, fast: values of all coordinates.
+    """
+    names = run.names
+    if body in names.carried:
+        slow, fast = at_nodes(carried, run.origin, run.states, names.kinematics)
+        part, start, size = names.carried[body]
+    else:
+        part, start, size = names.place(body)
     return (slow if part == "s" else fast)[..., start : start + size]
+
+
+def _bodies(system: System, state: State, kinematics: Kinematics):
+    return kinematics(state.q_s, state.q_f, system.params[JOINTS])
+
+
+def _body_rates(system: System, state: State, kinematics: Kinematics):
+    return kinematics.velocities(state.q_s, state.q_f, *_velocity(system, state), system.params[JOINTS])
+
+
+def _body_momenta(system: System, state: State, kinematics: Kinematics):
+    return kinematics.momenta(state.q_s, state.q_f, *_velocity(system, state), system.params)
 
 
 def _velocities(run: "Trajectory"):

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
-from vmri_jax.scene.layout import join
+from vmri_jax.scene.layout import Layout, join
 from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import FUNCTIONS, IMPLIED, MASS, Actuation, DroppedRows, SomeRows
+from vmri_jax.scene.terms import FUNCTIONS, IMPLIED, JOINTS, MASS, Actuation, DroppedRows, SomeRows
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
@@ -18,24 +19,32 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         sorting: bodies at their places.
         placed: the effects, all of the sorting or some.
     """
-    bodies, places = sorting.bodies, sorting.places
+    bodies, where = sorting.bodies, sorting.layout
     potentials: dict[str, tuple] = {}
     terms: dict[str, list] = {}
     for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):  # forces may build on potentials
-        name, made = part.effect.name, part.effect.terms(part.elements, bodies, places, potentials)
+        name, made = part.effect.name, part.effect.terms(part.elements, bodies, where, potentials)
         if part.effect.kind == "potential":
             potentials[name] = (*potentials.get(name, ()), *made)
         terms.setdefault(part.home, []).extend([SomeRows(made, part.dropped)] if part.dropped else made)
         if part.dropped:
             terms.setdefault("implied", []).append(DroppedRows(made, part.dropped))
-    functions: dict[str, Any] = {home: FUNCTIONS[home](tuple(terms[home])) for home in FUNCTIONS if terms.get(home)}
+    if where.kinematics is not None:
+        terms.setdefault("kinetic", [])
+    functions: dict[str, Any] = {
+        home: FUNCTIONS[home](tuple(terms[home]), _kinematics(home, terms[home], where))
+        for home in FUNCTIONS
+        if home in terms
+    }
     for home in ("constraint", "slow_constraint", "implied"):
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])
     params: dict[str, Any] = {part.effect.name: part.effect.parameters(bodies) for part in placed}
-    slow, fast = (join(bodies, places, part, "masses") for part in ("s", "f"))
+    slow, fast = (join(bodies, where, part, "masses") for part in ("s", "f"))
     if "kinetic" in functions:
         params[MASS] = {"slow": slow, "fast": fast}
+    if where.kinematics is not None:
+        params[JOINTS] = sorting.joints
     if "implied" in functions:
         params[IMPLIED] = np.concatenate([part.sizes for part in placed])
     kinetic = functions.pop("kinetic", None) or ConstantMass(slow, fast)
@@ -49,6 +58,13 @@ def actuation(sorting: Sorting) -> Actuation | None:
         sorting: bodies at their places, effects at their homes.
     """
     controls = [part for part in sorting.placed if part.home == "control"]
-    terms = [part.effect.terms(part.elements, sorting.bodies, sorting.places, {}) for part in controls]
+    made = [part.effect.terms(part.elements, sorting.bodies, sorting.layout, {}) for part in controls]
+    terms = tuple(term for (term,) in made)
     names = tuple(part.effect.components(sorting.bodies) for part in controls)
-    return Actuation(tuple(term for (term,) in terms), names) if controls else None
+    return Actuation(terms, _kinematics("control", terms, sorting.layout), names) if controls else None
+
+
+def _kinematics(home: str, terms: Sequence, layout: Layout) -> Kinematics | None:
+    """The kinematics, unless the terms take nothing but coordinates of the scene; a kinetic energy is that of all bodies."""
+    bodies = home == "kinetic" or not all(term.within(layout.sizes) for term in terms)
+    return layout.kinematics if bodies else None

@@ -87,6 +87,7 @@ class AnyBody(ABC):
         block: its coordinates are general ones, not those of points.
         rigid: they are those of a rigid body.
         rotation: (3, 3) its axes in space at the start as columns; None of what has no axes.
+        wide: which directors are among its coordinates.
     """
 
     name: str
@@ -96,6 +97,7 @@ class AnyBody(ABC):
     block: bool
     rigid: bool = False
     rotation: Any = None
+    wide: tuple[int, ...] = ()
 
     @property
     @abstractmethod

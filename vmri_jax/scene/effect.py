@@ -12,10 +12,11 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.mechanics.functions import check_arguments
-from vmri_jax.mechanics.names import Place, unknown
+from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, body_of, end_of, label_of, moving
 from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
-from vmri_jax.scene.layout import Rows
+from vmri_jax.scene.layout import Layout
 from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, Role, choose
 
 Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
@@ -171,6 +172,10 @@ class Effect(ABC):
             end += bodies[name].size
         return replace(self._term((i,), bodies, places), select=None), {self.name: self._own(i, bodies, params)}
 
+    def pair_of_joint(self, i: int) -> tuple[str, int] | None:
+        """The joint and the number of its pair of bodies whose freedom is all that element i depends on; None of other effects."""
+        return None
+
     def _own(self, i: int, bodies: Bodies, params: dict[str, Any]) -> dict[str, Any]:
         """Parameters of element i among those of all."""
         return params if len(self.elements(bodies)) == 1 else choose(params, (i,), self.split)
@@ -251,15 +256,15 @@ class Effect(ABC):
         body, end = body_of(bodies, name), end_of(bodies, name, self.whole)
         return name == GROUND, isinstance(name, Attachment), body.size, end.size
 
-    def terms(self, select: Sequence[int], bodies: Bodies, places: Mapping[str, Place], potentials: Mapping[str, Any]):
+    def terms(self, select: Sequence[int], bodies: Bodies, layout: Layout, potentials: Mapping[str, Any]):
         """The terms of some of the elements; those of bodies of other sizes in another term.
 
         Args:
             select: indices of elements.
-            places: of all bodies in q_s and q_f.
+            layout: of all bodies.
             potentials: terms of all potentials of the scene by name of the effect.
         """
-        return tuple(self._term(some, bodies, places) for some in self.by_size(select, bodies))
+        return tuple(self._term(some, bodies, layout.bodies) for some in self.by_size(select, bodies))
 
     def _term(self, some: Sequence[int], bodies: Bodies, places: Mapping[str, Place]) -> EffectTerm:
         """The term of elements of one kind."""

@@ -31,7 +31,7 @@ def names_of(sorting: Sorting) -> Names:
         sorting: bodies at their places, effects at their homes.
     """
     sizes: dict[str, dict[str, int]] = {"s": {}, "f": {}, "constraint": {}, "slow_constraint": {}}
-    for name, place in sorting.places.items():
+    for name, place in sorting.layout.own.items():
         sizes[place.part][name] = place.size
     for part in sorting.placed:
         if part.home in ("constraint", "slow_constraint"):
@@ -39,7 +39,9 @@ def names_of(sorting: Sorting) -> Names:
     blocks, rigid = (
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )
-    return Names(sizes["s"], sizes["f"], sizes["constraint"], sizes["slow_constraint"], blocks, rigid)
+    carried = {name: place for name, place in sorting.places.items() if name not in sorting.layout.own}
+    rows = sizes["constraint"], sizes["slow_constraint"]
+    return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics)
 
 
 def _rows(sorting: Sorting, part: Placed) -> dict[str, int]:

@@ -1,12 +1,12 @@
-"""Where the coordinates of bodies lie in q_s and q_f, and how they are taken out without a gather."""
+"""Where the coordinates of bodies and joints lie in q_s and q_f."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.names import Part, Place
+from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.scene.body import Bodies
 
 
@@ -17,111 +17,48 @@ class Pace(NamedTuple):
     reason: str
 
 
-def layout(bodies: Bodies, paces: Mapping[str, Pace]) -> dict[str, Place]:
-    """The place of every body: slow ones in order in q_s, fast ones in order in q_f.
+@dataclass(frozen=True)
+class Layout:
+    """Where everything is.
 
-    Args:
-        bodies, paces: by name.
+    Attributes:
+        bodies: the coordinates of every body as a point or rigid body, in Q_s and Q_f, see `Kinematics`. Those of bodies on no joint are
+            coordinates of the scene, at the same place in q_s and q_f.
+        own: the coordinates of the scene by name: those of bodies, and freedoms of joints.
+        freedoms: the places of the freedoms of joints, by name of the joint, number of its pair of bodies, and name of the freedom.
+        kinematics: the map from q to Q; None without trees.
     """
-    ends: dict[Part, int] = {"s": 0, "f": 0}
-    places = {}
-    for name, body in bodies.items():
-        part: Part = "f" if paces[name].value == "fast" else "s"
-        places[name] = Place(part, ends[part], body.size)
-        ends[part] += body.size
-    return places
+
+    bodies: dict[str, Place]
+    own: dict[str, Place]
+    freedoms: dict[tuple[str, int, str], Place] = field(default_factory=dict)
+    kinematics: Kinematics | None = None
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """(n_s, n_f)."""
+        slow, fast = (sum(place.size for place in self.own.values() if place.part == part) for part in ("s", "f"))
+        return slow, fast
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Lengths of Q_s and Q_f."""
+        slow, fast = (
+            max((place.start + place.size for place in (*self.own.values(), *self.bodies.values()) if place.part == part), default=0)
+            for part in ("s", "f")
+        )
+        return slow, fast
 
 
-def join(bodies: Bodies, places: Mapping[str, Place], part: Part, what: str):
-    """One vector of all slow or of all fast bodies.
+def join(bodies: Bodies, layout: Layout, part: Part, what: str) -> Any:
+    """One vector Q_s or Q_f of all slow or of all fast bodies, at their places; zero for freedoms of joints.
 
     Args:
-        bodies, places: by name.
+        bodies: by name.
+        layout: of these.
         part: "s" for slow ones, "f" for fast ones.
         what: "coordinates", "rates" or "masses".
     """
-    pieces = [jnp.asarray(getattr(body, what)) for name, body in bodies.items() if places[name].part == part]
-    return jnp.concatenate(pieces) if pieces else jnp.zeros(0)
-
-
-class Run(NamedTuple):
-    """`count` bodies that follow one another in q_part, or (`same`) one body `count` times."""
-
-    part: Part
-    start: int
-    count: int
-    same: bool
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Coordinates of some bodies of one size, as static slices; compared by value, as `jax.jit` needs it.
-
-    Of every body with `stride` coordinates the first `size` are taken.
-    """
-
-    size: int
-    stride: int
-    runs: tuple[Run, ...]
-    single: bool
-
-    @classmethod
-    def of(cls, places: Sequence[Place], size: int | None = None) -> "Rows":
-        """The rows at these places.
-
-        Args:
-            places: a single one gives a vector (size,), more give (n, size).
-            size: so many coordinates of each; None for all.
-        """
-        stride, runs = places[0].size, []
-        for part, start, _ in places:
-            last = runs[-1] if runs else Run(part, start, 0, False)
-            follows = not last.same and start == last.start + stride * last.count
-            again = last.start == start and (last.same or last.count == 1)
-            if last.part == part and last.count and (follows or again):
-                runs[-1] = last._replace(count=last.count + 1, same=again)
-            else:
-                runs.append(Run(part, start, 1, False))
-        return cls(size or stride, stride, tuple(runs), len(places) == 1)
-
-    def take(self, q_s, q_f):
-        """The rows of these vectors, positions or velocities."""
-        pieces = []
-        for part, start, count, same in self.runs:
-            q = q_s if part == "s" else q_f
-            if same or count == 1:
-                piece = q[start : start + self.size]
-                pieces.append(jnp.tile(piece, count) if same else piece)
-            else:
-                piece = q[start : start + self.stride * count]
-                pieces.append(self._first(piece, count))
-        flat = jnp.concatenate(pieces)
-        return flat if self.single else flat.reshape(-1, self.size)
-
-    def put(self, rows, n_s: int, n_f: int):
-        """The transpose of `take`.
-
-        Args:
-            rows: one for each place, or one for all.
-            n_s, n_f: lengths of q_s and q_f.
-
-        Returns:
-            Vectors (n_s,), (n_f,) with the rows added at their places.
-        """
-        rows, at = jnp.broadcast_to(rows, (sum(run.count for run in self.runs), self.size)), 0
-        sums = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}
-        for part, start, count, same in self.runs:
-            piece = rows[at : at + count]
-            piece = jnp.sum(piece, axis=0) if same else self._whole(piece).reshape(-1)
-            after = sums[part].shape[0] - start - piece.shape[0]
-            sums[part] += jnp.pad(piece, (start, after))
-            at += count
-        return tuple(sums.values())
-
-    def _first(self, piece, count: int):
-        """The first coordinates of bodies that follow one another, flat."""
-        return piece if self.size == self.stride else piece.reshape(count, self.stride)[:, : self.size].reshape(-1)
-
-    def _whole(self, rows):
-        """(n, stride) with zeros for the coordinates that are not taken."""
-        return rows if self.size == self.stride else jnp.pad(rows, ((0, 0), (0, self.stride - self.size)))
+    pieces = {place.start: jnp.asarray(getattr(bodies[name], what)) for name, place in layout.bodies.items() if place.part == part}
+    pieces |= {place.start: jnp.zeros(1) for place in layout.freedoms.values() if place.part == part}
+    return jnp.concatenate([pieces[start] for start in sorted(pieces)]) if pieces else jnp.zeros(0)

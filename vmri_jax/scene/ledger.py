@@ -117,9 +117,11 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
     one = stage_scheme(scheme)
     intervals = {"macro": stages * one.degree, "micro": stages * one.degree * one.num_micro}
     rows = []
+    sizes = {name: sorting.places[name].size for name in sorting.bodies}
+    sizes |= {branch.child: len(branch.joint.freedoms) for branch in sorting.branches}
     for name, pace in sorting.paces.items():
         grid = "micro" if pace.value == "fast" else "macro"
-        unknowns = intervals[grid] * sorting.bodies[name].size
+        unknowns = intervals[grid] * sizes[name]
         rows.append(Row(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
     whole, times = _measure(sorting, scheme, macro_dt) if measure else (None, [None] * len(sorting.placed))
     for part, nanoseconds in zip(sorting.placed, times, strict=True):

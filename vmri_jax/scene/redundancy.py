@@ -204,12 +204,12 @@ def _listed(names: Sequence[str]) -> str:
 
 def _advice(sorting: Sorting, rows: ConstraintRows, micro: list[int]) -> str:
     """What to do about constraints that the fast bodies cannot keep."""
-    fast = [name for name, place in sorting.places.items() if place.part == "f"]
+    fast = [name for name, place in sorting.layout.own.items() if place.part == "f"]
     jacobian = rows.jacobian[micro]
     involved = jacobian[rank_of(jacobian[:, rows.num_slow :]).dependent]
     touched = {
         name
-        for name, place in sorting.places.items()
+        for name, place in sorting.layout.own.items()
         if place.part == "s" and involved[:, place.start : place.start + place.size].any()
     }
     more = f"make {' or '.join(sorted(touched))} fast too" if touched else "make more of their bodies fast"

@@ -1,6 +1,6 @@
 """The rows of a scene's constraints one by one: their names, their values and their Jacobian at any positions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import chain
@@ -14,9 +14,12 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.labels import label
+from vmri_jax.scene.layout import join
 from vmri_jax.scene.sorting import Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm
 
+WAYS = ("slide", "along", "across")
+"""Freedoms of joints that are lengths; others are angles."""
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
 
 
@@ -40,7 +43,7 @@ class Row(NamedTuple):
 class _Element(NamedTuple):
     """An element of a constraint as a function of its coordinates.
 
-    columns: where these are among all coordinates, slow ones first.
+    columns: where these are among the coordinates of all bodies (Q_s, Q_f).
     """
 
     term: EffectTerm
@@ -58,8 +61,9 @@ class ConstraintRows:
         start: (n,) coordinates at the start.
         masses: (n,); 1 each where they are traced, since they only weigh the choice of the rows to drop.
         scales: (n,) by how much each coordinate changes in a large motion: the extent of the scene for positions, 1 for
-            directors of rigid bodies, and for general coordinates their value, at least 1.
+            directors of rigid bodies and angles of joints, and for general coordinates their value, at least 1.
         num_slow: number of slow coordinates.
+        to_bodies: the coordinates of all bodies (Q_s, Q_f) one after the other at q, and their Jacobian.
     """
 
     rows: tuple[Row, ...]
@@ -68,6 +72,7 @@ class ConstraintRows:
     masses: np.ndarray
     scales: np.ndarray
     num_slow: int
+    to_bodies: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
     @classmethod
     def of(cls, sorting: Sorting) -> "ConstraintRows | None":
@@ -76,37 +81,39 @@ class ConstraintRows:
         params = {i: part.effect.parameters(bodies) for i, part in held}
         if not held or not is_concrete(([body.coordinates for body in bodies.values()], params)):
             return None
-        order = sorted(bodies, key=lambda name: sorting.places[name].part == "f")
-        num_slow = sum(place.size for place in sorting.places.values() if place.part == "s")
+        where, to_bodies = sorting.layout, sorting.to_bodies
         columns = {
-            name: place.start + np.arange(place.size) + (num_slow if place.part == "f" else 0)
-            for name, place in sorting.places.items()
+            name: place.start + np.arange(place.size) + (where.ends[0] if place.part == "f" else 0)
+            for name, place in where.bodies.items()
         }
-        start = np.concatenate([np.asarray(bodies[name].coordinates) for name in order])
-        masses = [bodies[name].masses for name in order]
-        masses = np.concatenate(masses) if is_concrete(masses) else np.ones_like(start)
+        start = np.concatenate(sorting.positions)
+        masses = join(bodies, where, "s", "masses"), join(bodies, where, "f", "masses")
+        masses = np.concatenate(masses) if is_concrete(masses) else None
+        extended, jacobian = to_bodies(start)
+        masses = np.ones_like(start) if masses is None else np.sum(masses[:, None] * np.asarray(jacobian) ** 2, axis=0)
         rows, elements = [], []
         for i, part in held:
             number = 0
             for names, element in _elements(part, bodies, columns, params[i]):
                 elements.append(element)
-                size = _evaluated(element, start, 0.0)[0].size
+                size = _evaluated(element, extended, 0.0)[0].size
                 for j in range(size):
                     name = names if size == 1 else f"{names} [{j}]"
                     rows.append(Row(name, i, number, part.effect, part.home, number not in part.dropped))
                     number += 1
-        scales = np.concatenate([_scales(bodies[name], _extent(bodies)) for name in order])
-        return cls(tuple(rows), tuple(elements), start, masses, scales, num_slow)
+        scales = _scales(sorting, _extent(bodies))
+        return cls(tuple(rows), tuple(elements), start, masses, scales, where.sizes[0], to_bodies)
 
     def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values (k,) and Jacobian (k, n) at a time and at positions (n,)."""
-        values, jacobian, first = np.empty(len(self.rows)), np.zeros((len(self.rows), q.size)), 0
+        bodies, of_bodies = self.to_bodies(q)
+        values, jacobian, first = np.empty(len(self.rows)), np.zeros((len(self.rows), bodies.size)), 0
         for element in self.elements:
-            value, entries = _evaluated(element, q, t)
+            value, entries = _evaluated(element, bodies, t)
             values[first : first + value.size] = value
             jacobian[first : first + value.size, element.columns] = entries
             first += value.size
-        return values, jacobian
+        return values, jacobian @ of_bodies
 
     @cached_property
     def jacobian(self) -> np.ndarray:
@@ -167,8 +174,19 @@ def _extent(bodies: Bodies) -> float:
     return float(np.abs(points - points.mean(axis=0)).max() or np.abs(points).max() or 1.0)
 
 
-def _scales(body: AnyBody, extent: float) -> np.ndarray:
-    """By how much each coordinate of a body changes in a large motion, see `ConstraintRows`."""
+def _scales(sorting: Sorting, extent: float) -> np.ndarray:
+    """By how much each coordinate changes in a large motion, see `ConstraintRows`."""
+    turning = {place: freedom not in WAYS for (_, _, freedom), place in sorting.layout.freedoms.items()}
+    places = sorted(sorting.layout.own.items(), key=lambda item: (item[1].part == "f", item[1].start))
+    found = [
+        np.full(1, 1.0 if turning[place] else extent) if place in turning else _scales_of(sorting.bodies[name], extent)
+        for name, place in places
+    ]
+    return np.concatenate(found)
+
+
+def _scales_of(body: AnyBody, extent: float) -> np.ndarray:
+    """By how much each coordinate of a body changes in a large motion."""
     q = np.asarray(body.coordinates)
     if body.block:
         return np.maximum(np.abs(q), 1.0)

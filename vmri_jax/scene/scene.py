@@ -11,7 +11,8 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
-from vmri_jax.mechanics.names import Names, Place, unknown
+from vmri_jax.mechanics.names import Names, unknown
+from vmri_jax.mechanics.rows import Place
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
@@ -25,6 +26,7 @@ from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_r
 from vmri_jax.scene.rigid import RigidBody, Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import RESERVED, Actuation
+from vmri_jax.scene.trees import Branch, grow
 from vmri_jax.scene.velocities import with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -67,6 +69,7 @@ class Scene:
     effects: Any = ()
     project: bool = False
     redundant: Literal["refuse", "drop"] = "refuse"
+    coordinates: Literal["joint", "directors", "auto"] = "auto"
 
     def __repr__(self) -> str:
         effects = [effect.name for effect in self.effects]
@@ -80,6 +83,8 @@ class Scene:
         require_x64()
         if self.redundant not in ("refuse", "drop"):
             raise ValueError(f"Scene: redundant is {self.redundant!r}; it must be 'refuse' or 'drop'.")
+        if self.coordinates not in ("joint", "directors", "auto"):
+            raise ValueError(f"Scene: coordinates is {self.coordinates!r}; it must be 'joint', 'directors' or 'auto'.")
         for name, kind in (("bodies", AnyBody), ("effects", Effect)):
             items = getattr(self, name)
             if isinstance(items, kind) or not isinstance(items, Iterable):
@@ -137,16 +142,22 @@ class Scene:
         return {body.name: body for body in self.bodies}
 
     @cached_property
+    def branches(self) -> tuple[Branch, ...]:
+        """The bodies that are functions of the freedoms of joints."""
+        return grow(self.by_name, self.effects) if self.coordinates == "joint" else ()
+
+    @cached_property
     def everything(self) -> tuple[Effect, ...]:
         """The effects, after what keeps rigid bodies rigid; with the joints that they name."""
-        rigid = [body.name for body in self.bodies if body.rigid]
+        carried = {branch.child for branch in self.branches}
+        rigid = [body.name for body in self.bodies if body.rigid and body.name not in carried]
         effects = tuple(effect.bound(self.effects) for effect in self.effects)
         return (Rigidity(rigid), *effects) if rigid else effects
 
     @cached_property
     def sorting(self) -> Sorting:
         """Who is slow and who is fast, where every effect lives, and why."""
-        found = sort(self.by_name, self.everything)
+        found = sort(self.by_name, self.everything, self.branches)
         return without_redundant(found) if self.redundant == "drop" else found
 
     @property

@@ -9,20 +9,24 @@ A body is fast that a stiff potential (not one of V) or kinetic effect touches: 
 between slow and fast, see `vmri_jax.scene.rates`.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import chain
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.names import Place
-from vmri_jax.scene.body import Bodies, moving
+from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.mechanics.rows import Place
+from vmri_jax.scene.body import GROUND, Bodies, moving
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.layout import Pace, join, layout
+from vmri_jax.scene.layout import Layout, Pace, join
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
+from vmri_jax.scene.trees import Branch, Link, joint_numbers, layout, start_on_joints
 
 NAMED = 3
 """Most bodies that a reason names."""
@@ -54,29 +58,125 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class Sorting:
-    """Bodies by name, their paces, their places in q_s and q_f, and where every effect lives."""
+    """Bodies by name, their paces, their places, and where every effect lives.
+
+    Attributes:
+        links: the frames of bodies on joints, in the order of the kinematics.
+    """
 
     bodies: Bodies
     paces: dict[str, Pace]
-    places: dict[str, Place]
+    layout: Layout
     placed: tuple[Placed, ...]
+    links: tuple[Link, ...] = ()
+
+    @property
+    def branches(self) -> tuple[Branch, ...]:
+        """The bodies on joints."""
+        return tuple(dict.fromkeys(link.branch for link in self.links))
+
+    @property
+    def places(self) -> dict[str, Place]:
+        """Where the coordinates of bodies are in Q_s and Q_f, see `Layout`."""
+        return self.layout.bodies
 
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """(q_s, q_f, v_s, v_f) at the start."""
 
-        def both(what: str):
-            return join(self.bodies, self.places, "s", what), join(self.bodies, self.places, "f", what)
+        if self.layout.kinematics is None:
+            return (*self._of_bodies("coordinates"), *self._of_bodies("rates"))
+        return self._on_joints[0]
 
-        return (*both("coordinates"), *both("rates"))
+    @property
+    def positions(self) -> tuple[jax.Array, jax.Array]:
+        """(q_s, q_f) at the start."""
+        slow, fast = self._of_bodies("coordinates")
+        n_s, n_f = self.layout.sizes
+        return slow[:n_s], fast[:n_f]
+
+    @property
+    def missed(self) -> Any:
+        """The part of the velocities of bodies that their joints do not allow, in the norm of the kinetic energy; see `start`."""
+        return self._on_joints[1] if self.layout.kinematics is not None else 0.0
+
+    @cached_property
+    def _on_joints(self) -> tuple[tuple, Any]:
+        masses = self._of_bodies("masses")
+        return start_on_joints(self.layout, self.joints, self.positions, self._of_bodies("rates"), masses)
+
+    def _of_bodies(self, what: str) -> tuple[jax.Array, jax.Array]:
+        return join(self.bodies, self.layout, "s", what), join(self.bodies, self.layout, "f", what)
+
+    def to_bodies(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The coordinates of all bodies (Q_s, Q_f) one after the other, and their Jacobian, of q = (q_s, q_f)."""
+        if self.layout.kinematics is None:
+            return q, np.eye(q.size)
+        bodies, jacobian = _bodies_and_jacobian(self.layout.kinematics, q, self.joints)
+        return np.asarray(bodies), np.asarray(jacobian)
+
+    @cached_property
+    def joints(self) -> dict[str, Any]:
+        """Points and triads of the joints that carry bodies, see `Kinematics`; empty without such."""
+        return joint_numbers(self.bodies, self.links)
 
 
-def sort(bodies: Bodies, effects: Sequence[Effect]) -> Sorting:
+@partial(jax.jit, static_argnames="kinematics")
+def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
+    """Q and dQ/dq."""
+
+    def bodies(q):
+        found = jnp.concatenate(kinematics(*jnp.split(q, [kinematics.sizes[0]]), joints))
+        return found, found
+
+    jacobian, found = jax.jacfwd(bodies, has_aux=True)(q)
+    return found, jacobian
+
+
+class Owners(NamedTuple):
+    """The bodies whose coordinates an element of an effect depends on.
+
+    all: every one of them.
+    between: those that move its bodies against each other.
+    """
+
+    all: tuple[str, ...]
+    between: tuple[str, ...]
+
+
+def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[Owners]:
+    """The bodies whose coordinates each element of an effect depends on."""
+    on_joints = {branch.child: branch for branch in branches}
+    carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
+    found = []
+    for i, names in enumerate(effect.elements(bodies)):
+        child = carried.get(effect.pair_of_joint(i) or ("", 0))
+        chains = [[child]] if child else [_chain(name, on_joints) for name in dict.fromkeys(map(str, names))]
+        everything = tuple(dict.fromkeys(name for chain in chains for name in chain))
+        shared = set.intersection(*map(set, chains)) if len(chains) > 1 else set()
+        found.append(Owners(everything, tuple(name for name in everything if name not in shared) or everything))
+    return found
+
+
+def _chain(name: str, branches: Mapping[str, Branch]) -> list[str]:
+    """The bodies whose coordinates a body depends on, itself first."""
+    found = []
+    while name != GROUND:
+        if name not in branches or branches[name].joint.freedoms:
+            found.append(name)
+        if name not in branches:
+            break
+        name = branches[name].parent
+    return found
+
+
+def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = ()) -> Sorting:
     """Paces of all bodies and homes of all effects.
 
     Args:
         bodies: by name.
         effects: in the order in which their terms are added.
+        branches: bodies that are functions of the freedoms of joints, parents before children.
 
     Raises:
         ValueError: a potential that is to be fast but touches a slow body; something to be decided by numbers that are traced.
@@ -92,16 +192,21 @@ def sort(bodies: Bodies, effects: Sequence[Effect]) -> Sorting:
         max((rates.max() for rates in declared["slow"]), default=0.0),
         min((rates.min() for rates in declared["fast"]), default=np.inf),
     )
-    paces = _paces(bodies, energies, measured, limit)
+    carrying = {(branch.joint.name, branch.element) for branch in branches}
+    owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
+    paces = _paces(bodies, energies, measured, limit, owned)
     placed = []
     for effect in effects:
         homes: dict[Home, dict[int, Reason]] = {}
-        for i, element in enumerate(map(moving, effect.elements(bodies))):
-            slow = tuple(name for name in element if paces[name].value == "slow")
-            home, reason = _home(effect, i, slow, len(element), measured, limit)
+        for i, (names, _) in enumerate(owned[effect.name]):
+            if (effect.name, i) in carrying:
+                continue  # it has no equation
+            slow = tuple(name for name in names if paces[name].value == "slow")
+            home, reason = _home(effect, i, slow, len(names), measured, limit)
             homes.setdefault(home, {})[i] = reason
         placed += [Placed(effect, tuple(some), home, _together(some.values())) for home, some in homes.items()]
-    return Sorting(bodies, paces, layout(bodies, paces), tuple(placed))
+    where, ordered = layout(bodies, paces, branches)
+    return Sorting(bodies, paces, where, tuple(placed), ordered)
 
 
 def _measure(bodies, energies) -> dict[str, Rates]:
@@ -125,7 +230,7 @@ def _measure(bodies, energies) -> dict[str, Rates]:
     return measure(bodies, energies)
 
 
-def _paces(bodies, energies, measured, limit) -> dict[str, Pace]:
+def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owners]]) -> dict[str, Pace]:
     paces = {}
     for name, body in bodies.items():
         if body.pace != "auto":
@@ -135,11 +240,11 @@ def _paces(bodies, energies, measured, limit) -> dict[str, Pace]:
         else:
             paces[name] = Pace("slow", f"touched by nothing stiff, above {limit:.3g} rad/s")
     for effect in energies:
-        for i, element in enumerate(map(moving, effect.elements(bodies))):
-            if effect.kind == "potential" and any(bodies[name].pace == "slow" for name in element):
+        for i, (names, between) in enumerate(owned[effect.name]):
+            if effect.kind == "potential" and any(bodies[name].pace == "slow" for name in names):
                 continue  # it is part of V
             why = _stiff(effect, i, measured, limit)
-            for name in element if why else ():
+            for name in between if why else ():
                 if paces[name].value == "slow" and bodies[name].pace == "auto":
                     paces[name] = Pace("fast", f"touched by {effect.name}, {why}")
     return paces

@@ -15,13 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.scene.body import GROUND_COORDINATES
-from vmri_jax.scene.layout import Rows
+from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
+from vmri_jax.mechanics.rows import Rows
 
-MASS = "mass"
-"""Where the masses are in params if the kinetic energy is a function."""
 IMPLIED = "implied"
 """Where the sizes of rows that are left out are in params."""
-RESERVED = {MASS: "the masses", IMPLIED: "the sizes of rows that are left out"}
+RESERVED = {
+    MASS: "the masses",
+    IMPLIED: "the sizes of rows that are left out",
+    JOINTS: "the points and axes of joints that carry bodies",
+}
 """Names in params that no effect may have, and what stands there."""
 
 
@@ -155,6 +158,10 @@ class EffectTerm:
         forces = self.function(self._positions(q_s, q_f, own), u, own)
         return totals([role.put(force, own, *sizes) for role, force in zip(self.roles, forces, strict=True)])
 
+    def within(self, sizes: tuple[int, int]) -> bool:
+        """Whether it takes nothing but the coordinates of the scene, the first (n_s, n_f) of Q."""
+        return all(isinstance(role, OnGround) or role.rows.within(sizes) for role in self.roles)
+
     def _positions(self, q_s, q_f, params):
         return tuple(role.positions(q_s, q_f, params) for role in self.roles)
 
@@ -173,6 +180,10 @@ class SomeRows:
     def timed(self) -> bool:
         """Whether one of them depends on time."""
         return any(term.timed for term in self.terms)
+
+    def within(self, sizes: tuple[int, int]) -> bool:
+        """As of `EffectTerm`."""
+        return all(term.within(sizes) for term in self.terms)
 
     def value(self, q_s, q_f, params, t=None):
         """The values that stay, by static slices."""
@@ -197,6 +208,10 @@ class TangentDamping:
 
     name: str
     terms: tuple[EffectTerm, ...]
+
+    def within(self, sizes: tuple[int, int]) -> bool:
+        """As of `EffectTerm`."""
+        return all(term.within(sizes) for term in self.terms)
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates."""
@@ -240,23 +255,47 @@ def joined(values: Sequence):
 
 @dataclass(frozen=True)
 class _OfTerms:
-    """A function of a `System` that is made of terms; compared by class and terms."""
+    """A function of a `System` that is made of terms; compared by class, terms and kinematics.
+
+    Args:
+        terms: functions of the coordinates of bodies Q.
+        kinematics: from the coordinates of the scene q to Q; None where they are the same.
+    """
 
     terms: tuple[Any, ...]
+    kinematics: Kinematics | None = None
+
+    def bodies(self, q_s, q_f, params):
+        """(Q_s, Q_f) of q_s and q_f, one of which may be None."""
+        return (q_s, q_f) if self.kinematics is None else self.kinematics(q_s, q_f, params[JOINTS])
+
+    def motions(self, q_s, q_f, v_s, v_f, params):
+        """(Q_s, Q_f) and their rates."""
+        if self.kinematics is None:
+            return (q_s, q_f), (v_s, v_f)
+        return jax.jvp(lambda *q: self.bodies(*q, params), (q_s, q_f), (v_s, v_f))
+
+    def forces_on(self, q_s, q_f, params, forces):
+        """(F_s, F_f) of forces on the coordinates of bodies: ``(dQ/dq)^T F``."""
+        if self.kinematics is None:
+            return forces
+        return jax.vjp(lambda *q: self.bodies(*q, params), q_s, q_f)[1](forces)
 
 
 class SlowPotential(_OfTerms):
     """``V(q_s, q_f, params)``, the sum of its terms."""
 
     def __call__(self, q_s, q_f, params):
-        return total([term.value(q_s, q_f, params) for term in self.terms])
+        bodies = self.bodies(q_s, q_f, params)
+        return total([term.value(*bodies, params) for term in self.terms])
 
 
 class FastPotential(_OfTerms):
     """``W(q_f, params)``, the sum of its terms."""
 
     def __call__(self, q_f, params):
-        return total([term.value(None, q_f, params) for term in self.terms])
+        bodies = self.bodies(None, q_f, params)
+        return total([term.value(*bodies, params) for term in self.terms])
 
 
 class MicroConstraint(_OfTerms):
@@ -264,7 +303,8 @@ class MicroConstraint(_OfTerms):
 
     def __call__(self, *arguments):
         *t, q_s, q_f, params = arguments
-        return joined([term.value(q_s, q_f, params, *t) for term in self.terms])
+        bodies = self.bodies(q_s, q_f, params)
+        return joined([term.value(*bodies, params, *t) for term in self.terms])
 
 
 class MacroConstraint(_OfTerms):
@@ -272,7 +312,8 @@ class MacroConstraint(_OfTerms):
 
     def __call__(self, *arguments):
         *t, q_s, params = arguments
-        return joined([term.value(q_s, None, params, *t) for term in self.terms])
+        bodies = self.bodies(q_s, None, params)
+        return joined([term.value(*bodies, params, *t) for term in self.terms])
 
 
 class ImpliedRows(MicroConstraint):
@@ -283,19 +324,22 @@ class ImpliedRows(MicroConstraint):
 
 
 class KineticEnergy(_OfTerms):
-    """``T = sum m v^2 / 2`` and the velocity-dependent terms."""
+    """``T = sum m V^2 / 2`` of the rates V of bodies, and the velocity-dependent terms."""
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
+        bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
         mass = params[MASS]
-        constant = (jnp.sum(mass["slow"] * v_s**2) + jnp.sum(mass["fast"] * v_f**2)) / 2
-        return total([constant, *(term.kinetic(q_s, q_f, v_s, v_f, params) for term in self.terms)])
+        constant = (jnp.sum(mass["slow"] * rates[0] ** 2) + jnp.sum(mass["fast"] * rates[1] ** 2)) / 2
+        return total([constant, *(term.kinetic(*bodies, *rates, params) for term in self.terms)])
 
 
 class TotalForce(_OfTerms):
     """``F(t, q_s, q_f, v_s, v_f, params)``, the sum of its terms."""
 
     def __call__(self, t, q_s, q_f, v_s, v_f, params):
-        return totals([term.forces(t, q_s, q_f, v_s, v_f, params) for term in self.terms])
+        bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
+        forces = totals([term.forces(t, *bodies, *rates, params) for term in self.terms])
+        return self.forces_on(q_s, q_f, params, forces)
 
 
 @dataclass(frozen=True)
@@ -307,7 +351,7 @@ class Actuation(_OfTerms):
         names: of the controls of each effect.
     """
 
-    names: tuple[tuple[str, ...], ...]
+    names: tuple[tuple[str, ...], ...] = ()
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -315,10 +359,10 @@ class Actuation(_OfTerms):
         return tuple(chain(*self.names))
 
     def __call__(self, q_s, q_f, u, params):
-        ends = np.cumsum([len(names) for names in self.names])[:-1]
-        return totals(
-            [term.controlled(q_s, q_f, own, params) for term, own in zip(self.terms, jnp.split(u, ends), strict=True)]
-        )
+        ends, bodies = np.cumsum([len(names) for names in self.names])[:-1], self.bodies(q_s, q_f, params)
+        controls = zip(self.terms, jnp.split(u, ends), strict=True)
+        forces = totals([term.controlled(*bodies, own, params) for term, own in controls])
+        return self.forces_on(q_s, q_f, params, forces)
 
 
 FUNCTIONS = {

@@ -38,7 +38,9 @@ def with_rates(sorting: Sorting, effects: Sequence[Effect], system: System, want
         )
     q_s, q_f, v_s, v_f = sorting.start
     q, v, n_s = jnp.concatenate([q_s, q_f]), np.concatenate([v_s, v_f]), q_s.size
-    columns = {name: place.start + (n_s if place.part == "f" else 0) for name, place in sorting.places.items()}
+    first = {"s": 0, "f": sorting.layout.ends[0]}
+    columns = {name: place.start + first[place.part] for name, place in sorting.places.items()}
+    bodies, of_bodies = sorting.to_bodies(np.asarray(q))
 
     def constraints(t, q):
         return system.constraints(t, q[:n_s], q[n_s:])
@@ -50,8 +52,8 @@ def with_rates(sorting: Sorting, effects: Sequence[Effect], system: System, want
     rows = [np.asarray(jax.jacfwd(constraints, 1)(t, q))]
     values = [-np.asarray(jax.jacfwd(constraints)(t, q))]
     for joint, freedom, given in _rates(effects, sorting.bodies, wanted):
-        jacobian = jax.jacfwd(lambda q, joint=joint, of=freedom: _freedoms(joint, of, sorting.bodies, columns, q))(q)
-        rows.append(np.asarray(jacobian))
+        along = jax.jacfwd(lambda q, joint=joint, of=freedom: _freedoms(joint, of, sorting.bodies, columns, q))
+        rows.append(np.asarray(along(jnp.asarray(bodies))) @ of_bodies)
         values.append(given)
     c, b = np.concatenate(rows), np.concatenate(values)
     root = np.linalg.cholesky(np.asarray(jax.jacfwd(momentum)(jnp.asarray(v))))  # M = R R^T
@@ -63,7 +65,8 @@ def with_rates(sorting: Sorting, effects: Sequence[Effect], system: System, want
             f"Scene.with_rates: no velocities have these rates of {', '.join(wanted)} and keep the constraints: they are missed by "
             f"{missed:.3g}. Give fewer rates: those of a joint follow from others, or it cannot move here."
         )
-    return [body.with_rates(v[columns[name] : columns[name] + body.size]) for name, body in sorting.bodies.items()]
+    rates = of_bodies @ v
+    return [body.with_rates(rates[columns[name] : columns[name] + body.size]) for name, body in sorting.bodies.items()]
 
 
 def _rates(effects: Sequence[Effect], bodies: Bodies, wanted: Mapping[str, Any]):
@@ -94,7 +97,7 @@ def _rates(effects: Sequence[Effect], bodies: Bodies, wanted: Mapping[str, Any])
 
 
 def _freedoms(joint: Joint, of: str, bodies: Bodies, columns: Mapping[str, int], q):
-    """How far each pair of a joint has turned or moved, (n,)."""
+    """How far each pair of a joint has turned or moved, (n,), by the coordinates of all bodies."""
     params, found = joint.parameters(bodies), []
     for i, element in enumerate(joint.elements(bodies)):
         _, own = joint.one(i, bodies, params)

@@ -150,6 +150,14 @@ class ControlAlong:
         return pull(u.reshape(x.shape))[0]
 
 
+@dataclass(frozen=True)
+class ControlOnCoordinate:
+    """u on a freedom that is a coordinate; compared by value."""
+
+    def __call__(self, q, u, params):
+        return (u.reshape(q[0].shape),)
+
+
 @effect_class
 class ControlledJoint(InJoint):
     """What `Controlled` is in a joint.
@@ -163,6 +171,10 @@ class ControlledJoint(InJoint):
     @property
     def function(self) -> Callable:
         return ControlAlong(FREEDOMS[self.freedom])
+
+    @property
+    def of_coordinate(self) -> Callable:
+        return ControlOnCoordinate()
 
     def check_bodies(self, bodies):
         super().check_bodies(bodies)

@@ -134,8 +134,8 @@ class RayleighDamping(Effect):
             raise ValueError(f"{self.name}: mass and stiffness are both None; give at least one of them.")
         super().check_parameters(bodies)
 
-    def terms(self, select, bodies, places, potentials):
-        terms = () if self.mass is None else super().terms(select, bodies, places, potentials)
+    def terms(self, select, bodies, layout, potentials):
+        terms = () if self.mass is None else super().terms(select, bodies, layout, potentials)
         names = [name for name in potentials if self.of is None or name in self.refers_to]
         damped = tuple(term for name in names for term in potentials[name])
         return terms if self.stiffness is None or not damped else (*terms, TangentDamping(self.name, damped))

@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, number, of_time, positive
 from vmri_jax.scene.effect import Effect, real_tree
 from vmri_jax.scene.effects.joints import FREEDOMS, M_PRIME, Freedom, Joint, M, dot, freedom_of, slide, triads
 from vmri_jax.scene.effects.springs import elastic_energy
+from vmri_jax.scene.terms import EffectTerm, OnBodies
 
 
 @dataclass(frozen=True)
@@ -43,20 +45,41 @@ class ForceAlong:
         return jax.vjp(freedom, q)[1](jnp.broadcast_to(self.law(t, x, rate, params), x.shape))[0]
 
 
+@dataclass(frozen=True)
+class EnergyOfCoordinate:
+    """``law(x, params)`` of a freedom x that is a coordinate; compared by value."""
+
+    law: Callable
+
+    def __call__(self, q, params):
+        return self.law(q[0][..., 0], params)
+
+
+@dataclass(frozen=True)
+class ForceOnCoordinate:
+    """``f(t, x, x', params)`` on a freedom x that is a coordinate; compared by value."""
+
+    law: Callable
+
+    def __call__(self, t, q, v, params):
+        x, rate = q[0][..., 0], v[0][..., 0]
+        return (jnp.broadcast_to(self.law(t, x, rate, params), x.shape)[..., None],)
+
+
 @effect_class
 class InJoint(Effect):
     """What acts along the freedom x of a joint: the angle by which b has turned, or how far it has moved, since the start.
 
     Args:
-        joint: name of the joint in the scene: a `Revolute`, `Prismatic` or `Cylindrical`.
-        of: "turn" or "slide", of a joint that leaves both free; "auto" for the one that there is.
+        joint: name of the joint in the scene, one that leaves an angle or a way free.
+        of: "turn", "slide" or "tilt", of a joint that leaves several free; "auto" for the one that there is.
 
     Raises:
         ValueError: (of the scene) no joint of this name, or one that leaves no such freedom.
     """
 
     joint: Any
-    of: Literal["turn", "slide", "auto"] = field(default="auto", kw_only=True)
+    of: Literal["turn", "slide", "tilt", "auto"] = field(default="auto", kw_only=True)
 
     whole = True
     same_size = False
@@ -77,8 +100,26 @@ class InJoint(Effect):
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from None
 
+    @property
+    def of_coordinate(self) -> Callable:
+        """Its function where the freedom is a coordinate of the scene: that of an element between "bodies" (1,)."""
+        raise NotImplementedError
+
     def elements(self, bodies):
         return self.joint.elements(bodies)
+
+    def pair_of_joint(self, i):
+        return self.joint.name, i
+
+    def terms(self, select, bodies, layout, potentials):
+        places = {i: layout.freedoms.get((self.joint.name, i, self.freedom)) for i in select}
+        direct = [i for i in select if places[i] is not None]
+        terms = super().terms([i for i in select if places[i] is None], bodies, layout, potentials)
+        if not direct:
+            return terms
+        chosen = None if len(direct) == len(self.elements(bodies)) else tuple(direct)
+        roles = (OnBodies(Rows.of([places[i] for i in direct])),)
+        return (*terms, EffectTerm(self.name, self.of_coordinate, roles, chosen, self.split, self.timed))
 
     def parameters(self, bodies):
         return super().parameters(bodies) | self.joint.parameters(bodies)
@@ -114,6 +155,10 @@ class JointSpring(InJoint):
     def function(self):
         return EnergyOf(self.law, FREEDOMS[self.freedom])
 
+    @property
+    def of_coordinate(self):
+        return EnergyOfCoordinate(self.law)
+
 
 @effect_class
 class JointLimit(InJoint):
@@ -148,6 +193,10 @@ class JointLimit(InJoint):
     def function(self):
         return EnergyOf(self.law, FREEDOMS[self.freedom])
 
+    @property
+    def of_coordinate(self):
+        return EnergyOfCoordinate(self.law)
+
     def curvature(self, bodies):
         return None if self.freedom == "turn" else self.stiffness
 
@@ -178,6 +227,10 @@ class JointDamper(InJoint):
     @property
     def function(self):
         return ForceAlong(self.law, FREEDOMS[self.freedom])
+
+    @property
+    def of_coordinate(self):
+        return ForceOnCoordinate(self.law)
 
 
 @dataclass(frozen=True)
@@ -210,8 +263,22 @@ class JointDrive(InJoint):
     def function(self):
         return ForceAlong(OfHistory(self.history), FREEDOMS[self.freedom])
 
+    @property
+    def of_coordinate(self):
+        return ForceOnCoordinate(OfHistory(self.history))
+
     def parameters(self, bodies):
         return super().parameters(bodies) | {"history": real_tree(f"{self.name}: params", self.params)}
+
+
+@dataclass(frozen=True)
+class GivenCoordinate:
+    """``x - a(t)`` of a freedom x that is a coordinate; compared by value."""
+
+    path: Callable
+
+    def __call__(self, t, q, params):
+        return q[0][..., 0] - self.path(t, params["path"])
 
 
 @dataclass(frozen=True)
@@ -253,6 +320,10 @@ class JointMotion(InJoint):
     @property
     def function(self):
         return GivenMotion(self.path, self.freedom)
+
+    @property
+    def of_coordinate(self):
+        return GivenCoordinate(self.path)
 
     def parameters(self, bodies):
         return super().parameters(bodies) | {"path": real_tree(f"{self.name}: params", self.params)}

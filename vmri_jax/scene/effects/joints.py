@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, squeeze
 from vmri_jax.scene.effect import START, Effect
@@ -66,6 +67,9 @@ UNTURNED = (M, M_PRIME)
 """The product that vanishes where b has not turned about the axis."""
 
 
+Freedom = Literal["turn", "slide", "tilt"]
+
+
 @effect_class
 class Joint(Effect):
     """What all joints share: two bodies, one of them perhaps the ground, and the point where they are joined.
@@ -86,10 +90,10 @@ class Joint(Effect):
     whole = True
     same_size = False
     derived = ("point_a", "point_b", "frame_a", "frame_b")
-    turns: ClassVar[bool] = False
-    """Whether b can turn about the axis n."""
-    slides: ClassVar[bool] = False
-    """Whether b can slide along the axis n."""
+    moves: ClassVar[tuple[Move, ...] | None] = None
+    """What its freedoms do with the triad of a; None where the freedoms are no coordinates without a pole."""
+    freedoms: ClassVar[tuple[Freedom, ...]] = ()
+    """What it leaves free, in the order of the coordinates of its moves."""
 
     def elements(self, bodies):
         return tuple(tuple(map(str, element)) for element in super().elements(bodies))
@@ -100,8 +104,17 @@ class Joint(Effect):
     def points(self, bodies):
         return {}
 
+    def label(self, i: int, bodies: Bodies) -> str:
+        """What the i-th pair is called: the name of the joint, where it has several with that of its bodies."""
+        elements = self.elements(bodies)
+        return self.name if len(elements) == 1 else f"{self.name} {'-'.join(elements[i])}"
+
+    def pitch_of(self, i: int):
+        """How far b moves along the axis in a turn of the i-th pair, m; zero of joints that are no screws."""
+        return jnp.zeros(())
+
     def frame(self, count: int) -> list | None:
-        """(n, 3, 3) the triads (m, m', n) in space at the start, None where the joint needs no direction."""
+        """(n, 3, 3) the triads (m, m', n) in space where its freedoms are zero, None where the joint needs no direction."""
         return None
 
     def check_bodies(self, bodies):
@@ -116,7 +129,7 @@ class Joint(Effect):
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
-        for a, b, points in zip(*zip(*self._given(bodies), strict=True), self._points(bodies), strict=True):
+        for a, b, points in zip(*zip(*self._given(bodies), strict=True), self.joining_points(bodies), strict=True):
             if not is_concrete(points):
                 continue
             away = jnp.linalg.norm(points[1] - points[0])
@@ -153,7 +166,7 @@ class Joint(Effect):
     def _given(self, bodies):
         return super().elements(bodies)
 
-    def _points(self, bodies):
+    def joining_points(self, bodies):
         """The points of the joint in space, one in each body, pair by pair."""
         given = self._given(bodies)
         if self.at is not None:
@@ -182,7 +195,7 @@ class Joint(Effect):
 
     def _frames(self, bodies) -> dict[str, list]:
         """Points and triads of every pair, as weights of the directors of each body."""
-        elements, points = self.elements(bodies), self._points(bodies)
+        elements, points = self.elements(bodies), self.joining_points(bodies)
         frames = self.frame(len(elements))
         found: dict[str, list] = {}
         for i, element in enumerate(elements):
@@ -248,7 +261,8 @@ class Revolute(_AboutAxis):
     """
 
     default_name = "revolute"
-    turns = True
+    moves = (Move("turn", N),)
+    freedoms = ("turn",)
 
     @staticmethod
     def function(q, params):
@@ -270,6 +284,8 @@ class Universal(_AboutAxis):
     second: Any = (1.0, 0.0, 0.0)
 
     default_name = "universal"
+    moves = (Move("turn", N), Move("turn", M))
+    freedoms = ("turn", "tilt")
 
     @staticmethod
     def function(q, params):
@@ -291,6 +307,7 @@ class Fixed(_AboutAxis):
     """
 
     default_name = "fixed"
+    moves = ()
 
     @staticmethod
     def function(q, params):
@@ -312,7 +329,8 @@ class Cylindrical(_AboutAxis):
     """
 
     default_name = "cylindrical"
-    turns = slides = True
+    moves = (Move("slide", N), Move("turn", N))
+    freedoms = ("slide", "turn")
 
     @staticmethod
     def function(q, params):
@@ -328,7 +346,8 @@ class Prismatic(_AboutAxis):
     """
 
     default_name = "prismatic"
-    slides = True
+    moves = (Move("slide", N),)
+    freedoms = ("slide",)
 
     @staticmethod
     def function(q, params):
@@ -347,9 +366,15 @@ def slide(q, params):
     return dot(triads(q, params)[0][..., N, :], gap(q, params))
 
 
-Freedom = Literal["turn", "slide"]
-FREEDOMS = {"turn": turn, "slide": slide}
-"""What a joint can leave free."""
+def tilt(q, params):
+    """The angle by which b has turned about its own axis e since the start, rad, between -pi and pi, (...)."""
+    of_a, of_b = triads(q, params)
+    n = of_a[..., N, :]
+    return jnp.arctan2(dot(of_b[..., M_PRIME, :], n), dot(of_b[..., N, :], n))
+
+
+FREEDOMS = {"turn": turn, "slide": slide, "tilt": tilt}
+"""What a joint can leave free, as functions of the coordinates of its two bodies."""
 
 
 def freedom_of(joint: Joint, of: str) -> Freedom:
@@ -358,12 +383,10 @@ def freedom_of(joint: Joint, of: str) -> Freedom:
     Raises:
         ValueError: it leaves another one, several, or none.
     """
-    if joint.turns and (of == "turn" or (of == "auto" and not joint.slides)):
-        return "turn"
-    if joint.slides and (of == "slide" or (of == "auto" and not joint.turns)):
-        return "slide"
-    free = [name for name, has in (("turn", joint.turns), ("slide", joint.slides)) if has]
-    left = " and ".join(free) or "neither an angle nor a way along an axis"
+    fitting = [freedom for freedom in joint.freedoms if of in (freedom, "auto")]
+    if len(fitting) == 1:
+        return fitting[0]
+    left = " and ".join(joint.freedoms) or "neither an angle nor a way along an axis"
     raise ValueError(f"of is {of!r}; {joint.name} leaves {left} free.")
 
 

@@ -1,0 +1,234 @@
+"""Bodies of a tree as functions of few coordinates: what is left of bodies that joints tie.
+
+A body b hangs on a body a, or on the ground, by a joint with one coordinate x, or with none. The joint lies at the points X_a and X_b of
+the bodies, and has a triad in each, the rows of F_a and F_b; all are components along the directors, the rows of D. With x = 0 points and
+triads coincide, and x turns b about the axis k of the triad or moves it along. With the centres phi,
+
+    D_b = M D_a,   phi_b = phi_a + r D_a,
+    M = F_b^T T(x) F_a = N + P cos x + S sin x,   r = X_a - X_b M + (way along k) F_a[k]
+
+So the four rows (r, M) are ``C + P cos x + S sin x + E x``, with constants that are computed once. Along a chain they are multiplied; a tree
+of depth d takes log2(d) rounds, in each of which every body takes over what its parent has (pointer jumping).
+
+Joints of several coordinates are chains of such with frames between them. Bodies on no joint, the roots, have their centre and directors
+among the coordinates themselves.
+
+Source: R. Featherstone, Rigid Body Dynamics Algorithms, Springer (2008), chapter 4.
+"""
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.rows import Part, Place, Rows, Run
+
+GROUND = -1
+"""The number of the body that does not move."""
+JOINTS = "kinematics"
+"""Where the numbers of joints are in the params of a system."""
+MASS = "mass"
+"""Where the masses of the coordinates of bodies are in them, "slow" and "fast"."""
+Grid = Literal["s", "f", "sf"]
+"""The coordinates that a body depends on: slow ones, fast ones, both."""
+GRIDS: tuple[Grid, ...] = ("s", "f", "sf")
+"""In the order in which bodies are computed."""
+
+
+class Move(NamedTuple):
+    """What one coordinate of a joint does with a triad.
+
+    kind: "turn" about a vector of the triad, "slide" along it, or "screw": both.
+    axis: number of the vector.
+    """
+
+    kind: Literal["turn", "slide", "screw"]
+    axis: int
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Bodies that depend on coordinates of one kind, and frames between them; compared by value.
+
+    Args:
+        grid: the coordinates.
+        parents: numbers of the frames that they hang on, among these; -1 of those that hang on `roots`.
+        roots: for each frame the body where its chain ends, `GROUND` or a number among the roots of the kinematics and then the bodies
+            of `Frames` before these.
+        coordinates: of the first frames, one each; None where no frame moves.
+        slides: whether a coordinate moves along its axis.
+        bodies: numbers of the frames that are bodies.
+        directors: which directors each body has.
+    """
+
+    grid: Grid
+    parents: tuple[int, ...]
+    roots: tuple[int, ...]
+    coordinates: Rows | None
+    slides: bool
+    bodies: tuple[int, ...]
+    directors: tuple[tuple[int, ...], ...]
+
+    @property
+    def sizes(self) -> list[int]:
+        """Coordinates of each body as a rigid body."""
+        return [3 + 3 * len(kept) for kept in self.directors]
+
+    def relative(self, q_s, q_f, joints: dict[str, Any]):
+        """(n, 4, 3) the rows (r, M) of every frame in those it hangs on.
+
+        Args:
+            q_s, q_f: coordinates.
+            joints: the constants C, P, S, E of these frames.
+        """
+        rows = joints["constant"]
+        if self.coordinates is None:
+            return rows
+        x = self.coordinates.take(q_s, q_f).reshape(-1)
+        x = jnp.pad(x, (0, len(self.parents) - x.shape[0]))[:, None, None]
+        rows = rows + jnp.cos(x) * joints["cosine"] + jnp.sin(x) * joints["sine"]
+        return rows + x * joints["way"] if self.slides else rows
+
+    def to_roots(self, rows):
+        """(n, 4, 3) the rows of every frame in the body where its chain ends.
+
+        Args:
+            rows: those in the frames that they hang on.
+        """
+        parents = np.array(self.parents)
+        while np.any(parents >= 0):
+            rows = after(rows, taken(rows, parents))
+            parents = np.where(parents >= 0, parents[parents], -1)
+        return rows
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """The map from coordinates q to those of points and rigid bodies Q; compared by value.
+
+    Q_s is q_s with the centres and directors of the bodies after it that depend on slow coordinates alone; Q_f is q_f with those of bodies
+    that depend on fast ones alone, and then with all others.
+
+    Args:
+        roots: where the coordinates of bodies that carry others are in q_s and q_f.
+        frames: one entry at most for each of `GRIDS`, in this order.
+        sizes: (n_s, n_f), numbers of coordinates.
+    """
+
+    roots: tuple[Place, ...]
+    frames: tuple[Frames, ...]
+    sizes: tuple[int, int]
+
+    def __call__(self, q_s, q_f, joints: dict[str, Any]):
+        """(Q_s, Q_f).
+
+        Args:
+            q_s, q_f: coordinates; None for one of them gives None for its Q, and the other Q without what depends on both.
+            joints: the constants C, P, S, E (n, 4, 3) of all frames, "constant", "cosine", "sine", "way".
+        """
+        known, first = self._roots(q_s, q_f), 0
+        found = {"s": [q_s], "f": [q_f]}
+        for frames in self.frames:
+            last = first + len(frames.parents)
+            if all(found[part][0] is not None for part in frames.grid):
+                own = {name: values[first:last] for name, values in joints.items()}
+                rows = frames.to_roots(frames.relative(q_s, q_f, own))
+                if any(root != GROUND for root in frames.roots):
+                    rows = after(rows, jnp.stack([known[root] for root in frames.roots]))
+                known |= {len(known) - 1 + i: rows[k] for i, k in enumerate(frames.bodies)}
+                found["s" if frames.grid == "s" else "f"].append(_coordinates(rows, frames))
+            else:
+                known |= {len(known) - 1 + i: None for i in range(len(frames.bodies))}
+            first = last
+        return tuple(None if pieces[0] is None else jnp.concatenate(pieces) for pieces in found.values())
+
+    def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
+        """Rates of (Q_s, Q_f)."""
+        return jax.jvp(lambda q_s, q_f: self(q_s, q_f, joints), (q_s, q_f), (v_s, v_f))[1]
+
+    def momenta(self, q_s, q_f, v_s, v_f, params: dict[str, Any]):
+        """Momenta of the bodies, their masses times their velocities."""
+        rates = self.velocities(q_s, q_f, v_s, v_f, params[JOINTS])
+        return tuple(params[MASS][part] * rate for part, rate in zip(("slow", "fast"), rates, strict=True))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Kinematics":
+        """The inverse of `to_dict`, also of what JSON makes of it.
+
+        Args:
+            data: from `to_dict`.
+        """
+        frames = []
+        for some in data["frames"]:
+            rows = some["coordinates"]
+            runs = None if rows is None else tuple(Run(*run) for run in rows["runs"])
+            found = {name: tuple(some[name]) for name in ("parents", "roots", "bodies")}
+            found["coordinates"] = None if rows is None else Rows(**(rows | {"runs": runs}))
+            found["directors"] = tuple(map(tuple, some["directors"]))
+            frames.append(Frames(**(some | found)))
+        return cls(tuple(Place(*root) for root in data["roots"]), tuple(frames), tuple(data["sizes"]))
+
+    @cached_property
+    def places(self) -> tuple[Place, ...]:
+        """Where the bodies of the frames are in Q_s and Q_f, in their order."""
+        ends, found = {"s": self.sizes[0], "f": self.sizes[1]}, []
+        for frames in self.frames:
+            part: Part = "s" if frames.grid == "s" else "f"
+            for size in frames.sizes:
+                found.append(Place(part, ends[part], size))
+                ends[part] += size
+        return tuple(found)
+
+    def _roots(self, q_s, q_f) -> dict[int, Any]:
+        """(4, 3) centre and directors of the ground and of the roots, None of those whose coordinates are not given."""
+        found: dict[int, Any] = {GROUND: jnp.asarray(UNMOVED)}
+        for number, (part, start, size) in enumerate(self.roots):
+            q = q_s if part == "s" else q_f
+            rows = None if q is None else q[start : start + size].reshape(-1, 3)
+            found[number] = None if rows is None else jnp.pad(rows, ((0, 4 - len(rows)), (0, 0)))
+        return found
+
+
+UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+"""(4, 3) centre and directors of what has not moved."""
+
+
+def after(rows, others):
+    """The rows (r, M) of frames in bodies whose own rows are (s, D): ``(s + r D, M D)``.
+
+    Args:
+        rows, others: (n, 4, 3).
+    """
+    turned = jnp.sum(rows[:, :, :, None] * others[:, None, 1:, :], axis=2)
+    return turned + jnp.pad(others[:, :1], ((0, 0), (0, 3), (0, 0)))
+
+
+def taken(rows, numbers: np.ndarray):
+    """(k, 4, 3) some of the rows (n, 4, 3), by slices; `UNMOVED` for -1.
+
+    Args:
+        numbers: (k,) of the rows.
+    """
+    pieces, first = [], 0
+    for last in range(1, len(numbers) + 1):
+        step = 0 if numbers[first] < 0 else 1
+        if last == len(numbers) or numbers[last] != numbers[last - 1] + step:
+            low, count = int(numbers[first]), last - first
+            pieces.append(jnp.broadcast_to(UNMOVED, (count, 4, 3)) if low < 0 else rows[low : low + count])
+            first = last
+    return jnp.concatenate(pieces)
+
+
+def _coordinates(rows, frames: Frames):
+    """Coordinates of the bodies among frames, one after the other."""
+    if any(len(kept) < 3 for kept in frames.directors):
+        pieces = [rows[i, [0, *(k + 1 for k in kept)]] for i, kept in zip(frames.bodies, frames.directors, strict=True)]
+        return jnp.concatenate(pieces).reshape(-1)
+    return (rows if frames.bodies == tuple(range(len(rows))) else taken(rows, np.array(frames.bodies))).reshape(-1)

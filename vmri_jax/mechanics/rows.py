@@ -1,0 +1,106 @@
+"""Coordinates of some bodies in q_s and q_f, taken out and put back without a gather."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+
+Part = Literal["s", "f"]
+
+
+class Place(NamedTuple):
+    """Coordinates ``q_part[start : start + size]`` of a body."""
+
+    part: Part
+    start: int
+    size: int
+
+
+class Run(NamedTuple):
+    """`count` bodies that follow one another in q_part, or (`same`) one body `count` times."""
+
+    part: Part
+    start: int
+    count: int
+    same: bool
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Coordinates of some bodies of one size, as static slices; compared by value, as `jax.jit` needs it.
+
+    Of every body with `stride` coordinates the first `size` are taken.
+    """
+
+    size: int
+    stride: int
+    runs: tuple[Run, ...]
+    single: bool
+
+    @classmethod
+    def of(cls, places: Sequence[Place], size: int | None = None) -> "Rows":
+        """The rows at these places.
+
+        Args:
+            places: a single one gives a vector (size,), more give (n, size).
+            size: so many coordinates of each; None for all.
+        """
+        stride, runs = places[0].size, []
+        for part, start, _ in places:
+            last = runs[-1] if runs else Run(part, start, 0, False)
+            follows = not last.same and start == last.start + stride * last.count
+            again = last.start == start and (last.same or last.count == 1)
+            if last.part == part and last.count and (follows or again):
+                runs[-1] = last._replace(count=last.count + 1, same=again)
+            else:
+                runs.append(Run(part, start, 1, False))
+        return cls(size or stride, stride, tuple(runs), len(places) == 1)
+
+    def within(self, sizes: tuple[int, int]) -> bool:
+        """Whether they are among the first (n_s, n_f) coordinates."""
+        most = {"s": sizes[0], "f": sizes[1]}
+        ends = [(run.part, run.start + self.stride * (1 if run.same else run.count)) for run in self.runs]
+        return all(end <= most[part] for part, end in ends)
+
+    def take(self, q_s, q_f):
+        """The rows of these vectors, positions or velocities."""
+        pieces = []
+        for part, start, count, same in self.runs:
+            q = q_s if part == "s" else q_f
+            if same or count == 1:
+                piece = q[start : start + self.size]
+                pieces.append(jnp.tile(piece, count) if same else piece)
+            else:
+                piece = q[start : start + self.stride * count]
+                pieces.append(self._first(piece, count))
+        flat = jnp.concatenate(pieces)
+        return flat if self.single else flat.reshape(-1, self.size)
+
+    def put(self, rows, n_s: int, n_f: int):
+        """The transpose of `take`.
+
+        Args:
+            rows: one for each place, or one for all.
+            n_s, n_f: lengths of q_s and q_f.
+
+        Returns:
+            Vectors (n_s,), (n_f,) with the rows added at their places.
+        """
+        rows, at = jnp.broadcast_to(rows, (sum(run.count for run in self.runs), self.size)), 0
+        sums = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}
+        for part, start, count, same in self.runs:
+            piece = rows[at : at + count]
+            piece = jnp.sum(piece, axis=0) if same else self._whole(piece).reshape(-1)
+            after = sums[part].shape[0] - start - piece.shape[0]
+            sums[part] += jnp.pad(piece, (start, after))
+            at += count
+        return tuple(sums.values())
+
+    def _first(self, piece, count: int):
+        """The first coordinates of bodies that follow one another, flat."""
+        return piece if self.size == self.stride else piece.reshape(count, self.stride)[:, : self.size].reshape(-1)
+
+    def _whole(self, rows):
+        """(n, stride) with zeros for the coordinates that are not taken."""
+        return rows if self.size == self.stride else jnp.pad(rows, ((0, 0), (0, self.stride - self.size)))

@@ -1,0 +1,304 @@
+"""Trees of bodies on joints: which joints carry a body as a function of their freedoms, and which close loops.
+
+Every joint whose freedoms are coordinates without a pole may carry a body. Of those that form a loop one is cut: its rows stay as
+constraints. A spanning tree that grows from the ground, or from the heaviest body of what floats, takes the joint with the most rows first
+(Prim's algorithm), so that the fewest rows are left, and the one nearest to the root among equals, so that trees are not deep.
+"""
+
+from collections.abc import Mapping, Sequence
+from heapq import heappop, heappush
+from itertools import count
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.kinematics import GRIDS, Frames, Grid, Kinematics, Move
+from vmri_jax.mechanics.rows import Part, Place, Rows
+from vmri_jax.scene.body import GROUND, Bodies, body_of
+from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.joints import Joint
+from vmri_jax.scene.layout import Layout, Pace
+
+
+class Branch(NamedTuple):
+    """A body that hangs on another one, or on the ground, by a pair of a joint.
+
+    element: number of the pair.
+    forward: whether the body is the second one of the pair.
+    """
+
+    child: str
+    parent: str
+    joint: Joint
+    element: int
+    forward: bool
+
+    @property
+    def keys(self) -> list[tuple[str, int, str]]:
+        """Its freedoms as keys of `Layout.freedoms`."""
+        return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
+
+    def labels(self, bodies: Bodies) -> list[str]:
+        """What its coordinates are called."""
+        name = self.joint.label(self.element, bodies)
+        freedoms = self.joint.freedoms
+        return [name] if len(freedoms) == 1 else [f"{name} {freedom}" for freedom in freedoms]
+
+
+class Link(NamedTuple):
+    """A frame of a tree that hangs on another one: the body of a branch, or a frame between two moves of its joint.
+
+    step: number of its move, from the parent of the branch on.
+    """
+
+    branch: Branch
+    step: int
+
+    @property
+    def is_first(self) -> bool:
+        """Whether it hangs on a body."""
+        return self.step == 0
+
+    @property
+    def is_last(self) -> bool:
+        """Whether it is a body."""
+        return self.step + 1 >= len(self.branch.joint.moves)
+
+    @property
+    def coordinate(self) -> int | None:
+        """Number of its move among those of the joint; None of one that leaves nothing free."""
+        count = len(self.branch.joint.moves)
+        return None if not count else self.step if self.branch.forward else count - 1 - self.step
+
+    @property
+    def move(self) -> Move | None:
+        """What its coordinate does."""
+        return None if self.coordinate is None else self.branch.joint.moves[self.coordinate]
+
+    @property
+    def key(self) -> tuple[str, int, str] | None:
+        """Its freedom as a key of `Layout.freedoms`."""
+        return None if self.coordinate is None else self.branch.keys[self.coordinate]
+
+    def amount(self, kind: Literal["turn", "slide"]) -> float:
+        """1 or -1, forwards or backwards, where its coordinate turns or slides like this, else 0."""
+        does = self.move is not None and self.move.kind in (kind, "screw" if kind == "turn" else kind)
+        return (1.0 if self.branch.forward else -1.0) * does
+
+    @property
+    def pitch(self):
+        """How far it moves along the axis in a turn, m; zero unless it is a screw."""
+        return self.branch.joint.pitch_of(self.branch.element)
+
+
+def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:
+    """The branches of all trees, parents before children.
+
+    Args:
+        bodies: by name.
+        effects: joints among them.
+    """
+    edges: dict[str, list[tuple]] = {}
+    for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.moves is not None):
+        for i, (a, b) in enumerate(joint.elements(bodies)):
+            if body_of(bodies, a).rigid and body_of(bodies, b).rigid:
+                edges.setdefault(a, []).append((b, joint, i, True))
+                edges.setdefault(b, []).append((a, joint, i, False))
+    found, reached, order = [], set(), count()
+    for root in (GROUND, *sorted(edges, key=lambda name: _as_root(name, bodies))):
+        if root not in edges or root in reached:
+            continue
+        reached.add(root)
+        waiting: list[tuple] = []
+
+        def offer(parent: str, depth: int, waiting=waiting):
+            for child, joint, i, forward in edges[parent]:
+                if child not in reached:
+                    heappush(waiting, (len(joint.moves), depth, next(order), Branch(child, parent, joint, i, forward)))
+
+        offer(root, 1)
+        while waiting:
+            _, depth, _, branch = heappop(waiting)
+            if branch.child not in reached:
+                reached.add(branch.child)
+                found.append(branch)
+                offer(branch.child, depth + 1)
+    return tuple(found)
+
+
+def _as_root(name: str, bodies: Bodies) -> tuple:
+    """The smaller, the better a body is a root: one that is said to be slow, that has all directors, that is heavy."""
+    if name == GROUND:
+        return (False,)
+    body = bodies[name]
+    mass: Any = getattr(body, "mass", 0.0)
+    return True, body.pace != "slow", -len(body.wide), -float(mass) if is_concrete(mass) else 0.0
+
+
+def layout(
+    bodies: Bodies, paces: Mapping[str, Pace], branches: Sequence[Branch] = ()
+) -> tuple[Layout, tuple[Link, ...]]:
+    """The places of all bodies: slow ones in order in q_s, fast ones in order in q_f; of bodies on joints the freedoms of these.
+
+    Args:
+        bodies, paces: by name.
+        branches: bodies on joints, parents before children.
+
+    Returns:
+        The layout, and the links of the frames of its kinematics, in their order.
+    """
+    ends: dict[Part, int] = {"s": 0, "f": 0}
+    on_joints = {branch.child: branch for branch in branches}
+    own, places, freedoms = {}, {}, {}
+    for name, body in bodies.items():
+        part: Part = "f" if paces[name].value == "fast" else "s"
+        branch = on_joints.get(name)
+        if branch is None:
+            own[name] = places[name] = Place(part, ends[part], body.size)
+            ends[part] += body.size
+            continue
+        for freedom, label in zip(branch.joint.freedoms, branch.labels(bodies), strict=True):
+            own[label] = freedoms[branch.joint.name, branch.element, freedom] = Place(part, ends[part], 1)
+            ends[part] += 1
+    if not branches:
+        return Layout(places, own), ()
+    return _with_kinematics(bodies, branches, places, own, freedoms, (ends["s"], ends["f"]))
+
+
+def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, own, freedoms, sizes):
+    """The layout with the bodies on joints, and the links of their frames."""
+    grids: dict[str, Grid] = {GROUND: "s"} | {name: place.part for name, place in places.items()}
+    depths: dict[str, int] = {}
+    for branch in branches:
+        parts = {freedoms[key].part for key in branch.keys}
+        parts |= set() if branch.parent == GROUND else {*grids[branch.parent]}
+        grids[branch.child] = "sf" if len(parts) > 1 else parts.pop() if parts else "s"
+        depths[branch.child] = depths.get(branch.parent, 0) + 1
+    roots = list(dict.fromkeys(branch.parent for branch in branches if branch.parent in places))
+    numbers = {GROUND: -1} | {name: i for i, name in enumerate(roots)}
+    frames, links, carried = [], [], []
+    for grid in GRIDS:
+        some = sorted((b for b in branches if grids[b.child] == grid), key=lambda b: depths[b.child])
+        if some:
+            made, ordered = _frames(grid, some, bodies, freedoms, numbers)
+            numbers |= {branch.child: len(roots) + len(carried) + i for i, branch in enumerate(some)}
+            frames.append(made)
+            links += ordered
+            carried += [branch.child for branch in some]
+    kinematics = Kinematics(tuple(places[name] for name in roots), tuple(frames), sizes)
+    where = dict(zip(carried, kinematics.places, strict=True))
+    everywhere = {name: places.get(name) or where[name] for name in bodies}
+    return Layout(everywhere, own, freedoms, kinematics), tuple(links)
+
+
+def _frames(grid: Grid, branches: Sequence[Branch], bodies: Bodies, freedoms, numbers: Mapping[str, int]):
+    """The frames of bodies that depend on the same coordinates, and their links in the same order: first those that move.
+
+    Args:
+        branches: parents before children.
+        numbers: of the bodies that they may hang on.
+    """
+    links = [Link(branch, step) for branch in branches for step in range(max(1, len(branch.joint.moves)))]
+    links.sort(key=lambda link: link.move is None)
+    at = {(link.branch.child, link.step): i for i, link in enumerate(links)}
+    ends = {branch.child: at[branch.child, max(0, len(branch.joint.moves) - 1)] for branch in branches}
+    parents, roots = [], {}
+    for link in links:
+        inner = at.get((link.branch.child, link.step - 1), -1)
+        parents.append(inner if link.step else ends.get(link.branch.parent, -1))
+    for branch in branches:
+        roots[branch.child] = roots.get(branch.parent, numbers.get(branch.parent))
+    moving = [freedoms[link.key] for link in links if link.key is not None]
+    frames = Frames(
+        grid,
+        tuple(parents),
+        tuple(roots[link.branch.child] for link in links),
+        Rows.of(moving) if moving else None,
+        any(link.move is not None and link.move.kind != "turn" for link in links),
+        tuple(ends.values()),
+        tuple(bodies[branch.child].wide for branch in branches),
+    )
+    return frames, links
+
+
+def joint_numbers(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
+    """The constants C, P, S, E (n, 4, 3) of all links, see `vmri_jax.mechanics.kinematics`.
+
+    Args:
+        bodies: by name.
+        links: of a layout.
+    """
+    ends = _ends(bodies, links)
+    axes = [link.move.axis if link.move else 2 for link in links]
+    cyclic = np.array([[(k + 1) % 3, (k + 2) % 3, k] for k in axes])
+    inner, outer = (ends[name][np.arange(len(links))[:, None], cyclic] for name in ("frame_a", "frame_b"))
+
+    def dyads(i: int, j: int):
+        return outer[:, i, :, None] * inner[:, j, None, :]
+
+    def rows(matrix, point):
+        """(r, M) with ``r = X - X_b M``."""
+        turned = jnp.sum(ends["point_b"][:, :, None] * matrix, axis=1)
+        return jnp.concatenate([(point - turned)[:, None], matrix], axis=1)
+
+    turns, ways = (np.array([link.amount(kind) for link in links])[:, None, None] for kind in ("turn", "slide"))
+    screws = jnp.stack([link.pitch / (2 * jnp.pi) for link in links])[:, None]
+    across, along = dyads(0, 0) + dyads(1, 1), dyads(2, 2)
+    way = (ways[:, 0] + turns[:, 0] * screws) * inner[:, 2]
+    zero = jnp.zeros_like(ends["point_a"])
+    return {
+        "constant": rows(along + (1 - np.abs(turns)) * across, ends["point_a"]),
+        "cosine": rows(np.abs(turns) * across, zero),
+        "sine": rows(turns * (dyads(0, 1) - dyads(1, 0)), zero),
+        "way": jnp.pad(way[:, None], ((0, 0), (0, 3), (0, 0))),
+    }
+
+
+def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
+    """Points and triads of all links in what they hang on and in their own frames, "point_a", "frame_a", "point_b", "frame_b"."""
+    carried = {link.branch.child for link in links}
+    joints = {link.branch.joint.name: link.branch.joint for link in links}
+    points = {name: joint.joining_points(bodies) for name, joint in joints.items()}
+    triads = {name: joint.frame(len(points[name])) for name, joint in joints.items()}
+    found: dict[str, list] = {}
+    for link in links:
+        branch = link.branch
+        point, triad = (some[branch.joint.name][branch.element] for some in (points, triads))
+        first, last = (0, 1) if branch.forward else (1, 0)
+        for role, name, which, here in (("a", branch.parent, first, link.is_first), ("b", branch.child, last, link.is_last)):
+            body = body_of(bodies, name)
+            along = body.components if name in carried else body.weights
+            at = along((point[which] - body.position) @ body.rotation) if here else jnp.zeros(3)
+            axes = jnp.stack([along(row @ body.rotation) for row in triad]) if here else jnp.eye(3)
+            found.setdefault(f"point_{role}", []).append(at)
+            found.setdefault(f"frame_{role}", []).append(axes)
+    return {name: jnp.stack(values) for name, values in found.items()}
+
+
+def start_on_joints(layout: Layout, joints: dict[str, Any], positions, rates, masses) -> tuple[tuple, Any]:
+    """The start of the scene with the velocities nearest to those of the bodies.
+
+    With ``J = dQ/dq`` and the masses M of bodies, ``J^T M J v = J^T M V``.
+
+    Args:
+        layout, joints: of the scene.
+        positions: (q_s, q_f).
+        rates, masses: those of (Q_s, Q_f).
+
+    Returns:
+        ``(q_s, q_f, v_s, v_f)``, and the part of the velocities that the joints do not allow, in the norm of the kinetic energy.
+    """
+    n_s = layout.sizes[0]
+
+    def bodies(q):
+        return jnp.concatenate(layout.kinematics(q[:n_s], q[n_s:], joints))
+
+    jacobian, given, mass = jax.jacfwd(bodies)(jnp.concatenate(positions)), jnp.concatenate(rates), jnp.concatenate(masses)
+    v = jnp.linalg.solve(jacobian.T @ (mass[:, None] * jacobian), jacobian.T @ (mass * given))
+    missed = given - jacobian @ v
+    whole = jnp.sum(mass * given**2)
+    part = jnp.sqrt(jnp.sum(mass * missed**2) / jnp.where(whole > 0, whole, 1.0))
+    return (*positions, v[:n_s], v[n_s:]), part
