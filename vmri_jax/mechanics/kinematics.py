@@ -7,8 +7,8 @@ triads coincide, and x turns b about the axis k of the triad or moves it along. 
     D_b = M D_a,   phi_b = phi_a + r D_a,
     M = F_b^T T(x) F_a = N + P cos x + S sin x,   r = X_a - X_b M + (way along k) F_a[k]
 
-So the four rows (r, M) are ``C + P cos x + S sin x + E x``, with constants that are computed once. Along a chain they are multiplied; a tree
-of depth d takes log2(d) rounds, in each of which every body takes over what its parent has (pointer jumping).
+So the four rows (r, M) are ``C + P cos x + S sin x + E x``, with constants that are computed once. They are multiplied from the roots
+outwards, for all bodies of one depth together.
 
 Joints of several coordinates are chains of such with frames between them. Bodies on no joint, the roots, have their centre and directors
 among the coordinates themselves.
@@ -16,6 +16,7 @@ among the coordinates themselves.
 Source: R. Featherstone, Rigid Body Dynamics Algorithms, Springer (2008), chapter 4.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -24,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.kernels import matmul
 from vmri_jax.mechanics.rows import Part, Place, Rows, Run
 
 GROUND = -1
@@ -55,19 +57,21 @@ class Frames:
 
     Args:
         grid: the coordinates.
-        parents: numbers of the frames that they hang on, among these; -1 of those that hang on `roots`.
-        roots: for each frame the body where its chain ends, `GROUND` or a number among the roots of the kinematics and then the bodies
-            of `Frames` before these.
-        coordinates: of the first frames, one each; None where no frame moves.
+        roots: what the frames of the first level hang on: `GROUND` or a number among the roots of the kinematics and then the bodies of
+            `Frames` before these.
+        parents: for each further level, what its frames hang on: numbers among those of the level before.
+        coordinates: of the frames that move; None where none does.
+        moving: for each frame the number of its coordinate, -1 where it has none.
         slides: whether a coordinate moves along its axis.
         bodies: numbers of the frames that are bodies.
         directors: which directors each body has.
     """
 
     grid: Grid
-    parents: tuple[int, ...]
     roots: tuple[int, ...]
+    parents: tuple[tuple[int, ...], ...]
     coordinates: Rows | None
+    moving: tuple[int, ...]
     slides: bool
     bodies: tuple[int, ...]
     directors: tuple[tuple[int, ...], ...]
@@ -87,22 +91,23 @@ class Frames:
         rows = joints["constant"]
         if self.coordinates is None:
             return rows
-        x = self.coordinates.take(q_s, q_f).reshape(-1)
-        x = jnp.pad(x, (0, len(self.parents) - x.shape[0]))[:, None, None]
+        x = taken(self.coordinates.take(q_s, q_f).reshape(-1), self.moving, np.zeros(()))[:, None, None]
         rows = rows + jnp.cos(x) * joints["cosine"] + jnp.sin(x) * joints["sine"]
         return rows + x * joints["way"] if self.slides else rows
 
-    def to_roots(self, rows):
-        """(n, 4, 3) the rows of every frame in the body where its chain ends.
+    def in_space(self, rows, roots):
+        """(n, 4, 3) origins and directors of all frames.
 
         Args:
-            rows: those in the frames that they hang on.
+            rows: (n, 4, 3) those of every frame in those it hangs on.
+            roots: (m, 4, 3) those of what the first level hangs on; None for the ground.
         """
-        parents = np.array(self.parents)
-        while np.any(parents >= 0):
-            rows = after(rows, taken(rows, parents))
-            parents = np.where(parents >= 0, parents[parents], -1)
-        return rows
+        last = len(self.roots)
+        levels = [rows[:last] if roots is None else after(rows[:last], roots)]
+        for parents in self.parents:
+            first, last = last, last + len(parents)
+            levels.append(after(rows[first:last], taken(levels[-1], parents)))
+        return jnp.concatenate(levels)
 
 
 @dataclass(frozen=True)
@@ -132,12 +137,12 @@ class Kinematics:
         known, first = self._roots(q_s, q_f), 0
         found = {"s": [q_s], "f": [q_f]}
         for frames in self.frames:
-            last = first + len(frames.parents)
+            last = first + len(frames.moving)
             if all(found[part][0] is not None for part in frames.grid):
                 own = {name: values[first:last] for name, values in joints.items()}
-                rows = frames.to_roots(frames.relative(q_s, q_f, own))
-                if any(root != GROUND for root in frames.roots):
-                    rows = after(rows, jnp.stack([known[root] for root in frames.roots]))
+                on_ground = all(root == GROUND for root in frames.roots)
+                roots = None if on_ground else jnp.stack([known[root] for root in frames.roots])
+                rows = frames.in_space(frames.relative(q_s, q_f, own), roots)
                 known |= {len(known) - 1 + i: rows[k] for i, k in enumerate(frames.bodies)}
                 found["s" if frames.grid == "s" else "f"].append(_coordinates(rows, frames))
             else:
@@ -169,7 +174,8 @@ class Kinematics:
         for some in data["frames"]:
             rows = some["coordinates"]
             runs = None if rows is None else tuple(Run(*run) for run in rows["runs"])
-            found = {name: tuple(some[name]) for name in ("parents", "roots", "bodies")}
+            found = {name: tuple(some[name]) for name in ("roots", "moving", "bodies")}
+            found["parents"] = tuple(map(tuple, some["parents"]))
             found["coordinates"] = None if rows is None else Rows(**(rows | {"runs": runs}))
             found["directors"] = tuple(map(tuple, some["directors"]))
             frames.append(Frames(**(some | found)))
@@ -206,22 +212,24 @@ def after(rows, others):
     Args:
         rows, others: (n, 4, 3).
     """
-    turned = jnp.sum(rows[:, :, :, None] * others[:, None, 1:, :], axis=2)
-    return turned + jnp.pad(others[:, :1], ((0, 0), (0, 3), (0, 0)))
+    return matmul(rows, others[:, 1:]) + jnp.pad(others[:, :1], ((0, 0), (0, 3), (0, 0)))
 
 
-def taken(rows, numbers: np.ndarray):
-    """(k, 4, 3) some of the rows (n, 4, 3), by slices; `UNMOVED` for -1.
+def taken(rows, numbers: Sequence[int], otherwise=None):
+    """Some entries of (n, ...), by slices.
 
     Args:
-        numbers: (k,) of the rows.
+        numbers: of the entries.
+        otherwise: what stands where a number is -1.
     """
+    if list(numbers) == list(range(len(rows))):
+        return rows
     pieces, first = [], 0
     for last in range(1, len(numbers) + 1):
         step = 0 if numbers[first] < 0 else 1
         if last == len(numbers) or numbers[last] != numbers[last - 1] + step:
             low, count = int(numbers[first]), last - first
-            pieces.append(jnp.broadcast_to(UNMOVED, (count, 4, 3)) if low < 0 else rows[low : low + count])
+            pieces.append(jnp.broadcast_to(otherwise, (count, *rows.shape[1:])) if low < 0 else rows[low : low + count])
             first = last
     return jnp.concatenate(pieces)
 
@@ -231,4 +239,4 @@ def _coordinates(rows, frames: Frames):
     if any(len(kept) < 3 for kept in frames.directors):
         pieces = [rows[i, [0, *(k + 1 for k in kept)]] for i, kept in zip(frames.bodies, frames.directors, strict=True)]
         return jnp.concatenate(pieces).reshape(-1)
-    return (rows if frames.bodies == tuple(range(len(rows))) else taken(rows, np.array(frames.bodies))).reshape(-1)
+    return taken(rows, frames.bodies).reshape(-1)

@@ -5,6 +5,7 @@ constraints. A spanning tree that grows from the ground, or from the heaviest bo
 (Prim's algorithm), so that the fewest rows are left, and the one nearest to the root among equals, so that trees are not deep.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from heapq import heappop, heappush
 from itertools import count
@@ -35,6 +36,11 @@ class Branch(NamedTuple):
     joint: Joint
     element: int
     forward: bool
+
+    @property
+    def size(self) -> int:
+        """Number of frames from the parent to the child, the latter included."""
+        return max(1, len(self.joint.moves))
 
     @property
     def keys(self) -> list[tuple[str, int, str]]:
@@ -201,22 +207,27 @@ def _frames(grid: Grid, branches: Sequence[Branch], bodies: Bodies, freedoms, nu
         branches: parents before children.
         numbers: of the bodies that they may hang on.
     """
-    links = [Link(branch, step) for branch in branches for step in range(max(1, len(branch.joint.moves)))]
-    links.sort(key=lambda link: link.move is None)
-    at = {(link.branch.child, link.step): i for i, link in enumerate(links)}
-    ends = {branch.child: at[branch.child, max(0, len(branch.joint.moves) - 1)] for branch in branches}
-    parents, roots = [], {}
-    for link in links:
-        inner = at.get((link.branch.child, link.step - 1), -1)
-        parents.append(inner if link.step else ends.get(link.branch.parent, -1))
+    depths: dict[str, int] = {}
     for branch in branches:
-        roots[branch.child] = roots.get(branch.parent, numbers.get(branch.parent))
+        depths[branch.child] = depths.get(branch.parent, 0) + branch.size
+    links = [Link(branch, step) for branch in branches for step in range(branch.size)]
+    level = {link: depths[link.branch.child] - link.branch.size + link.step for link in links}
+    links.sort(key=lambda link: level[link])
+    at = {(link.branch.child, link.step): i for i, link in enumerate(links)}
+    ends = {branch.child: at[branch.child, branch.size - 1] for branch in branches}
+    first, parents = np.cumsum([0, *Counter(level.values()).values()]), []
+    for number in range(1, 1 + max(level.values())):
+        some = [link for link in links if level[link] == number]
+        inner = [at[link.branch.child, link.step - 1] if link.step else ends[link.branch.parent] for link in some]
+        parents.append(tuple(int(i - first[number - 1]) for i in inner))
     moving = [freedoms[link.key] for link in links if link.key is not None]
+    which = iter(range(len(moving)))
     frames = Frames(
         grid,
+        tuple(numbers[link.branch.parent] for link in links if level[link] == 0),
         tuple(parents),
-        tuple(roots[link.branch.child] for link in links),
         Rows.of(moving) if moving else None,
+        tuple(-1 if link.key is None else next(which) for link in links),
         any(link.move is not None and link.move.kind != "turn" for link in links),
         tuple(ends.values()),
         tuple(bodies[branch.child].wide for branch in branches),
