@@ -21,6 +21,11 @@ def is_concrete(tree) -> bool:
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def library(*values):
+    """NumPy, or `jax.numpy` where a value is traced: single calls of JAX take some 20 ms each the first time."""
+    return np if is_concrete(values) else jnp
+
+
 def of_one_type(tree):
     """A pytree with its numbers as arrays of NumPy, tracers as they are: what differs in kind would be traced anew."""
     return jax.tree.map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, tree)

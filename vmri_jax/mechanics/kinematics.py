@@ -8,7 +8,7 @@ triads coincide, and x turns b about the axis k of the triad or moves it along. 
     M = F_b^T T(x) F_a = N + P cos x + S sin x,   r = X_a - X_b M + (way along k) F_a[k]
 
 So the four rows (r, M) are ``C + P cos x + S sin x + E x``, with constants that are computed once. They are multiplied from the roots
-outwards, for all bodies of one depth together.
+outwards, along all ways to outermost bodies at once (a loop over the depth keeps programs small).
 
 Joints of several coordinates are chains of such with frames between them. Bodies on no joint, the roots, have their centre and directors
 among the coordinates themselves.
@@ -57,11 +57,10 @@ class Frames:
 
     Args:
         grid: the coordinates.
-        roots: what the frames of the first level hang on: `GROUND` or a number among the roots of the kinematics and then the bodies of
-            `Frames` before these.
-        parents: for each further level, what its frames hang on: numbers among those of the level before.
+        roots: what each way starts from: `GROUND` or a number among the roots of the kinematics and then the bodies of `Frames` before
+            these. A way leads from there to an outermost body; those that have a part in common repeat it.
         coordinates: of the frames that move; None where none does.
-        moving: for each frame the number of its coordinate, -1 where it has none.
+        moving: for each frame the number of its coordinate, -1 where it has none; the first ones of all ways, then the second ones.
         slides: whether a coordinate moves along its axis.
         bodies: numbers of the frames that are bodies.
         directors: which directors each body has.
@@ -69,7 +68,6 @@ class Frames:
 
     grid: Grid
     roots: tuple[int, ...]
-    parents: tuple[tuple[int, ...], ...]
     coordinates: Rows | None
     moving: tuple[int, ...]
     slides: bool
@@ -99,15 +97,14 @@ class Frames:
         """(n, 4, 3) origins and directors of all frames.
 
         Args:
-            rows: (n, 4, 3) those of every frame in those it hangs on.
-            roots: (m, 4, 3) those of what the first level hangs on; None for the ground.
+            rows: (n, 4, 3) those of every frame in the one before it.
+            roots: (ways, 4, 3) those of what the ways start from.
         """
-        last = len(self.roots)
-        levels = [rows[:last] if roots is None else after(rows[:last], roots)]
-        for parents in self.parents:
-            first, last = last, last + len(parents)
-            levels.append(after(rows[first:last], taken(levels[-1], parents)))
-        return jnp.concatenate(levels)
+
+        def outwards(inner, rows):
+            return (outer := after(rows, inner)), outer
+
+        return jax.lax.scan(outwards, roots, rows.reshape(-1, *roots.shape))[1].reshape(rows.shape)
 
 
 @dataclass(frozen=True)
@@ -140,8 +137,7 @@ class Kinematics:
             last = first + len(frames.moving)
             if all(found[part][0] is not None for part in frames.grid):
                 own = {name: values[first:last] for name, values in joints.items()}
-                on_ground = all(root == GROUND for root in frames.roots)
-                roots = None if on_ground else jnp.stack([known[root] for root in frames.roots])
+                roots = jnp.stack([known[root] for root in frames.roots])
                 rows = frames.in_space(frames.relative(q_s, q_f, own), roots)
                 known |= {len(known) - 1 + i: rows[k] for i, k in enumerate(frames.bodies)}
                 found["s" if frames.grid == "s" else "f"].append(_coordinates(rows, frames))
@@ -175,7 +171,6 @@ class Kinematics:
             rows = some["coordinates"]
             runs = None if rows is None else tuple(Run(*run) for run in rows["runs"])
             found = {name: tuple(some[name]) for name in ("roots", "moving", "bodies")}
-            found["parents"] = tuple(map(tuple, some["parents"]))
             found["coordinates"] = None if rows is None else Rows(**(rows | {"runs": runs}))
             found["directors"] = tuple(map(tuple, some["directors"]))
             frames.append(Frames(**(some | found)))

@@ -24,6 +24,8 @@ DRAWN = {"link": "links", "spring": "springs"}
 """What joins two bodies in a drawing, and its entry there."""
 POINTS = ("at_0", "at_1", "at_2", "at_3")
 """Parameters with the points fixed in rigid bodies, role by role."""
+ALONE = "alone"
+"""What the term of a single element is called."""
 START = 1e-9
 """How far, relative to its size, what a constraint keeps may be from its value at the start."""
 
@@ -170,7 +172,8 @@ class Effect(ABC):
         for name in moving(self.elements(bodies)[i]):
             places[name] = Place("s", end, bodies[name].size)
             end += bodies[name].size
-        return replace(self._term((i,), bodies, places), select=None), {self.name: self._own(i, bodies, params)}
+        term = replace(self._term((i,), bodies, places), name=ALONE, select=None)  # one program for all of a kind
+        return term, {ALONE: self._own(i, bodies, params)}
 
     def pair_of_joint(self, i: int) -> tuple[str, int] | None:
         """The joint and the number of its pair of bodies whose freedom is all that element i depends on; None of other effects."""

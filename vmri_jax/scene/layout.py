@@ -3,8 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-import jax.numpy as jnp
+import numpy as np
 
+from vmri_jax.mechanics.arrays import library
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.scene.body import Bodies
@@ -59,6 +60,7 @@ def join(bodies: Bodies, layout: Layout, part: Part, what: str) -> Any:
         part: "s" for slow ones, "f" for fast ones.
         what: "coordinates", "rates" or "masses".
     """
-    pieces = {place.start: jnp.asarray(getattr(bodies[name], what)) for name, place in layout.bodies.items() if place.part == part}
-    pieces |= {place.start: jnp.zeros(1) for place in layout.freedoms.values() if place.part == part}
-    return jnp.concatenate([pieces[start] for start in sorted(pieces)]) if pieces else jnp.zeros(0)
+    pieces = {place.start: getattr(bodies[name], what) for name, place in layout.bodies.items() if place.part == part}
+    pieces |= {place.start: np.zeros(1) for place in layout.freedoms.values() if place.part == part}
+    found = [pieces[start] for start in sorted(pieces)]
+    return library(found).concatenate(found) if found else np.zeros(0)

@@ -19,14 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Place
 from vmri_jax.scene.body import GROUND, Bodies, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.layout import Layout, Pace, join
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
-from vmri_jax.scene.trees import Branch, Link, joint_numbers, layout, start_on_joints
+from vmri_jax.scene.trees import Branch, Link, joint_numbers, layout, nearest_rates
 
 NAMED = 3
 """Most bodies that a reason names."""
@@ -61,19 +61,19 @@ class Sorting:
     """Bodies by name, their paces, their places, and where every effect lives.
 
     Attributes:
-        links: the frames of bodies on joints, in the order of the kinematics.
+        links: the frames of bodies on joints, in the order of the kinematics; None where a way has ended.
     """
 
     bodies: Bodies
     paces: dict[str, Pace]
     layout: Layout
     placed: tuple[Placed, ...]
-    links: tuple[Link, ...] = ()
+    links: tuple[Link | None, ...] = ()
 
     @property
     def branches(self) -> tuple[Branch, ...]:
         """The bodies on joints."""
-        return tuple(dict.fromkeys(link.branch for link in self.links))
+        return tuple(dict.fromkeys(link.branch for link in self.links if link is not None))
 
     @property
     def places(self) -> dict[str, Place]:
@@ -102,8 +102,10 @@ class Sorting:
 
     @cached_property
     def _on_joints(self) -> tuple[tuple, Any]:
-        masses = self._of_bodies("masses")
-        return start_on_joints(self.layout, self.joints, self.positions, self._of_bodies("rates"), masses)
+        q, n_s = library(self.positions).concatenate(self.positions), self.layout.sizes[0]
+        rates, masses = (library(both).concatenate(both) for both in map(self._of_bodies, ("rates", "masses")))
+        v, missed = nearest_rates(self.to_bodies(q)[1], rates, masses)
+        return (*self.positions, v[:n_s], v[n_s:]), missed
 
     def _of_bodies(self, what: str) -> tuple[jax.Array, jax.Array]:
         return join(self.bodies, self.layout, "s", what), join(self.bodies, self.layout, "f", what)
@@ -112,8 +114,8 @@ class Sorting:
         """The coordinates of all bodies (Q_s, Q_f) one after the other, and their Jacobian, of q = (q_s, q_f)."""
         if self.layout.kinematics is None:
             return q, np.eye(q.size)
-        bodies, jacobian = _bodies_and_jacobian(self.layout.kinematics, q, self.joints)
-        return np.asarray(bodies), np.asarray(jacobian)
+        found = _bodies_and_jacobian(self.layout.kinematics, q, self.joints)
+        return tuple(map(np.asarray, found)) if is_concrete(found) else found
 
     @cached_property
     def joints(self) -> dict[str, Any]:

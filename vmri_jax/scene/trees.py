@@ -5,18 +5,15 @@ constraints. A spanning tree that grows from the ground, or from the heaviest bo
 (Prim's algorithm), so that the fewest rows are left, and the one nearest to the root among equals, so that trees are not deep.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from heapq import heappop, heappush
 from itertools import count
 from typing import Any, Literal, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
-from vmri_jax.mechanics.kinematics import GRIDS, Frames, Grid, Kinematics, Move
+from vmri_jax.mechanics.arrays import is_concrete, library
+from vmri_jax.mechanics.kinematics import GRIDS, UNMOVED, Frames, Grid, Kinematics, Move
 from vmri_jax.mechanics.rows import Part, Place, Rows
 from vmri_jax.scene.body import GROUND, Bodies, body_of
 from vmri_jax.scene.effect import Effect
@@ -146,7 +143,7 @@ def _as_root(name: str, bodies: Bodies) -> tuple:
 
 def layout(
     bodies: Bodies, paces: Mapping[str, Pace], branches: Sequence[Branch] = ()
-) -> tuple[Layout, tuple[Link, ...]]:
+) -> tuple[Layout, tuple[Link | None, ...]]:
     """The places of all bodies: slow ones in order in q_s, fast ones in order in q_f; of bodies on joints the freedoms of these.
 
     Args:
@@ -201,71 +198,76 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, own, fr
 
 
 def _frames(grid: Grid, branches: Sequence[Branch], bodies: Bodies, freedoms, numbers: Mapping[str, int]):
-    """The frames of bodies that depend on the same coordinates, and their links in the same order: first those that move.
+    """The frames of bodies that depend on the same coordinates, and their links in the same order, None beyond the end of a way.
 
     Args:
         branches: parents before children.
         numbers: of the bodies that they may hang on.
     """
-    depths: dict[str, int] = {}
-    for branch in branches:
-        depths[branch.child] = depths.get(branch.parent, 0) + branch.size
-    links = [Link(branch, step) for branch in branches for step in range(branch.size)]
-    level = {link: depths[link.branch.child] - link.branch.size + link.step for link in links}
-    links.sort(key=lambda link: level[link])
-    at = {(link.branch.child, link.step): i for i, link in enumerate(links)}
-    ends = {branch.child: at[branch.child, branch.size - 1] for branch in branches}
-    first, parents = np.cumsum([0, *Counter(level.values()).values()]), []
-    for number in range(1, 1 + max(level.values())):
-        some = [link for link in links if level[link] == number]
-        inner = [at[link.branch.child, link.step - 1] if link.step else ends[link.branch.parent] for link in some]
-        parents.append(tuple(int(i - first[number - 1]) for i in inner))
-    moving = [freedoms[link.key] for link in links if link.key is not None]
-    which = iter(range(len(moving)))
+    branch_of = {branch.child: branch for branch in branches}
+    outermost = [branch for branch in branches if all(other.parent != branch.child for other in branches)]
+    ways = [_way(branch, branch_of) for branch in outermost]
+    depth = max(map(len, ways))
+    links = [way[level] if level < len(way) else None for level in range(depth) for way in ways]
+    coordinates = [freedoms[link.key] for link in links if link is not None and link.key is not None]
+    which = iter(range(len(coordinates)))
     frames = Frames(
         grid,
-        tuple(numbers[link.branch.parent] for link in links if level[link] == 0),
-        tuple(parents),
-        Rows.of(moving) if moving else None,
-        tuple(-1 if link.key is None else next(which) for link in links),
-        any(link.move is not None and link.move.kind != "turn" for link in links),
-        tuple(ends.values()),
+        tuple(numbers[way[0].branch.parent] for way in ways),
+        Rows.of(coordinates) if coordinates else None,
+        tuple(-1 if link is None or link.key is None else next(which) for link in links),
+        any(link is not None and link.move is not None and link.move.kind != "turn" for link in links),
+        tuple(links.index(Link(branch, branch.size - 1)) for branch in branches),
         tuple(bodies[branch.child].wide for branch in branches),
     )
     return frames, links
 
 
-def joint_numbers(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
-    """The constants C, P, S, E (n, 4, 3) of all links, see `vmri_jax.mechanics.kinematics`.
+def _way(branch: Branch | None, branch_of: Mapping[str, Branch]) -> list[Link]:
+    """The links from a root to the body of a branch."""
+    way: list[Link] = []
+    while branch is not None:
+        way = [*(Link(branch, step) for step in range(branch.size)), *way]
+        branch = branch_of.get(branch.parent)
+    return way
+
+
+def joint_numbers(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, Any]:
+    """The constants C, P, S, E (n, 4, 3) of all links, see `vmri_jax.mechanics.kinematics`; of None those of what does not move.
 
     Args:
         bodies: by name.
         links: of a layout.
     """
-    ends = _ends(bodies, links)
-    axes = [link.move.axis if link.move else 2 for link in links]
+    known = list(dict.fromkeys(link for link in links if link is not None))
+    ends = _ends(bodies, known)
+    xp = library(ends)
+    axes = [link.move.axis if link.move else 2 for link in known]
     cyclic = np.array([[(k + 1) % 3, (k + 2) % 3, k] for k in axes])
-    inner, outer = (ends[name][np.arange(len(links))[:, None], cyclic] for name in ("frame_a", "frame_b"))
+    inner, outer = (ends[name][np.arange(len(known))[:, None], cyclic] for name in ("frame_a", "frame_b"))
 
     def dyads(i: int, j: int):
         return outer[:, i, :, None] * inner[:, j, None, :]
 
     def rows(matrix, point):
         """(r, M) with ``r = X - X_b M``."""
-        turned = jnp.sum(ends["point_b"][:, :, None] * matrix, axis=1)
-        return jnp.concatenate([(point - turned)[:, None], matrix], axis=1)
+        turned = xp.sum(ends["point_b"][:, :, None] * matrix, axis=1)
+        return xp.concatenate([(point - turned)[:, None], matrix], axis=1)
 
-    turns, ways = (np.array([link.amount(kind) for link in links])[:, None, None] for kind in ("turn", "slide"))
-    screws = jnp.stack([link.pitch / (2 * jnp.pi) for link in links])[:, None]
+    turns, ways = (np.array([link.amount(kind) for link in known])[:, None, None] for kind in ("turn", "slide"))
+    pitches = [link.pitch / (2 * np.pi) for link in known]
+    screws = library(pitches).stack(pitches)[:, None]
     across, along = dyads(0, 0) + dyads(1, 1), dyads(2, 2)
-    way = (ways[:, 0] + turns[:, 0] * screws) * inner[:, 2]
-    zero = jnp.zeros_like(ends["point_a"])
-    return {
+    zero = xp.zeros_like(ends["point_a"])
+    found = {
         "constant": rows(along + (1 - np.abs(turns)) * across, ends["point_a"]),
         "cosine": rows(np.abs(turns) * across, zero),
         "sine": rows(turns * (dyads(0, 1) - dyads(1, 0)), zero),
-        "way": jnp.pad(way[:, None], ((0, 0), (0, 3), (0, 0))),
+        "way": xp.pad(((ways[:, 0] + turns[:, 0] * screws) * inner[:, 2])[:, None], ((0, 0), (0, 3), (0, 0))),
     }
+    which = np.array([len(known) if link is None else known.index(link) for link in links])
+    unmoved = {name: UNMOVED if name == "constant" else np.zeros((4, 3)) for name in found}
+    return {name: xp.concatenate([values, unmoved[name][None]])[which] for name, values in found.items()}
 
 
 def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
@@ -279,37 +281,30 @@ def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
         branch = link.branch
         point, triad = (some[branch.joint.name][branch.element] for some in (points, triads))
         first, last = (0, 1) if branch.forward else (1, 0)
-        for role, name, which, here in (("a", branch.parent, first, link.is_first), ("b", branch.child, last, link.is_last)):
+        for role, name, which, here in (
+            ("a", branch.parent, first, link.is_first),
+            ("b", branch.child, last, link.is_last),
+        ):
             body = body_of(bodies, name)
             along = body.components if name in carried else body.weights
-            at = along((point[which] - body.position) @ body.rotation) if here else jnp.zeros(3)
-            axes = jnp.stack([along(row @ body.rotation) for row in triad]) if here else jnp.eye(3)
+            at = along((point[which] - body.position) @ body.rotation) if here else np.zeros(3)
+            axes = [along(row @ body.rotation) for row in triad] if here else np.eye(3)
             found.setdefault(f"point_{role}", []).append(at)
-            found.setdefault(f"frame_{role}", []).append(axes)
-    return {name: jnp.stack(values) for name, values in found.items()}
+            found.setdefault(f"frame_{role}", []).append(library(axes).stack(axes))
+    return {name: library(values).stack(values) for name, values in found.items()}
 
 
-def start_on_joints(layout: Layout, joints: dict[str, Any], positions, rates, masses) -> tuple[tuple, Any]:
-    """The start of the scene with the velocities nearest to those of the bodies.
-
-    With ``J = dQ/dq`` and the masses M of bodies, ``J^T M J v = J^T M V``.
+def nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
+    """The velocities v of the scene nearest to those V of the bodies, ``J^T M J v = J^T M V``.
 
     Args:
-        layout, joints: of the scene.
-        positions: (q_s, q_f).
-        rates, masses: those of (Q_s, Q_f).
+        jacobian: J = dQ/dq.
+        rates, masses: V and the masses M of (Q_s, Q_f) one after the other.
 
     Returns:
-        ``(q_s, q_f, v_s, v_f)``, and the part of the velocities that the joints do not allow, in the norm of the kinetic energy.
+        v, and the part of V that the joints do not allow, in the norm of the kinetic energy.
     """
-    n_s = layout.sizes[0]
-
-    def bodies(q):
-        return jnp.concatenate(layout.kinematics(q[:n_s], q[n_s:], joints))
-
-    jacobian, given, mass = jax.jacfwd(bodies)(jnp.concatenate(positions)), jnp.concatenate(rates), jnp.concatenate(masses)
-    v = jnp.linalg.solve(jacobian.T @ (mass[:, None] * jacobian), jacobian.T @ (mass * given))
-    missed = given - jacobian @ v
-    whole = jnp.sum(mass * given**2)
-    part = jnp.sqrt(jnp.sum(mass * missed**2) / jnp.where(whole > 0, whole, 1.0))
-    return (*positions, v[:n_s], v[n_s:]), part
+    xp = library(jacobian, rates, masses)
+    v = xp.linalg.solve(jacobian.T @ (masses[:, None] * jacobian), jacobian.T @ (masses * rates))
+    missed, whole = rates - jacobian @ v, xp.sum(masses * rates**2)
+    return v, xp.sqrt(xp.sum(masses * missed**2) / xp.where(whole > 0, whole, 1.0))

@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
 from vmri_jax.scene.declare import effect_class, names, squeeze
@@ -99,7 +99,7 @@ class Joint(Effect):
         return tuple(tuple(map(str, element)) for element in super().elements(bodies))
 
     def parameters(self, bodies):
-        return {name: squeeze(jnp.stack(values)) for name, values in self._frames(bodies).items()}
+        return {name: squeeze(library(values).stack(values)) for name, values in self._frames(bodies).items()}
 
     def points(self, bodies):
         return {}
@@ -111,7 +111,7 @@ class Joint(Effect):
 
     def pitch_of(self, i: int):
         """How far b moves along the axis in a turn of the i-th pair, m; zero of joints that are no screws."""
-        return jnp.zeros(())
+        return np.zeros(())
 
     def frame(self, count: int) -> list | None:
         """(n, 3, 3) the triads (m, m', n) in space where its freedoms are zero, None where the joint needs no direction."""
@@ -132,8 +132,8 @@ class Joint(Effect):
         for a, b, points in zip(*zip(*self._given(bodies), strict=True), self.joining_points(bodies), strict=True):
             if not is_concrete(points):
                 continue
-            away = jnp.linalg.norm(points[1] - points[0])
-            size = jnp.maximum(jnp.max(jnp.abs(points[0])), 1.0)
+            away = np.linalg.norm(points[1] - points[0])
+            size = max(np.max(np.abs(points[0])), 1.0)
             where = " and ".join(
                 f"{label_of(name)} is at {np.asarray(p)}" for name, p in zip((a, b), points, strict=True)
             )
@@ -206,15 +206,15 @@ class Joint(Effect):
                         raise ValueError(
                             f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
                         )
-                    found.setdefault(f"point_{role}", []).append(jnp.zeros(3))
+                    found.setdefault(f"point_{role}", []).append(np.zeros(3))
                     continue
                 found.setdefault(f"point_{role}", []).append(body.weights((point - body.position) @ body.rotation))
                 if frames is not None:
                     try:
-                        own = jnp.stack([body.weights(vector @ body.rotation) for vector in frames[i]])
+                        own = [body.weights(vector @ body.rotation) for vector in frames[i]]
                     except ValueError as error:
                         raise ValueError(f"{self.name}: {error}") from None
-                    found.setdefault(f"frame_{role}", []).append(own)
+                    found.setdefault(f"frame_{role}", []).append(library(own).stack(own))
         return found
 
 
@@ -247,7 +247,7 @@ class _AboutAxis(Joint):
     def _directions(self, name: str, count: int):
         """(n, 3) unit vectors of a field."""
         rows = _rows(f"{self.name}: {name}", getattr(self, name), count)
-        lengths = jnp.linalg.norm(rows, axis=-1, keepdims=True)
+        lengths = library(rows).linalg.norm(rows, axis=-1, keepdims=True)
         self.require(lengths > 0, name, getattr(self, name), "it must not be zero")
         return rows / lengths
 
@@ -293,9 +293,9 @@ class Universal(_AboutAxis):
 
     def frame(self, count: int):
         first, second = self._directions("axis", count), self._directions("second", count)
-        tilt = jnp.sum(first * second, axis=-1)
-        self.require(jnp.abs(tilt) < START, "axis . second", tilt, "the axes must be perpendicular")
-        return [jnp.stack([m, jnp.cross(n, m), n]) for n, m in zip(first, second, strict=True)]
+        tilt, xp = (first * second).sum(axis=-1), library(first, second)
+        self.require(abs(tilt) < START, "axis . second", tilt, "the axes must be perpendicular")
+        return [xp.stack([m, xp.cross(n, m), n]) for n, m in zip(first, second, strict=True)]
 
 
 @effect_class
@@ -411,16 +411,17 @@ def along_run(joint: Joint, run, bodies: Bodies, of: str, pair: int) -> np.ndarr
 
 def triad(axis):
     """(3, 3) orthonormal (m, m', n) with n along a unit vector."""
-    helper = jnp.eye(3)[jnp.argmin(jnp.abs(axis))]
-    m = jnp.cross(helper, axis)
-    m = m / jnp.linalg.norm(m)
-    return jnp.stack([m, jnp.cross(axis, m), axis])
+    xp = library(axis)
+    helper = xp.eye(3)[xp.argmin(xp.abs(axis))]
+    m = xp.cross(helper, axis)
+    m = m / xp.linalg.norm(m)
+    return xp.stack([m, xp.cross(axis, m), axis])
 
 
 def _rows(what: str, given, count: int):
     """(n, 3) vectors of one or of n."""
-    rows = jnp.asarray(real_array(what, given))
+    rows = real_array(what, given)
     if rows.shape not in ((3,), (count, 3)):
         more = f", or one for each pair, ({count}, 3)" if count > 1 else ""
         raise ValueError(f"{what} has shape {rows.shape}; give (3,){more}.")
-    return jnp.broadcast_to(rows, (count, 3))
+    return library(rows).broadcast_to(rows, (count, 3))
