@@ -10,12 +10,17 @@ from functools import partial
 from itertools import chain
 from typing import Any
 
+import jax
 import numpy as np
 
 from vmri_jax.animation.checks import angles, check_keys, direction, entries, numbers, positive
+from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.names import near
 
-KEYS = ("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres", "up", "view", "caption")
+KEYS = (
+    *("bodies", "solids", "blocks", "links", "springs", "anchors", "planes", "spheres"),
+    *("up", "view", "caption", "kinematics"),
+)
 BLOCK_KEYS = ("name", "coordinates", "labels")
 BODY_KEYS = ("name", "coordinates", "offset", "radius", "color", "shown")
 SOLID_KEYS = ("name", "coordinates", "corners", "faces", "color")
@@ -122,6 +127,8 @@ class Drawing:
         view: azimuth and elevation from which one looks, in degrees; None for one that suits. (-90, 0) is from the front, with
             x to the right; (-90, 90) from above.
         caption: a line that is shown with the picture.
+        carried: the map from the coordinates of a run to those that bodies name, and the numbers of its joints, see
+            `vmri_jax.mechanics.kinematics`; None where they are the same.
     """
 
     bodies: tuple[Body, ...]
@@ -133,6 +140,7 @@ class Drawing:
     up: tuple[float, ...] | None = None
     view: tuple[float, ...] | None = None
     caption: str = ""
+    carried: tuple[Kinematics, dict[str, np.ndarray]] | None = None
 
     @classmethod
     def from_dict(cls, data: Any) -> "Drawing":
@@ -150,7 +158,7 @@ class Drawing:
                 - ``links``, ``springs``: pairs of names, and a third entry "slow" or "fast" if wanted.
                 - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), and if wanted ``pace``.
                 - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
-                - ``up``, ``view``, ``caption``: see above.
+                - ``up``, ``view``, ``caption``: see above; ``kinematics``: "map" and "joints" of `carried`, which a scene writes.
 
         Raises:
             ValueError: anything else, with the entry that is wrong.
@@ -184,7 +192,24 @@ class Drawing:
             up=None if data.get("up") is None else direction(data["up"], "drawing: up"),
             view=None if data.get("view") is None else angles(data["view"], "drawing: view"),
             caption=str(data.get("caption") or ""),
+            carried=_carried(data.get("kinematics")),
         )
+
+    def extended(self, q_s, q_f, v_s, v_f) -> tuple[np.ndarray, ...]:
+        """Coordinates that bodies name, and their rates, (k, n) each.
+
+        Args:
+            q_s, q_f, v_s, v_f: (k, n_s), (k, n_f) those of a run.
+        """
+        if self.carried is None:
+            return q_s, q_f, v_s, v_f
+        kinematics, joints = self.carried
+
+        def at(q_s, q_f, v_s, v_f):
+            bodies, rates = jax.jvp(lambda q_s, q_f: kinematics(q_s, q_f, joints), (q_s, q_f), (v_s, v_f))
+            return *bodies, *rates
+
+        return tuple(map(np.asarray, jax.jit(jax.vmap(at))(q_s, q_f, v_s, v_f)))
 
     def corners(self, points: np.ndarray) -> list[np.ndarray]:
         """(..., n, 3) corners of every solid.
@@ -242,7 +267,7 @@ class Drawing:
         """Offset (n, 3) and matrix (n, 3, n_s + n_f): where the bodies are in the picture, ``offset + matrix @ q``.
 
         Args:
-            n_s, n_f: lengths of q_s and q_f.
+            n_s, n_f: lengths of the slow and of the fast coordinates that `extended` gives.
 
         Raises:
             ValueError: a body uses a coordinate that q does not have.
@@ -255,6 +280,14 @@ class Drawing:
                     check_index(body.name, part, index, n_s, n_f)
                     matrix[i, axis, first[part] + index] += weight
         return self.place([body.offset for body in self.bodies]), np.einsum("ad,idq->iaq", self.frame(), matrix)
+
+
+def _carried(data: Any) -> tuple[Kinematics, dict[str, np.ndarray]] | None:
+    """The map of bodies on joints, of its plain data."""
+    if data is None:
+        return None
+    check_keys(data, ("map", "joints"), ("map", "joints"), "drawing: kinematics")
+    return Kinematics.from_dict(data["map"]), {name: np.asarray(values) for name, values in data["joints"].items()}
 
 
 def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:

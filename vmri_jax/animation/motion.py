@@ -123,13 +123,17 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
     count = len(t) if finite.all() else int(np.argmin(finite))
     if count == 0:
         raise ValueError("motion: the trajectory has no node with finite positions; there is nothing to draw.")
-    drawing = with_bars(drawing, q_s[:count], q_f[:count])
-    offset, matrix = drawing.maps(q_s.shape[1], q_f.shape[1])
+    slow, fast, *_ = drawing.extended(q_s[:count], q_f[:count], 0 * q_s[:count], 0 * q_f[:count])
+    drawing = with_bars(drawing, slow, fast)
+    offset, matrix = drawing.maps(slow.shape[1], fast.shape[1])
     nodes, q = t[:count], np.concatenate([q_s, q_f], axis=1)[:count]
     v = _differences(nodes, q) if system is None else _velocities(system, trajectory, count)
     t, q, v = _with_micro_nodes(trajectory, nodes, q, v)
     if system is None and len(t) > len(nodes):  # differences between macro nodes miss the fast motion
         v[:, q_s.shape[1] :] = CubicSpline(t, q[:, q_s.shape[1] :])(t, 1)
+    n_s = q_s.shape[1]
+    slow, fast, v_slow, v_fast = drawing.extended(q[:, :n_s], q[:, n_s:], v[:, :n_s], v[:, n_s:])
+    q, v = np.concatenate([slow, fast], axis=1), np.concatenate([v_slow, v_fast], axis=1)
     energies, relative = _energies(trajectory, count, system)
     residual = np.asarray(trajectory.constraint_residual, dtype=float)[:count].reshape(count, -1)
     return Motion(

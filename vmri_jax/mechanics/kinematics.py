@@ -124,7 +124,7 @@ class Kinematics:
     frames: tuple[Frames, ...]
     sizes: tuple[int, int]
 
-    def __call__(self, q_s, q_f, joints: dict[str, Any]):
+    def __call__(self, q_s, q_f, joints: dict[str, Any]) -> tuple[Any, Any]:
         """(Q_s, Q_f).
 
         Args:
@@ -132,7 +132,7 @@ class Kinematics:
             joints: the constants C, P, S, E (n, 4, 3) of all frames, "constant", "cosine", "sine", "way".
         """
         known, first = self._roots(q_s, q_f), 0
-        found = {"s": [q_s], "f": [q_f]}
+        found: dict[str, list] = {"s": [q_s], "f": [q_f]}
         for frames in self.frames:
             last = first + len(frames.moving)
             if all(found[part][0] is not None for part in frames.grid):
@@ -144,7 +144,8 @@ class Kinematics:
             else:
                 known |= {len(known) - 1 + i: None for i in range(len(frames.bodies))}
             first = last
-        return tuple(None if pieces[0] is None else jnp.concatenate(pieces) for pieces in found.values())
+        slow, fast = (None if pieces[0] is None else jnp.concatenate(pieces) for pieces in found.values())
+        return slow, fast
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
         """Rates of (Q_s, Q_f)."""
@@ -170,7 +171,7 @@ class Kinematics:
         for some in data["frames"]:
             rows = some["coordinates"]
             runs = None if rows is None else tuple(Run(*run) for run in rows["runs"])
-            found = {name: tuple(some[name]) for name in ("roots", "moving", "bodies")}
+            found: dict[str, Any] = {name: tuple(some[name]) for name in ("roots", "moving", "bodies")}
             found["coordinates"] = None if rows is None else Rows(**(rows | {"runs": runs}))
             found["directors"] = tuple(map(tuple, some["directors"]))
             frames.append(Frames(**(some | found)))
@@ -210,7 +211,7 @@ def after(rows, others):
     return matmul(rows, others[:, 1:]) + jnp.pad(others[:, :1], ((0, 0), (0, 3), (0, 0)))
 
 
-def taken(rows, numbers: Sequence[int], otherwise=None):
+def taken(rows, numbers: Sequence[int], otherwise: Any = None):
     """Some entries of (n, ...), by slices.
 
     Args:

@@ -102,6 +102,14 @@ class Names:
             raise ValueError(unknown("body", body, {**self.bodies, **self.carried}))
         return self.bodies[body]
 
+    def place_of(self, body: str) -> Place:
+        """The place of a body in (Q_s, Q_f) of the kinematics, or as `place`.
+
+        Raises:
+            ValueError: no body of this name.
+        """
+        return self.carried[body] if body in self.carried else self.place(body)
+
     def of(self, system: System, n_s: int, n_f: int) -> "Names":
         """The same with plain names for coordinates and constraints of a system that have none.
 

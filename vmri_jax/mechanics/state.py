@@ -86,13 +86,22 @@ def initial_state(
                 "initial_state: the momenta are not finite. The mass matrix d2T/dv2 or the constraint Jacobian is "
                 "singular at the initial positions, or a function returned NaN there."
             )
-        _tell_of_velocities(float(taken), project)
+        tell_of_velocities("initial_state", float(taken), project)
     return state
 
 
-def _tell_of_velocities(taken: float, project: bool) -> None:
-    """Say which part of the velocities does not fit the constraints, at rest or moving, and refuse a large one."""
-    message = f"initial_state: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit the constraints"
+def tell_of_velocities(what: str, taken: float, project: bool, constraints: str = "the constraints") -> None:
+    """Say which part of the velocities does not fit the constraints, at rest or moving, and refuse a large one.
+
+    Args:
+        what: who says so.
+        taken: the part, in the norm of the kinetic energy.
+        project: whether the nearest velocities that fit are meant.
+        constraints: what they do not fit.
+    """
+    message = (
+        f"{what}: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit {constraints}"
+    )
     scenes = "of a scene, with_rates({joint: rate}) finds all that belong to the rate of a joint"
     if project and taken > MOST:
         warnings.warn(f"{message}, and project=True has taken them away; {scenes}.", stacklevel=3)

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from vmri_jax.mechanics.kinematics import JOINTS, Kinematics
 from vmri_jax.mechanics.motion import motion, powers, reaction_force
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.projection import legendre
+from vmri_jax.mechanics.rows import Place
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
@@ -114,7 +115,7 @@ class Quantities(ABC):
         return _of_body(run, body, _bodies, run.q_s, run.q_f)
 
     def momentum(self, body: str):
-        """Momenta of a body at the saved nodes, (..., k, size).
+        """Momenta of a body at the saved nodes, (..., k, size); in joint coordinates of a rigid body ``M v`` of itself alone.
 
         Args:
             body: its name; "q_s" or "q_f" for all coordinates of a system without names.
@@ -123,6 +124,9 @@ class Quantities(ABC):
             ValueError: no body of this name.
         """
         run = self.whole()
+        names = run.names
+        if names.kinematics is not None and body in names.rigid:  # p of a root is that of all it carries
+            return _part(at_nodes(_body_momenta, run.origin, run.states, names.kinematics), names.place_of(body))
         return _of_body(run, body, _body_momenta, run.p_s, run.p_f)
 
     def velocity(self, body: str):
@@ -167,7 +171,12 @@ class Quantities(ABC):
         run = _known("reaction_forces", self.whole())
         names = run.names
         if constraint not in names.rows:
-            raise ValueError(f"reaction_forces: {unknown('constraint', constraint, names.rows)}")
+            hint = (
+                " Joints that carry bodies have no rows; scene.by_directors(run) gives the run that has."
+                if names.carried
+                else ""
+            )
+            raise ValueError(f"reaction_forces: {unknown('constraint', constraint, names.rows)}{hint}")
         rows = tuple(names.rows[constraint])
         forces, touched = at_nodes(reaction_force, run.origin, _states(run, micro), rows)
         n_s = run.q_s.shape[-1]
@@ -238,23 +247,28 @@ def _of_body(run: "Trajectory", body: str, carried: Callable, slow=None, fast=No
     """
     names = run.names
     if body in names.carried:
-        slow, fast = at_nodes(carried, run.origin, run.states, names.kinematics)
-        part, start, size = names.carried[body]
-    else:
-        part, start, size = names.place(body)
-    return (slow if part == "s" else fast)[..., start : start + size]
+        slow, fast = tuple(at_nodes(carried, run.origin, run.states, names.kinematics))
+    return _part((slow, fast), names.place_of(body))
 
 
-def _bodies(system: System, state: State, kinematics: Kinematics):
+def _part(values: Any, place: Place):
+    """Values of one body among those of all, (slow, fast)."""
+    part, start, size = place
+    return values[part == "f"][..., start : start + size]
+
+
+def _bodies(system: System, state: State, kinematics: Kinematics) -> tuple:
     return kinematics(state.q_s, state.q_f, system.params[JOINTS])
 
 
 def _body_rates(system: System, state: State, kinematics: Kinematics):
-    return kinematics.velocities(state.q_s, state.q_f, *_velocity(system, state), system.params[JOINTS])
+    v_s, v_f = _velocity(system, state)
+    return kinematics.velocities(state.q_s, state.q_f, v_s, v_f, system.params[JOINTS])
 
 
 def _body_momenta(system: System, state: State, kinematics: Kinematics):
-    return kinematics.momenta(state.q_s, state.q_f, *_velocity(system, state), system.params)
+    v_s, v_f = _velocity(system, state)
+    return kinematics.momenta(state.q_s, state.q_f, v_s, v_f, system.params)
 
 
 def _velocities(run: "Trajectory"):

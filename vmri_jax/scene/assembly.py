@@ -34,7 +34,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     functions: dict[str, Any] = {
         home: FUNCTIONS[home](tuple(terms[home]), _kinematics(home, terms[home], where))
         for home in FUNCTIONS
-        if home in terms
+        if terms.get(home) or (home == "kinetic" and home in terms)
     }
     for home in ("constraint", "slow_constraint", "implied"):
         if any(term.timed for term in terms.get(home, ())):

@@ -45,7 +45,14 @@ class Layout:
     def ends(self) -> tuple[int, int]:
         """Lengths of Q_s and Q_f."""
         slow, fast = (
-            max((place.start + place.size for place in (*self.own.values(), *self.bodies.values()) if place.part == part), default=0)
+            max(
+                (
+                    place.start + place.size
+                    for place in (*self.own.values(), *self.bodies.values())
+                    if place.part == part
+                ),
+                default=0,
+            )
             for part in ("s", "f")
         )
         return slow, fast

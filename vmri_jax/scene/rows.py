@@ -79,7 +79,7 @@ class ConstraintRows:
         """The rows of the constraints of these effects; None where there are none, or where their numbers are traced."""
         bodies, held = sorting.bodies, [(i, part) for i, part in enumerate(sorting.placed) if part.home in HOMES]
         params = {i: part.effect.parameters(bodies) for i, part in held}
-        if not held or not is_concrete(([body.coordinates for body in bodies.values()], params)):
+        if not held or not is_concrete((sorting.positions, sorting.joints, params)):
             return None
         where, to_bodies = sorting.layout, sorting.to_bodies
         columns = {

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -13,9 +13,10 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import require_x64
 from vmri_jax.mechanics.names import Names, unknown
 from vmri_jax.mechanics.rows import Place
-from vmri_jax.mechanics.state import Problem, State, initial_state
+from vmri_jax.mechanics.state import Problem, State, initial_state, tell_of_velocities
 from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.scene.assembly import actuation, build
 from vmri_jax.scene.body import AnyBody
 from vmri_jax.scene.effect import Effect
@@ -27,7 +28,7 @@ from vmri_jax.scene.rigid import RigidBody, Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import RESERVED, Actuation
 from vmri_jax.scene.trees import Branch, grow
-from vmri_jax.scene.velocities import with_rates
+from vmri_jax.scene.velocities import joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
@@ -60,6 +61,12 @@ class Scene:
             "drop" leaves as many rows of them out as are too many, see `dropped`. These must follow from the others along the motion,
             not only at the start: the scene tries random motions, and runs watch the rows, see `System.implied`.
 
+        coordinates: of rigid bodies, "directors" for a centre and directors each, tied by joints as constraints; "joint" for bodies that
+            are functions of the freedoms of joints, along trees. Then every such joint adds a coordinate for each of its freedoms, zero at
+            the start, and no row; roots of trees that are not the ground keep directors, a joint that closes a loop its rows, and
+            a `Spherical` one, too.
+        joint_starts: values and rates of their coordinates at the start, see `with_joints`, which sets them.
+
     Raises:
         TypeError: something else among them.
         ValueError: 64-bit mode is off, no bodies, names that occur twice, what is wrong with an effect (see there), redundant constraints.
@@ -69,7 +76,8 @@ class Scene:
     effects: Any = ()
     project: bool = False
     redundant: Literal["refuse", "drop"] = "refuse"
-    coordinates: Literal["joint", "directors", "auto"] = "auto"
+    coordinates: Literal["joint", "directors"] = "directors"
+    joint_starts: Mapping[tuple[str, int, str], tuple[Any, Any]] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
         effects = [effect.name for effect in self.effects]
@@ -83,8 +91,8 @@ class Scene:
         require_x64()
         if self.redundant not in ("refuse", "drop"):
             raise ValueError(f"Scene: redundant is {self.redundant!r}; it must be 'refuse' or 'drop'.")
-        if self.coordinates not in ("joint", "directors", "auto"):
-            raise ValueError(f"Scene: coordinates is {self.coordinates!r}; it must be 'joint', 'directors' or 'auto'.")
+        if self.coordinates not in ("joint", "directors"):
+            raise ValueError(f"Scene: coordinates is {self.coordinates!r}; it must be 'joint' or 'directors'.")
         for name, kind in (("bodies", AnyBody), ("effects", Effect)):
             items = getattr(self, name)
             if isinstance(items, kind) or not isinstance(items, Iterable):
@@ -157,7 +165,7 @@ class Scene:
     @cached_property
     def sorting(self) -> Sorting:
         """Who is slow and who is fast, where every effect lives, and why."""
-        found = sort(self.by_name, self.everything, self.branches)
+        found = replace(sort(self.by_name, self.everything, self.branches), joint_starts=self.joint_starts)
         return without_redundant(found) if self.redundant == "drop" else found
 
     @property
@@ -167,7 +175,7 @@ class Scene:
 
     @property
     def places(self) -> dict[str, Place]:
-        """Where each body's coordinates are in q_s and q_f."""
+        """Where each body's coordinates are in q_s and q_f; of bodies on joints, in (Q_s, Q_f) of `Names.kinematics`."""
         return self.sorting.places
 
     @cached_property
@@ -182,8 +190,15 @@ class Scene:
 
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """(q_s, q_f, v_s, v_f) at the start."""
-        return self.sorting.start
+        """(q_s, q_f, v_s, v_f) at the start.
+
+        Raises:
+            ValueError: velocities of bodies that their joints do not allow, unless `project` takes the nearest.
+        """
+        start, missed = self.sorting.start, self.sorting.missed
+        if is_concrete(missed):
+            tell_of_velocities("Scene", float(missed), self.project, "the joints")
+        return start
 
     @cached_property
     def actuation(self) -> Actuation | None:
@@ -231,6 +246,25 @@ class Scene:
         if joint not in joints:
             raise ValueError(f"Scene.joint_motion: {unknown('joint', joint, joints)}")
         return along_run(joints[joint], run, self.by_name, of, pair)
+
+    def by_directors(self, run: Trajectory) -> Trajectory:
+        """A run in joint coordinates as one of the same scene by directors: its joints have rows, multipliers and reaction forces.
+
+            scene.by_directors(run).reaction_forces("hinge")["panel"]  # on the centre and the directors of the panel
+
+        Args:
+            run: of this scene.
+        """
+        bodies = [replace(body, pace="slow") for body in self.bodies]  # all rows on one grid: none is too many there
+        effects = [replace(effect, rate="auto") for effect in self.effects]
+        twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
+        arrays: dict[str, Any] = {}
+        for letter, of_body in (("q", run.position), ("p", run.momentum)):
+            for part in ("s", "f"):
+                places = {name: place for name, place in twin.places.items() if place.part == part}
+                pieces = [of_body(name) for name in sorted(places, key=lambda name: places[name].start)]
+                arrays[f"{letter}_{part}"] = np.concatenate(pieces, axis=-1) if pieces else run.q_s[..., :0]
+        return replace(run, **arrays, t_micro=None, q_f_micro=None).of(twin)
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.
@@ -291,7 +325,25 @@ class Scene:
             TypeError: no mapping, or numbers of the scene that are traced.
             ValueError: no joint of this name, one that leaves no such freedom, rates that cannot be together.
         """
-        return replace(self, bodies=with_rates(self.sorting, self.effects, self.system(), rates))
+        bodies, starts = with_rates(self.sorting, self.effects, self.system(), rates)
+        return replace(self, bodies=bodies, joint_starts=starts)
+
+    def with_joints(self, joints: Mapping[str, Any]) -> "Scene":
+        """The scene with joints that start with other angles or ways, and rates; what they carry moves along.
+
+            scene.with_joints({"shoulder": 0.3, "elbow": (-0.5, 2.0), "axle": {"turn": (0.0, 10.0), "slide": 0.1}})
+
+        Angles and ways stay zero where the bodies are as they are given, and so do rest positions that springs measure there.
+
+        Args:
+            joints: by the name of the joint: an angle (rad) or a way (m), or a pair of it and its rate, which is zero by default; of a joint
+                with several freedoms by their names. For a joint of several pairs of bodies each may be one number for all, or one for each.
+
+        Raises:
+            TypeError: no mapping.
+            ValueError: no joint of this name, one that leaves no such freedom or has no coordinate of its own, numbers that are not finite.
+        """
+        return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.effects, joints)})
 
     def explain(self, scheme: Scheme | Composition, *, macro_dt: float | None = None, measure: bool = True) -> Ledger:
         """What every body and effect adds to a macro step of a scheme: where it lives, unknowns, evaluations, and its cost.
@@ -305,7 +357,7 @@ class Scene:
 
     def drawing(self) -> dict[str, list]:
         """What the scene looks like as plain lists, strings and numbers, see `vmri_jax.animation.Drawing.from_dict`."""
-        seen: dict[str, list] = {kind: [] for kind in ("bodies", "blocks", *DRAWN_LISTS)}
+        seen: dict[str, Any] = {kind: [] for kind in ("bodies", "blocks", *DRAWN_LISTS)}
         radii = {body.name: float(body.radius) for body in self.bodies if body.radius is not None}
         for body in self.bodies:
             part, start, size = self.places[body.name]
@@ -326,6 +378,9 @@ class Scene:
         for entry in seen["bodies"]:
             if entry["name"] in radii:
                 entry["radius"] = radii[entry["name"]]
+        if (kinematics := self.sorting.layout.kinematics) is not None:
+            joints = {name: np.asarray(values).tolist() for name, values in self.sorting.joints.items()}
+            seen["kinematics"] = {"map": kinematics.to_dict(), "joints": joints}
         return seen
 
     def _drawn_points(self) -> list[dict[str, Any]]:

@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
+
+from vmri_jax.mechanics.arrays import library
 
 SIDES = 20
 """Of a cylinder as it is drawn."""
@@ -20,8 +21,8 @@ class Box:
 
     def inertia(self, mass):
         """``J_1 = m (b^2 + c^2) / 12`` and so on, (3,) kg m^2."""
-        squares = jnp.asarray(self.edges) ** 2
-        return mass * (jnp.sum(squares) - squares) / 12
+        squares = library(self.edges).asarray(self.edges) ** 2
+        return mass * (squares.sum() - squares) / 12
 
     def polyhedron(self) -> Polyhedron:
         """Eight corners and six faces."""
@@ -40,7 +41,7 @@ class Cylinder:
     def inertia(self, mass):
         """``J_1 = J_2 = m (3 r^2 + l^2) / 12``, ``J_3 = m r^2 / 2``, (3,) kg m^2."""
         across = mass * (3 * self.radius**2 + self.length**2) / 12
-        return jnp.stack([across, across, mass * self.radius**2 / 2])
+        return library(across, self.radius).stack([across, across, mass * self.radius**2 / 2])
 
     def polyhedron(self) -> Polyhedron:
         """Two polygons of so many `SIDES`, and what is between them."""
@@ -59,7 +60,7 @@ class Ball:
 
     def inertia(self, mass):
         """``J = 2 m r^2 / 5``, (3,) kg m^2."""
-        return jnp.full(3, 0.4 * mass * self.radius**2)
+        return np.ones(3) * (0.4 * mass * self.radius**2)
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class Rod:
     def inertia(self, mass):
         """``J_1 = J_2 = m l^2 / 12``, ``J_3 = 0``, (3,) kg m^2."""
         across = mass * self.length**2 / 12
-        return jnp.stack([across, across, jnp.zeros_like(across)])
+        return library(across).stack([across, across, 0 * across])
 
 
 Shape = Box | Cylinder | Ball | Rod

@@ -10,7 +10,7 @@ between slow and fast, see `vmri_jax.scene.rates`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain
 from typing import Any, Literal, NamedTuple
@@ -22,7 +22,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Place
-from vmri_jax.scene.body import GROUND, Bodies, moving
+from vmri_jax.scene.body import GROUND, Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.layout import Layout, Pace, join
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
@@ -62,6 +62,8 @@ class Sorting:
 
     Attributes:
         links: the frames of bodies on joints, in the order of the kinematics; None where a way has ended.
+        joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`; others are zero, with the
+            rates that the velocities of bodies give.
     """
 
     bodies: Bodies
@@ -69,6 +71,7 @@ class Sorting:
     layout: Layout
     placed: tuple[Placed, ...]
     links: tuple[Link | None, ...] = ()
+    joint_starts: Mapping[tuple[str, int, str], tuple[Any, Any]] = field(default_factory=dict)
 
     @property
     def branches(self) -> tuple[Branch, ...]:
@@ -91,9 +94,24 @@ class Sorting:
     @property
     def positions(self) -> tuple[jax.Array, jax.Array]:
         """(q_s, q_f) at the start."""
+        return self._with_joint_starts(*self.assembled, 0)
+
+    @property
+    def assembled(self) -> tuple[Any, Any]:
+        """(q_s, q_f) where the bodies are as they are given, and freedoms of joints are zero."""
         slow, fast = self._of_bodies("coordinates")
         n_s, n_f = self.layout.sizes
         return slow[:n_s], fast[:n_f]
+
+    def _with_joint_starts(self, slow, fast, which: int) -> tuple[Any, Any]:
+        """Slow and fast coordinates with the values that freedoms of joints start with, or (1) velocities with their rates."""
+        for key, value in self.joint_starts.items():
+            part, start, _ = self.layout.freedoms[key]
+            given = (slow, fast)[part == "f"]
+            pieces = given[:start], library(value[which]).reshape(value[which], (1,)), given[start + 1 :]
+            changed = library(pieces).concatenate(pieces)
+            slow, fast = (changed, fast) if part == "s" else (slow, changed)
+        return slow, fast
 
     @property
     def missed(self) -> Any:
@@ -102,25 +120,25 @@ class Sorting:
 
     @cached_property
     def _on_joints(self) -> tuple[tuple, Any]:
-        q, n_s = library(self.positions).concatenate(self.positions), self.layout.sizes[0]
+        q, n_s = library(self.assembled).concatenate(self.assembled), self.layout.sizes[0]
         rates, masses = (library(both).concatenate(both) for both in map(self._of_bodies, ("rates", "masses")))
         v, missed = nearest_rates(self.to_bodies(q)[1], rates, masses)
-        return (*self.positions, v[:n_s], v[n_s:]), missed
+        return (*self.positions, *self._with_joint_starts(v[:n_s], v[n_s:], 1)), missed
 
     def _of_bodies(self, what: str) -> tuple[jax.Array, jax.Array]:
         return join(self.bodies, self.layout, "s", what), join(self.bodies, self.layout, "f", what)
 
-    def to_bodies(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def to_bodies(self, q: Any) -> tuple[Any, Any]:
         """The coordinates of all bodies (Q_s, Q_f) one after the other, and their Jacobian, of q = (q_s, q_f)."""
         if self.layout.kinematics is None:
             return q, np.eye(q.size)
-        found = _bodies_and_jacobian(self.layout.kinematics, q, self.joints)
-        return tuple(map(np.asarray, found)) if is_concrete(found) else found
+        bodies, jacobian = _bodies_and_jacobian(self.layout.kinematics, q, self.joints)
+        return (np.asarray(bodies), np.asarray(jacobian)) if is_concrete(jacobian) else (bodies, jacobian)
 
     @cached_property
     def joints(self) -> dict[str, Any]:
         """Points and triads of the joints that carry bodies, see `Kinematics`; empty without such."""
-        return joint_numbers(self.bodies, self.links)
+        return joint_numbers(self.bodies, self.links) if self.links else {}
 
 
 @partial(jax.jit, static_argnames="kinematics")
@@ -128,7 +146,8 @@ def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
     """Q and dQ/dq."""
 
     def bodies(q):
-        found = jnp.concatenate(kinematics(*jnp.split(q, [kinematics.sizes[0]]), joints))
+        n_s = kinematics.sizes[0]
+        found = jnp.concatenate(kinematics(q[:n_s], q[n_s:], joints))
         return found, found
 
     jacobian, found = jax.jacfwd(bodies, has_aux=True)(q)
@@ -184,7 +203,8 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
         ValueError: a potential that is to be fast but touches a slow body; something to be decided by numbers that are traced.
     """
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
-    measured = _measure(bodies, energies)
+    owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
+    measured = _measure(bodies, energies, owned)
     declared = {
         rate: [measured[effect.name].rate for effect in energies if effect.rate == rate and effect.name in measured]
         for rate in ("slow", "fast")
@@ -195,7 +215,6 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
         min((rates.min() for rates in declared["fast"]), default=np.inf),
     )
     carrying = {(branch.joint.name, branch.element) for branch in branches}
-    owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
     paces = _paces(bodies, energies, measured, limit, owned)
     placed = []
     for effect in effects:
@@ -211,13 +230,11 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
     return Sorting(bodies, paces, where, tuple(placed), ordered)
 
 
-def _measure(bodies, energies) -> dict[str, Rates]:
+def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[str, Rates]:
     """Rates of potentials and kinetic effects, if a decision depends on them."""
     undecided = []
     for effect in energies:
-        free = [
-            all(bodies[name].pace != "slow" for name in element) for element in map(moving, effect.elements(bodies))
-        ]
+        free = [all(bodies[name].pace != "slow" for name in names) for names, _ in owned[effect.name]]
         if effect.kind == "potential" and effect.rate == "auto" and any(free):
             undecided.append(effect.name)
     if not undecided and all(body.pace != "auto" for body in bodies.values()):

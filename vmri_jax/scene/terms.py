@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.scene.body import GROUND_COORDINATES
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.rows import Rows
+from vmri_jax.scene.body import GROUND_COORDINATES
 
 IMPLIED = "implied"
 """Where the sizes of rows that are left out are in params."""
@@ -265,7 +265,7 @@ class _OfTerms:
     terms: tuple[Any, ...]
     kinematics: Kinematics | None = None
 
-    def bodies(self, q_s, q_f, params):
+    def bodies(self, q_s, q_f, params) -> tuple[Any, Any]:
         """(Q_s, Q_f) of q_s and q_f, one of which may be None."""
         return (q_s, q_f) if self.kinematics is None else self.kinematics(q_s, q_f, params[JOINTS])
 
@@ -273,13 +273,13 @@ class _OfTerms:
         """(Q_s, Q_f) and their rates."""
         if self.kinematics is None:
             return (q_s, q_f), (v_s, v_f)
-        return jax.jvp(lambda *q: self.bodies(*q, params), (q_s, q_f), (v_s, v_f))
+        return jax.jvp(lambda q_s, q_f: self.bodies(q_s, q_f, params), (q_s, q_f), (v_s, v_f))
 
     def forces_on(self, q_s, q_f, params, forces):
         """(F_s, F_f) of forces on the coordinates of bodies: ``(dQ/dq)^T F``."""
         if self.kinematics is None:
             return forces
-        return jax.vjp(lambda *q: self.bodies(*q, params), q_s, q_f)[1](forces)
+        return jax.vjp(lambda q_s, q_f: self.bodies(q_s, q_f, params), q_s, q_f)[1](forces)
 
 
 class SlowPotential(_OfTerms):

@@ -19,6 +19,7 @@ from vmri_jax.scene.body import GROUND, Bodies, body_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joints import Joint
 from vmri_jax.scene.layout import Layout, Pace
+from vmri_jax.scene.rigid import RigidBody
 
 
 class Branch(NamedTuple):
@@ -105,7 +106,7 @@ def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:
         effects: joints among them.
     """
     edges: dict[str, list[tuple]] = {}
-    for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.moves is not None):
+    for joint in (effect for effect in effects if isinstance(effect, Joint) and effect.carries):
         for i, (a, b) in enumerate(joint.elements(bodies)):
             if body_of(bodies, a).rigid and body_of(bodies, b).rigid:
                 edges.setdefault(a, []).append((b, joint, i, True))
@@ -173,7 +174,8 @@ def layout(
 
 def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, own, freedoms, sizes):
     """The layout with the bodies on joints, and the links of their frames."""
-    grids: dict[str, Grid] = {GROUND: "s"} | {name: place.part for name, place in places.items()}
+    grids: dict[str, Grid] = {name: place.part for name, place in places.items()}
+    grids[GROUND] = "s"
     depths: dict[str, int] = {}
     for branch in branches:
         parts = {freedoms[key].part for key in branch.keys}
@@ -275,20 +277,20 @@ def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
     carried = {link.branch.child for link in links}
     joints = {link.branch.joint.name: link.branch.joint for link in links}
     points = {name: joint.joining_points(bodies) for name, joint in joints.items()}
-    triads = {name: joint.frame(len(points[name])) for name, joint in joints.items()}
+    triads: dict[str, Any] = {name: joint.frame(len(points[name])) for name, joint in joints.items()}
     found: dict[str, list] = {}
     for link in links:
         branch = link.branch
-        point, triad = (some[branch.joint.name][branch.element] for some in (points, triads))
+        point, triad = points[branch.joint.name][branch.element], triads[branch.joint.name][branch.element]
         first, last = (0, 1) if branch.forward else (1, 0)
         for role, name, which, here in (
             ("a", branch.parent, first, link.is_first),
             ("b", branch.child, last, link.is_last),
         ):
             body = body_of(bodies, name)
-            along = body.components if name in carried else body.weights
+            along = body.components if isinstance(body, RigidBody) and name in carried else body.weights
             at = along((point[which] - body.position) @ body.rotation) if here else np.zeros(3)
-            axes = [along(row @ body.rotation) for row in triad] if here else np.eye(3)
+            axes = [along(row @ body.rotation) for row in triad] if here else list(np.eye(3))
             found.setdefault(f"point_{role}", []).append(at)
             found.setdefault(f"frame_{role}", []).append(library(axes).stack(axes))
     return {name: library(values).stack(values) for name, values in found.items()}

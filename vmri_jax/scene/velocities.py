@@ -20,8 +20,10 @@ REACHED = 1e-8
 """Part of the rates by which they may be missed."""
 
 
-def with_rates(sorting: Sorting, effects: Sequence[Effect], system: System, wanted: Mapping[str, Any]) -> list[AnyBody]:
-    """The bodies with velocities that have these rates in their joints, see `Scene.with_rates`.
+def with_rates(
+    sorting: Sorting, effects: Sequence[Effect], system: System, wanted: Mapping[str, Any]
+) -> tuple[list[AnyBody], dict[tuple[str, int, str], tuple[Any, Any]]]:
+    """The bodies with velocities that have these rates in their joints, see `Scene.with_rates`, and the starts of joints that carry some.
 
     With all constraints and rates as rows ``C v = b``, v is the nearest to the given velocities v_0 in the norm of the
     kinetic energy: with ``M = R R^T``, ``R^T (v - v_0)`` is the shortest solution of ``C R^-T x = b - C v_0``.
@@ -65,8 +67,63 @@ def with_rates(sorting: Sorting, effects: Sequence[Effect], system: System, want
             f"Scene.with_rates: no velocities have these rates of {', '.join(wanted)} and keep the constraints: they are missed by "
             f"{missed:.3g}. Give fewer rates: those of a joint follow from others, or it cannot move here."
         )
-    rates = of_bodies @ v
-    return [body.with_rates(rates[columns[name] : columns[name] + body.size]) for name, body in sorting.bodies.items()]
+    rates = sorting.to_bodies(np.concatenate(sorting.assembled))[1] @ v
+    moved = [body.with_rates(rates[columns[name] : columns[name] + body.size]) for name, body in sorting.bodies.items()]
+    if not sorting.layout.freedoms:
+        return moved, {}
+    at = {key: place.start + (n_s if place.part == "f" else 0) for key, place in sorting.layout.freedoms.items()}
+    return moved, {key: (np.asarray(q[i]), v[i]) for key, i in at.items()}
+
+
+def joint_starts(
+    sorting: Sorting, effects: Sequence[Effect], wanted: Mapping[str, Any]
+) -> dict[tuple[str, int, str], tuple[Any, Any]]:
+    """Values and rates of freedoms by the keys of `Layout.freedoms`, see `Scene.with_joints`.
+
+    Args:
+        sorting: bodies at their places.
+        effects: of the scene, joints among them.
+        wanted: by the name of the joint.
+    """
+    if not isinstance(wanted, Mapping):
+        raise TypeError(
+            f'Scene.with_joints: joints is {wanted!r}; give starts by the names of joints, {{"hinge": 0.3}}.'
+        )
+    joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
+    found = {}
+    for name, given in wanted.items():
+        if name not in joints:
+            raise ValueError(f"Scene.with_joints: {unknown('joint', name, joints)}")
+        joint, count = joints[name], len(joints[name].elements(sorting.bodies))
+        for of, start in given.items() if isinstance(given, Mapping) else [("auto", given)]:
+            try:
+                freedom = freedom_of(joint, of)
+            except ValueError as error:
+                raise ValueError(f"Scene.with_joints: {error} Give a dictionary of them.") from None
+            value, rate = start if isinstance(start, tuple) else (start, 0.0)
+            what = f"Scene.with_joints: the start of {name}"
+            numbers = [real_array(what, number) for number in (value, rate)]
+            for number in numbers:
+                if number.shape not in ((), (count,)):
+                    more = f", or one for each pair, ({count},)" if count > 1 else ""
+                    raise ValueError(
+                        f"{what} has shape {number.shape}; give one number, or a pair (value, rate){more}."
+                    )
+                if is_concrete(number) and not np.isfinite(number).all():
+                    raise ValueError(f"{what} is {number}; it must be finite.")
+            for i in range(count):
+                key = name, i, freedom
+                if key not in sorting.layout.freedoms:
+                    raise ValueError(
+                        f"Scene.with_joints: {joint.label(i, sorting.bodies)} has no coordinate of its own: "
+                        + (
+                            "it closes a loop; set the other joints of the loop."
+                            if sorting.layout.freedoms
+                            else 'give the scene coordinates="joint".'
+                        )
+                    )
+                found[key] = tuple(number if number.ndim == 0 else number[i] for number in numbers)
+    return found
 
 
 def _rates(effects: Sequence[Effect], bodies: Bodies, wanted: Mapping[str, Any]):

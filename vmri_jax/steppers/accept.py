@@ -48,17 +48,22 @@ class Accepted(NamedTuple):
     tolerance: of Newton, over `SAFETY`, since what is left of every step adds up.
     slow, fast: round-off, (2,): of these variables alone, and with that of variables that constraints tie to them. At the origin
         they have none of their own.
+    stopped: round-off of positions at which corrections may stop shrinking. Coordinates of a kinetic energy that is a function may be
+        angles: where bodies are is known to no more digits than with angles of one radian, also at angles near zero.
     """
 
     tolerance: Number
     slow: Float[Array, "2"]
     fast: Float[Array, "2"]
+    stopped: Float[Array, ""]
 
     @classmethod
     def of(cls, equations: StepEquations, newton) -> "Accepted":
         """For a step from its positions."""
         slow, fast = max_abs(equations.q_s), max_abs(equations.q_f)
         to_slow = to_fast = 0.0
+        largest = jnp.maximum(slow, fast)
+        largest = largest if equations.system.has_constant_mass else jnp.maximum(largest, 1.0)
         if equations.system.constraint is not None and equations.q_s.size and equations.q_f.size:
             to_slow = to_fast = 1.0
             masses = equations.system.kinetic
@@ -69,7 +74,8 @@ class Accepted(NamedTuple):
             jnp.stack([slow, jnp.maximum(slow, to_slow * fast)]),
             jnp.stack([fast, jnp.maximum(fast, to_fast * slow)]),
         )
-        return cls(newton.tolerance / SAFETY, *(ROUNDOFF * jnp.finfo(float).eps * floor for floor in floors))
+        roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in (*floors, largest))
+        return cls(newton.tolerance / SAFETY, *roundoff)
 
     def sizes(self, motions, iterations) -> tuple[Any, Any]:
         """The changes (slow, fast) that are accepted with such motions after so many iterations."""
@@ -86,7 +92,7 @@ class Accepted(NamedTuple):
 
     def is_roundoff(self, size, floor=FLOOR):
         """Whether a correction is at most `floor` units of round-off of the positions."""
-        return size <= floor / ROUNDOFF * jnp.maximum(self.slow[0], self.fast[0])
+        return size <= floor / ROUNDOFF * self.stopped
 
     def over(self, changes, motions, iterations):
         """Changes (slow, fast) over what is accepted of them, see `sizes`; the larger of the two."""

@@ -112,13 +112,13 @@ class InJoint(Effect):
         return self.joint.name, i
 
     def terms(self, select, bodies, layout, potentials):
-        places = {i: layout.freedoms.get((self.joint.name, i, self.freedom)) for i in select}
-        direct = [i for i in select if places[i] is not None]
-        terms = super().terms([i for i in select if places[i] is None], bodies, layout, potentials)
+        keys = {i: (self.joint.name, i, self.freedom) for i in select}
+        direct = [i for i in select if keys[i] in layout.freedoms]
+        terms = super().terms([i for i in select if i not in direct], bodies, layout, potentials)
         if not direct:
             return terms
         chosen = None if len(direct) == len(self.elements(bodies)) else tuple(direct)
-        roles = (OnBodies(Rows.of([places[i] for i in direct])),)
+        roles = (OnBodies(Rows.of([layout.freedoms[keys[i]] for i in direct])),)
         return (*terms, EffectTerm(self.name, self.of_coordinate, roles, chosen, self.split, self.timed))
 
     def parameters(self, bodies):

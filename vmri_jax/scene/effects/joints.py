@@ -68,6 +68,7 @@ UNTURNED = (M, M_PRIME)
 
 
 Freedom = Literal["turn", "slide", "tilt"]
+"""An angle about the axis, a way along it, an angle about the second axis."""
 
 
 @effect_class
@@ -90,8 +91,10 @@ class Joint(Effect):
     whole = True
     same_size = False
     derived = ("point_a", "point_b", "frame_a", "frame_b")
-    moves: ClassVar[tuple[Move, ...] | None] = None
-    """What its freedoms do with the triad of a; None where the freedoms are no coordinates without a pole."""
+    carries: ClassVar[bool] = False
+    """Whether b may be a function of its freedoms: whether these are coordinates without a pole."""
+    moves: ClassVar[tuple[Move, ...]] = ()
+    """What these do with the triad of a, one after the other."""
     freedoms: ClassVar[tuple[Freedom, ...]] = ()
     """What it leaves free, in the order of the coordinates of its moves."""
 
@@ -261,6 +264,7 @@ class Revolute(_AboutAxis):
     """
 
     default_name = "revolute"
+    carries = True
     moves = (Move("turn", N),)
     freedoms = ("turn",)
 
@@ -284,6 +288,7 @@ class Universal(_AboutAxis):
     second: Any = (1.0, 0.0, 0.0)
 
     default_name = "universal"
+    carries = True
     moves = (Move("turn", N), Move("turn", M))
     freedoms = ("turn", "tilt")
 
@@ -307,7 +312,7 @@ class Fixed(_AboutAxis):
     """
 
     default_name = "fixed"
-    moves = ()
+    carries = True
 
     @staticmethod
     def function(q, params):
@@ -329,8 +334,9 @@ class Cylindrical(_AboutAxis):
     """
 
     default_name = "cylindrical"
-    moves = (Move("slide", N), Move("turn", N))
-    freedoms = ("slide", "turn")
+    carries = True
+    moves = (Move("turn", N), Move("slide", N))
+    freedoms = ("turn", "slide")
 
     @staticmethod
     def function(q, params):
@@ -346,6 +352,7 @@ class Prismatic(_AboutAxis):
     """
 
     default_name = "prismatic"
+    carries = True
     moves = (Move("slide", N),)
     freedoms = ("slide",)
 
@@ -373,7 +380,7 @@ def tilt(q, params):
     return jnp.arctan2(dot(of_b[..., M_PRIME, :], n), dot(of_b[..., N, :], n))
 
 
-FREEDOMS = {"turn": turn, "slide": slide, "tilt": tilt}
+FREEDOMS: dict[str, Any] = {"turn": turn, "slide": slide, "tilt": tilt}
 """What a joint can leave free, as functions of the coordinates of its two bodies."""
 
 
@@ -383,7 +390,7 @@ def freedom_of(joint: Joint, of: str) -> Freedom:
     Raises:
         ValueError: it leaves another one, several, or none.
     """
-    fitting = [freedom for freedom in joint.freedoms if of in (freedom, "auto")]
+    fitting: list[Freedom] = [freedom for freedom in joint.freedoms if of in (freedom, "auto")]
     if len(fitting) == 1:
         return fitting[0]
     left = " and ".join(joint.freedoms) or "neither an angle nor a way along an axis"

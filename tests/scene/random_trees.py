@@ -1,0 +1,65 @@
+"""Random trees of rigid bodies on joints: roots on the ground or free, every kind of joint, springs, dampers, forces."""
+
+from typing import Any
+
+import numpy as np
+
+from vmri_jax.scene import (
+    Box,
+    Cylindrical,
+    Effect,
+    Fixed,
+    Gravity,
+    JointDamper,
+    JointSpring,
+    Prismatic,
+    Revolute,
+    RigidBody,
+    Scene,
+    Spherical,
+    Spring,
+    Universal,
+)
+
+JOINTS = (Revolute, Prismatic, Cylindrical, Universal, Fixed, Spherical)
+BODIES = 4
+
+
+def random_scene(seed: int) -> tuple[Scene, dict[str, tuple[float, float]]]:
+    """A scene in joint coordinates at rest, and random starts of all its freedoms (value, rate) by joint and freedom.
+
+    Args:
+        seed: of the random numbers; the ground carries trees of odd ones.
+    """
+    random = np.random.default_rng(seed)
+    bodies, effects, starts = [], [], {}
+    names = ["ground"] if seed % 2 else []
+    for i in range(BODIES):
+        name, place = f"body {i}", random.normal(size=3)
+        pace: Any = random.choice(["slow", "fast"]) if i else "slow"
+        shape = Box(tuple(random.uniform(0.5, 1.5, size=3)))
+        bodies.append(RigidBody(name, random.uniform(0.5, 2.0), shape, place, random.normal(size=3), pace=pace))
+        if names:
+            parent, kind = random.choice(names), JOINTS[random.integers(len(JOINTS))]
+            pair = (parent, name) if random.random() < 0.5 else (name, parent)
+            effects += _on_joint(kind, pair, f"joint {i}", random, starts)
+        names.append(name)
+    ends = ("body 2", random.normal(size=3) / 5), ("body 3", random.normal(size=3) / 5)
+    effects += [Gravity([0.3, 0.2, -1.0]), Spring(ends, 3.0, 0.4)]
+    return Scene(bodies, effects, coordinates="joint"), starts
+
+
+def _on_joint(kind, pair, name: str, random, starts) -> list[Effect]:
+    """A joint, with a spring and a damper in every freedom."""
+    axis = random.normal(size=3)
+    second = np.cross(axis, random.normal(size=3))
+    axes = {} if kind is Spherical else {"axis": axis} | ({"second": second} if kind is Universal else {})
+    joint = kind(pair, at=random.normal(size=3), name=name, **axes)
+    found: list[Effect] = [joint]
+    for freedom in joint.freedoms if joint.carries else ():
+        label = f"{name} {freedom}"
+        neutral = random.normal() / 5
+        found.append(JointSpring(name, 2.0, neutral, of=freedom, name=f"{label} spring"))
+        found.append(JointDamper(name, 0.1, of=freedom, name=f"{label} damper"))
+        starts.setdefault(name, {})[freedom] = (random.normal() / 4, random.normal() / 4)
+    return found

@@ -1,0 +1,298 @@
+"""Bodies as functions of the freedoms of joints: the same mechanics as by directors, with fewer unknowns."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.scene.random_trees import random_scene
+from vmri_jax.animation.drawing import Drawing
+from vmri_jax.animation.motion import motion as motion_of
+from vmri_jax.mechanics.invariants import energy
+from vmri_jax.mechanics.motion import motion
+from vmri_jax.mechanics.names import Names
+from vmri_jax.mechanics.projection import legendre
+from vmri_jax.mechanics.state import State
+from vmri_jax.scene import (
+    Ball,
+    Box,
+    Controlled,
+    Cylindrical,
+    Gravity,
+    JointDrive,
+    JointLimit,
+    JointMotion,
+    JointSpring,
+    Revolute,
+    RigidBody,
+    Scene,
+    angular_momentum,
+)
+
+
+def state_of(scene):
+    """The state at the start, of velocities that keep all constraints."""
+    system, (q_s, q_f, v_s, v_f) = scene.system(), scene.start
+    return State(jnp.zeros(()), q_s, q_f, *jax.jit(legendre)(system, q_s, q_f, v_s, v_f))
+
+
+def accelerations(scene, state):
+    """Positions, velocities and accelerations of all bodies by name."""
+    moved = jax.jit(motion)(scene.system(), state)
+    q, v, a = (state.q_s, state.q_f), (moved.v_s, moved.v_f), (moved.a_s, moved.a_f)
+    layout, joints = scene.sorting.layout, scene.sorting.joints
+    if layout.kinematics is not None:
+
+        @jax.jit
+        def of_bodies(q, v, a):
+            def velocities(q, v):
+                return layout.kinematics.velocities(*q, *v, joints)
+
+            return layout.kinematics(*q, joints), *jax.jvp(velocities, (q, v), (v, a))
+
+        q, v, a = of_bodies(q, v, a)
+    return {
+        name: tuple(both[part == "f"][start : start + size] for both in (q, v, a))
+        for name, (part, start, size) in layout.bodies.items()
+    }
+
+
+def by_directors(scene, moved):
+    """The scene by directors, all of them slow, and its state with these positions and velocities of bodies."""
+    bodies = [replace(body, pace="slow") for body in scene.bodies]
+    twin = replace(scene, bodies=bodies, coordinates="directors", joint_starts={})
+    q, v = (jnp.concatenate([moved[name][k] for name in twin.places]) for k in range(2))
+    none = jnp.zeros(0)
+    return twin, State(jnp.zeros(()), q, none, *legendre(twin.system(), q, none, v, none))
+
+
+SEEDS = [*range(3), *(pytest.param(seed, marks=pytest.mark.full) for seed in range(3, 10))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_bodies_of_random_trees_accelerate_as_by_directors(seed):
+    scene, starts = random_scene(seed)
+    carried = {branch.joint.name for branch in scene.branches}
+    scene = scene.with_joints({name: start for name, start in starts.items() if name in carried})
+    state = state_of(scene)
+    mine = accelerations(scene, state)
+    twin, there = by_directors(scene, mine)
+    theirs = accelerations(twin, there)
+    for name in theirs:
+        for a, b in zip(mine[name], theirs[name], strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-10)  # values up to 10, measured 3e-14
+    energies = [float(energy(s.system(), x.q_s, x.q_f, x.p_s, x.p_f)) for s, x in ((scene, state), (twin, there))]
+    assert energies[0] == pytest.approx(energies[1], rel=1e-12)
+    assert state.q_s.size + state.q_f.size < there.q_s.size
+
+
+SPIN = np.array([0.05, 0.02, 0.2])
+DRIFT = np.array([0.1, 0.0, 0.0])
+
+
+def satellite(coordinates: Any = "joint", stiffness=20.0, along=0.0, rate: Any = "auto"):
+    """A hub that floats, slow, with a panel on a hinge, fast."""
+    place = np.array([0.1, 0.9, 0.0])
+    hub = RigidBody("hub", 5.0, Box((1, 1, 1)), [0, 0, 0], spin=SPIN, velocity=DRIFT, pace="slow")
+    panel = RigidBody(
+        "panel", 1.0, Box((0.4, 0.8, 0.03)), place, spin=SPIN, velocity=np.cross(SPIN, place) + DRIFT, pace="fast"
+    )
+    hinge = Revolute(("hub", "panel"), at=np.array([0, 0.5, 0]) + along * np.array([0, 0.1, 0]), axis=[1, 0, 0.2])
+    effects = [replace(hinge, name="hinge"), JointSpring("hinge", stiffness, 0.3, rate=rate)]
+    return Scene([hub, panel], effects, coordinates=coordinates)
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A second of it, ten micro steps of 0.005 s each."""
+    return vm.simulate(satellite(), vm.fully_implicit(10), macro_dt=0.05, num_steps=20)
+
+
+def test_a_hinge_is_one_unknown_and_no_row():
+    scene = satellite()
+    assert [x.size for x in scene.start] == [12, 1, 12, 1]
+    assert scene.system().num_constraints(*scene.start[:2]) == (0, 6)
+    assert (scene.names.slow, scene.names.fast) == ({"hub": 12}, {"hinge": 1})
+    rows = {row.name: row for row in scene.explain(vm.fully_implicit(10), measure=False).rows}
+    assert (rows["panel"].unknowns, rows["panel"].grid) == (10, "micro")
+    assert rows["joint_springs"].kind == "fast potential W"
+    assert "hinge" not in rows
+
+
+def test_a_floating_root_keeps_all_momenta(run):
+    for name in ("hub", "panel"):
+        assert run.position(name).shape == run.velocity(name).shape == run.momentum(name).shape == (21, 12)
+    momentum = run.momentum("hub")[:, :3] + run.momentum("panel")[:, :3]
+    turning, more = (angular_momentum(run.position(name), run.momentum(name)) for name in ("hub", "panel"))
+    turning = turning + more
+    assert np.abs(momentum - momentum[0]).max() < 1e-13  # of 0.6
+    assert np.abs(turning - turning[0]).max() < 1e-13  # of 0.4
+    assert np.ptp(run.position("hinge")) > 0.5
+
+
+def test_the_motion_is_that_by_directors_to_the_order_of_the_scheme(run):
+    errors = []
+    for refined in (1, 2):
+        steps = {"macro_dt": 0.05 / refined, "num_steps": 20 * refined, "save_every": 20 * refined}
+        one, other = (vm.simulate(satellite(kind), vm.fully_implicit(10), **steps) for kind in ("joint", "directors"))
+        errors.append(max(float(np.abs(one.position(b)[-1] - other.position(b)[-1]).max()) for b in ("hub", "panel")))
+    assert errors[0] < 1e-2
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.15)
+    np.testing.assert_allclose(satellite().joint_motion(run, "hinge"), run.position("hinge")[:, 0], atol=1e-14)
+
+
+def test_reaction_forces_are_those_of_the_rows(run):
+    scene = satellite()
+    forces = scene.by_directors(run).reaction_forces("hinge")["panel"]
+    acceleration = accelerations(scene, run[5])["panel"][2]
+    np.testing.assert_allclose(forces[5][:3], acceleration[:3], atol=1e-10)  # 1 kg, and nothing else pulls its centre
+    with pytest.raises(ValueError, match="by_directors"):
+        run.reaction_forces("hinge")
+
+
+def test_a_stored_run_is_drawn_as_it_moved(run, tmp_path):
+    problem = satellite().problem()
+    run.save(tmp_path / "run.npz", problem.drawing)
+    loaded = vm.Trajectory.load(tmp_path / "run.npz")
+    assert problem.names is not None
+    drawing = Drawing.from_dict(json.loads(json.dumps(problem.drawing)))
+    seen = motion_of(loaded, drawing)
+    at = [body.name for body in drawing.bodies].index("panel")
+    np.testing.assert_allclose(seen.points[:, at], run.position("panel")[:, :3], atol=1e-12)
+    assert Names.from_dict(json.loads(json.dumps(problem.names.to_dict()))).kinematics == problem.names.kinematics
+    with pytest.raises(ValueError, match="does not know its system"):
+        loaded.position("panel")
+    np.testing.assert_allclose(loaded.of(problem).position("panel"), run.position("panel"), atol=1e-14)
+
+
+def test_joints_start_where_they_are_told():
+    turned = satellite().with_joints({"hinge": (0.4, -2.0)})
+    assert [x.tolist() for x in turned.start[1::2]] == [[0.4], [-2.0]]
+    (q, v, _), axis = accelerations(turned, state_of(turned))["panel"], np.array([1, 0, 0.2]) / np.hypot(1, 0.2)
+    spin = np.cross(q[3:].reshape(3, 3), v[3:].reshape(3, 3)).sum(axis=0) / 2
+    np.testing.assert_allclose(spin, SPIN - 2.0 * axis, atol=1e-12)
+    assert float(satellite().with_rates({"hinge": 1.5}).start[3][0]) == pytest.approx(1.5)
+    kept = turned.with_rates({"hinge": 1.5}).start
+    assert (float(kept[1][0]), float(kept[3][0])) == pytest.approx((0.4, 1.5))
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        ({"hing": 0.1}, "Did you mean hinge"),
+        ({"hinge": {"slide": 0.1}}, "leaves turn free"),
+        ({"hinge": [0.1, 0.2]}, r"shape \(2,\)"),
+        ({"hinge": np.nan}, "finite"),
+    ],
+)
+def test_starts_that_cannot_be_are_refused(joints, message):
+    with pytest.raises(ValueError, match=message):
+        satellite().with_joints(joints)
+
+
+def test_starts_of_joints_need_joint_coordinates():
+    with pytest.raises(ValueError, match='coordinates="joint"'):
+        satellite("directors").with_joints({"hinge": 0.1})
+    with pytest.raises(ValueError, match="coordinates is 'angles'"):
+        satellite("angles")
+    with pytest.raises(ValueError, match="closes a loop"):
+        four_bar().with_joints({"pin 2": 0.1})
+
+
+def test_velocities_that_joints_do_not_allow_are_refused():
+    torn = satellite().replace("panel", velocity=[0.0, 0.0, 1.0])
+    with pytest.raises(ValueError, match="do not fit the joints"):
+        torn.problem()
+    assert replace(torn, project=True).problem().v_f.size == 1
+
+
+def torque(t, params):
+    """A torque that changes with time."""
+    return params["size"] * jnp.cos(t)
+
+
+def angle(t, params):
+    """An angle that is given."""
+    return params["size"] * jnp.sin(t)
+
+
+def test_what_acts_in_a_joint_acts_on_its_coordinate():
+    bodies = [
+        RigidBody("arm", 2.0, Ball(0.3), [1, 0, 0], pace="slow"),
+        RigidBody("sleeve", 1.0, Ball(0.2), [1, 0.5, 0], pace="fast"),
+    ]
+    effects = [
+        Gravity([0, 0, -1.0]),
+        Revolute(("ground", "arm"), at=[0, 0, 0], axis=[0, 1, 0], name="hinge"),
+        Cylindrical(("sleeve", "arm"), at=[1, 0.2, 0], axis=[0, 1, 0], name="guide"),
+        JointDrive("hinge", torque, {"size": 0.3}),
+        JointLimit("guide", -0.1, 0.1, stiffness=50.0, smoothing=0.01, of="slide"),
+        JointMotion("guide", angle, {"size": 0.5}, of="turn"),
+        Controlled("hinge", "torque"),
+    ]
+    scene = Scene(bodies, effects, coordinates="joint").with_joints({"guide": {"slide": 0.12}})
+    q_s, q_f, *_ = scene.start
+    assert [q_s.tolist(), q_f.tolist()] == [[0.0], [0.0, 0.12]]
+    system, still = scene.system(), scene.without("joint_motion")
+    np.testing.assert_allclose(system.g(0.7, q_s, q_f + jnp.array([0.3, 0])), 0.3 - 0.5 * np.sin(0.7), atol=1e-15)
+    assert scene.actuation is not None
+    push = scene.actuation(q_s, q_f, jnp.array([2.0]), system.params)
+    np.testing.assert_allclose(jnp.concatenate(push), [2.0, 0.0, 0.0], atol=1e-15)
+    mine = accelerations(still, state_of(still))
+    theirs = accelerations(*by_directors(still, mine))
+    for name in mine:
+        np.testing.assert_allclose(mine[name][2], theirs[name][2], atol=1e-10)
+
+
+def four_bar(coordinates: Any = "joint", second: Any = Revolute):
+    """A crank, a rod and a rocker between hinges, in a plane."""
+    pins = np.array([[0, 0, 0], [0.3, 0.95, 0], [2, 1.5, 0], [2, 0, 0]])
+    names, bodies, effects = ("ground", "crank", "rod", "rocker", "ground"), [], []
+    for name, start, end in zip(names[1:], pins[:-1], pins[1:], strict=False):
+        way = end - start
+        shape = Box((float(np.linalg.norm(way)), 0.1, 0.1))
+        turn = [0, 0, np.arctan2(way[1], way[0])]
+        bodies.append(RigidBody(name, 1.0, shape, (start + end) / 2, rotation=turn, pace="slow"))
+    for i, pin in enumerate(pins):
+        joint = second if i == 1 else Revolute
+        effects.append(joint(names[i : i + 2], at=pin, axis=[0, 0, 1], name=f"pin {i}"))
+    return Scene(bodies, [Gravity([0, -9.81, 0]), *effects], coordinates=coordinates, redundant="drop", project=True)
+
+
+def test_a_loop_is_cut_at_one_joint():
+    scene = four_bar()
+    assert [x.size for x in scene.start[:2]] == [3, 0]
+    assert len(scene.dropped) == 3
+    assert scene.system().num_constraints(*scene.start[:2]) == (0, 2)
+    run = vm.simulate(scene, vm.fully_implicit(1), macro_dt=0.005, num_steps=100)
+    assert float(run.constraint_residual[:, 0].max()) < 1e-14
+    mine = accelerations(scene, run[50])
+    theirs = accelerations(*by_directors(scene, mine))
+    for name in mine:
+        np.testing.assert_allclose(mine[name][2], theirs[name][2], atol=1e-9)
+    cranked = scene.with_rates({"pin 0": 3.0})
+    rates = dict(zip(scene.names.slow, cranked.start[2], strict=True))
+    assert float(rates["pin 0"]) == pytest.approx(3.0)
+    assert jnp.abs(scene.system().constraint_rates(0.0, *cranked.start)).max() < 1e-12
+
+
+def test_of_a_loop_the_joint_with_the_fewest_rows_is_cut():
+    assert {branch.joint.name for branch in four_bar().branches} == {"pin 0", "pin 1", "pin 3"}
+    assert {branch.joint.name for branch in four_bar(second=Cylindrical).branches} == {"pin 0", "pin 2", "pin 3"}
+
+
+def test_the_numbers_of_a_scene_may_be_traced():
+    def turned(stiffness, along):
+        problem = replace(satellite("joint", stiffness, along, "fast"), project=True).problem()
+        steps = {"macro_dt": 0.02, "num_steps": 5, "save_every": 5}
+        return vm.simulate(problem.system, vm.fully_implicit(2), problem.state(), **steps).q_f[-1, 0]
+
+    found = jax.grad(turned, (0, 1))(20.0, 0.0)
+    for i, step in enumerate((1e-3, 1e-5)):
+        low, high = (turned(*(np.array([20.0, 0.0]) + sign * step * np.eye(2)[i])) for sign in (-1, 1))
+        assert float(found[i]) == pytest.approx(float(high - low) / (2 * step), rel=1e-6)
