@@ -122,6 +122,13 @@ def test_a_mechanism(capsys):
     assert f"```text\n{capsys.readouterr().out}```" in (ROOT / "docs/how_to/scenes.md").read_text()
 
 
+def test_joint_coordinates(capsys):
+    page = (ROOT / "docs/how_to/scenes.md").read_text()
+    programs = [p for p in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "hinge = " in p or "with_joints" in p]
+    exec("".join(["import numpy as np\nfrom vmri_jax.scene import Scene\n", *programs]), {})
+    assert f"```text\n{capsys.readouterr().out}```" in page
+
+
 def test_molecules(capsys):
     page = (ROOT / "docs/how_to/molecules.md").read_text()
     first, rigid, steps, many = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
