@@ -95,6 +95,8 @@ RIGID_EFFECTS = [
     sc.Fixed(PAIR, AT),
     sc.Cylindrical(PAIR, AT),
     sc.Prismatic(PAIR, AT),
+    sc.Screw(PAIR, AT, pitch=0.1),
+    sc.Planar(PAIR, AT),
     sc.JointSpring("pin", 2.0),
     sc.JointLimit("pin", -1.0, 1.0, stiffness=1e3, smoothing=0.01),
     sc.JointDamper("pin", 0.1),

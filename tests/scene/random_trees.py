@@ -12,16 +12,18 @@ from vmri_jax.scene import (
     Gravity,
     JointDamper,
     JointSpring,
+    Planar,
     Prismatic,
     Revolute,
     RigidBody,
     Scene,
+    Screw,
     Spherical,
     Spring,
     Universal,
 )
 
-JOINTS = (Revolute, Prismatic, Cylindrical, Universal, Fixed, Spherical)
+JOINTS = (Revolute, Prismatic, Cylindrical, Universal, Fixed, Spherical, Screw, Planar)
 BODIES = 4
 
 
@@ -54,7 +56,9 @@ def _on_joint(kind, pair, name: str, random, starts) -> list[Effect]:
     axis = random.normal(size=3)
     second = np.cross(axis, random.normal(size=3))
     axes: dict[str, Any] = (
-        {} if kind is Spherical else {"axis": axis} | ({"second": second} if kind is Universal else {})
+        {}
+        if kind is Spherical
+        else {"axis": axis} | ({"second": second} if kind is Universal else {"pitch": 0.5} if kind is Screw else {})
     )
     joint = kind(pair, at=random.normal(size=3), name=name, **axes)
     found: list[Effect] = [joint]

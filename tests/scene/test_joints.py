@@ -12,15 +12,17 @@ from vmri_jax.scene import (
     Gravity,
     JointLimit,
     JointSpring,
+    Planar,
     Prismatic,
     Revolute,
     RigidBody,
     Rod,
     Scene,
+    Screw,
     Spherical,
     Universal,
 )
-from vmri_jax.scene.effects.joints import slide, turn
+from vmri_jax.scene.effects.freedoms import slide, turn
 from vmri_jax.scene.rigid import rotation
 
 MOMENTS = [1.0, 2.0, 2.5]
@@ -51,9 +53,11 @@ JOINTS = {
     "fixed": (Fixed(("a", "b"), AT), 0),
     "cylindrical": (Cylindrical(("a", "b"), AT, Y), 2),
     "prismatic": (Prismatic(("a", "b"), AT, Y), 1),
+    "screw": (Screw(("a", "b"), AT, Y, 0.2), 1),
+    "planar": (Planar(("a", "b"), AT, Y), 3),
 }
-MOVE_ELSEWHERE = ("spherical", "prismatic")
-"""Joints of the slider-crank in `test_velocities`, whose motion is known: here their runs are for --full."""
+MOVE_ELSEWHERE = ("spherical", "prismatic", "screw", "planar")
+"""Joints of the slider-crank in `test_velocities` and of `random_trees`, whose motion is known: here their runs are for --full."""
 
 
 @pytest.mark.parametrize("name", JOINTS)

@@ -10,7 +10,17 @@ from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag
 from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, HarmonicDrive
 from vmri_jax.scene.effects.fields import Gravity, MagneticField
 from vmri_jax.scene.effects.joint_effects import JointDamper, JointDrive, JointLimit, JointMotion, JointSpring
-from vmri_jax.scene.effects.joints import Cylindrical, Fixed, Joint, Prismatic, Revolute, Spherical, Universal
+from vmri_jax.scene.effects.joints import (
+    Cylindrical,
+    Fixed,
+    Joint,
+    Planar,
+    Prismatic,
+    Revolute,
+    Screw,
+    Spherical,
+    Universal,
+)
 from vmri_jax.scene.effects.links import Anchor, Guide, MovingPivot, RigidLink
 from vmri_jax.scene.effects.pairs import Coulomb, LennardJones, NBodyGravity, within_bonds
 from vmri_jax.scene.effects.springs import MovingAnchor, NonlinearSpring, Spring, SpringAnchor
@@ -55,6 +65,7 @@ __all__ = [
     "MovingPivot",
     "NBodyGravity",
     "NonlinearSpring",
+    "Planar",
     "PlaneContact",
     "Potential",
     "Prismatic",
@@ -65,6 +76,7 @@ __all__ = [
     "RigidLink",
     "Rod",
     "Scene",
+    "Screw",
     "SphereContact",
     "Spherical",
     "Spring",

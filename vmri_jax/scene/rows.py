@@ -13,13 +13,12 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, moving
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.freedoms import ANGLES
 from vmri_jax.scene.labels import label
 from vmri_jax.scene.layout import join
 from vmri_jax.scene.sorting import Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm
 
-WAYS = ("slide", "along", "across")
-"""Freedoms of joints that are lengths; others are angles."""
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
 
 
@@ -176,7 +175,7 @@ def _extent(bodies: Bodies) -> float:
 
 def _scales(sorting: Sorting, extent: float) -> np.ndarray:
     """By how much each coordinate changes in a large motion, see `ConstraintRows`."""
-    turning = {place: freedom not in WAYS for (_, _, freedom), place in sorting.layout.freedoms.items()}
+    turning = {place: freedom in ANGLES for (_, _, freedom), place in sorting.layout.freedoms.items()}
     places = sorted(sorting.layout.own.items(), key=lambda item: (item[1].part == "f", item[1].start))
     found = [
         np.full(1, 1.0 if turning[place] else extent) if place in turning else _scales_of(sorting.bodies[name], extent)

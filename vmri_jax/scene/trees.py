@@ -1,7 +1,7 @@
 """Trees of bodies on joints: which joints carry a body as a function of their freedoms, and which close loops.
 
 Every joint whose freedoms are coordinates without a pole may carry a body. Of those that form a loop one is cut: its rows stay as
-constraints. A spanning tree that grows from the ground, or from the heaviest body of what floats, takes the joint with the most rows first
+constraints. A spanning tree that grows from the ground, or from a body of what floats (one that is said to be slow, or else the heaviest), takes the joint with the most rows first
 (Prim's algorithm), so that the fewest rows are left, and the one nearest to the root among equals, so that trees are not deep.
 """
 
@@ -186,7 +186,8 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, own, fr
     numbers = {GROUND: -1} | {name: i for i, name in enumerate(roots)}
     frames, links, carried = [], [], []
     for grid in GRIDS:
-        some = sorted((b for b in branches if grids[b.child] == grid), key=lambda b: depths[b.child])
+        some = [branch for branch in branches if grids[branch.child] == grid]
+        some.sort(key=lambda branch: depths[branch.child])  # as the frames are: taken by few slices
         if some:
             made, ordered = _frames(grid, some, bodies, freedoms, numbers)
             numbers |= {branch.child: len(roots) + len(carried) + i for i, branch in enumerate(some)}

@@ -13,7 +13,8 @@ from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, AnyBody, Bodies
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.joints import FREEDOMS, Joint, freedom_of
+from vmri_jax.scene.effects.freedoms import FREEDOMS
+from vmri_jax.scene.effects.joints import Joint, freedom_of
 from vmri_jax.scene.sorting import Sorting
 
 REACHED = 1e-8

@@ -11,8 +11,9 @@ from vmri_jax.mechanics.names import AXES
 from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.effects.freedoms import FREEDOMS
 from vmri_jax.scene.effects.joint_effects import InJoint
-from vmri_jax.scene.effects.joints import FREEDOMS, Joint
+from vmri_jax.scene.effects.joints import Joint
 from vmri_jax.scene.rigid import split
 
 Load = Literal["force", "torque"]

@@ -11,7 +11,8 @@ from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, number, of_time, positive
 from vmri_jax.scene.effect import Effect, real_tree
-from vmri_jax.scene.effects.joints import FREEDOMS, M_PRIME, Freedom, Joint, M, dot, freedom_of, slide, triads
+from vmri_jax.scene.effects.freedoms import ANGLES, FREEDOMS, Freedom
+from vmri_jax.scene.effects.joints import Joint, freedom_of
 from vmri_jax.scene.effects.springs import elastic_energy
 from vmri_jax.scene.terms import EffectTerm, OnBodies
 
@@ -72,14 +73,14 @@ class InJoint(Effect):
 
     Args:
         joint: name of the joint in the scene, one that leaves an angle or a way free.
-        of: "turn", "slide" or "tilt", of a joint that leaves several free; "auto" for the one that there is.
+        of: which of its freedoms, where it leaves several; "auto" for the one that there is.
 
     Raises:
         ValueError: (of the scene) no joint of this name, or one that leaves no such freedom.
     """
 
     joint: Any
-    of: Literal["turn", "slide", "tilt", "auto"] = field(default="auto", kw_only=True)
+    of: Freedom | Literal["auto"] = field(default="auto", kw_only=True)
 
     whole = True
     same_size = False
@@ -198,7 +199,7 @@ class JointLimit(InJoint):
         return EnergyOfCoordinate(self.law)
 
     def curvature(self, bodies):
-        return None if self.freedom == "turn" else self.stiffness
+        return None if self.freedom in ANGLES else self.stiffness
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
@@ -283,18 +284,17 @@ class GivenCoordinate:
 
 @dataclass(frozen=True)
 class GivenMotion:
-    """``x - a(t)``, of an angle as ``e . (m' cos a - m sin a)``, which is homogeneous in the directors; compared by value."""
+    """``x - a(t)``, of an angle x as ``sin x cos a - cos x sin a``, which is homogeneous in the directors; compared by value."""
 
     path: Callable
     freedom: Freedom
 
     def __call__(self, t, q, params):
         given = self.path(t, params["path"])
-        if self.freedom == "slide":
-            return slide(q, params) - given
-        of_a, of_b = triads(q, params)
-        e = of_b[..., M, :]
-        return dot(of_a[..., M_PRIME, :], e) * jnp.cos(given) - dot(of_a[..., M, :], e) * jnp.sin(given)
+        if self.freedom not in ANGLES:
+            return FREEDOMS[self.freedom](q, params) - given
+        sine, cosine = ANGLES[self.freedom](q, params)
+        return sine * jnp.cos(given) - cosine * jnp.sin(given)
 
 
 @effect_class

@@ -11,6 +11,8 @@ With the point of the joint at ``phi + rho`` in each body, the gap ``D = phi_b +
 | fixed | ``D``, ``n . e``, ``n . e'``, ``m . e'`` |
 | cylindrical | ``m . D``, ``m' . D``, ``n . e``, ``n . e'`` |
 | prismatic | ``m . D``, ``m' . D``, ``n . e``, ``n . e'``, ``m . e'`` |
+| screw | those of the cylindrical joint, and the turn that belongs to the way ``n . D`` |
+| planar | ``n . D``, ``n . e``, ``n . e'`` |
 
 Rows of axes are homogeneous in the directors of each body: between macro nodes, where the interpolated directors of a slow
 body are a little too short, they still mean the same direction.
@@ -18,7 +20,7 @@ body are a little too short, they still mean the same direction.
 Source: P. Betsch, S. Leyendecker, Int. J. Numer. Meth. Engng 67 (2006).
 """
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,49 +28,23 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, library, real_array
 from vmri_jax.mechanics.kinematics import Move
 from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
-from vmri_jax.scene.declare import effect_class, names, squeeze
+from vmri_jax.scene.declare import effect_class, names, number, squeeze
 from vmri_jax.scene.effect import START, Effect
-from vmri_jax.scene.rigid import RigidBody, split
-
-
-def place(q, weights):
-    """``phi + sum_i X_i d_i``, (..., 3)."""
-    phi, d = split(q)
-    return phi + jnp.sum(weights[..., : d.shape[-2], None] * d, axis=-2)
-
-
-def gap(q, params):
-    """``D``, (..., 3)."""
-    a, b = q
-    return place(b, params["point_b"]) - place(a, params["point_a"])
-
-
-def triads(q, params):
-    """``(m, m', n)`` of a and ``(e, e', f)`` of b in space, (..., 3, 3) with one vector per row."""
-    return tuple(params[f"frame_{role}"] @ split(x)[1] for role, x in zip("ab", q, strict=True))
-
-
-def dot(u, v):
-    """``u . v`` over the last axis."""
-    return jnp.sum(u * v, axis=-1)
-
-
-def aligned(q, params, *pairs: tuple[int, int]):
-    """Products of the i-th vector of a with the j-th of b, (..., number of pairs)."""
-    of_a, of_b = triads(q, params)
-    return jnp.stack([dot(of_a[..., i, :], of_b[..., j, :]) for i, j in pairs], axis=-1)
-
-
-M, M_PRIME, N = range(3)
-"""Rows of a triad."""
-PARALLEL = ((N, M), (N, M_PRIME))
-"""Products that vanish where the axes of both bodies are parallel."""
-UNTURNED = (M, M_PRIME)
-"""The product that vanishes where b has not turned about the axis."""
-
-
-Freedom = Literal["turn", "slide", "tilt"]
-"""An angle about the axis, a way along it, an angle about the second axis."""
+from vmri_jax.scene.effects.freedoms import (
+    FREEDOMS,
+    M_PRIME,
+    PARALLEL,
+    UNTURNED,
+    Freedom,
+    M,
+    N,
+    across,
+    aligned,
+    gap,
+    slide,
+    turn_by_sine,
+)
+from vmri_jax.scene.rigid import RigidBody
 
 
 @effect_class
@@ -319,12 +295,6 @@ class Fixed(_AboutAxis):
         return jnp.concatenate([gap(q, params), aligned(q, params, *PARALLEL, UNTURNED)], axis=-1)
 
 
-def across(q, params):
-    """``(m . D, m' . D)``, (..., 2)."""
-    apart, (of_a, _) = gap(q, params), triads(q, params)
-    return jnp.stack([dot(of_a[..., i, :], apart) for i in (M, M_PRIME)], axis=-1)
-
-
 @effect_class
 class Cylindrical(_AboutAxis):
     """b slides along an axis and turns about it; four rows, ``m . D = m' . D = 0, n . e = n . e' = 0``.
@@ -344,6 +314,76 @@ class Cylindrical(_AboutAxis):
 
 
 @effect_class
+class Screw(_AboutAxis):
+    """Nuts on bolts: b moves along the axis as it turns; five rows, those of `Cylindrical` and ``m' . e cos a = m . e sin a``.
+
+    a is the angle that belongs to the way, ``2 pi n . D / pitch``.
+
+    Args:
+        between, at, axis: as of `Revolute`.
+        pitch: how far b moves along the axis in a turn, m, not zero, negative for a left-handed one; one number, or one for each pair.
+
+    Raises:
+        ValueError: (of the scene) a pitch of zero.
+    """
+
+    pitch: Any = number(default=1e-3)
+
+    default_name = "screw"
+    carries = True
+    moves = (Move("screw", N),)
+    freedoms = ("turn",)
+
+    def parameters(self, bodies):
+        return super().parameters(bodies) | {"pitch": self._pitch(len(self.elements(bodies)))}
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        pitch = self._pitch(len(self.elements(bodies)))
+        self.require(pitch != 0, "pitch", pitch, "it must not be zero; without one take Revolute")
+
+    def pitch_of(self, i):
+        pitch = real_array(f"{self.name}: pitch", self.pitch)
+        return pitch[i] if pitch.ndim else pitch
+
+    def _pitch(self, count: int):
+        pitch = real_array(f"{self.name}: pitch", self.pitch)
+        if pitch.shape not in ((), (count,)):
+            raise ValueError(
+                f"{self.name}: pitch has shape {pitch.shape}; give one number, or one for each of {count} pairs."
+            )
+        return pitch
+
+    @staticmethod
+    def function(q, params):
+        angle = 2 * jnp.pi * slide(q, params) / params["pitch"]
+        sine, cosine = turn_by_sine(q, params)
+        turned = sine * jnp.cos(angle) - cosine * jnp.sin(angle)
+        return jnp.concatenate([across(q, params), aligned(q, params, *PARALLEL), turned[..., None]], axis=-1)
+
+
+@effect_class
+class Planar(_AboutAxis):
+    """b moves in a plane: along two directions across the axis, and about the axis; three rows, ``n . D = 0, n . e = n . e' = 0``.
+
+    Its freedoms are "along" and "across", the ways along m and m', and "turn".
+
+    Args:
+        between, at: as of `Joint`.
+        axis: as of `Revolute`, across the plane.
+    """
+
+    default_name = "planar"
+    carries = True
+    moves = (Move("slide", M), Move("slide", M_PRIME), Move("turn", N))
+    freedoms = ("along", "across", "turn")
+
+    @staticmethod
+    def function(q, params):
+        return jnp.concatenate([slide(q, params)[..., None], aligned(q, params, *PARALLEL)], axis=-1)
+
+
+@effect_class
 class Prismatic(_AboutAxis):
     """Slides: b moves along an axis and does not turn; five rows, those of `Cylindrical` and ``m . e' = 0``.
 
@@ -359,29 +399,6 @@ class Prismatic(_AboutAxis):
     @staticmethod
     def function(q, params):
         return jnp.concatenate([across(q, params), aligned(q, params, *PARALLEL, UNTURNED)], axis=-1)
-
-
-def turn(q, params):
-    """The angle by which b has turned about the axis since the start, rad, between -pi and pi, (...)."""
-    of_a, of_b = triads(q, params)
-    e = of_b[..., M, :]
-    return jnp.arctan2(dot(of_a[..., M_PRIME, :], e), dot(of_a[..., M, :], e))
-
-
-def slide(q, params):
-    """How far b has moved along the axis since the start, ``n . D``, m, (...)."""
-    return dot(triads(q, params)[0][..., N, :], gap(q, params))
-
-
-def tilt(q, params):
-    """The angle by which b has turned about its own axis e since the start, rad, between -pi and pi, (...)."""
-    of_a, of_b = triads(q, params)
-    n = of_a[..., N, :]
-    return jnp.arctan2(dot(of_b[..., M_PRIME, :], n), dot(of_b[..., N, :], n))
-
-
-FREEDOMS: dict[str, Any] = {"turn": turn, "slide": slide, "tilt": tilt}
-"""What a joint can leave free, as functions of the coordinates of its two bodies."""
 
 
 def freedom_of(joint: Joint, of: str) -> Freedom:
