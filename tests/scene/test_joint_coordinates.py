@@ -71,7 +71,9 @@ def by_directors(scene, moved):
     return twin, State(jnp.zeros(()), q, none, *legendre(twin.system(), q, none, v, none))
 
 
-SEEDS = [*range(3), *(pytest.param(seed, marks=pytest.mark.full) for seed in range(3, 10))]
+DRAWN = (0, 6, 11)
+"""Seeds whose scenes have all kinds of joints between them, from the first body to the second and back."""
+SEEDS = [*DRAWN, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(1, 10) if seed not in DRAWN)]
 
 
 @pytest.mark.parametrize("seed", SEEDS)

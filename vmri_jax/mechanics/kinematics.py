@@ -128,24 +128,20 @@ class Kinematics:
         """(Q_s, Q_f).
 
         Args:
-            q_s, q_f: coordinates; None for one of them gives None for its Q, and the other Q without what depends on both.
+            q_s, q_f: coordinates.
             joints: the constants C, P, S, E (n, 4, 3) of all frames, "constant", "cosine", "sine", "way".
         """
         known, first = self._roots(q_s, q_f), 0
-        found: dict[str, list] = {"s": [q_s], "f": [q_f]}
+        slow, fast = [q_s], [q_f]
         for frames in self.frames:
             last = first + len(frames.moving)
-            if all(found[part][0] is not None for part in frames.grid):
-                own = {name: values[first:last] for name, values in joints.items()}
-                roots = jnp.stack([known[root] for root in frames.roots])
-                rows = frames.in_space(frames.relative(q_s, q_f, own), roots)
-                known |= {len(known) - 1 + i: rows[k] for i, k in enumerate(frames.bodies)}
-                found["s" if frames.grid == "s" else "f"].append(_coordinates(rows, frames))
-            else:
-                known |= {len(known) - 1 + i: None for i in range(len(frames.bodies))}
+            own = {name: values[first:last] for name, values in joints.items()}
+            roots = jnp.stack([known[root] for root in frames.roots])
+            rows = frames.in_space(frames.relative(q_s, q_f, own), roots)
+            known |= {len(known) - 1 + i: rows[k] for i, k in enumerate(frames.bodies)}
+            (slow if frames.grid == "s" else fast).append(_coordinates(rows, frames))
             first = last
-        slow, fast = (None if pieces[0] is None else jnp.concatenate(pieces) for pieces in found.values())
-        return slow, fast
+        return jnp.concatenate(slow), jnp.concatenate(fast)
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
         """Rates of (Q_s, Q_f)."""
@@ -189,12 +185,11 @@ class Kinematics:
         return tuple(found)
 
     def _roots(self, q_s, q_f) -> dict[int, Any]:
-        """(4, 3) centre and directors of the ground and of the roots, None of those whose coordinates are not given."""
+        """(4, 3) centre and directors of the ground and of the roots by number."""
         found: dict[int, Any] = {GROUND: jnp.asarray(UNMOVED)}
         for number, (part, start, size) in enumerate(self.roots):
-            q = q_s if part == "s" else q_f
-            rows = None if q is None else q[start : start + size].reshape(-1, 3)
-            found[number] = None if rows is None else jnp.pad(rows, ((0, 4 - len(rows)), (0, 0)))
+            rows = (q_s if part == "s" else q_f)[start : start + size].reshape(-1, 3)
+            found[number] = jnp.pad(rows, ((0, 4 - len(rows)), (0, 0)))
         return found
 
 

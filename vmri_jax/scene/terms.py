@@ -266,8 +266,11 @@ class _OfTerms:
     kinematics: Kinematics | None = None
 
     def bodies(self, q_s, q_f, params) -> tuple[Any, Any]:
-        """(Q_s, Q_f) of q_s and q_f, one of which may be None."""
-        return (q_s, q_f) if self.kinematics is None else self.kinematics(q_s, q_f, params[JOINTS])
+        """(Q_s, Q_f) of q_s and q_f, one of which may be None: the terms do not depend on it, zeros are as good."""
+        if self.kinematics is None:
+            return q_s, q_f
+        slow, fast = (jnp.zeros(n) if q is None else q for q, n in zip((q_s, q_f), self.kinematics.sizes, strict=True))
+        return self.kinematics(slow, fast, params[JOINTS])
 
     def motions(self, q_s, q_f, v_s, v_f, params):
         """(Q_s, Q_f) and their rates."""
