@@ -89,7 +89,7 @@ class ConstraintRows:
         masses = join(bodies, where, "s", "masses"), join(bodies, where, "f", "masses")
         masses = np.concatenate(masses) if is_concrete(masses) else None
         extended, jacobian = to_bodies(start)
-        masses = np.ones_like(start) if masses is None else np.sum(masses[:, None] * np.asarray(jacobian) ** 2, axis=0)
+        masses = np.ones_like(start) if masses is None else masses @ (jacobian * jacobian)
         rows, elements = [], []
         for i, part in held:
             number = 0

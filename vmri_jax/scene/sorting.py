@@ -18,6 +18,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import eye_array
 
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.kinematics import Kinematics
@@ -131,7 +132,7 @@ class Sorting:
     def to_bodies(self, q: Any) -> tuple[Any, Any]:
         """The coordinates of all bodies (Q_s, Q_f) one after the other, and their Jacobian, of q = (q_s, q_f)."""
         if self.layout.kinematics is None:
-            return q, np.eye(q.size)
+            return q, eye_array(q.size)
         bodies, jacobian = _bodies_and_jacobian(self.layout.kinematics, q, self.joints)
         return (np.asarray(bodies), np.asarray(jacobian)) if is_concrete(jacobian) else (bodies, jacobian)
 

@@ -89,8 +89,9 @@ class Link(NamedTuple):
 
     def amount(self, kind: Literal["turn", "slide"]) -> float:
         """1 or -1, forwards or backwards, where its coordinate turns or slides like this, else 0."""
-        does = self.move is not None and self.move.kind in (kind, "screw" if kind == "turn" else kind)
-        return (1.0 if self.branch.forward else -1.0) * does
+        kinds = ("turn", "screw") if kind == "turn" else ("slide",)
+        sign = 1.0 if self.branch.forward else -1.0
+        return sign if self.move is not None and self.move.kind in kinds else 0.0
 
     @property
     def pitch(self):

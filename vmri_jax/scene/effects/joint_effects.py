@@ -1,5 +1,6 @@
 """What acts in a joint, along the freedom that it leaves: springs, dampers, drives, a motion that is given, limits."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Literal
@@ -102,9 +103,9 @@ class InJoint(Effect):
             raise ValueError(f"{self.name}: {error}") from None
 
     @property
+    @abstractmethod
     def of_coordinate(self) -> Callable:
-        """Its function where the freedom is a coordinate of the scene: that of an element between "bodies" (1,)."""
-        raise NotImplementedError
+        """Its function where the freedom is a coordinate of the scene: an element has this coordinate (1,) as its one body."""
 
     def elements(self, bodies):
         return self.joint.elements(bodies)

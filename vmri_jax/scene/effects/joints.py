@@ -322,6 +322,7 @@ class Screw(_AboutAxis):
     Args:
         between, at, axis: as of `Revolute`.
         pitch: how far b moves along the axis in a turn, m, not zero, negative for a left-handed one; one number, or one for each pair.
+            A millimetre by default.
 
     Raises:
         ValueError: (of the scene) a pitch of zero.
