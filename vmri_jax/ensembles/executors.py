@@ -8,6 +8,7 @@ from typing import Any
 
 from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
 from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.running.interrupts import interrupts_noted
 
 RETRIES = 2
 """Times that Dask tries a task again that raised an error. How often it does where workers died is its own setting."""
@@ -109,17 +110,30 @@ def local_workers(count: int) -> Iterator[Any]:
 
 
 def as_done(
-    submit: Callable[..., Future], room: Callable[[], int], arguments: Iterable[tuple]
+    submit: Callable[..., Future],
+    room: Callable[[], int],
+    arguments: Iterable[tuple],
+    interrupted: Callable[[], bool] = lambda: False,
 ) -> Iterator[tuple[tuple, Future]]:
     """Submit all of these, not too many ahead, and yield them with their futures as they are done.
 
+    Args:
+        submit: starts one task.
+        room: how many tasks may be under way.
+        arguments: of every task.
+        interrupted: whether Ctrl-C was pressed. Python loses a `KeyboardInterrupt` that falls into the finaliser of a future of
+            Dask, so that Ctrl-C is noted and asked for here.
+
     Raises:
         CancelledError: there is no room any more: the workers are gone.
+        KeyboardInterrupt: Ctrl-C was noted.
     """
     waiting: dict[Future, tuple] = {}
     left = iter(arguments)
     try:
         while True:
+            if interrupted():
+                raise KeyboardInterrupt
             if not room():
                 raise CancelledError
             while len(waiting) < room() and (one := next(left, None)) is not None:
@@ -155,8 +169,11 @@ def mapped(
     """
     given = list(arguments)
     found: list = [None] * len(given)
-    with executor_of(what, executor, None) as (tasks, room):
+    with ExitStack() as opened:
+        tasks, room = opened.enter_context(executor_of(what, executor, None))
         here, versions = isinstance(tasks, Here), known_versions()
+        # A task of this process is stopped at once.
+        interrupted = (lambda: False) if here else opened.enter_context(interrupts_noted())
         calls = ((i,) for i in range(len(given)))
 
         def submit(i: int) -> Future:
@@ -166,7 +183,7 @@ def mapped(
             return tasks.submit(*call_in_worker(versions, call_packed, packed(what, (task, given[i]))))
 
         try:
-            for (i,), future in as_done(submit, room, calls):
+            for (i,), future in as_done(submit, room, calls, interrupted):
                 found[i] = future.result()
         except KeyboardInterrupt:
             raise MappingInterrupted(found) from None

@@ -218,7 +218,7 @@ def ensemble(
         opened.enter_context(locked(path))
         clear_partial(path)
         tell = opened.enter_context(progress_shown()) if progress else silent
-        interrupted = opened.enter_context(interrupts_noted()) if isinstance(tasks, Here) else (lambda: False)
+        interrupted = opened.enter_context(interrupts_noted())
         found = Ensemble(path, chunks, store.committed(path))
         _compute(found, job_of(path, chunks, work, design), tasks, room, tell, interrupted)
     if found.failures and throw:
@@ -237,7 +237,7 @@ def _compute(found: Ensemble, job: Job, tasks, room, tell: Progress, interrupted
         submit = lambda number: tasks.submit(*call_in_worker(versions, run_packed_chunk, data, number))  # noqa: E731
     tell(_progress(found), _lanes_done(found), job.chunks.lanes)
     try:
-        for (number,), future in as_done(submit, room, missing):
+        for (number,), future in as_done(submit, room, missing, interrupted):
             try:
                 done: Done = future.result()
             except Exception as error:
@@ -249,14 +249,10 @@ def _compute(found: Ensemble, job: Job, tasks, room, tell: Progress, interrupted
                 return
             found.seconds = time.perf_counter() - begin
             tell(_progress(found), _lanes_done(found), job.chunks.lanes)
-            if interrupted():
-                raise Stopped(found)
-    except (KeyboardInterrupt, CancelledError) as stopped:
-        if isinstance(stopped, Stopped):
-            raise
-        if isinstance(stopped, CancelledError):
-            raise _gone(found) from stopped
+    except KeyboardInterrupt:
         raise Stopped(found) from None
+    except CancelledError as gone:
+        raise _gone(found) from gone
 
 
 def _why(error: Exception, found: Ensemble) -> str:
