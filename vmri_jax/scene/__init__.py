@@ -1,15 +1,23 @@
 """Scenes: bodies and effects, turned into a `System` in which only what the scene calls for exists."""
 
-from vmri_jax.scene.body import Body
+from vmri_jax.scene.body import Body, Frame
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.angles import Angle, Bending, Torsion
 from vmri_jax.scene.effects.contact import PlaneContact, SphereContact
 from vmri_jax.scene.effects.controls import Controlled
+from vmri_jax.scene.effects.couplings import Gear, JointCoupling
 from vmri_jax.scene.effects.custom import Constraint, CustomEffect, Force, Kinetic, Potential
 from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag, RayleighDamping
 from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, HarmonicDrive
 from vmri_jax.scene.effects.fields import Gravity, MagneticField
-from vmri_jax.scene.effects.joint_effects import JointDamper, JointDrive, JointLimit, JointMotion, JointSpring
+from vmri_jax.scene.effects.joint_effects import (
+    JointDamper,
+    JointDrive,
+    JointLimit,
+    JointMotion,
+    JointSpring,
+    RotorInertia,
+)
 from vmri_jax.scene.effects.joints import (
     Cylindrical,
     Fixed,
@@ -48,10 +56,13 @@ __all__ = [
     "Fixed",
     "FollowerForce",
     "Force",
+    "Frame",
+    "Gear",
     "Gravity",
     "Guide",
     "HarmonicDrive",
     "Joint",
+    "JointCoupling",
     "JointDamper",
     "JointDrive",
     "JointLimit",
@@ -75,6 +86,7 @@ __all__ = [
     "RigidBody",
     "RigidLink",
     "Rod",
+    "RotorInertia",
     "Scene",
     "Screw",
     "SphereContact",

@@ -274,6 +274,55 @@ class Ground(AnyBody):
         return self
 
 
+@dataclass(frozen=True, eq=False)
+class Frame(AnyBody):
+    """A frame without mass between joints of one body: three hinges in a row make a hip, two slides and a hinge a planar robot.
+
+        bodies = [Frame("yoke", [0, 0, 1]), RigidBody("thigh", 4.0, Rod(0.4), [0, 0, 0.8])]
+        joints = [
+            Revolute(("ground", "yoke"), [0, 0, 1], axis=[1, 0, 0], name="roll"),
+            Revolute(("yoke", "thigh"), [0, 0, 1], axis=[0, 1, 0], name="pitch"),
+        ]
+        Scene(bodies, joints, coordinates="joint")
+
+    It moves with the joints that it hangs on, so that it needs joint coordinates, and it must carry a body.
+
+    Args:
+        name: what joints call it.
+        position: (3,) at the start, m; its axes are those of space there.
+        pace: "slow", "fast" or "auto", as of `Body`: that of the joint that it hangs on.
+    """
+
+    name: str
+    position: Any
+    pace: Pace = "auto"
+
+    rigid, block, radius, wide = True, False, None, (0, 1, 2)
+    rotation = np.eye(3)
+
+    def __post_init__(self):
+        self._check_names()
+        position = self._numbers("position", self.position)
+        if position.shape != (3,):
+            raise ValueError(f"Frame {self.name}: position has shape {position.shape}; give (3,).")
+        object.__setattr__(self, "position", position)
+
+    @property
+    def coordinates(self):
+        """(12,) origin and axes."""
+        return joined([self.position, np.eye(3).ravel()])
+
+    rates = property(lambda self: np.zeros(12))
+    masses = property(lambda self: np.zeros(12))
+
+    def point(self, at: Any = None) -> Point:
+        """The origin, or a point fixed in it, at the start."""
+        return Point(self.name, self.position if at is None else self.position + at)
+
+    def with_rates(self, rates: np.ndarray) -> "Frame":
+        return self
+
+
 Bodies = Mapping[str, AnyBody]
 """The bodies of a scene by name."""
 

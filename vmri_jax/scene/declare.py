@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
-from vmri_jax.scene.body import Bodies, Point, entry, is_entry
+from vmri_jax.scene.body import Bodies, Frame, Point, entry, is_entry
 
 Elements = tuple[tuple[str, ...], ...]
 Sign = Literal["", "positive", "at least zero"]
@@ -32,7 +32,7 @@ class Names:
 
     Args:
         pairs: a list of bodies stands for all pairs of them.
-        may_be_all: None stands for all bodies of the scene.
+        may_be_all: None stands for all bodies of the scene, without frames.
     """
 
     count: int
@@ -49,7 +49,7 @@ class Names:
             ValueError: elements of another number of bodies, or none at all.
         """
         if given is None and self.may_be_all:
-            given = tuple(bodies)
+            given = tuple(name for name, body in bodies.items() if not isinstance(body, Frame))
         items: tuple[Any, ...] = (given,) if is_entry(given) else tuple(given) if isinstance(given, Iterable) else ()
         flat = bool(items) and all(is_entry(item) for item in items)
         if self.pairs and flat:

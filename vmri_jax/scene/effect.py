@@ -22,7 +22,9 @@ from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, 
 Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
 DRAWN = {"link": "links", "spring": "springs"}
 """What joins two bodies in a drawing, and its entry there."""
-POINTS = ("at_0", "at_1", "at_2", "at_3")
+MOST_ROLES = 32
+"""Bodies of an element at most: those of sixteen joints that one equation ties."""
+POINTS = tuple(f"at_{role}" for role in range(MOST_ROLES))
 """Parameters with the points fixed in rigid bodies, role by role."""
 ALONE = "alone"
 """What the term of a single element is called."""
@@ -175,9 +177,9 @@ class Effect(ABC):
         term = replace(self._term((i,), bodies, places), name=ALONE, select=None)  # one program for all of a kind
         return term, {ALONE: self._own(i, bodies, params)}
 
-    def pair_of_joint(self, i: int) -> tuple[str, int] | None:
-        """The joint and the number of its pair of bodies whose freedom is all that element i depends on; None of other effects."""
-        return None
+    def pairs_of_joints(self, i: int) -> tuple[tuple[str, int], ...]:
+        """The joints, and the numbers of their pairs of bodies, whose freedoms are all that element i depends on; () of other effects."""
+        return ()
 
     def _own(self, i: int, bodies: Bodies, params: dict[str, Any]) -> dict[str, Any]:
         """Parameters of element i among those of all."""

@@ -18,7 +18,7 @@ from vmri_jax.mechanics.summary import listed, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.scene.assembly import actuation, build
-from vmri_jax.scene.body import AnyBody
+from vmri_jax.scene.body import AnyBody, Frame
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joints import Joint, along_run
 from vmri_jax.scene.labels import names_of
@@ -27,12 +27,12 @@ from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_r
 from vmri_jax.scene.rigid import RigidBody, Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import RESERVED, Actuation
-from vmri_jax.scene.trees import Branch, grow
+from vmri_jax.scene.trees import Branch, check_frames, grow
 from vmri_jax.scene.velocities import joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 
-EXPECTED = {"bodies": "Body or RigidBody", "effects": "Effect"}
+EXPECTED = {"bodies": "Body, RigidBody or Frame", "effects": "Effect"}
 DRAWN_LISTS = ("solids", "links", "springs", "anchors", "planes", "spheres")
 """Entries of a drawing to which effects add."""
 
@@ -52,7 +52,7 @@ class Scene:
     numbers; these are in the system's params by the name of the effect, ``params["springs"]["stiffness"]``.
 
     Args:
-        bodies: of `Body` and `RigidBody`; slow ones become q_s and fast ones q_f, in this order.
+        bodies: of `Body`, `RigidBody` and `Frame`; slow ones become q_s and fast ones q_f, in this order.
         effects: of `vmri_jax.scene`, also custom ones: `Potential`, `Constraint`, `Kinetic`, `Force`. Energies are
             summed and constraints joined in this order.
         project: move positions onto the constraints at the start, and take away what of the velocities points against them,
@@ -119,6 +119,7 @@ class Scene:
             for name in effect.refers_to:
                 if name not in potentials:
                     raise ValueError(f"{effect.name}: {unknown('potential', name, potentials)}")
+        check_frames(self.by_name, self.branches)
         check_constraints(self.sorting)
 
     @classmethod
@@ -254,7 +255,16 @@ class Scene:
 
         Args:
             run: of this scene.
+
+        Raises:
+            ValueError: the scene has frames without mass, which cannot move by directors.
         """
+        frames = [body.name for body in self.bodies if isinstance(body, Frame)]
+        if frames:
+            raise ValueError(
+                f"Scene.by_directors: {', '.join(frames)} have no mass, and bodies by directors need some. Reaction forces are known of scenes "
+                "without frames: join bodies by Universal, Cylindrical or Planar, or put bodies of small mass in place of the frames."
+            )
         bodies = [replace(body, pace="slow") for body in self.bodies]  # all rows on one grid: none is too many there
         effects = [replace(effect, rate="auto") for effect in self.effects]
         twin = replace(self, bodies=bodies, effects=effects, coordinates="directors", joint_starts={})
@@ -365,7 +375,7 @@ class Scene:
             if isinstance(body, RigidBody):
                 for kind, entries in body.drawing(part, start).items():
                     seen[kind] += entries
-            else:
+            elif not isinstance(body, Frame):
                 seen["blocks" if body.block else "bodies"].append({"name": body.name, "coordinates": axes})
         seen["bodies"] += self._drawn_points()
         for effect in self.everything:

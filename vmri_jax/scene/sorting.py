@@ -27,7 +27,7 @@ from vmri_jax.scene.body import GROUND, Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.layout import Layout, Pace, join
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
-from vmri_jax.scene.trees import Branch, Link, joint_numbers, layout, nearest_rates
+from vmri_jax.scene.trees import Branch, Link, joint_numbers, layout, nearest_rates, with_weight
 
 NAMED = 3
 """Most bodies that a reason names."""
@@ -172,8 +172,11 @@ def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
     found = []
     for i, names in enumerate(effect.elements(bodies)):
-        child = carried.get(effect.pair_of_joint(i) or ("", 0))
-        chains = [[child]] if child else [_chain(name, on_joints) for name in dict.fromkeys(map(str, names))]
+        pairs = effect.pairs_of_joints(i)
+        if pairs and all(pair in carried for pair in pairs):
+            chains = [[carried[pair]] for pair in pairs]
+        else:
+            chains = [_chain(name, on_joints) for name in dict.fromkeys(map(str, names))]
         everything = tuple(dict.fromkeys(name for chain in chains for name in chain))
         shared = set.intersection(*map(set, chains)) if len(chains) > 1 else set()
         found.append(Owners(everything, tuple(name for name in everything if name not in shared) or everything))
@@ -205,7 +208,7 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
     """
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
-    measured = _measure(bodies, energies, owned)
+    measured = _measure(with_weight(bodies, branches), energies, owned)
     declared = {
         rate: [measured[effect.name].rate for effect in energies if effect.rate == rate and effect.name in measured]
         for rate in ("slow", "fast")

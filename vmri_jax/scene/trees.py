@@ -15,7 +15,7 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.mechanics.kinematics import GRIDS, UNMOVED, Frames, Grid, Kinematics, Move
 from vmri_jax.mechanics.rows import Part, Place, Rows
-from vmri_jax.scene.body import GROUND, Bodies, body_of
+from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joints import Joint
 from vmri_jax.scene.layout import Layout, Pace
@@ -141,6 +141,47 @@ def _as_root(name: str, bodies: Bodies) -> tuple:
     body = bodies[name]
     mass: Any = getattr(body, "mass", 0.0)
     return True, body.pace != "slow", -len(body.wide), -float(mass) if is_concrete(mass) else 0.0
+
+
+def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
+    """Refuse frames that hang on no joint, or that carry nothing.
+
+    Args:
+        bodies: by name.
+        branches: of all trees; () by directors.
+
+    Raises:
+        ValueError: with the name of the frame.
+    """
+    hanging, carrying = ({getattr(branch, end) for branch in branches} for end in ("child", "parent"))
+    for name, body in bodies.items():
+        if not isinstance(body, Frame):
+            continue
+        if not branches:
+            raise ValueError(
+                f'Scene: {name} is a frame without mass, which moves with joints alone; give the scene coordinates="joint".'
+            )
+        if name not in hanging or name not in carrying:
+            where = "hangs on no body, by no joint that may carry it," if name not in hanging else "carries no body"
+            raise ValueError(
+                f"Scene: the frame {name} {where} and has no mass of its own; tie it to what it hangs on and to what it carries by joints "
+                "with coordinates, such as Revolute, or leave it out."
+            )
+
+
+def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
+    """The bodies with frames as heavy as what they carry: so frequencies of what acts on them can be estimated.
+
+    Args:
+        bodies: by name.
+        branches: of all trees, parents before children.
+    """
+    found = dict(bodies)
+    for branch in reversed(branches):
+        frame, carried = bodies.get(branch.parent), found[branch.child]
+        if isinstance(frame, Frame) and isinstance(carried, RigidBody):
+            found[frame.name] = RigidBody(frame.name, carried.mass, carried.moments, frame.position, pace=frame.pace)
+    return found
 
 
 def layout(

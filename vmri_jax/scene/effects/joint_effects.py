@@ -110,8 +110,8 @@ class InJoint(Effect):
     def elements(self, bodies):
         return self.joint.elements(bodies)
 
-    def pair_of_joint(self, i):
-        return self.joint.name, i
+    def pairs_of_joints(self, i):
+        return ((self.joint.name, i),)
 
     def terms(self, select, bodies, layout, potentials):
         keys = {i: (self.joint.name, i, self.freedom) for i in select}
@@ -233,6 +233,46 @@ class JointDamper(InJoint):
     @property
     def of_coordinate(self):
         return ForceOnCoordinate(self.law)
+
+
+@dataclass(frozen=True)
+class EnergyOfRate:
+    """``J x'^2 / 2`` of the freedom x of a joint; compared by value."""
+
+    freedom: Callable
+
+    def __call__(self, q, v, params):
+        rate = jax.jvp(lambda q: self.freedom(q, params), (q,), (v,))[1]
+        return jnp.sum(params["inertia"] * rate**2) / 2
+
+
+def energy_of_rate(q, v, params):
+    """``J x'^2 / 2`` of a freedom x that is a coordinate."""
+    return jnp.sum(params["inertia"] * v[0][..., 0] ** 2) / 2
+
+
+@effect_class
+class RotorInertia(InJoint):
+    """What turns or slides with a joint and nowhere else, such as the rotor of its motor: ``T = J x'^2 / 2``; MuJoCo's armature.
+
+    Args:
+        joint, of: as of `InJoint`.
+        inertia: J, kg m^2 of an angle, kg of a way, positive: that of the rotor times its gear ratio squared; one number, or one for each
+            pair of the joint.
+    """
+
+    inertia: Any = positive()
+
+    kind = "kinetic"
+    default_name = "rotors"
+
+    @property
+    def function(self):
+        return EnergyOfRate(FREEDOMS[self.freedom])
+
+    @property
+    def of_coordinate(self):
+        return energy_of_rate
 
 
 @dataclass(frozen=True)

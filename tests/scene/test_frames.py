@@ -1,0 +1,179 @@
+"""Several joints of one body, rotors and gears: the same accelerations as of joints and bodies that say the same otherwise."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.scene.test_joint_coordinates import accelerations, by_directors, state_of
+from vmri_jax.scene import (
+    Box,
+    Frame,
+    Gear,
+    Gravity,
+    JointCoupling,
+    JointDamper,
+    JointSpring,
+    Planar,
+    Prismatic,
+    Revolute,
+    RigidBody,
+    RotorInertia,
+    Scene,
+    Universal,
+)
+
+PLATE = RigidBody("plate", 1.5, Box((0.4, 0.6, 0.2)), [0.3, 0.2, 0.1])
+HAND = RigidBody("hand", 0.5, Box((0.3, 0.1, 0.2)), [0.3, 0.7, 0.1])
+WRIST = Revolute(("plate", "hand"), [0.3, 0.5, 0.1], axis=[1.0, 0.2, 0.0], name="wrist")
+
+
+def scene_of(bodies, effects):
+    return Scene([*bodies, PLATE, HAND], [*effects, WRIST, Gravity([0.5, 0.3, -2.0])], coordinates="joint")
+
+
+def test_joints_in_a_row_are_one_joint_of_several_freedoms():
+    """Two hinges a cardan joint, two slides and a hinge one in a plane; springs and dampers of each freedom act alike."""
+    axis, second = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]  # the triad of a planar joint about z is (x, y, z)
+    cases = [
+        (Universal(("ground", "plate"), [0, 0, 0], axis=axis, second=second, name="joint"), [Revolute, Revolute]),
+        (Planar(("ground", "plate"), [0, 0, 0], axis=axis, name="joint"), [Prismatic, Prismatic, Revolute]),
+    ]
+    for whole, kinds in cases:
+        axes = whole.frame(1)[0][[move.axis for move in whole.moves]]
+        frames = [Frame(f"frame {i}", [0.1 * i, 0.2, 0.3]) for i in range(len(kinds) - 1)]
+        names = ["ground", *(frame.name for frame in frames), "plate"]
+        row = [
+            kind(pair, [0, 0, 0], axis=along, name=f"joint {i}")
+            for i, (kind, pair, along) in enumerate(zip(kinds, pairwise(names), axes, strict=True))
+        ]
+        starts = dict(zip(whole.freedoms, [(0.3, 0.5), (-0.2, 0.4), (0.4, -0.3)], strict=False))
+        first, last = whole.freedoms[0], whole.freedoms[-1]
+        one = scene_of([], [whole, JointSpring("joint", 3.0, 0.1, of=first), JointDamper("joint", 0.2, of=last)])
+        other = scene_of(frames, [*row, JointSpring("joint 0", 3.0, 0.1), JointDamper(row[-1].name, 0.2)])
+        one = one.with_joints({"joint": starts, "wrist": (0.2, -0.6)})
+        other = other.with_joints(
+            {"wrist": (0.2, -0.6)} | dict(zip((j.name for j in row), starts.values(), strict=True))
+        )
+        found, expected = (accelerations(scene, state_of(scene)) for scene in (other, one))
+        for name in ("plate", "hand"):
+            for mine, theirs in zip(found[name], expected[name], strict=True):
+                np.testing.assert_allclose(mine, theirs, atol=1e-12)
+
+
+def driven(coordinates="joint", **starts):
+    """A plate and its hand on hinges, with a rotor, a gear or a law between the two."""
+    shoulder = Revolute(("ground", "plate"), [0, 0, 0], axis=[0.2, 0.1, 1.0], name="shoulder")
+    return scene_of([], [shoulder, RotorInertia("shoulder", 0.7), RotorInertia("wrist", 0.1, name="motor")])
+
+
+def bend(x, params):
+    """A row for two angles: the second is a polynomial of the first."""
+    return x[1] - params["slope"] * x[0] - params["curve"] * x[0] ** 2
+
+
+@pytest.mark.parametrize(
+    "tie",
+    [
+        None,
+        Gear(["shoulder", "wrist"], ratios=[1.0, -2.0]),
+        JointCoupling(["shoulder", "wrist"], bend, {"slope": 0.5, "curve": 0.3}),
+    ],
+)
+def test_rotors_and_couplings_are_the_same_by_directors(tie):
+    scene = driven()
+    angle, rate = 0.4, 0.8
+    wrist, wrist_rate = (
+        (angle / 2, rate / 2)
+        if tie is None or isinstance(tie, Gear)
+        else (0.5 * angle + 0.3 * angle**2, (0.5 + 0.6 * angle) * rate)
+    )
+    scene = replace(scene, effects=[*scene.effects, *([tie] if tie else [])])
+    scene = scene.with_joints({"shoulder": (angle, rate), "wrist": (wrist, wrist_rate)})
+    state = state_of(scene)
+    assert scene.system().num_constraints(*scene.start[:2]) == (0, int(tie is not None))
+    mine = accelerations(scene, state)
+    theirs = accelerations(*by_directors(scene, mine))
+    for name in theirs:
+        for a, b in zip(mine[name], theirs[name], strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-11)
+
+
+def test_a_rotor_slows_a_pendulum():
+    """A point of mass m at the length l with a rotor J in its hinge: ``(m l^2 + J) x'' = -m g l sin x``."""
+    bob = RigidBody("bob", 2.0, (1e-9, 1e-9, 1e-9), [0.5, 0.0, 0.0])
+    hinge = Revolute(("ground", "bob"), [0, 0, 0], axis=[0, 1, 0], name="hinge")
+    scene = Scene([bob], [hinge, RotorInertia("hinge", 1.5), Gravity([0, 0, -10.0])], coordinates="joint")
+    a = accelerations(scene, state_of(scene))["bob"][2][:3]
+    np.testing.assert_allclose(a, [0.0, 0.0, -10.0 * 2.0 * 0.5**2 / (2.0 * 0.5**2 + 1.5)], atol=1e-8)
+
+
+def test_a_run_with_frames_has_the_order_of_its_scheme():
+    """A gimbal with a gear, its micro steps taken by the hand: names, position and energy along the run."""
+    frame = Frame("yoke", [0, 0, 0])
+    row = [
+        Revolute(("ground", "yoke"), [0, 0, 0], axis=[0, 0, 1], name="pan"),
+        Revolute(("yoke", "plate"), [0, 0, 0], axis=[1, 0, 0], name="tilt"),
+    ]
+    hand = replace(HAND, pace="fast")
+    scene = Scene(
+        [frame, PLATE, hand], [*row, WRIST, JointSpring("wrist", 5.0), Gravity([0, 0, -9.81])], coordinates="joint"
+    )
+    scene = scene.with_joints({"pan": (0.0, 1.0), "wrist": 0.2})
+    ends = [
+        vm.simulate(scene, vm.fully_implicit(5), macro_dt=0.02 / n, num_steps=20 * n, save_every=20 * n).position(
+            "hand"
+        )[-1]
+        for n in (1, 2, 4)
+    ]
+    assert np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1] - ends[2]) == pytest.approx(4.0, rel=0.1)
+    assert scene.names.slow == {"pan": 1, "tilt": 1}
+    drawn = [entry["name"] for kind in ("bodies", "solids") for entry in scene.drawing()[kind]]
+    assert "plate" in drawn
+    assert "yoke" not in drawn
+
+
+def test_frames_that_cannot_move_are_refused():
+    frame, pan = Frame("yoke", [0, 0, 0]), Revolute(("ground", "yoke"), [0, 0, 0], name="pan")
+    tilt = Revolute(("yoke", "plate"), [0, 0, 0], axis=[1, 0, 0], name="tilt")
+    with pytest.raises(ValueError, match=r'yoke is a frame without mass.*coordinates="joint"'):
+        Scene([frame, PLATE], [pan, tilt])
+    with pytest.raises(ValueError, match=r"the frame yoke carries no body"):
+        Scene([frame, PLATE], [pan, replace(tilt, between=("ground", "plate"))], coordinates="joint")
+    with pytest.raises(ValueError, match=r"the frame yoke hangs on no body"):
+        Scene([frame, PLATE], [replace(tilt, between=("ground", "plate"))], coordinates="joint")
+    scene = Scene([frame, PLATE], [pan, tilt], coordinates="joint")
+    with pytest.raises(ValueError, match=r"by_directors: yoke have no mass"):
+        scene.by_directors(None)
+    with pytest.raises(ValueError, match=r"Frame yoke: position has shape \(2,\); give \(3,\)"):
+        Frame("yoke", [0, 1])
+
+
+def two_values(x, params):
+    return jnp.ones((2, 2)) * x[0]
+
+
+def shifted(x, params):
+    return x[0] - x[1] + 0.1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Gear(["shoulder"], ratios=[1.0]), r"joints is \['shoulder'\]; give names of 2 to 16"),
+        (lambda: Gear(["shoulder", "elbow"], ratios=[1.0, 2.0]), r"gear: there is no joint 'elbow'"),
+        (lambda: Gear(["shoulder", "wrist"], ratios=[1.0]), r"ratios is \[1.\]; give one for each"),
+        (lambda: Gear(["shoulder", "wrist"], ratios=[1.0, 0.0]), r"none of them may be zero"),
+        (lambda: Gear(["shoulder", ("wrist", "slide")], ratios=[1.0, 2.0]), r"wrist leaves turn free"),
+        (lambda: JointCoupling(["shoulder", "wrist"], two_values), r"law returns .*\(2, 2\).*one value"),
+        (lambda: JointCoupling(["shoulder", "wrist"], shifted), r"the equation is 0.1"),
+        (lambda: JointCoupling(["shoulder", "wrist"], lambda x: x[0]), r"law .*x, params"),
+        (lambda: RotorInertia("shoulder", -1.0, name="more"), r"inertia is -1.0; it must be positive"),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        replace(driven(), effects=[*driven().effects, make()])

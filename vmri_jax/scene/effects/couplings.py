@@ -1,0 +1,212 @@
+"""Equations between the freedoms of several joints: gears, racks, differentials, fingers that a tendon bends."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.arrays import real_array
+from vmri_jax.mechanics.checks import describe, shape_of
+from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
+from vmri_jax.mechanics.names import unknown
+from vmri_jax.mechanics.rows import Rows
+from vmri_jax.scene.declare import effect_class
+from vmri_jax.scene.effect import MOST_ROLES, START, Effect, real_tree
+from vmri_jax.scene.effects.freedoms import FREEDOMS, Freedom
+from vmri_jax.scene.effects.joints import Joint, freedom_of
+from vmri_jax.scene.terms import EffectTerm, OnBodies
+
+
+@dataclass(frozen=True)
+class EquationOfBodies:
+    """``g(x, params)`` of the freedoms x of joints by the coordinates of their bodies, a and b of each; compared by value."""
+
+    law: Callable
+    freedoms: tuple[Freedom, ...]
+
+    def __call__(self, q, params):
+        x = [
+            FREEDOMS[of](q[2 * i : 2 * i + 2], joint)
+            for i, (of, joint) in enumerate(zip(self.freedoms, params["joints"], strict=True))
+        ]
+        return self.law(jnp.stack(x), params["law"])
+
+
+@dataclass(frozen=True)
+class EquationOfCoordinates:
+    """``g(x, params)`` of freedoms x that are coordinates; compared by value."""
+
+    law: Callable
+
+    def __call__(self, q, params):
+        return self.law(jnp.concatenate(q), params["law"])
+
+
+@effect_class
+class _Coupling(Effect):
+    """An equation between freedoms of joints.
+
+    Args:
+        joints: names of joints of the scene, each between two bodies; of one that leaves several freedoms ``(name, freedom)``.
+
+    Raises:
+        ValueError: fewer than two joints; (of the scene) no joint of this name, one between several pairs of bodies, one that leaves no such
+            freedom; an equation that is not kept at the start.
+    """
+
+    joints: Any
+
+    kind = "constraint"
+    whole = True
+    same_size = False
+
+    @property
+    @abstractmethod
+    def equation(self) -> Callable:
+        """``g(x, params)`` of the freedoms x (n,)."""
+
+    @abstractmethod
+    def numbers(self) -> Any:
+        """The params of the equation."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        given = () if isinstance(self.joints, str) else tuple(self.joints)
+        if not 2 <= len(given) <= MOST_ROLES // 2:
+            raise ValueError(
+                f"{self.name}: joints is {self.joints!r}; give names of 2 to {MOST_ROLES // 2} joints, ['motor', 'wheel']."
+            )
+        object.__setattr__(self, "joints", given)
+
+    def bound(self, effects):
+        """The same with the joints themselves, each with its freedom, instead of their names."""
+        known, found = {effect.name: effect for effect in effects if isinstance(effect, Joint)}, []
+        for given in self.joints:
+            name, of = (given, "auto") if isinstance(given, str) else given
+            if name not in known:
+                raise ValueError(f"{self.name}: {unknown('joint', name, known)}")
+            try:
+                found.append((known[name], freedom_of(known[name], of)))
+            except ValueError as error:
+                raise ValueError(f"{self.name}: {error}") from None
+        return replace(self, joints=tuple(found))
+
+    def elements(self, bodies):
+        return (tuple(name for joint, _ in self.joints for name in joint.elements(bodies)[0]),)
+
+    def pairs_of_joints(self, i):
+        return tuple((joint.name, 0) for joint, _ in self.joints)
+
+    @property
+    def function(self):
+        return EquationOfBodies(self.equation, tuple(of for _, of in self.joints))
+
+    def parameters(self, bodies):
+        return {"law": self.numbers(), "joints": tuple(joint.parameters(bodies) for joint, _ in self.joints)}
+
+    def terms(self, select, bodies, layout, potentials):
+        keys = [(joint.name, 0, of) for joint, of in self.joints]
+        if not all(key in layout.freedoms for key in keys):
+            return super().terms(select, bodies, layout, potentials)
+        roles = tuple(OnBodies(Rows.of([layout.freedoms[key]])) for key in keys)
+        return (EffectTerm(self.name, EquationOfCoordinates(self.equation), roles),)
+
+    def check_bodies(self, bodies):
+        """Those of the joints are checked there."""
+        for joint, _ in self.joints:
+            count = len(joint.elements(bodies))
+            self.require(
+                count == 1, f"the number of pairs of {joint.name}", count, "give each pair a joint of its own name"
+            )
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        apart = jnp.abs(self.equation(jnp.zeros(len(self.joints)), self.numbers()))
+        self.require(apart < START, "the equation", apart, "freedoms are counted from the start, where it must be zero")
+
+
+@effect_class
+class JointCoupling(_Coupling):
+    """An equation between the freedoms x of joints, ``g(x, params) = 0``; angles are between -pi and pi unless they are coordinates.
+
+        def cam(x, params):
+            turn, lift = x
+            return lift - params["stroke"] * (1 - jnp.cos(turn)) / 2
+
+        JointCoupling(["camshaft", "valve"], cam, {"stroke": 0.01})
+
+    Args:
+        joints: names of joints of the scene, each between two bodies; of one that leaves several freedoms ``(name, freedom)``.
+        law: ``g(x, params) -> ()`` or (k,), x the freedoms in the order of `joints`, rad and m since the start, (n,); zero at x = 0. Define
+            it at module level, it is compared by identity.
+        params: numbers, arrays or trees of them that the law gets; traced.
+
+    Raises:
+        TypeError: a law that is no function of (x, params).
+        ValueError: fewer than two joints; (of the scene) no joint of this name, one between several pairs of bodies, one that leaves no such
+            freedom; a law that returns no vector, or that is not zero at the start.
+    """
+
+    law: Callable
+    params: Any = field(default_factory=dict)
+
+    default_name = "coupling"
+
+    def __post_init__(self):
+        super().__post_init__()
+        instead = NO_VELOCITY.format(moving="JointMotion, of one joint", force="JointDamper")
+        check_arguments(f"{self.name}: law", self.law, "x, params", instead)
+
+    @property
+    def equation(self):
+        return self.law
+
+    def numbers(self):
+        return real_tree(f"{self.name}: params", self.params)
+
+    def check_parameters(self, bodies):
+        value: Any = shape_of(f"{self.name}: law", self.law, jnp.zeros(len(self.joints)), self.numbers())
+        if getattr(value, "ndim", 2) > 1:
+            raise ValueError(
+                f"{self.name}: law returns {describe(value)}; it must return one value () or several (k,)."
+            )
+        super().check_parameters(bodies)
+
+
+def weighted_sum(x, params):
+    """``sum_i r_i x_i``."""
+    return jnp.sum(params["ratios"] * x)
+
+
+@effect_class
+class Gear(_Coupling):
+    """Joints whose freedoms move in fixed ratios, ``sum_i r_i x_i = 0``.
+
+        Gear(["motor", "wheel"], ratios=[1.0, -4.0])  # the motor turns four times as fast as the wheel, the same way
+
+    Args:
+        joints: as of `JointCoupling`.
+        ratios: (n,) r, one for each of the joints, none of them zero.
+
+    Raises:
+        ValueError: as of `JointCoupling`; ratios of another number, or a zero among them.
+    """
+
+    ratios: Any
+
+    default_name = "gear"
+
+    @property
+    def equation(self):
+        return weighted_sum
+
+    def numbers(self):
+        return {"ratios": jnp.asarray(real_array(f"{self.name}: ratios", self.ratios))}
+
+    def check_parameters(self, bodies):
+        ratios = self.numbers()["ratios"]
+        self.require(jnp.shape(ratios) == (len(self.joints),), "ratios", self.ratios, "give one for each of the joints")
+        self.require(ratios != 0, "ratios", self.ratios, "none of them may be zero")
+        super().check_parameters(bodies)
