@@ -163,7 +163,7 @@ def shifted(x, params):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Gear(["shoulder"], ratios=[1.0]), r"joints is \['shoulder'\]; give names of 2 to 16"),
+        (lambda: Gear([], ratios=[1.0]), r"joints is \[\]; give names of 1 to 16"),
         (lambda: Gear(["shoulder", "elbow"], ratios=[1.0, 2.0]), r"gear: there is no joint 'elbow'"),
         (lambda: Gear(["shoulder", "wrist"], ratios=[1.0]), r"ratios is \[1.\]; give one for each"),
         (lambda: Gear(["shoulder", "wrist"], ratios=[1.0, 0.0]), r"none of them may be zero"),

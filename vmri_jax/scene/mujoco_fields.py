@@ -17,11 +17,13 @@ PASSIVE = "SPRING DAMPER"
 READ = {
     "bodies, their masses, and which are welded together": """nbody body_mass body_inertia body_ipos body_iquat body_pos body_quat
         body_parentid body_weldid body_mocapid""",
-    "joints": "njnt nq nv jnt_type jnt_bodyid jnt_pos jnt_axis jnt_qposadr jnt_dofadr dof_jntid",
-    "springs and dampers in joints": "jnt_stiffness dof_damping qpos_spring",
-    "the start, where no qpos is given": "qpos0",
+    "joints": """njnt nq nv jnt_type jnt_bodyid jnt_pos jnt_axis jnt_qposadr jnt_dofadr dof_jntid body_jntadr
+        body_jntnum""",
+    "springs, dampers and armature in joints": "jnt_stiffness dof_damping qpos_spring dof_armature",
+    "limits of joints, where they are to be springs": "jnt_range jnt_solref dof_invweight0",
+    "the start, where no qpos is given": "qpos0 nkey key_qpos key_qvel",
     "gravity, and what compensates it": "opt.gravity body_gravcomp",
-    "equalities connect and weld": """neq eq_type eq_objtype eq_obj1id eq_obj2id eq_active0 eq_data
+    "equalities connect, weld, and of joints and fixed tendons": """tendon_adr tendon_num wrap_type wrap_objid wrap_prm neq eq_type eq_objtype eq_obj1id eq_obj2id eq_active0 eq_data
         nsite site_bodyid site_pos site_quat""",
     "which bodies could touch": "ngeom geom_bodyid pair_geom1 pair_geom2 nexclude exclude_signature",
     "names": "names name_*",
@@ -37,11 +39,11 @@ IDLE = {
         nhfield* geom_matid geom_group geom_castshadow geom_rgba site_type site_dataid site_matid site_group site_size site_rgba
         site_sameframe jnt_group paths npaths""",
     "what a sensor measures": "sensor_* nsensor* opt.magnetic opt.disableflags.SENSOR",
-    "data of users, and states that may be given as qpos": "body_user jnt_user geom_user site_user nuser* numeric_* nnumeric* text_* ntext* tuple_* ntuple* key_* nkey",
-    "what MuJoCo derives from other fields": """stat.* signature flg_* ngravcomp body_rootid body_jntadr body_dofnum body_dofadr
+    "data of users, and states that may be given as qpos": "body_user jnt_user geom_user site_user nuser* numeric_* nnumeric* text_* ntext* tuple_* ntuple* key_*",
+    "what MuJoCo derives from other fields": """stat.* signature flg_* ngravcomp body_rootid body_dofnum body_dofadr
         body_treeid body_geomnum body_geomadr body_simple body_sameframe body_subtreemass body_invweight0 body_margin body_contype
         body_conaffinity body_bvhadr body_bvhnum bvh_* nbvh* oct_* noct dof_bodyid dof_parentid dof_treeid dof_Madr dof_simplenum
-        dof_invweight0 dof_M0 dof_length tree_bodyadr tree_bodynum tree_dofadr tree_dofnum ntree B_* D_* M_* mapD2M mapM2D mapM2M
+        dof_M0 dof_length tree_bodyadr tree_bodynum tree_dofadr tree_dofnum ntree B_* D_* M_* mapD2M mapM2D mapM2M
         nB nC nD nM nJmom nemax nnames nnames_map names_map""",
     "memory": "narena nbuffer njmax nconmax nhistory",
     "how MuJoCo integrates and solves; here a scheme and its step are chosen": """opt.timestep opt.integrator opt.cone opt.jacobian
@@ -73,7 +75,7 @@ class Refusal:
 
 REFUSED = {
     "actuators": Refusal(
-        "no control acts, and neither do the armature and damping of actuators",
+        "no actuator exerts anything, and neither do their armature and damping act",
         {
             "nactuator": ("ACTUATION",),
             "actuator_armature": (),
@@ -83,13 +85,12 @@ REFUSED = {
         "nu nout na actuator_* jnt_actuatorid tendon_actuatorid jnt_actfrclimited jnt_actfrcrange",
     ),
     "tendons": Refusal(
-        "their springs, dampers, limits, dry friction and armature do not act",
+        "their springs, dampers, dry friction and armature do not act",
         {
             "tendon_stiffness": ("SPRING",),
             "tendon_stiffnesspoly": ("SPRING",),
             "tendon_damping": ("DAMPER",),
             "tendon_dampingpoly": ("DAMPER",),
-            "tendon_limited": (CONSTRAINTS, "LIMIT"),
             "tendon_frictionloss": (CONSTRAINTS, "FRICTIONLOSS"),
             "tendon_armature": (),
         },
@@ -108,11 +109,11 @@ REFUSED = {
         opt.o_solref opt.o_solimp opt.o_friction opt.enableflags.OVERRIDE opt.enableflags.SPECULATIVE""",
     ),
     "limits": Refusal(
-        "joints turn and slide without end",
-        {"jnt_limited": (CONSTRAINTS, "LIMIT")},
-        "jnt_range jnt_margin jnt_solref jnt_solimp",
+        'joints turn and slide, and tendons stretch, without end; limits="spring" makes those of joints springs',
+        {"jnt_limited": (CONSTRAINTS, "LIMIT"), "tendon_limited": (CONSTRAINTS, "LIMIT")},
+        "jnt_margin jnt_solimp",
     ),
-    "armature": Refusal("rotors have no inertia", {"dof_armature": ()}),
+    "armature of ball and free joints": Refusal("it is left out"),
     "frictionloss": Refusal(
         "joints have no dry friction", {"dof_frictionloss": (CONSTRAINTS, "FRICTIONLOSS")}, "dof_solref dof_solimp"
     ),
@@ -141,7 +142,7 @@ REFUSED = {
         "bodies at rest are moved like others", {"opt.enableflags.SLEEP": ()}, "opt.sleep_tolerance tree_sleep_policy"
     ),
     "several joints of one body": Refusal(
-        "put a body of small mass between two joints, so that each body has one", {"body_jntnum": ()}, ignorable=False
+        'take coordinates="joint", with hinges and slides in place of a ball', ignorable=False
     ),
     "compensation of gravity by actuators": Refusal(
         "take actuatorgravcomp off the joints: gravcomp of bodies then acts by itself",

@@ -28,10 +28,12 @@ class Compiled:
     Args:
         mujoco: the package.
         model: `mujoco.MjModel`.
+        coordinates: of the scene: by "directors" a body can have one joint.
     """
 
     mujoco: Any
     model: Any
+    coordinates: str = "joint"
 
     def off(self, *flags: str) -> bool:
         """Whether one of these is set among opt.disableflags; of several flags in one string all must be."""
@@ -62,6 +64,30 @@ class Compiled:
             int(objects.mjOBJ_BODY),
             int(objects.mjOBJ_SITE),
         )
+
+    def ties(self, i: int) -> bool:
+        """Whether an equality ties joints with one coordinate, or fixed tendons of such."""
+        model, kinds = self.model, self.mujoco.mjtEq
+        numbers = [int(n) for n in (model.eq_obj1id[i], model.eq_obj2id[i]) if n >= 0]
+        if model.eq_type[i] == int(kinds.mjEQ_TENDON):
+            wraps = np.concatenate([model.tendon_adr[n] + np.arange(model.tendon_num[n]) for n in numbers])
+            if np.any(model.wrap_type[wraps] != int(self.mujoco.mjtWrap.mjWRAP_JOINT)):
+                return False
+            numbers = model.wrap_objid[wraps]
+        elif model.eq_type[i] != int(kinds.mjEQ_JOINT):
+            return False
+        return not np.any(self.turning[numbers])
+
+    @property
+    def turning(self) -> np.ndarray:
+        """(njnt,) whether a joint is a ball joint or free, so that its coordinates are no single number."""
+        kinds = self.mujoco.mjtJoint
+        return np.isin(self.model.jnt_type, [int(kinds.mjJNT_FREE), int(kinds.mjJNT_BALL)])
+
+    def joints_of(self, body: int) -> list[int]:
+        """The joints of a body, one after the other from its parent on."""
+        model = self.model
+        return list(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]))
 
     @cached_property
     def roots(self) -> list[int]:
@@ -115,6 +141,7 @@ class Compiled:
         looks: dict[str, Callable[[], str]] = {
             "actuators": self._actuators,
             "contact": self._contact,
+            "armature of ball and free joints": self._turning_armature,
             "springs and dampers of ball and free joints": self._turning_springs,
             "couplings": self._couplings,
             "soft equalities": self._soft_equalities,
@@ -150,18 +177,30 @@ class Compiled:
         return ", ".join(names[:NAMED] + more)
 
     def _actuators(self) -> str:
-        """Those of groups that are not disabled; their armature and damping act in any case."""
+        """Those of groups that are not disabled and that exert something with controls of zero; armature and damping act in any case."""
         fields = REFUSED["actuators"].fields
         groups = np.asarray(self.model.actuator_group)
         # a bit for each of the groups 0 to 30; others cannot be disabled
         disabled = (
             (groups >= 0) & (groups < 31) & ((int(self.model.opt.disableactuator) >> groups.clip(0, 30)) & 1 == 1)
         )
-        acting = np.zeros(len(groups), dtype=bool) if self.off("ACTUATION") else ~disabled
+        acting = np.zeros(len(groups), dtype=bool) if self.off("ACTUATION") else ~disabled & ~self._exert_nothing()
         for name, flags in fields.items():
             if name != "nactuator" and not self.off(*flags):
                 acting = acting | _rows(getattr(self.model, name))
         return self._listed("actuator", np.flatnonzero(acting))
+
+    def _exert_nothing(self) -> np.ndarray:
+        """(nactuator,) those whose force is a multiple of the control, or of what integrates or filters it from zero."""
+        model, mujoco = self.model, self.mujoco
+        gains = [int(kind) for kind in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)]
+        dynamics = mujoco.mjtDyn
+        plain = [dynamics.mjDYN_NONE, dynamics.mjDYN_INTEGRATOR, dynamics.mjDYN_FILTER, dynamics.mjDYN_FILTEREXACT]
+        return (
+            np.isin(model.actuator_gaintype, gains)
+            & np.isin(model.actuator_dyntype, [int(kind) for kind in plain])
+            & ~_rows(model.actuator_biasprm)
+        )
 
     def _contact(self) -> str:
         pairs = self.touching()
@@ -194,24 +233,28 @@ class Compiled:
 
     def _turning_springs(self) -> str:
         """Ball and free joints with a spring or a damper."""
-        model, kinds = self.model, self.mujoco.mjtJoint
-        turning = np.isin(model.jnt_type, [int(kinds.mjJNT_FREE), int(kinds.mjJNT_BALL)])
+        model = self.model
         sprung = np.zeros(model.njnt, dtype=bool) if self.off("SPRING") else np.asarray(model.jnt_stiffness) != 0
         damped = [] if self.off("DAMPER") else model.dof_jntid[np.flatnonzero(model.dof_damping)]
         sprung[np.asarray(damped, dtype=int)] = True
-        return self._listed("joint", np.flatnonzero(turning & sprung))
+        return self._listed("joint", np.flatnonzero(self.turning & sprung))
+
+    def _turning_armature(self) -> str:
+        """Ball and free joints with armature."""
+        rows = self.model.dof_jntid[np.flatnonzero(self.model.dof_armature)]
+        return self._listed("joint", [j for j in rows if self.turning[j]])
 
     def _couplings(self) -> str:
-        """Equalities that are neither connect nor weld."""
-        return self._listed("equality", [i for i in self.equalities if not self.closes(i)])
+        """Equalities that are neither connect nor weld, nor tie joints with one coordinate."""
+        return self._listed("equality", [i for i in self.equalities if not (self.closes(i) or self.ties(i))])
 
     def _soft_equalities(self) -> str:
-        """Connects and welds that are softer than by default; with negative numbers solref is a spring."""
+        """Equalities that are softer than by default; with negative numbers solref is a spring."""
         model = self.model
         soft = [
             i
             for i in self.equalities
-            if self.closes(i)
+            if (self.closes(i) or self.ties(i))
             and (not 0 < model.eq_solref[i, 0] <= SOFTEST_TIME or model.eq_solimp[i, :2].min() < SOFTEST_IMPEDANCE)
         ]
         return self._listed("equality", soft)
@@ -221,7 +264,11 @@ class Compiled:
         return "the flag sleep" if asleep else ""
 
     def _several_joints(self) -> str:
-        return self._listed("body", np.flatnonzero(np.asarray(self.model.body_jntnum) > 1))
+        """Bodies with several, of which one is a ball or the scene is by directors."""
+        several = np.flatnonzero(np.asarray(self.model.body_jntnum) > 1)
+        if self.coordinates != "directors":
+            several = [b for b in several if np.any(self.turning[self.joints_of(int(b))])]
+        return self._listed("body", several)
 
     def _actuated_compensation(self) -> str:
         """Joints whose actuators compensate gravity, where it is compensated at all."""

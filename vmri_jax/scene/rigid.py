@@ -102,7 +102,7 @@ class RigidBody(AnyBody):
         what = f"RigidBody {self.name}: inertia"
         axes = np.eye(3)
         if inertia.shape == (3, 3) and is_concrete(inertia):
-            if not np.allclose(inertia, inertia.T, rtol=ORTHONORMAL, atol=0.0):
+            if np.abs(inertia - inertia.T).max() > ORTHONORMAL * np.abs(inertia).max():
                 raise ValueError(f"{what} is {inertia.tolist()}; it must be a symmetric matrix.")
             if np.count_nonzero(inertia - np.diag(np.diagonal(inertia))):
                 inertia, axes = np.linalg.eigh(inertia)

@@ -123,8 +123,18 @@ class Scene:
         check_constraints(self.sorting)
 
     @classmethod
-    def from_mujoco(cls, model: Any, *, qpos: Any = None, qvel: Any = None, ignore: Collection[str] = ()) -> "Scene":
-        """The scene of a model of MuJoCo: bodies, inertias, joints, their springs and dampers, connect, weld, gravity and gravcomp.
+    def from_mujoco(
+        cls,
+        model: Any,
+        *,
+        qpos: Any = None,
+        qvel: Any = None,
+        key: str | int | None = None,
+        ignore: Collection[str] = (),
+        limits: Literal["refuse", "spring"] = "refuse",
+        coordinates: Literal["joint", "directors"] = "joint",
+    ) -> "Scene":
+        """The scene of a model of MuJoCo: bodies, inertias, joints with springs, dampers and armature, equalities, gravity and gravcomp.
 
         Flags of the model are heard: what they switch off neither acts nor is refused. All bodies decide their pace by
         themselves; ``scene.replace("arm", pace="fast")`` changes that.
@@ -133,17 +143,21 @@ class Scene:
             model: path of an MJCF or URDF file, or a compiled `mujoco.MjModel`.
             qpos, qvel: MuJoCo's coordinates and velocities at the start; None for those of the model, at rest. Loops that
                 qpos leaves open by less than a thousandth of the model's extent are closed by moving the joints.
+            key: a keyframe of the model, name or number, in place of qpos and qvel.
             ignore: what is left out of the motion although the model has it, by the names in the message that refuses it.
+            limits: "spring" for limits of joints as smooth springs, see `JointLimit`, as stiff as MuJoCo's for the inertia at the joint.
+            coordinates: of the scene; by "directors" each body can have one joint.
 
         Raises:
             ImportError: without the package mujoco, or with one before 4.0.
             TypeError: a model of another kind, names to ignore that are no list.
-            ValueError: a file that MuJoCo cannot read; all that a scene does not express, in one list; loops that are open at
-                the start; an unknown name to ignore; qpos or qvel of another shape or not finite.
+            ValueError: a file that MuJoCo cannot read; all that a scene does not express, in one list; equalities that do not hold at
+                the start; an unknown name to ignore, or keyframe; qpos or qvel of another shape or not finite.
         """
         from vmri_jax.scene.mujoco import bodies_and_effects  # its package is an extra
 
-        return cls(*bodies_and_effects(model, qpos, qvel, ignore), redundant="drop", project=True)
+        made = bodies_and_effects(model, qpos, qvel, key, ignore, limits, coordinates)
+        return cls(*made, redundant="drop", project=True, coordinates=coordinates)
 
     @cached_property
     def by_name(self) -> dict[str, AnyBody]:

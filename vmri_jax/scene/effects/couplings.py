@@ -52,7 +52,7 @@ class _Coupling(Effect):
         joints: names of joints of the scene, each between two bodies; of one that leaves several freedoms ``(name, freedom)``.
 
     Raises:
-        ValueError: fewer than two joints; (of the scene) no joint of this name, one between several pairs of bodies, one that leaves no such
+        ValueError: none, or more than 16 joints; (of the scene) no joint of this name, one between several pairs of bodies, one that leaves no such
             freedom; an equation that is not kept at the start.
     """
 
@@ -74,9 +74,9 @@ class _Coupling(Effect):
     def __post_init__(self):
         super().__post_init__()
         given = () if isinstance(self.joints, str) else tuple(self.joints)
-        if not 2 <= len(given) <= MOST_ROLES // 2:
+        if not 1 <= len(given) <= MOST_ROLES // 2:
             raise ValueError(
-                f"{self.name}: joints is {self.joints!r}; give names of 2 to {MOST_ROLES // 2} joints, ['motor', 'wheel']."
+                f"{self.name}: joints is {self.joints!r}; give names of 1 to {MOST_ROLES // 2} joints, ['motor', 'wheel']."
             )
         object.__setattr__(self, "joints", given)
 
@@ -114,17 +114,24 @@ class _Coupling(Effect):
         return (EffectTerm(self.name, EquationOfCoordinates(self.equation), roles),)
 
     def check_bodies(self, bodies):
-        """Those of the joints are checked there."""
+        """Nothing: those of the joints are checked there."""
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
         for joint, _ in self.joints:
             count = len(joint.elements(bodies))
             self.require(
                 count == 1, f"the number of pairs of {joint.name}", count, "give each pair a joint of its own name"
             )
 
-    def check_parameters(self, bodies):
-        super().check_parameters(bodies)
+    def check_start(self, bodies):
         apart = jnp.abs(self.equation(jnp.zeros(len(self.joints)), self.numbers()))
-        self.require(apart < START, "the equation", apart, "freedoms are counted from the start, where it must be zero")
+        self.require(
+            apart < START,
+            "the equation",
+            apart,
+            "freedoms are counted from the start, where it must be zero; or let the scene move the joints, project=True",
+        )
 
 
 @effect_class
@@ -145,7 +152,7 @@ class JointCoupling(_Coupling):
 
     Raises:
         TypeError: a law that is no function of (x, params).
-        ValueError: fewer than two joints; (of the scene) no joint of this name, one between several pairs of bodies, one that leaves no such
+        ValueError: none, or more than 16 joints; (of the scene) no joint of this name, one between several pairs of bodies, one that leaves no such
             freedom; a law that returns no vector, or that is not zero at the start.
     """
 
