@@ -5,13 +5,12 @@ from collections import Counter
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.mechanics.motion import motion as continuous_motion
-from vmri_jax.mechanics.projection import legendre
+from tests.scene.test_joint_coordinates import accelerations as motions
+from tests.scene.test_joint_coordinates import state_of
 from vmri_jax.scene import Fixed, Scene, Spherical
 from vmri_jax.scene.mujoco_fields import IDLE, READ, REFUSED
 from vmri_jax.scene.mujoco_model import Compiled
@@ -86,11 +85,19 @@ def motion(model, qpos, qvel, t_end):
 
 def accelerations(scene):
     """Accelerations of the centres of mass at the start, by the continuous equations of the scene."""
-    system, (q_s, q_f, v_s, v_f) = scene.system(), scene.start
-    state = vm.State(0.0, q_s, q_f, *legendre(system, q_s, q_f, v_s, v_f))  # not projected: that takes 12 s to compile
-    a = jax.jit(continuous_motion)(system, state)
-    parts = {"s": a.a_s, "f": a.a_f}
-    return {name: np.asarray(parts[place.part][place.start : place.start + 3]) for name, place in scene.places.items()}
+    return {name: np.asarray(a[:3]) for name, (_, _, a) in motions(scene, state_of(scene)).items()}
+
+
+def their_accelerations(model, data):
+    """Accelerations of the centres of mass of MuJoCo's bodies, (nbody, 3)."""
+    mujoco.mj_forward(model, data)
+    mujoco.mj_rnePostConstraint(model, data)
+    found = np.zeros((model.nbody, 3))
+    for b in range(1, model.nbody):
+        felt = np.zeros(6)
+        mujoco.mj_objectAcceleration(model, data, mujoco.mjtObj.mjOBJ_BODY, b, felt, 0)
+        found[b] = felt[3:] + model.opt.gravity  # what a body feels is -g at rest
+    return found
 
 
 def test_a_tree_accelerates_as_in_mujoco():
@@ -100,15 +107,9 @@ def test_a_tree_accelerates_as_in_mujoco():
     rng = np.random.default_rng(0)
     mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 0.3)
     data.qvel[:] = rng.normal(size=model.nv)
-    mujoco.mj_forward(model, data)
-    mujoco.mj_rnePostConstraint(model, data)
     scene = Scene.from_mujoco(model, qpos=data.qpos, qvel=data.qvel)
     assert [body.name for body in scene.bodies] == ["upper", "hand", "slider"]  # the weight is welded to the hand
-    ours, theirs = accelerations(scene), np.zeros((model.nbody, 3))
-    for b in range(1, model.nbody):
-        proper = np.zeros(6)
-        mujoco.mj_objectAcceleration(model, data, mujoco.mjtObj.mjOBJ_BODY, b, proper, 0)
-        theirs[b] = proper[3:] + model.opt.gravity  # theirs is felt, so that it is -g at rest
+    ours, theirs = accelerations(scene), their_accelerations(model, data)
     hand = [model.body(name).id for name in ("hand", "weight")]
     np.testing.assert_allclose(
         ours["hand"], model.body_mass[hand] @ theirs[hand] / model.body_mass[hand].sum(), rtol=1e-9, atol=1e-9
@@ -129,6 +130,95 @@ def test_a_loop_between_sites_accelerates_as_in_mujoco():
     theirs = (before.xipos - 2 * start.xipos + after.xipos) / h**2
     for name, ours in accelerations(scene).items():
         np.testing.assert_allclose(ours, theirs[model.body(name).id], atol=1e-3)
+
+
+ROBOT = """
+<mujoco>
+  <option gravity="0 0 -9.81"><flag contact="disable" {flags}/></option>
+  <default><joint armature="0.05" damping="0.1" solreflimit="0.1 1"/><geom type="capsule" size=".04"/></default>
+  <worldbody>
+    <body name="torso" pos="0 0 1">
+      <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1" ref="1"/><joint name="pitch" axis="0 1 0" pos="0 0 .2"/>
+      <geom fromto="0 0 -.3 0 0 .3"/>
+      <body name="thigh" pos="0.1 0.1 -.3">
+        <joint name="hip roll" axis="1 0 0" stiffness="2" springref="30"/><joint name="hip pitch" axis="0 1 0" pos="0 .05 0" range="-20 60"/>
+        <geom fromto="0 0 0 .1 0 -.4"/>
+        <body name="carrier" pos=".1 0 -.4"><joint name="knee" axis="0 1 0" range="-10 10"/><geom size=".02" fromto="0 0 0 .05 0 0"/>
+          <body name="shin"><joint name="slide" type="slide" axis="0 .2 -1"/><geom fromto="0 0 0 -.1 0 -.4"/></body></body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon><fixed name="t"><joint joint="hip roll" coef="1"/><joint joint="slide" coef="-2"/></fixed></tendon>
+  <equality>
+    <joint name="bend" joint1="knee" joint2="hip pitch" polycoef="0 .5 .2 -.1 .3" solref="0.0004 1"/>
+    <tendon name="held" tendon1="t" solref="0.0004 1"/>
+  </equality>
+  <actuator><motor joint="knee" gear="3"/><general joint="hip pitch" dyntype="integrator" gainprm="2"/></actuator>
+  <keyframe><key name="stand"/><key name="leap" qpos=".1 1.3 .2 .3 .4 -.1 .2" qvel="1 -.5 .3 .2 -.4 .6 .1"/></keyframe>
+</mujoco>
+"""
+"""A planar root, two joints of one body, armature, laws of joints and tendons, keyframes."""
+
+
+def test_a_robot_accelerates_as_in_mujoco():
+    """From a keyframe; MuJoCo's equalities are soft, so that they are off here."""
+    model = mujoco.MjModel.from_xml_string(ROBOT.format(flags='equality="disable" limit="disable"'))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 1)
+    scene = Scene.from_mujoco(model, key="leap")
+    assert {type(body).__name__: 0 for body in scene.bodies}.keys() == {"RigidBody", "Frame"}
+    assert sum(x.size for x in scene.start[:2]) == model.nv == 7
+    ours, theirs = accelerations(scene), their_accelerations(model, data)
+    for name in ("torso", "thigh", "shin"):
+        np.testing.assert_allclose(ours[name], theirs[model.body(name).id], rtol=1e-9, atol=1e-9)
+    again = Scene.from_mujoco(model, key=1)
+    np.testing.assert_array_equal(again.bodies[-1].velocity, scene.bodies[-1].velocity)
+
+
+def test_joints_and_tendons_that_equalities_tie():
+    """MuJoCo's motion with equalities ten times stiffer than by default is that of the scene, which keeps them to round-off."""
+    model = mujoco.MjModel.from_xml_string(ROBOT.format(flags='limit="disable"'))
+    model.opt.timestep = 2e-4
+    scene = Scene.from_mujoco(model)
+    assert scene.system().num_constraints(*scene.start[:2]) in ((0, 2), (2, 0), (1, 1))
+    run = vm.simulate(scene, vm.fully_implicit(1), macro_dt=0.002, t_end=0.3)
+    end, start = motion(model, model.qpos0, 0.0, 0.3), model.qpos0
+    turned = dict(zip(("x", "z", "pitch", "hip roll", "hip pitch", "knee", "slide"), end.qpos - start, strict=True))
+    for name, value in turned.items():
+        np.testing.assert_allclose(scene.joint_motion(run, name)[-1], value, atol=2e-4)
+    assert abs(turned["slide"]) > 0.01
+    x = {name: scene.joint_motion(run, name) for name in turned}
+    np.testing.assert_allclose(x["knee"], np.polyval([0.3, -0.1, 0.2, 0.5, 0.0], x["hip pitch"]), atol=1e-14)
+    np.testing.assert_allclose(x["hip roll"], 2 * x["slide"], atol=1e-14)
+
+
+def test_limits_as_springs():
+    """A hinge that has gone beyond its limit is pushed back with MuJoCo's stiffness for the inertia at the hinge."""
+    model = mujoco.MjModel.from_xml_string(ROBOT.format(flags='equality="disable"'))
+    with pytest.raises(ValueError, match=r"limits \(joint hip pitch, joint knee\)"):
+        Scene.from_mujoco(model)
+    with pytest.raises(ValueError, match=r"limits is 'soft'; it must be 'refuse' or 'spring'"):
+        Scene.from_mujoco(model, limits="soft")
+    names = [effect.name for effect in Scene.from_mujoco(model, limits="spring").effects]
+    assert [name for name in names if name.endswith("limit")] == ["hip pitch limit", "knee limit"]
+    pendulum = arm(joint='range="-20 20" solreflimit="0.1 1"', option='gravity="0 0 0"')
+    scene = Scene.from_mujoco(pendulum, qpos=[np.radians(25)], limits="spring")
+    inertia = 1 / pendulum.dof_invweight0[0]
+    spin = np.asarray(state_of(scene).q_s), accelerations(scene)["arm"]
+    turning = np.linalg.norm(spin[1]) / np.linalg.norm(pendulum.body_ipos[1])
+    assert turning == pytest.approx(np.radians(5) / 0.1**2, rel=1e-6), inertia
+
+
+def test_starts_that_equalities_and_keyframes_do_not_allow():
+    model = mujoco.MjModel.from_xml_string(ROBOT.format(flags='limit="disable"'))
+    with pytest.raises(ValueError, match=r"bend is missed by 0\.\d+ at the start\. Here equalities hold exactly"):
+        Scene.from_mujoco(model, key="leap")
+    with pytest.raises(ValueError, match=r"there is no keyframe 'jump'.*leap"):
+        Scene.from_mujoco(model, key="jump")
+    with pytest.raises(ValueError, match=r"key is 2; the model has 2 keyframes, counted from 0"):
+        Scene.from_mujoco(model, key=2)
+    with pytest.raises(ValueError, match=r"key and qpos or qvel are given"):
+        Scene.from_mujoco(model, key=0, qpos=model.qpos0)
 
 
 def test_half_of_gravity():
@@ -161,8 +251,10 @@ def test_a_small_gap_is_closed_by_the_joints():
     turned = "<site name='s' pos='0 0 1' euler='0 30 0'/>"
     more = '<equality><weld name="w" site1="s" site2="here"/></equality>'
     model = arm(more, body=turned, child='<site name="here"/>')
-    exact = Scene.from_mujoco(model, qpos=[np.pi / 6])
-    close = Scene.from_mujoco(model, qpos=[np.pi / 6 + 1e-5])
+    exact = Scene.from_mujoco(model, qpos=[np.pi / 6], coordinates="directors")
+    close = Scene.from_mujoco(model, qpos=[np.pi / 6 + 1e-5], coordinates="directors")
+    with pytest.raises(ValueError, match=r"nothing can move: w leave no freedom"):
+        Scene.from_mujoco(model, qpos=[np.pi / 6])
     np.testing.assert_allclose(close.bodies[0].position, exact.bodies[0].position, atol=1e-13)  # 1e-17; off by 1e-6
     (weld,) = [effect for effect in close.effects if effect.name == "w"]
     assert isinstance(weld, Fixed)
@@ -185,7 +277,7 @@ def test_anchors_of_equalities():
 
 
 COUPLED = '<equality><joint joint1="hinge"/></equality>'
-MOTOR = '<actuator><motor name="m" joint="hinge" gear="2"/></actuator>'
+MOTOR = '<actuator><position name="m" joint="hinge" kp="2"/></actuator>'
 PINNED = '<equality><connect name="e" body1="arm" anchor=".3 0 0"/></equality>'
 FLAGS = {
     "equality": ('equality="disable"', PINNED, ""),
@@ -280,19 +372,22 @@ def test_several_joints_of_one_body_cannot_be_ignored():
     """Leaving one out would weld the body to the other's."""
     body = '<body name="point"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><geom fromto="0 0 0 1 0 0"/></body>'
     with pytest.raises(
-        ValueError, match=r"several joints of one body \(body point\).*put a body of small mass between"
+        ValueError, match=r"several joints of one body \(body point\).*take coordinates=\"joint\", with hinges"
     ):
-        Scene.from_mujoco(arm(body=body), ignore=["several joints of one body"])
+        Scene.from_mujoco(arm(body=body), ignore=["several joints of one body"], coordinates="directors")
+    ball = body.replace('type="slide" axis="0 1 0"', 'type="ball"')
+    with pytest.raises(ValueError, match=r"several joints of one body \(body point\)"):
+        Scene.from_mujoco(arm(body=ball))
 
 
 def test_what_a_scene_does_not_express_is_refused_in_one_list(monkeypatch):
-    model = arm(MOTOR, joint='armature="0.1" range="-10 10"')
+    model = arm(MOTOR, joint='frictionloss="0.1" range="-10 10"')
     with pytest.raises(
         ValueError,
-        match=r"actuators \(actuator m\); limits \(joint hinge\); armature .*ignore=\['actuators', 'limits', ",
+        match=r"actuators \(actuator m\); limits \(joint hinge\); frictionloss .*ignore=\['actuators', 'limits', ",
     ):
         Scene.from_mujoco(model)
-    assert Scene.from_mujoco(model, ignore=["actuators", "limits", "armature"]).bodies
+    assert Scene.from_mujoco(model, ignore=["actuators", "limits", "frictionloss"]).bodies
     with pytest.raises(ValueError, match=r"ignore: there is no name 'limit'.*limits"):
         Scene.from_mujoco(model, ignore=["limit"])
     with pytest.raises(TypeError, match=r"ignore is 'limits'; give a list, ignore=\['limits'\]"):
@@ -404,7 +499,7 @@ def test_each_refused_field_is_refused_by_name_and_ignored_by_name():
     assert not list(Compiled(mujoco, arm(**QUIET)).beyond())
     for kind, refusal in REFUSED.items():
         for field in refusal.fields:
-            compiled = Compiled(mujoco, away(field))
+            compiled = Compiled(mujoco, away(field), "directors" if field == "body_jntnum" else "joint")
             with pytest.raises(ValueError, match=rf"does not express: (.*; )?{kind} \("):
                 compiled.refuse([])
             others = [name for name, _ in compiled.beyond() if name != kind]
@@ -422,7 +517,11 @@ def test_springs_and_dampers_of_ball_and_free_joints_and_couplings():
         body, kind = ball.format(f'{attribute}="1"'), "springs and dampers of ball and free joints"
         assert list(Compiled(mujoco, arm(body=body)).beyond()) == [(kind, "joint ball")]
         assert not list(Compiled(mujoco, arm(body=body, flags=f'{flag}="disable"')).beyond())
-    assert [kind for kind, _ in Compiled(mujoco, arm(COUPLED)).beyond()] == ["couplings"]
+    body, kind = ball.format('armature="1"'), "armature of ball and free joints"
+    assert list(Compiled(mujoco, arm(body=body)).beyond()) == [(kind, "joint ball")]
+    cable = '<tendon><spatial name="t"><site site="hook"/><site site="tip"/></spatial></tendon>'
+    tied = arm(cable + '<equality><tendon tendon1="t"/></equality>')
+    assert [kind for kind, _ in Compiled(mujoco, tied).beyond()] == ["couplings"]
 
 
 def test_springs_that_are_ignored_are_left_out_whole():

@@ -128,14 +128,12 @@ class _Reader:
             made.append(self._body(root))
         return made
 
-    def _body(self, root: int) -> RigidBody | Frame:
-        """The body of all that is welded to a body; a frame where they have no mass."""
+    def _body(self, root: int) -> RigidBody:
+        """All that is welded to a body, as one."""
         model, name = self.compiled.model, self.compiled.name("body", root)
         members = np.flatnonzero(model.body_weldid == root)
         masses, centres = model.body_mass[members], self.data.xipos[members]
         mass = float(masses.sum())
-        if mass == 0.0:
-            return Frame(name, self.data.xpos[root])
         centre = masses @ centres / mass
         inertia = np.zeros((3, 3))
         for b, m, position in zip(members, masses, centres, strict=True):

@@ -22,6 +22,11 @@ from vmri_jax.scene.terms import EffectTerm
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
 
 
+CANCELLED = 1e-14
+"""Part of the product of the gradient of a row by bodies and the motion of these by a coordinate below which their inner product is zero: so it is with the rows of a planar loop that
+hold it in its plane. A larger one takes a row away whose lever is short, a smaller one takes round-off for an independent row."""
+
+
 class Row(NamedTuple):
     """A row of a constraint.
 
@@ -112,7 +117,9 @@ class ConstraintRows:
             values[first : first + value.size] = value
             jacobian[first : first + value.size, element.columns] = entries
             first += value.size
-        return values, jacobian @ of_bodies
+        found = jacobian @ of_bodies
+        largest = np.linalg.norm(jacobian, axis=1)[:, None] * np.sqrt((of_bodies * of_bodies).sum(axis=0))
+        return values, np.where(np.abs(found) > CANCELLED * largest, found, 0.0)
 
     @cached_property
     def jacobian(self) -> np.ndarray:

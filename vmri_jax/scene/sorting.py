@@ -204,7 +204,8 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
         branches: bodies that are functions of the freedoms of joints, parents before children.
 
     Raises:
-        ValueError: a potential that is to be fast but touches a slow body; something to be decided by numbers that are traced.
+        ValueError: a potential that is to be fast but touches a slow body; something to be decided by numbers that are traced; joints
+            that leave no freedom.
     """
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
@@ -231,6 +232,11 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
             homes.setdefault(home, {})[i] = reason
         placed += [Placed(effect, tuple(some), home, _together(some.values())) for home, some in homes.items()]
     where, ordered = layout(bodies, paces, branches)
+    if not any(where.sizes):
+        joints = dict.fromkeys(branch.joint.name for branch in branches)
+        raise ValueError(
+            f"Scene: nothing can move: {', '.join(joints)} leave no freedom to any body. Leave one of them out."
+        )
     return Sorting(bodies, paces, where, tuple(placed), ordered)
 
 
