@@ -1,0 +1,46 @@
+"""The benchmark of model files, on two small ones."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from benchmarks import imports
+
+pytest.importorskip("mujoco")
+MODEL = """
+<mujoco>
+  <worldbody>
+    <body pos="0 0 1"><joint type="slide" axis="1 0 0" range="-1 1" limited="true"/><geom size=".1" mass="2"/>
+      <body><joint axis="0 1 0" armature=".1"/><geom type="capsule" fromto="0 0 0 0 0 -.5" size=".05"/></body></body>
+  </worldbody>
+  <actuator><position kp="3" {}/></actuator>
+</mujoco>
+"""
+
+
+def test_files_of_installed_packages_move_as_in_mujoco(tmp_path, monkeypatch):
+    folder = tmp_path / imports.FOLDERS["gymnasium"]
+    folder.mkdir(parents=True)
+    moves = MODEL.format('joint="j"').replace("<joint axis", '<joint name="j" axis')
+    (folder / "cartpole.xml").write_text(moves)
+    (folder / "swimmer.xml").write_text(moves.replace("<worldbody>", '<option density="1000"/><worldbody>'))
+    (folder / "giant.xml").write_text(moves)
+    known = {"gymnasium": SimpleNamespace(submodule_search_locations=[str(tmp_path)])}
+    monkeypatch.setattr(imports, "find_spec", known.get)
+    size = imports.sizes("quick")
+    assert [Path(file).stem for _, file in size.files] == ["cartpole", "swimmer"]
+    *_, report = imports.run(size, "quick")
+    first, second = report.rows
+    assert (first["file"], first["bodies"], first["coordinates"]) == ("gymnasium/cartpole.xml", 2, 2)
+    assert first["error"] < 1e-8
+    assert "fluid (density = 1000)" in second["not read"]
+    assert "1 of 2 files are read" in report.notes[0]
+
+
+def test_without_the_packages_it_says_how_to_get_the_files(monkeypatch):
+    monkeypatch.setattr(imports, "find_spec", lambda name: None)
+    with pytest.raises(
+        FileNotFoundError, match=r"neither gymnasium nor dm_control is installed: pip install --no-deps"
+    ):
+        imports.sizes("full")
