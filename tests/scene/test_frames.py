@@ -147,7 +147,7 @@ def test_frames_that_cannot_move_are_refused():
         Scene([frame, PLATE], [replace(tilt, between=("ground", "plate"))], coordinates="joint")
     scene = Scene([frame, PLATE], [pan, tilt], coordinates="joint")
     with pytest.raises(ValueError, match=r"by_directors: yoke have no mass"):
-        scene.by_directors(None)
+        scene.by_directors(None)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"Frame yoke: position has shape \(2,\); give \(3,\)"):
         Frame("yoke", [0, 1])
 
