@@ -15,8 +15,8 @@ TOOLS := tests/benchmarks tests/pages tests/tools tests/ensembles/test_workers.p
 reproduce: .venv/installed  ## the quick reference study: figures, tables and out/report.html
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
 
-test: .venv/installed  ## the library
-	$(PYTEST) $(addprefix --ignore=,tests/smoke $(TOOLS)) $(OPTIONS)
+test: .venv/installed  ## the library; the same instructions, compiled without LLVM's optimisations: most of the time is compiling
+	$(PYTEST) --unoptimised $(addprefix --ignore=,tests/smoke $(TOOLS)) $(OPTIONS)
 
 test-tools: .venv/installed  ## benchmarks, notebooks, programs and commands of the pages, every tool on every small system, ensembles on workers
 	$(PYTEST) $(TOOLS) $(OPTIONS)
