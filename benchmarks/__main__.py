@@ -24,6 +24,7 @@ from benchmarks import (
     imports,
     instructions,
     kills,
+    mechanisms,
     orders,
     peers,
     savings,
@@ -49,12 +50,16 @@ app.command()(gail2014)
 app.command()(hard)
 
 
+COMPILES = ("chains",)
+"""Commands that report seconds of compilation: programs in the cache would be no measure of them."""
+
+
 def _plain_command(name: str, module) -> None:
     """A command without options of its own; its help is the docstring of the benchmark."""
 
     @app.command(name, help=module.__doc__)
     def command(full: Full = False, core: Core = None, out: Out = OUT) -> None:
-        prepare(core)
+        prepare(core, cache=name not in COMPILES)
         _measure(name, module, full, out)
 
 
@@ -106,6 +111,21 @@ def peers_command(
     """Time to reach an error, against other integrators; the extra `peers` installs them."""
     prepare(core)
     _measure("peers", peers, full, out, only=only or (), peers=peer or ())
+
+
+@app.command("mechanisms", help=mechanisms.__doc__)
+def mechanisms_command(
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Mechanisms, e.g. 'chain 3', or all of a kind, e.g. chain; may be repeated."),
+    ] = None,
+    way: Annotated[list[str] | None, typer.Option(help="Ways that begin so, e.g. joint; may be repeated.")] = None,
+) -> None:
+    prepare(core, cache=False)
+    _measure("mechanisms", mechanisms, full, out, markdown=True, only=only or (), way=way or ())
 
 
 @app.command("against", help=against.__doc__)

@@ -1,7 +1,10 @@
-"""Linear in the number of bodies: time of one step of a hinged chain, a band against the full matrix."""
+"""Linear in the number of bodies: time of one step of hinged chains and stars, by directors (a band, the full matrix) and in joint coordinates."""
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -11,78 +14,143 @@ from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report, growing
 from vmri_jax.mechanics import constraint_pattern
 from vmri_jax.running.engine import engine
-from vmri_jax.scene import Box, Gravity, Revolute, RigidBody, Scene
+from vmri_jax.scene import Box, Gravity, JointSpring, Revolute, RigidBody, Scene
 from vmri_jax.study.timing import seconds_per_call
 
-COLUMNS = ("bodies", "rows", "band, us", "full, us", "band, us a body")
+Coordinates = Literal["joint", "directors"]
+COLUMNS = (
+    *("shape", "bodies", "rows", "band, us", "full, us", "joint, us", "band, us a body"),
+    *("band, first s", "joint, first s", "band over joint"),
+)
 SHORT, LONG = 50, 250
 """Steps of two runs; what a call costs besides its steps is in both."""
 MACRO_DT = 1e-3
 FROM = 20
 """Below so many bodies the band is not what `vm.simulate` takes, or what does not depend on their number counts as well."""
+JOINT_FROM = 10
+"""The same in joint coordinates."""
 LEVEL = [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
 """The rotation that lays the long axis of a bar along x."""
+CLOCK = time.process_time
+"""Seconds in which this process runs: others may share its core."""
 
 
 @dataclass(frozen=True)
 class Size:
-    """Numbers of bodies with a band, those of them with the full matrix too, samples of a time."""
+    """Numbers of bodies with a band, those of them with the full matrix too, samples of a time.
+
+    joint: chains that are timed in joint coordinates, too.
+    stars: numbers of panels around a hub.
+    """
 
     bodies: tuple[int, ...]
     full: tuple[int, ...]
     repeats: int
+    joint: tuple[int, ...] = ()
+    stars: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Microseconds of a step, and seconds of the scene, its compilation and its first run."""
+
+    us: float
+    first: float
 
 
 def sizes(name: str) -> Size:
     """ "quick" or "full"."""
-    quick = Size((10, 20, 40), (10, 20), 3)
-    return quick if name == "quick" else Size((1, 5, 10, 20, 40, 70, 100), (1, 5, 10, 20, 40), 5)
+    if name == "quick":
+        return Size((10, 20, 40), (10, 20), 3, (10,), (3,))
+    numbers = (1, 3, 10, 30, 100)
+    return Size(numbers, (1, 10, 30), 5, numbers, numbers)
 
 
-def chain(bodies: int) -> Scene:
+def chain(bodies: int, coordinates: Coordinates = "directors") -> Scene:
     """Bars of 1 kg and 1 m in a row along x, the first hinged to the ground, at rest."""
     bars = [
         RigidBody(f"bar {i}", 1.0, Box((0.1, 0.1, 1.0)), [0.5 + i, 0.0, 0.0], LEVEL, pace="fast") for i in range(bodies)
     ]
     pairs = [("ground", "bar 0"), *((f"bar {i}", f"bar {i + 1}") for i in range(bodies - 1))]
     hinges = Revolute(pairs, [[float(i), 0.0, 0.0] for i in range(bodies)], [0.0, 1.0, 0.0], name="hinges")
-    return Scene(bars, [Gravity(), hinges])
+    return Scene(bars, [Gravity(), hinges], coordinates=coordinates)
 
 
-def microseconds(bodies: int, few: int, repeats: int) -> float:
-    """Of one RATTLE step; a band where there are more than `few` rows."""
+def star(panels: int, coordinates: Coordinates = "directors") -> Scene:
+    """A hub of 100 kg that floats and turns, slow, and panels of 2 kg on springs in hinges along its rim, fast."""
+    hub = RigidBody("hub", 100.0, Box((1.0, 1.0, 1.0)), [0.0, 0.0, 0.0], spin=[0.0, 0.0, 0.2], pace="slow")
+    bodies, hinges, springs = [hub], [], []
+    for i in range(panels):
+        angle = 2 * np.pi * i / panels
+        out, along = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
+        place, spin = 0.9 * out, np.array([0.0, 0.0, 0.2]) + 0.5 * along
+        velocity = np.cross([0.0, 0.0, 0.2], place) + np.cross(0.5 * along, 0.4 * out)
+        panel = Box((0.8, 0.6, 0.03))
+        bodies.append(RigidBody(f"panel {i}", 2.0, panel, place, [0.0, 0.0, angle], velocity, spin, pace="fast"))
+        hinges.append(Revolute(("hub", f"panel {i}"), 0.5 * out, along, name=f"hinge {i}"))
+        springs.append(JointSpring(f"hinge {i}", 150.0, name=f"spring {i}"))
+    return Scene(bodies, [*hinges, *springs], coordinates=coordinates)
+
+
+SHAPES: dict[str, Callable[[int, Coordinates], Scene]] = {"chain": chain, "star": star}
+
+
+def measure(shape: str, bodies: int, coordinates: Coordinates, few: int, repeats: int) -> Measured:
+    """One step of kicks and RATTLE, or of kicks and free motion in joint coordinates; a band where there are more than `few` rows."""
     before, constraint_pattern.FEW = constraint_pattern.FEW, few
     engine.cache_clear()  # another limit is another program of the same scene
     try:
-        scene = chain(bodies)
-        seconds = {}
+        begin, seconds = CLOCK(), {}
+        scene = SHAPES[shape](bodies, coordinates)
+        run = vm.prepare(
+            scene, vm.fully_explicit(1), macro_dt=MACRO_DT, num_steps=1
+        )  # compiled once, for any number of steps
+        run()
+        first = CLOCK() - begin
         for steps in (SHORT, LONG):
-            run = vm.prepare(scene, vm.fully_explicit(1), macro_dt=MACRO_DT, num_steps=steps, save_every=steps)
-            run()
-            seconds[steps] = min(seconds_per_call(run, 1) for _ in range(repeats))
+            run(num_steps=steps)
+            seconds[steps] = min(seconds_per_call(partial(run, num_steps=steps), 1, CLOCK) for _ in range(repeats))
     finally:
         constraint_pattern.FEW = before
         engine.cache_clear()
-    return (seconds[LONG] - seconds[SHORT]) / (LONG - SHORT) * 1e6
+    return Measured((seconds[LONG] - seconds[SHORT]) / (LONG - SHORT) * 1e6, first)
 
 
 def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     """Measure all of it, a report after each number of bodies."""
     band: dict[int, float] = {}
+    joint: dict[str, dict[int, float]] = {shape: {} for shape in SHAPES}
 
-    def measured(bodies: int) -> tuple[list[dict], list[Claim]]:
-        tell(f"{bodies} bodies")
-        rows = 11 * bodies
-        band[bodies] = microseconds(bodies, 0, size.repeats)
-        full = microseconds(bodies, rows, size.repeats) if bodies in size.full else None
-        row = {"bodies": bodies, "rows": rows, "band, us": band[bodies], "full, us": full}
-        claims = []
-        many = [k for k in band if k >= FROM]
-        if bodies == size.bodies[-1] and len(many) > 1:
-            found = slope(np.array(many), np.array([band[k] for k in many]))
-            claims.append(
-                Claim(f"slope of log time against log bodies, {FROM} to {bodies}", Ratio(found, found, found), 1.15)
-            )
-        return [row | {"band, us a body": band[bodies] / bodies}], claims
+    def measured(shape: str, number: int) -> tuple[list[dict], list[Claim]]:
+        tell(f"{shape}, {number} bodies")
+        is_chain = shape == "chain"
+        rows = 11 * number + 6 * (not is_chain)  # five of each hinge, six of each body: those of the hub on top
+        by_directors = measure(shape, number, "directors", 0, size.repeats)
+        full = measure(shape, number, "directors", rows, size.repeats).us if is_chain and number in size.full else None
+        row: dict = {"shape": shape, "bodies": number, "rows": rows, "band, us": by_directors.us, "full, us": full}
+        row |= {"band, us a body": by_directors.us / number, "band, first s": by_directors.first}
+        if not is_chain or number in size.joint:
+            tell(f"{shape}, {number} bodies, joint coordinates")
+            found = measure(shape, number, "joint", 0, size.repeats)
+            joint[shape][number] = found.us
+            row |= {"joint, us": found.us, "joint, first s": found.first, "band over joint": by_directors.us / found.us}
+        if is_chain:
+            band[number] = by_directors.us
+        return [row], _slopes(shape, number, band if is_chain else {}, joint[shape], size)
 
-    return growing("chains", name, (measured(bodies) for bodies in size.bodies))
+    parts = [*(("chain", n) for n in size.bodies), *(("star", n) for n in size.stars)]
+    return growing("chains", name, (measured(*part) for part in parts))
+
+
+def _slopes(shape: str, number: int, band: dict[int, float], joint: dict[int, float], size: Size) -> list[Claim]:
+    """Of log time against log bodies, after the largest number of a shape: of the band a target, in joint coordinates none."""
+    claims = []
+    if number != (size.bodies if shape == "chain" else size.stars)[-1]:
+        return claims
+    for what, us, most in (("", band, 1.15), (", joint coordinates", joint, None)):
+        many = [n for n in us if n >= (FROM if most else JOINT_FROM)]
+        if len(many) > 1:
+            found = slope(np.array(many), np.array([us[n] for n in many]))
+            words = f"{shape}{what}: slope of log time against log bodies, {many[0]} to {many[-1]}"
+            claims.append(Claim(words, Ratio(found, found, found), most))
+    return claims

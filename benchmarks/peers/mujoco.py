@@ -25,11 +25,7 @@ def ladders(case: Case) -> list[Ladder]:
             model.opt.timestep = case.t_end / num_steps
 
             def run():
-                mujoco.mj_resetData(model, data)
-                data.qvel[:] = velocity
-                mujoco.mj_step(model, data, nstep=num_steps)
-                mujoco.mj_kinematics(model, data)
-                mujoco.mj_comPos(model, data)
+                step(model, data, velocity, num_steps)
                 return positions(case, data)
 
             return run
@@ -39,11 +35,26 @@ def ladders(case: Case) -> list[Ladder]:
     return [ladder(name) for name in INTEGRATORS]
 
 
-def prepare(case: Case):
-    """Model, data and joint velocities at the start, where all joint positions are zero."""
+def step(model, data, velocity, num_steps: int) -> None:
+    """Steps from the start, where all joint positions are zero; then the centres of the bodies."""
+    mujoco.mj_resetData(model, data)
+    data.qvel[:] = velocity
+    mujoco.mj_step(model, data, nstep=num_steps)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+
+
+def without_contacts():
+    """An empty model without contacts and constraints; a step too large is not mended."""
     spec = mujoco.MjSpec()
     for flag in ("CONTACT", "CONSTRAINT", "AUTORESET"):
         spec.option.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")
+    return spec
+
+
+def prepare(case: Case):
+    """Model, data and joint velocities at the start, where all joint positions are zero."""
+    spec = without_contacts()
     (_chain if case.is_chain else _particles)(case, spec)
     model = spec.compile()
     data = mujoco.MjData(model)

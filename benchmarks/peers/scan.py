@@ -3,12 +3,12 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 
-from benchmarks.peers.cases import LEVELS, Case, Ladder
+from benchmarks.peers.cases import LEVELS, Ladder
 
 FINE = 0.1
 """A ladder ends at the first error below so many times the finest level."""
@@ -20,6 +20,15 @@ HALVINGS = 2
 """How often the gap between two settings is halved."""
 ENOUGH = 0.01
 """Seconds that the calls for a rough time take together, at least."""
+
+
+class Judged(Protocol):
+    """What errors are measured against: the right end, and the error of what a run returns."""
+
+    @property
+    def q_end(self) -> np.ndarray: ...
+
+    def error(self, q) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -41,7 +50,12 @@ class Point:
 
 
 def scan(
-    peer: str, ladders: Sequence[Ladder], case: Case, seconds: float, levels: Sequence[float] = LEVELS
+    peer: str,
+    ladders: Sequence[Ladder],
+    case: Judged,
+    seconds: float,
+    levels: Sequence[float] = LEVELS,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> list[Point]:
     """Climb every ladder until it is fine enough, a run takes longer than `seconds`, or another ladder was faster.
 
@@ -49,7 +63,7 @@ def scan(
     """
     climbed: list[Climb] = []
     for ladder in ladders:
-        climb = Climb(peer, ladder, case)
+        climb = Climb(peer, ladder, case, clock)
         enough = min((p.seconds for c in climbed for p in c.points() if p.settled <= min(levels)), default=np.inf)
         for setting in ladder.settings:
             rung = climb.add(setting)
@@ -67,14 +81,14 @@ def scan(
 class Climb:
     """The settings of a ladder that were run, from coarse to fine."""
 
-    def __init__(self, peer: str, ladder: Ladder, case: Case):
-        self.peer, self.ladder, self.case = peer, ladder, case
+    def __init__(self, peer: str, ladder: Ladder, case: Judged, clock: Callable[[], float] = time.perf_counter):
+        self.peer, self.ladder, self.case, self.clock = peer, ladder, case, clock
         self.rungs: dict[float, Point] = {}
 
     def add(self, setting) -> Point:
         """Run one more."""
         compiled = next((p.compile for p in self.rungs.values()), None)
-        self.rungs[setting] = _try(self.peer, self.ladder, setting, self.case, compiled)
+        self.rungs[setting] = _try(self.peer, self.ladder, setting, self.case, compiled, self.clock)
         return self.rungs[setting]
 
     @property
@@ -120,30 +134,30 @@ def front(points: Sequence[Point]) -> list[Point]:
     return kept
 
 
-def _try(peer: str, ladder: Ladder, setting, case: Case, compiled: float | None) -> Point:
+def _try(peer: str, ladder: Ladder, setting, case: Judged, compiled: float | None, clock: Callable[[], float]) -> Point:
     """One setting; `compiled` is what compiling took before, None if this is the first call."""
-    start = time.perf_counter()
+    start = clock()
     run = ladder.build(setting)
-    built = time.perf_counter()
+    built = clock()
     try:
         q = jax.block_until_ready(run())
     except (RuntimeError, ArithmeticError):  # an integrator that gives up, where others return NaN
         q = np.full(case.q_end.shape, np.nan)
-    first = time.perf_counter() - built
+    first = clock() - built
     error = case.error(q)
     seconds = 0.0
     if np.isfinite(error):
-        seconds = _rough(run, None if compiled is None else first)
+        seconds = _rough(run, None if compiled is None else first, clock)
     if compiled is None:
         compiled = max(0.0, first - seconds)
     return Point(peer, ladder.label(setting), error, error, seconds, built - start, compiled, run)
 
 
-def _rough(run: Callable[[], Any], first: float | None) -> float:
+def _rough(run: Callable[[], Any], first: float | None, clock: Callable[[], float]) -> float:
     """Seconds of the fastest of up to five calls; the first one counts if nothing was compiled in it."""
     taken = [] if first is None else [first]
     while not taken or (len(taken) < 5 and sum(taken) < ENOUGH):
-        start = time.perf_counter()
+        start = clock()
         jax.block_until_ready(run())
-        taken.append(time.perf_counter() - start)
+        taken.append(clock() - start)
     return min(taken)

@@ -1,0 +1,163 @@
+"""Mechanisms by directors, in joint coordinates and by other integrators: the time to reach an error."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from benchmarks.measure import Tell, interleaved, quartiles, silent
+from benchmarks.mechanisms.cases import CASES
+from benchmarks.mechanisms.plane import Mechanism
+from benchmarks.mechanisms.ways import ways
+from benchmarks.peers.cases import NotRepresentable
+from benchmarks.peers.scan import Point, candidates, front, scan
+from benchmarks.report import Report, legend_below
+from vmri_jax import plots
+
+LEVELS = (1e-3, 1e-5)
+"""Largest errors of the centres of bars at the end, over the size of the mechanism."""
+COLUMNS = ("mechanism", "level", "way", "setting", "step, s", "error", "µs per s", "quartiles", "to best", "first, s")
+CLOCK = time.process_time
+"""Seconds in which this process runs: others may share its core."""
+OURS = ("joint", "directors", "functions")
+"""How the names of this toolkit's ways begin."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """Mechanisms, numbers of micro steps in joint coordinates and by directors, errors, longest run (s), samples of a time.
+
+    ways: beginnings of names, of which one is asked for; all by default.
+    """
+
+    mechanisms: tuple[str, ...]
+    num_micro: tuple[int, ...]
+    by_directors: tuple[int, ...]
+    levels: tuple[float, ...]
+    seconds: float
+    repeats: int
+    ways: tuple[str, ...] = ()
+
+
+def sizes(name: str, only: Sequence[str] = (), way: Sequence[str] = ()) -> Size:
+    """ "quick" or "full"; `only` these mechanisms, or all of a kind, e.g. "chain"; by `way`s that begin like these."""
+    names = ("satellite 1", "four-bar") if name == "quick" and not only else tuple(CASES)
+    chosen = [one for one in names if not only or one in only or one.partition(" ")[0] in only]
+    if not chosen:
+        raise ValueError(f"mechanisms: there is no {' or '.join(only)}; there are {', '.join(CASES)}.")
+    if name == "quick":
+        return Size(tuple(chosen), (10,), (10,), LEVELS[:1], 0.5, 3, tuple(way))
+    return Size(tuple(chosen), (1, 5, 10, 50), (1, 10), LEVELS, 2.0, 5, tuple(way))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What errors of one way are measured against.
+
+    q_end: (bars, 2) centres at the end.
+    centres: of what a run returns.
+    """
+
+    q_end: np.ndarray
+    size: float
+    centres: Callable
+
+    def error(self, found) -> float:
+        """The largest distance of a coordinate over the size; infinite for a run that failed."""
+        if isinstance(found, np.ndarray) and not np.all(np.isfinite(found)):
+            return np.inf
+        error = float(np.abs(self.centres(found) - self.q_end).max()) / self.size
+        return error if np.isfinite(error) else np.inf
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """A report after each mechanism."""
+    rows, notes = [], []
+    found: dict[str, dict[str, list[Point]]] = {}
+    for title in size.mechanisms:
+        mechanism = CASES[title]()
+        found[title] = scanned(mechanism, title, size, notes, tell)
+        tell(f"{title}, timing")
+        rows += timed(mechanism, title, found[title], size)
+        yield Report("mechanisms", name, list(rows), [], list(notes), {"mechanisms": partial(draw, dict(found))})
+
+
+def scanned(mechanism: Mechanism, title: str, size: Size, notes: list[str], tell: Tell) -> dict[str, list[Point]]:
+    """The runs of every way; ours, MuJoCo and Exudyn against DOP853, scipy and diffrax against Adams' methods."""
+    tell(f"{title}, reference")
+    end, other = mechanism.end("DOP853"), mechanism.end("LSODA")
+    apart = float(np.abs(end - other).max()) / mechanism.size
+    notes.append(f"{title}: the two references differ by {apart:.0e}.")
+    found = {}
+    for way, make in ways(mechanism, size.num_micro, size.by_directors).items():
+        if size.ways and not way.startswith(size.ways):
+            continue
+        tell(f"{title}, {way}")
+        try:
+            ladder, centres = make()
+        except ModuleNotFoundError as error:
+            _note(notes, f"{way} was left out: there is no {error.name}; pip install -e '.[peers]' installs it.")
+        except NotRepresentable as error:
+            _note(notes, f"{title}: {way.partition(' ')[0]} was left out: {error}.")
+        else:
+            judge = Judged(other if way.startswith(("scipy", "diffrax")) else end, mechanism.size, centres)
+            found[way] = scan(way, [ladder], judge, size.seconds, size.levels, CLOCK)
+    return found
+
+
+def _note(notes: list[str], text: str) -> None:
+    """Once."""
+    if text not in notes:
+        notes.append(text)
+
+
+def timed(mechanism: Mechanism, title: str, found: dict[str, list[Point]], size: Size) -> list[dict]:
+    """A row for each level and way: the cheapest setting that reaches the level, timed in turns with those of the other ways."""
+    rows = []
+    for level in size.levels:
+        best = {way: some[0] for way, points in found.items() if (some := candidates(points, level))}
+        seconds = interleaved({way: point.run for way, point in best.items()}, size.repeats, clock=CLOCK)
+        least = min((float(np.median(samples)) for samples in seconds.values()), default=np.nan)
+        for way, points in found.items():
+            row: dict = {"mechanism": title, "level": level, "way": way}
+            if way in best:
+                us = quartiles(seconds[way], 1e6 / mechanism.t_end)
+                first = max(p.build + p.compile for p in points) + best[way].seconds
+                row |= {"setting": best[way].label.partition(", ")[2], "error": best[way].error, "first, s": first}
+                row |= {"µs per s": us.value, "quartiles": f"{us.low:.3g} to {us.high:.3g}"}
+                row |= {"to best": us.value * mechanism.t_end / 1e6 / least, "step, s": _step(best[way], mechanism)}
+            else:
+                finest = min(points, key=lambda p: p.settled)
+                row |= {"setting": "not reached", "error": finest.settled}
+            rows.append(row)
+    return rows
+
+
+def _step(point: Point, mechanism: Mechanism) -> float | None:
+    """The step of a run with steps of one length; macro steps of ours."""
+    words = point.label.partition(", ")[2]
+    return mechanism.t_end / float(words.removesuffix(" steps")) if words.endswith(" steps") else None
+
+
+def draw(found: dict[str, dict[str, list[Point]]]):
+    """Error against time, a panel for each mechanism."""
+    columns = min(3, len(found))
+    rows = -(-len(found) // columns)
+    names = list(dict.fromkeys(way for points in found.values() for way in points))
+    with plots.new_figure(0.8 + 3.2 * columns, 1.4 + 2.6 * rows, "Mechanisms: time to an error", plots.LIGHT) as figure:
+        for axes, (title, ways_of) in zip(plots.panel_grid(figure, len(found), columns), found.items(), strict=True):
+            for way, points in ways_of.items():
+                shown = [p for p in front(points) if p.settled < 1.0]
+                look = {
+                    "color": f"C{names.index(way) % 10}",
+                    "marker": plots.MARKERS[names.index(way) % len(plots.MARKERS)],
+                }
+                strong = {"linewidth": 2.0} if way.startswith(OURS) else {"linewidth": 0.9, "linestyle": "--"}
+                axes.loglog(
+                    [p.seconds for p in shown], [p.settled for p in shown], label=way, markersize=4, **look, **strong
+                )
+            axes.set(title=title, xlabel="processor time, s", ylabel="error / size")
+        legend_below(figure, names)
+    return figure
