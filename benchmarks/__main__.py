@@ -28,7 +28,6 @@ from benchmarks import (
     orders,
     peers,
     savings,
-    squeezer,
     tricks,
 )
 from benchmarks.gail2014.command import gail2014
@@ -74,7 +73,6 @@ for _name, _module in {
     "orders": orders,
     "programs": instructions,
     "savings": savings,
-    "squeezer": squeezer,
 }.items():
     _plain_command(_name, _module)
 

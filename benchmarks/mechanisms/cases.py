@@ -120,10 +120,7 @@ def engine() -> Mechanism:
         *zip(names, heights.tolist(), strict=True),
         (GROUND, FOOT),
     ]
-    coils = tuple(
-        Coil(a, (BESIDE, y_a), b, (BESIDE, y_b), STIFFNESS, REST)
-        for (a, y_a), (b, y_b) in pairwise(ends)
-    )
+    coils = tuple(Coil(a, (BESIDE, y_a), b, (BESIDE, y_b), STIFFNESS, REST) for (a, y_a), (b, y_b) in pairwise(ends))
     slides = (Slide("piston", (0.0, 1.0)), Slide("valve", (0.0, 1.0)))
     acts = Contact(("crank", "valve"), cam_of_poses, cam, CONTACT)
     return Mechanism("engine", bars, hinges, poses, q, v, 0.02, CRANK, 40, slides, coils, acts)

@@ -49,7 +49,7 @@ def sizes(name: str, only: Sequence[str] = (), way: Sequence[str] = ()) -> Size:
         raise ValueError(f"mechanisms: there is no {' or '.join(only)}; there are {', '.join(CASES)}.")
     if name == "quick":
         return Size(tuple(chosen), (10,), (10,), LEVELS[:1], 0.5, 3, tuple(way))
-    return Size(tuple(chosen), (1, 5, 10, 50), (1, 10), LEVELS, 2.0, 5, tuple(way))
+    return Size(tuple(chosen), (1, 5, 10, 50), (10,), LEVELS, 2.0, 5, tuple(way))
 
 
 @dataclass(frozen=True)

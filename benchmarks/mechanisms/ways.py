@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,7 @@ DOUBLINGS = 14
 BY_HAND = SimpleNamespace(acceleration=lambda mechanism: mechanism.acceleration)
 """Equations as integrators of `benchmarks.peers` take them."""
 DEGREE = 2
-"""Of the Gauss scheme, of order 4, where nothing is fast."""
+"""Of the Gauss scheme, of order 4, with one interval to a step."""
 
 Way = tuple[Ladder, Callable[[Any], np.ndarray]]
 """A ladder, and what makes centres (bars, 2) of what its runs return."""
@@ -38,9 +39,9 @@ def ways(mechanism: Mechanism, num_micro: tuple[int, ...], by_directors: tuple[i
         if mechanism.has_fast:
             for n in numbers:
                 found[f"{coordinates}, num_micro {n}"] = partial(of_scene, mechanism, coordinates, vm.explicit_slow(n))
-        else:
+        if coordinates == "joint" or not mechanism.has_fast:
             found[f"{coordinates}, Gauss"] = partial(of_scene, mechanism, coordinates, vm.galerkin(1, DEGREE))
-    if not mechanism.has_fast:
+    if mechanism.loops is not None:
         found["functions of angles, Gauss"] = partial(of_functions, mechanism, vm.galerkin(1, DEGREE))
     for name in ("Euler", "implicitfast", "RK4"):
         found[f"MuJoCo {name}"] = partial(of_module, mechanism, "mujoco", name)
@@ -81,7 +82,8 @@ def _ours(mechanism: Mechanism, made: Callable, scheme: vm.Scheme, first: int) -
     @cache
     def prepared():  # the scene and its program: once for all numbers of steps
         system, state = made()
-        return vm.prepare(system, scheme, state, macro_dt=mechanism.t_end, num_steps=1)
+        run = vm.prepare(system, scheme, state, macro_dt=mechanism.t_end, num_steps=1)
+        return replace(run, may_fall_back=False)  # steps too large fail, and are not solved again in another way
 
     def build(num_steps: int):
         return partial(prepared(), num_steps=num_steps, macro_dt=mechanism.t_end / num_steps, throw=False)
