@@ -20,7 +20,7 @@ from vmri_jax.study.timing import seconds_per_call
 Coordinates = Literal["joint", "directors"]
 COLUMNS = (
     *("shape", "bodies", "rows", "band, us", "full, us", "joint, us", "band, us a body"),
-    *("band, first s", "joint, first s", "band over joint"),
+    *("directors, first s", "joint, first s", "directors over joint"),
 )
 SHORT, LONG = 50, 250
 """Steps of two runs; what a call costs besides its steps is in both."""
@@ -125,17 +125,25 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         tell(f"{shape}, {number} bodies")
         is_chain = shape == "chain"
         rows = 11 * number + 6 * (not is_chain)  # five of each hinge, six of each body: those of the hub on top
-        by_directors = measure(shape, number, "directors", 0, size.repeats)
-        full = measure(shape, number, "directors", rows, size.repeats).us if is_chain and number in size.full else None
-        row: dict = {"shape": shape, "bodies": number, "rows": rows, "band, us": by_directors.us, "full, us": full}
-        row |= {"band, us a body": by_directors.us / number, "band, first s": by_directors.first}
-        if not is_chain or number in size.joint:
+        row: dict = {"shape": shape, "bodies": number, "rows": rows}
+        with_joint = not is_chain or number in size.joint
+        in_full = rows <= constraint_pattern.FEW  # what `vm.simulate` takes
+        by_directors: Measured | None = None
+        if is_chain or not in_full:
+            by_directors = measure(shape, number, "directors", 0, size.repeats)
+            row |= {"band, us": by_directors.us, "band, us a body": by_directors.us / number}
+        if (is_chain and number in size.full) or (with_joint and in_full):
+            full = measure(shape, number, "directors", rows, size.repeats)
+            row["full, us"] = full.us
+            by_directors = full if in_full else by_directors
+        if with_joint and by_directors is not None:
             tell(f"{shape}, {number} bodies, joint coordinates")
             found = measure(shape, number, "joint", 0, size.repeats)
             joint[shape][number] = found.us
-            row |= {"joint, us": found.us, "joint, first s": found.first, "band over joint": by_directors.us / found.us}
+            row |= {"directors, first s": by_directors.first, "joint, first s": found.first}
+            row |= {"joint, us": found.us, "directors over joint": by_directors.us / found.us}
         if is_chain:
-            band[number] = by_directors.us
+            band[number] = row["band, us"]
         return [row], _slopes(shape, number, band if is_chain else {}, joint[shape], size)
 
     parts = [*(("chain", n) for n in size.bodies), *(("star", n) for n in size.stars)]

@@ -1,7 +1,8 @@
 """Kinds of figures of a study: what is run, what is expected, and how it is judged and drawn."""
 
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
@@ -16,6 +17,8 @@ from vmri_jax.study import ConvergenceStudy, CostStudy, convergence_study, cost_
 ORDER_TOLERANCE = 0.2
 UPTURN = 1.5
 """A cost that grows by more than this turns up again; smaller changes may be the machine's."""
+MINIMAL = "minimal coordinates"
+"""What figures call the exact solve of a system whose coordinates fulfil its constraints."""
 SETTLED = 10
 """From about so many micro steps on, the structured solve should cost the same per micro step."""
 
@@ -102,6 +105,7 @@ class CostPanel:
     dense, structured: make the problem that each solver gets; dense_num_micro and dense_t_end are those of the first.
     paper_minimum: the num_micro that was cheapest in the paper, None if it does not say.
     others: further methods of `vmri_jax.Newton`, on the structured problem.
+    minimal: makes the problem in coordinates without constraints, by "arrowhead"; None where it has none to lose.
     """
 
     title: str
@@ -116,12 +120,15 @@ class CostPanel:
     t_end: float
     repeats: int
     others: tuple[str, ...] = ()
+    minimal: Callable[[], vm.Problem] | None = None
 
     def measure(self, progress: Progress) -> CostStudy:
-        """Time both solvers."""
+        """Time all solvers."""
         runs = [(method, self.structured, self.num_micro, self.t_end) for method in ("arrowhead", *self.others)]
         if self.dense_num_micro:
             runs.insert(0, ("dense", self.dense, self.dense_num_micro, self.dense_t_end))
+        if self.minimal is not None:
+            runs.append((MINIMAL, self.minimal, self.num_micro, self.t_end))
         studies = [
             cost_study(
                 problem(),
@@ -129,14 +136,20 @@ class CostPanel:
                 num_micro,
                 micro_dt=self.micro_dt,
                 t_end=t_end,
-                methods=(solver,),
+                methods=("arrowhead" if solver == MINIMAL else solver,),
                 repeats=self.repeats,
                 label=self.title,
                 progress=part(progress, i, len(runs)),
+                clock=time.process_time,  # other processes may share the core
             )
             for i, (solver, problem, num_micro, t_end) in enumerate(runs)
         ]
-        return reduce(add, studies)
+        return reduce(add, [_called(study, run[0]) for study, run in zip(studies, runs, strict=True)])
+
+
+def _called(study: CostStudy, solver: str) -> CostStudy:
+    """The study with its rows under this name of a solver."""
+    return CostStudy(tuple(replace(row, method=solver) for row in study.rows))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import vmri_jax as vm
+from benchmarks.gail2014 import minimal
 from benchmarks.gail2014.figures import ConvergenceFigure, CostFigure, CostPanel
 from vmri_jax import systems
 
@@ -17,6 +18,8 @@ PAPER_STEPS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.000
 DEGREE_STEPS = (0.05, 0.025, 0.02, 0.0125, 0.01, 0.005, 0.002, 0.001)
 """Order 6 falls from the first errors to round-off within a decade of steps: more of them there."""
 PAPER_NUM_MICRO = (1, 4, *range(8, 101, 4))
+OTHERS = ("auto", "null_space")
+"""Solvers of constrained systems beside the exact one: what `vm.simulate` takes by itself, and that without multipliers."""
 PAPER_MINIMA = {  # cheapest num_micro by scheme: (smallest l, largest l, num_micro)
     "fully implicit": ((70, 80, 12), (90, 100, 8), (110, 200, 1)),
     "explicit slow": ((70, 110, 12), (120, 180, 8), (190, 200, 1)),
@@ -100,6 +103,14 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
         CostPanel("FPU, l = 3", chain, chain, vm.fully_implicit, 60, n, n, 0.01, 20.0, 20.0, size.repeats),
         CostPanel("SAM", atoms, atoms, vm.fully_implicit, 20, m, m, 0.001, 0.2, 1.0, size.repeats, ("null_space",)),
     )
+    pendulum = systems.triple_spherical_pendulum
+    constrained = tuple(
+        CostPanel(name, make, make, vm.fully_implicit, None, (), m, 0.001, 1.0, 1.0, size.repeats, OTHERS, without)
+        for name, make, without in (
+            ("TSP", pendulum, minimal.triple_spherical_pendulum),
+            ("SAM", atoms, minimal.simple_atomic_model),
+        )
+    )
     chains = tuple(_chain_panel(size, name, length) for name in SCHEMES for length in size.chain_lengths[name])
     return (
         CostFigure(
@@ -108,6 +119,12 @@ def _cost_figures(size: Size) -> tuple[CostFigure, ...]:
             "FPU with l = 3 is cheapest at 60 micro steps per macro step (183 unknowns), the simple atomic model at 20 "
             "(307 unknowns); then the dense solve makes the curves turn up again.",
             small,
+        ),
+        CostFigure(
+            "fig4-minimal",
+            "Computing time with constraints and in minimal coordinates",
+            "the paper asks at its end whether a minimal set of variables saves more computing time.",
+            constrained,
         ),
         CostFigure(
             "fig5",

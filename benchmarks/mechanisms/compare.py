@@ -64,11 +64,11 @@ class Judged:
     size: float
     centres: Callable
 
-    def error(self, found) -> float:
+    def error(self, q) -> float:
         """The largest distance of a coordinate over the size; infinite for a run that failed."""
-        if isinstance(found, np.ndarray) and not np.all(np.isfinite(found)):
+        if isinstance(q, np.ndarray) and not np.all(np.isfinite(q)):
             return np.inf
-        error = float(np.abs(self.centres(found) - self.q_end).max()) / self.size
+        error = float(np.abs(self.centres(q) - self.q_end).max()) / self.size
         return error if np.isfinite(error) else np.inf
 
 

@@ -168,7 +168,8 @@ class Mechanism:
         def rates(y):
             return jnp.concatenate([y[n:], self.acceleration(y[:n], y[n:])])
 
-        y, tight = np.concatenate([self.q, self.v]), {"rtol": 1e-13, "atol": 1e-13 * self.size}
+        y = np.concatenate([self.q, self.v])
+        tight: dict = {"rtol": 1e-13, "atol": 1e-13 * self.size}
         found = solve_ivp(lambda t, y: np.asarray(rates(y)), (0.0, self.t_end), y, method, [self.t_end], **tight)
         return self.centres(found.y[:n, -1])
 

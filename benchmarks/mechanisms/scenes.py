@@ -35,7 +35,7 @@ def scene(mechanism: Mechanism, coordinates: Coordinates) -> Scene:
         if one.moment is None:
             bodies.append(Body(name, one.mass, at, velocity, pace=pace))
         else:
-            turned = {"rotation": [0.0, 0.0, angle], "spin": [0.0, 0.0, rate]}
+            turned: dict = {"rotation": [0.0, 0.0, angle], "spin": [0.0, 0.0, rate]}
             bodies.append(RigidBody(name, one.mass, [one.moment] * 3, at, velocity=velocity, pace=pace, **turned))
     for i, hinge in enumerate(mechanism.hinges):
         effects.append(Revolute((hinge.a, hinge.b), [*hinge.at, 0.0], [0.0, 0.0, 1.0], name=f"hinge {i}"))

@@ -1,6 +1,6 @@
 """A satellite turned by its momentum wheels: a rigid hub, slow, and booms of hinged panels that vibrate fast.
 
-Teaches: joints between slow and fast rigid bodies; springs and drives in hinges.
+Teaches: joints between slow and fast rigid bodies; springs and drives in hinges; joint coordinates, six angles instead of six panels.
 
     vmri simulate notebooks/scenes/rigid_satellite.py:scene --scheme fully-explicit --num-micro 10 --macro-dt 0.02 --steps 600 --save-micro --out rigid_satellite.npz
     vmri animate rigid_satellite.npz --out rigid_satellite.png --frames 3 --to 12 --view=-60,25
@@ -52,4 +52,5 @@ scene = Scene(
         JointSpring("left hinges", 150.0, name="left springs"),
         JointSpring("right hinges", 150.0, name="right springs"),
     ],
+    coordinates="joint",
 )

@@ -5,18 +5,32 @@ import csv
 import dataclasses
 import re
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import vmri_jax as vm
 from benchmarks.__main__ import app
-from benchmarks.gail2014 import reference
+from benchmarks.gail2014 import minimal, reference
 from benchmarks.gail2014 import report as report_module
 from benchmarks.gail2014.figures import Check, ConvergenceFigure, CostFigure, CostPanel
 from benchmarks.gail2014.reference import reference_figures
 from benchmarks.gail2014.report import choose_figures, reproduce
 
-ALL = ["fig4", "fig5", "fig6", "fig7", "fig8", "fpu-half", "fpu-degree", "fig9", "fig10", "tsp-half", "tsp-degree"]
+ALL = [
+    "fig4",
+    "fig4-minimal",
+    "fig5",
+    "fig6",
+    "fig7",
+    "fig8",
+    "fpu-half",
+    "fpu-degree",
+    "fig9",
+    "fig10",
+    "tsp-half",
+    "tsp-degree",
+]
 
 
 def tiny_convergence(name="tiny", orders=2, factory=vm.systems.fermi_pasta_ulam):
@@ -212,3 +226,22 @@ def test_the_command_keeps_the_other_figures(gail2014, tmp_path, monkeypatch):
     assert code == 1
     assert "fig6: RuntimeError: out of luck" in text
     assert "out of luck" in (tmp_path / "study" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("name", ["triple_spherical_pendulum", "simple_atomic_model"])
+def test_minimal_coordinates_are_the_same_system(name):
+    """Positions, energy and momenta of the start; the coordinates keep the bonds wherever they are."""
+    full, small = getattr(vm.systems, name)(), getattr(minimal, name)()
+    positions = {"triple_spherical_pendulum": minimal.pendulum_positions, "simple_atomic_model": minimal.atom_positions}
+    x = positions[name](small.q_s, small.q_f, small.system.params)
+    start, other = full.state(), small.state()
+    np.testing.assert_allclose(np.concatenate(x), np.concatenate([start.q_s, start.q_f]), atol=1e-12)
+    energies = [
+        float(vm.diagnostics.energy(problem.system, s.q_s, s.q_f, s.p_s, s.p_f))
+        for problem, s in ((full, start), (small, other))
+    ]
+    assert energies[1] == pytest.approx(energies[0], rel=1e-10)
+    moved = positions[name](small.q_s + 0.1, small.q_f - 0.2, small.system.params)
+    assert np.abs(full.system.constraint(*moved, full.system.params)).max() < 1e-12
+    assert np.abs(full.system.slow_constraint(moved[0], full.system.params)).max() < 1e-12
+    assert small.q_s.size + small.q_f.size == full.q_s.size + full.q_f.size - sum(full.system.num_constraints(*x))

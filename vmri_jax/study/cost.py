@@ -1,5 +1,6 @@
 """Cost studies: computing time of a fixed simulated time against num_micro, at a constant micro step."""
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -91,6 +92,7 @@ def cost_study(
     min_seconds: float = 0.1,
     label: str = "",
     progress: Progress = silent,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> CostStudy:
     """Time ``scheme(n)`` for every n in `num_micro` with every method of Newton's iteration, over the same simulated time.
 
@@ -115,6 +117,7 @@ def cost_study(
         min_seconds: runs shorter than this are called several times and averaged.
         label: name of this scheme or system in the rows.
         progress: told about every program before it is compiled, and before times are measured.
+        clock: `time.process_time` where other processes share the core.
 
     Raises:
         ValueError: an empty or bad argument.
@@ -143,7 +146,7 @@ def cost_study(
                 runs.append((method, program, num_steps, program(num_steps)))
         progress(f"{label} measuring times".strip(), total - 1, total)
         calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}
-        seconds = interleaved(calls, repeats, min_seconds)
+        seconds = interleaved(calls, repeats, min_seconds, clock=clock)
     except KeyboardInterrupt:
         raise StudyInterrupted(study()) from None
     progress("done", total, total)
