@@ -32,5 +32,4 @@ def pin(core: int | None) -> int | None:
 def prepare(core: int | None = -1, cache: bool = True, devices: int = 1) -> None:
     """Before JAX starts: keep to one core, set the compiler's flags and its cache, switch 64-bit floats on."""
     pin(core)
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices here are small: threads only make times scatter
     configure(devices=devices if devices > 1 else None, cache=cache_folder() if cache else None)

@@ -163,10 +163,11 @@ def squeezer() -> Mechanism:
 
     q = np.array([c["START"][name] for name in ANGLES])
     bars = {f"K{k + 1}": Bar(*numbers) for k, numbers in enumerate(zip(c["MASSES"], c["MOMENTS"], strict=True))}
-    hinges = tuple(Hinge(*pair, tuple(map(float, point))) for pair, point in c["JOINTS"].items())
+    hinges = tuple(Hinge(*pair, (float(x), float(y))) for pair, (x, y) in c["JOINTS"].items())
     third = np.asarray(poses(q))[2]
     end = third[:2] + np.asarray(turn(third[2], c["SD"] - c["SB"], c["SA"] - c["SC"]))
-    coil = Coil("K3", tuple(map(float, end)), GROUND, tuple(map(float, c["C"])), c["STIFFNESS"], c["LENGTH"])
+    ends = ((float(end[0]), float(end[1])), (float(c["C"][0]), float(c["C"][1])))
+    coil = Coil("K3", ends[0], GROUND, ends[1], c["STIFFNESS"], c["LENGTH"])
     more = {"coils": (coil,), "loops": loops, "torque": c["TORQUE"]}
     return Mechanism("squeezer", bars, hinges, poses, q, np.zeros(7), 0.03, 0.04, 75, **more)
 

@@ -24,8 +24,8 @@ def swing(t, params):
 
 
 shoulder = np.array([0.0, 0.0, PILLAR])
-elbow = shoulder + [UPPER, 0.0, 0.0]
-wrist = elbow + [LOWER, 0.0, 0.0]
+elbow = np.array([UPPER, 0.0, PILLAR])
+wrist = np.array([UPPER + LOWER, 0.0, PILLAR])
 arm = [
     (UPPER_MASS, UPPER / 2),
     (LOWER_MASS, UPPER + LOWER / 2),
@@ -40,7 +40,7 @@ scene = Scene(
         RigidBody("pillar", 20.0, Cylinder(radius=0.12, length=PILLAR), shoulder / 2, pace="slow"),
         RigidBody("upper arm", UPPER_MASS, Box((UPPER, 0.1, 0.1)), (shoulder + elbow) / 2, pace="slow"),
         RigidBody("lower arm", LOWER_MASS, Box((LOWER, 0.08, 0.08)), (elbow + wrist) / 2, pace="slow"),
-        RigidBody("hand", HAND_MASS, Box((HAND, 0.16, 0.03)), wrist + [HAND / 2, 0.0, 0.0], pace="fast"),
+        RigidBody("hand", HAND_MASS, Box((HAND, 0.16, 0.03)), wrist + np.array([HAND / 2, 0.0, 0.0]), pace="fast"),
     ],
     [
         Gravity(),

@@ -55,7 +55,7 @@ def run(name: str):
 
 
 def test_all_scenes_are_there():
-    assert len(NAMES) == 16
+    assert len(NAMES) == 17
     readme = (FOLDER / "README.md").read_text(encoding="utf-8")
     for name in NAMES:
         assert f"]({name}.png)" in readme
@@ -76,6 +76,7 @@ LONG = (
     "engine",
     "four_bar",
     "rigid_satellite",
+    "robot_arm",
     "squeezer",
     "satellite",
     "valve_train",
