@@ -163,7 +163,7 @@ def squeezer() -> Mechanism:
 
     q = np.array([c["START"][name] for name in ANGLES])
     bars = {f"K{k + 1}": Bar(*numbers) for k, numbers in enumerate(zip(c["MASSES"], c["MOMENTS"], strict=True))}
-    hinges = tuple(Hinge(*pair, (float(x), float(y))) for pair, (x, y) in c["JOINTS"].items())
+    hinges = tuple(Hinge(inner, outer, (float(x), float(y))) for (inner, outer), (x, y) in c["JOINTS"].items())
     third = np.asarray(poses(q))[2]
     end = third[:2] + np.asarray(turn(third[2], c["SD"] - c["SB"], c["SA"] - c["SC"]))
     ends = ((float(end[0]), float(end[1])), (float(c["C"][0]), float(c["C"][1])))
