@@ -43,7 +43,7 @@ class Size:
 
 def sizes(name: str, only: Sequence[str] = (), way: Sequence[str] = ()) -> Size:
     """ "quick" or "full"; `only` these mechanisms, or all of a kind, e.g. "chain"; by `way`s that begin like these."""
-    names = ("satellite 1", "four-bar") if name == "quick" and not only else tuple(CASES)
+    names = ("satellite 1",) if name == "quick" and not only else tuple(CASES)
     chosen = [one for one in names if not only or one in only or one.partition(" ")[0] in only]
     if not chosen:
         raise ValueError(f"mechanisms: there is no {' or '.join(only)}; there are {', '.join(CASES)}.")
