@@ -19,6 +19,7 @@ the next steps, keep all matrices while the corrections shrink, and cost one gra
 Nothing here remembers a step before: the guess and the matrices that are kept come from `vmri_jax.steppers.marched`.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -264,15 +265,15 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
         arriving, answers, last, worst = carry
         m, x = given
         x = jnp.where(from_last, last, x)
-        (residual, rest), push = jax.linearize(lambda x: march.interval(m, x, arriving, slow), x)
-        by_x, hands_on = jax.vmap(push, out_axes=-1)(jnp.eye(x.size))
+        (residual, rest), push = jax.linearize(partial(march.interval, m), x, arriving, slow)
+
+        # columns: the unknowns of the interval, then the slow increments with the answers of the intervals before. One program for both:
+        # the tangents of the action are most of what there is to compile
+        by_unknowns = jnp.eye(x.size, x.size + march.num_slow)
+        by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, 0))), (answers, unit))
+        by_both, on_by_both = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, *by_slow)
+        (by_x, rows), (hands_on, rests) = (jnp.split(a, [x.size], axis=1) for a in (by_both, on_by_both))
         inverse = march.inverse(by_x, march.num_fast)
-
-        # how the interval answers to the slow increments: at fixed x, and by its own unknowns
-        def interval_change(answer: Handed, dslow):
-            return jax.jvp(lambda a, s: march.interval(m, x, a, s), (arriving, slow), (answer, dslow))[1]
-
-        rows, rests = jax.vmap(interval_change, in_axes=-1, out_axes=-1)(answers, unit)
         response = -matmul(inverse, rows)
         answers = Handed(answers.position + march.last_increment(response), rests + matmul(hands_on, response))
 
