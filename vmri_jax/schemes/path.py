@@ -185,6 +185,12 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
     return Nodes(groups, num_micro, degree)
 
 
+def slow_velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
+    """Nodes of a term that depends on slow positions and velocities alone: those of the rule, once on the macro interval."""
+    groups = (_on_one_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
+    return Nodes(tuple(groups), num_micro, degree)
+
+
 def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any, Nodes, Any]:
     """Nodes of a term that depends on positions only: (weight at 0, nodes inside, weight at 1).
 
