@@ -9,7 +9,6 @@ two nearly equal positions: momenta keep full relative precision however small t
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import groupby
 from typing import Any
 
@@ -136,7 +135,7 @@ class Nodes:
     num_micro: int
     degree: int
 
-    @cached_property
+    @property
     def weights(self):
         """Of all nodes, group after group."""
         return jnp.concatenate([jnp.asarray(g.weights) for g in self.groups])
