@@ -105,7 +105,7 @@ class MarchEquations:
 
     def seen(self, z):
         """(r n_v,) the slow increments in z that intervals see."""
-        return self.intervals.seen.take(z[: self.num_slow].reshape(self.r, self.n_s)).reshape(-1)
+        return self.intervals.seen.take(z[: self.num_slow].reshape(self.r, self.n_s)).reshape(self.num_seen)
 
     def start(self) -> Handed:
         """What arrives at the first interval."""
@@ -165,7 +165,7 @@ class MarchEquations:
         def for_all(answer):
             none = jnp.zeros((len(answer), self.r, self.n_s))
             seen = self.intervals.seen.put(answer.reshape(len(answer), self.r, self.n_v), none)
-            return jnp.pad(seen.reshape(len(answer), -1), [(0, 0), (0, z.size - self.num_slow)])
+            return jnp.pad(seen.reshape(len(answer), self.num_slow), [(0, 0), (0, z.size - self.num_slow)])
 
         answers = jax.tree.map(for_all, answers)
         matrix = jax.vmap(slow_residual_change, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)
