@@ -159,6 +159,7 @@ def test_what_is_not_known_gets_the_safe_answer(function):
 )
 def test_entries_that_are_seen(function, seen):
     assert entries_seen(function, Q).tolist() == [bool(s) for s in seen]
+    assert entries_seen(lambda q: jnp.sum(q**2), jnp.zeros(0)).size == 0
 
 
 def test_entries_are_taken_and_put_back():

@@ -107,11 +107,15 @@ def depends_on(function: Callable, *args) -> tuple[bool, ...]:
 def entries_seen(function: Callable, q) -> np.ndarray:
     """(n,) whether the outputs of ``function(q)`` can depend on each entry of the vector q."""
     jaxpr, n = jax.make_jaxpr(function)(q).jaxpr, q.size
-    if jaxpr.effects:
-        return np.ones(n, bool)
+    seen = np.zeros(n, bool)
+    if not n or jaxpr.effects:
+        return ~seen
     used: list[np.ndarray] = []
     used += _combinations(n, jaxpr, [np.eye(n)], jaxpr.outvars, used)
-    return np.any([a.reshape(-1, n).any(axis=0) for a in used if a is not None], axis=0) & np.ones(n, bool)
+    for combinations in used:
+        if combinations is not None:
+            seen |= combinations.reshape(-1, n).any(axis=0)
+    return seen
 
 
 def has_constant_hessian(function: Callable, *args) -> bool:
