@@ -74,7 +74,7 @@ PROGRAMS: dict[str, Program] = {
     "TSP, fully_implicit(5)": Program(TSP, vm.fully_implicit(5), 4890),
     "TSP, fully_implicit(5), exact matrices": Program(TSP, vm.fully_implicit(5), 5270, "arrowhead"),
     "SAM, fully_implicit(5)": Program(SAM, vm.fully_implicit(5), 6470),
-    "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7540, "arrowhead"),
+    "SAM, fully_implicit(5), exact matrices": Program(SAM, vm.fully_implicit(5), 7020, "arrowhead"),
     "gradient: double pendulum, fully_implicit(1)": Program(
         double_pendulum, vm.fully_implicit(1), 5020, is_gradient=True
     ),
