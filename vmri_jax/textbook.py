@@ -31,7 +31,7 @@ from numpy.polynomial import Polynomial
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import ConstantMass, System
 from vmri_jax.schemes.composition import Composition
-from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule
+from vmri_jax.schemes.quadrature import NODE_TOLERANCE, PlacedRule, macro
 from vmri_jax.schemes.scheme import Scheme
 
 
@@ -114,7 +114,12 @@ def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
         return macro_dt * jnp.sum(at.weights * jax.vmap(term)(at.q_s, at.q_f, at.v_s, at.v_f))
 
     slow_potential, fast_potential = potentials(system, scheme, macro_dt)
-    kinetic = action(scheme.kinetic, lambda q_s, q_f, v_s, v_f: system.kinetic(q_s, q_f, v_s, v_f, system.params))
+    T, T_s = system.kinetic, system.slow_kinetic
+    if T_s is not None:  # on the macro grid
+        T = T.function
+    kinetic = action(scheme.kinetic, lambda q_s, q_f, v_s, v_f: T(q_s, q_f, v_s, v_f, system.params))
+    if T_s is not None:
+        kinetic += action(macro(scheme.kinetic.rule), lambda q_s, q_f, v_s, v_f: T_s(q_s, v_s, system.params))
     kinetic -= action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
     return kinetic - action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
 

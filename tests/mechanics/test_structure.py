@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from jax.extend.core import Primitive
 
+from vmri_jax.mechanics.rows import Entries
 from vmri_jax.mechanics.structure import (
     curved_directions,
     depends_on,
+    entries_seen,
     has_constant_hessian,
     has_diagonal_hessian,
     reached,
@@ -142,3 +144,29 @@ def test_what_is_not_known_gets_the_safe_answer(function):
     assert not has_constant_hessian(function, Q)
     assert np.linalg.matrix_rank(curved_directions(function, Q)) == 4
     assert depends_on(lambda q, other: function(q), Q, Q)[0]
+
+
+@pytest.mark.parametrize(
+    ("function", "seen"),
+    [
+        (lambda q: jnp.sum(jnp.concatenate([q[2:], q])[:2] ** 2), [0, 0, 1, 1]),
+        (lambda q: jax.jvp(lambda q: jnp.cos(q[1:3]), (q,), (q,))[1], [0, 1, 1, 0]),
+        (lambda q: jax.lax.scan(lambda c, x: (c * x, c), jnp.pad(q[:1], (0, 1)), jnp.ones(3))[0], [1, 0, 0, 0]),
+        (lambda q: 3.0 * q[3], [0, 0, 0, 1]),
+        (lambda q: jnp.linalg.norm(q), [1, 1, 1, 1]),
+        (lambda q: jnp.ones(2), [0, 0, 0, 0]),
+    ],
+)
+def test_entries_that_are_seen(function, seen):
+    assert entries_seen(function, Q).tolist() == [bool(s) for s in seen]
+    assert entries_seen(lambda q: jnp.sum(q**2), jnp.zeros(0)).size == 0
+
+
+def test_entries_are_taken_and_put_back():
+    entries = Entries.of([False, True, True, False, True])
+    rows = jnp.arange(10.0).reshape(2, 5)
+    assert (entries.count, entries.runs) == (3, ((1, 3), (4, 5)))
+    assert entries.take(rows).tolist() == [[1, 2, 4], [6, 7, 9]]
+    assert entries.put(-entries.take(rows), rows).tolist() == [[0, -1, -2, 3, -4], [5, -6, -7, 8, -9]]
+    none = Entries.of([False, False])
+    assert none.put(none.take(jnp.ones(2)), jnp.ones(2)).tolist() == [1, 1]

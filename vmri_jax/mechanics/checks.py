@@ -82,6 +82,7 @@ def check_system(system: System, q_s, q_f) -> None:
                 raise ValueError(f"ConstantMass: {name} is for {mass.size} coordinates, the state has {n} {name} ones.")
     scalars = {
         "kinetic": (system.kinetic, (q_s, q_f, q_s, q_f)),
+        "slow_kinetic": (system.slow_kinetic, (q_s, q_s)),
         "slow_potential": (system.slow_potential, (q_s, q_f)),
         "fast_potential": (system.fast_potential, (q_f,)),
     }

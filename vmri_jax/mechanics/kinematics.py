@@ -17,7 +17,7 @@ Source: R. Featherstone, Rigid Body Dynamics Algorithms, Springer (2008), chapte
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -36,8 +36,6 @@ MASS = "mass"
 """Where the masses of the coordinates of bodies are in them, "slow" and "fast"."""
 Grid = Literal["s", "f", "sf"]
 """The coordinates that a body depends on: slow ones, fast ones, both."""
-GRIDS: tuple[Grid, ...] = ("s", "f", "sf")
-"""In the order in which bodies are computed."""
 
 
 class Move(NamedTuple):
@@ -57,6 +55,7 @@ class Frames:
 
     Args:
         grid: the coordinates.
+        first: number of the first frame among all of the kinematics.
         roots: what each way starts from: `GROUND` or a number among the roots of the kinematics and then the bodies of `Frames` before
             these. A way leads from there to an outermost body; those that have a part in common repeat it.
         coordinates: of the frames that move; None where none does.
@@ -67,6 +66,7 @@ class Frames:
     """
 
     grid: Grid
+    first: int
     roots: tuple[int, ...]
     coordinates: Rows | None
     moving: tuple[int, ...]
@@ -84,8 +84,9 @@ class Frames:
 
         Args:
             q_s, q_f: coordinates.
-            joints: the constants C, P, S, E of these frames.
+            joints: the constants C, P, S, E of all frames.
         """
+        joints = {name: values[self.first : self.first + len(self.moving)] for name, values in joints.items()}
         rows = joints["constant"]
         if self.coordinates is None:
             return rows
@@ -116,13 +117,26 @@ class Kinematics:
 
     Args:
         roots: where the coordinates of bodies that carry others are in q_s and q_f.
-        frames: one entry at most for each of `GRIDS`, in this order.
+        frames: at most one entry for each of these, in this order: bodies of slow coordinates that carry bodies of fast ones, bodies of fast
+            coordinates, bodies of both, bodies of slow coordinates that carry no other ones.
         sizes: (n_s, n_f), numbers of coordinates.
+        num_fast: number of entries of `frames` that Q_f needs, the first ones.
     """
 
     roots: tuple[Place, ...]
     frames: tuple[Frames, ...]
     sizes: tuple[int, int]
+    num_fast: int
+
+    @property
+    def of_slow(self) -> "Kinematics":
+        """The map from q_s to Q_s, with q_f as Q_f."""
+        return replace(self, frames=tuple(frames for frames in self.frames if frames.grid == "s"))
+
+    @property
+    def of_fast(self) -> "Kinematics":
+        """The map from q to Q_f; of Q_s there is what carries these bodies."""
+        return replace(self, frames=self.frames[: self.num_fast])
 
     def __call__(self, q_s, q_f, joints: dict[str, Any]) -> tuple[Any, Any]:
         """(Q_s, Q_f).
@@ -131,16 +145,13 @@ class Kinematics:
             q_s, q_f: coordinates.
             joints: the constants C, P, S, E (n, 4, 3) of all frames, "constant", "cosine", "sine", "way".
         """
-        known, first = self._roots(q_s, q_f), 0
+        known = self._roots(q_s, q_f)
         slow, fast = [q_s], [q_f]
         for frames in self.frames:
-            last = first + len(frames.moving)
-            own = {name: values[first:last] for name, values in joints.items()}
             roots = jnp.stack([known[root] for root in frames.roots])
-            rows = frames.in_space(frames.relative(q_s, q_f, own), roots)
+            rows = frames.in_space(frames.relative(q_s, q_f, joints), roots)
             known |= {len(known) - 1 + i: rows[k] for i, k in enumerate(frames.bodies)}
             (slow if frames.grid == "s" else fast).append(_coordinates(rows, frames))
-            first = last
         return jnp.concatenate(slow), jnp.concatenate(fast)
 
     def velocities(self, q_s, q_f, v_s, v_f, joints: dict[str, Any]):
@@ -171,7 +182,8 @@ class Kinematics:
             found["coordinates"] = None if rows is None else Rows(**(rows | {"runs": runs}))
             found["directors"] = tuple(map(tuple, some["directors"]))
             frames.append(Frames(**(some | found)))
-        return cls(tuple(Place(*root) for root in data["roots"]), tuple(frames), tuple(data["sizes"]))
+        roots = tuple(Place(*root) for root in data["roots"])
+        return cls(roots, tuple(frames), tuple(data["sizes"]), data["num_fast"])
 
     @cached_property
     def places(self) -> tuple[Place, ...]:

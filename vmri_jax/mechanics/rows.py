@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -24,6 +25,50 @@ class Run(NamedTuple):
     start: int
     count: int
     same: bool
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Some entries of vectors (n,), as static slices.
+
+    Args:
+        runs: first entry of each run of neighbours, and the one after its last.
+        size: n.
+    """
+
+    runs: tuple[tuple[int, int], ...]
+    size: int
+
+    @classmethod
+    def of(cls, marked: Sequence[bool]) -> "Entries":
+        """The entries that are marked.
+
+        Args:
+            marked: one for each entry.
+        """
+        ends = [i for i, (a, b) in enumerate(pairwise([False, *marked, False])) if a != b]
+        return cls(tuple(zip(ends[::2], ends[1::2], strict=True)), len(marked))
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return sum(stop - start for start, stop in self.runs)
+
+    def take(self, vectors):
+        """(..., count) the entries of vectors (..., n)."""
+        if self.count == self.size:
+            return vectors
+        return jnp.concatenate([vectors[..., :0], *(vectors[..., start:stop] for start, stop in self.runs)], axis=-1)
+
+    def put(self, entries, others):
+        """Vectors (..., n) with these entries (..., count), and the rest from others (..., n)."""
+        if self.count == self.size:
+            return entries
+        pieces, end, taken = [], 0, 0
+        for start, stop in self.runs:
+            pieces += [others[..., end:start], entries[..., taken : taken + stop - start]]
+            end, taken = stop, taken + stop - start
+        return jnp.concatenate([*pieces, others[..., end:]], axis=-1)
 
 
 @dataclass(frozen=True)

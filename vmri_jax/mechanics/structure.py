@@ -104,6 +104,20 @@ def depends_on(function: Callable, *args) -> tuple[bool, ...]:
     return tuple(any(_outputs_reached(jaxpr, (of_argument == i).tolist())) for i in range(len(args)))
 
 
+def entries_seen(function: Callable, q) -> np.ndarray:
+    """(n,) whether the outputs of ``function(q)`` can depend on each entry of the vector q."""
+    jaxpr, n = jax.make_jaxpr(function)(q).jaxpr, q.size
+    seen = np.zeros(n, bool)
+    if not n or jaxpr.effects:
+        return ~seen
+    used: list[np.ndarray] = []
+    used += _combinations(n, jaxpr, [np.eye(n)], jaxpr.outvars, used)
+    for combinations in used:
+        if combinations is not None:
+            seen |= combinations.reshape(-1, n).any(axis=0)
+    return seen
+
+
 def has_constant_hessian(function: Callable, *args) -> bool:
     """Whether ``function(*args) -> ()`` is at most quadratic in its arguments."""
 

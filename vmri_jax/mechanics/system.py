@@ -22,6 +22,7 @@ from vmri_jax.mechanics.summary import name_of, numbers, parameters, summary
 
 ARGUMENTS = {
     "kinetic": "q_s, q_f, v_s, v_f, params",
+    "slow_kinetic": "q_s, v_s, params",
     "slow_potential": "q_s, q_f, params",
     "fast_potential": "q_f, params",
     "constraint": "q_s, q_f, params",
@@ -37,12 +38,19 @@ _INSTEAD = {
 
 
 class KineticFunction(eqx.Module):
-    """Kinetic energy given by a function ``kinetic(q_s, q_f, v_s, v_f, params) -> ()``."""
+    """Kinetic energy given by functions, ``T(q_s, q_f, v_s, v_f, params) + T_s(q_s, v_s, params)``.
+
+    Args:
+        function: T.
+        slow: T_s, that of what depends on slow variables alone; None where T is all of it.
+    """
 
     function: TracedOnce = eqx.field(static=True)
+    slow: TracedOnce | None = eqx.field(static=True, default=None)
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
-        return self.function(q_s, q_f, v_s, v_f, params)
+        energy = self.function(q_s, q_f, v_s, v_f, params)
+        return energy if self.slow is None else energy + self.slow(q_s, v_s, params)
 
 
 class System(eqx.Module):
@@ -61,6 +69,8 @@ class System(eqx.Module):
         implied: ``g_i(q_s, q_f, params) -> (n_i,)``, rows that follow from the constraints and would be too many among them,
             scaled to order one; or a `Rheonomic` function. They are not solved for, and get no multipliers. A run watches them
             at its saved nodes: they count in `constraint_residual`, and where one is not zero the run ends as `NOT_IMPLIED`.
+        slow_kinetic: ``T_s(q_s, v_s, params) -> ()``, a part of the kinetic energy that slow variables alone have, besides the function
+            `kinetic`. Schemes evaluate it on the macro grid, see `vmri_jax.schemes.discrete_lagrangian`; kept in `kinetic`.
 
     Functions are compared by identity: define them at module level (not inside a loop) and pass what varies
     through `params`, and everything is compiled once. They are kept as `TracedOnce`, so that ``system.force`` is called
@@ -86,6 +96,7 @@ class System(eqx.Module):
         force=None,
         params=None,
         implied=None,
+        slow_kinetic=None,
     ):
         functions = {
             "slow_potential": slow_potential,
@@ -104,7 +115,13 @@ class System(eqx.Module):
                     "kinetic(q_s, q_f, v_s, v_f, params)."
                 )
             _check_function("kinetic", kinetic)
-            kinetic = KineticFunction(traced_once(kinetic))
+            slow: Any = _checked("slow_kinetic", slow_kinetic)
+            kinetic = KineticFunction(traced_once(kinetic), slow)
+        elif slow_kinetic is not None:
+            raise ValueError(
+                "System: slow_kinetic is given besides a ConstantMass, which has the masses of all slow variables; give the whole kinetic "
+                "energy as ConstantMass, or kinetic as a function."
+            )
         self.kinetic = kinetic
         self.params = params
 
@@ -117,7 +134,7 @@ class System(eqx.Module):
         if isinstance(kinetic, ConstantMass):
             mass = f"masses, slow {numbers(kinetic.slow)}; fast {numbers(kinetic.fast)}"
         else:
-            mass = f"function {name_of(kinetic)}"
+            mass = f"function {name_of(kinetic)}" + (f" + {name_of(kinetic.slow)}" if kinetic.slow else "")
         functions = {
             "slow potential V": self.slow_potential,
             "fast potential W": self.fast_potential,
@@ -151,6 +168,11 @@ class System(eqx.Module):
     def has_constant_mass(self) -> bool:
         """Whether the kinetic energy is that of constant masses."""
         return isinstance(self.kinetic, ConstantMass)
+
+    @property
+    def slow_kinetic(self) -> TracedOnce | None:
+        """The part T_s of the kinetic energy, None where there is none."""
+        return None if isinstance(self.kinetic, ConstantMass) else self.kinetic.slow
 
     @property
     def is_constrained(self) -> bool:

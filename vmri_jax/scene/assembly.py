@@ -31,10 +31,12 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
             terms.setdefault("implied", []).append(DroppedRows(made, part.dropped))
     if where.kinematics is not None:
         terms.setdefault("kinetic", [])
+    if "kinetic" in terms and where.sizes[0]:
+        terms["slow_kinetic"] = []
     functions: dict[str, Any] = {
         home: FUNCTIONS[home](tuple(terms[home]), _kinematics(home, terms[home], where))
         for home in FUNCTIONS
-        if terms.get(home) or (home == "kinetic" and home in terms)
+        if terms.get(home) or ("kinetic" in home and home in terms)
     }
     for home in ("constraint", "slow_constraint", "implied"):
         if any(term.timed for term in terms.get(home, ())):
@@ -65,6 +67,8 @@ def actuation(sorting: Sorting) -> Actuation | None:
 
 
 def _kinematics(home: str, terms: Sequence, layout: Layout) -> Kinematics | None:
-    """The kinematics, unless the terms take nothing but coordinates of the scene; a kinetic energy is that of all bodies."""
-    bodies = home == "kinetic" or not all(term.within(layout.sizes) for term in terms)
-    return layout.kinematics if bodies else None
+    """The kinematics, unless the terms take nothing but coordinates of the scene; of a kinetic energy then those of its own bodies."""
+    if layout.kinematics is None or not all(term.within(layout.sizes) for term in terms):
+        return layout.kinematics
+    own = {"kinetic": layout.kinematics.of_fast, "slow_kinetic": layout.kinematics.of_slow}
+    return own.get(home)

@@ -3,7 +3,7 @@
 A potential that touches a slow body is part of V. One that touches only fast bodies is part of W if it is stiff, else of
 V, where it is evaluated less often. A constraint that touches a fast body is held on the micro grid, one between slow
 bodies on the macro grid: on the micro grid it would be over-determined. Kinetic effects are on the micro grid always,
-because momenta need them there.
+because momenta need them there; the kinetic energy of bodies that depend on slow coordinates alone is on the macro grid.
 
 A body is fast that a stiff potential (not one of V) or kinetic effect touches: one whose frequency is above the border
 between slow and fast, see `vmri_jax.scene.rates`.

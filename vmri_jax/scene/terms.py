@@ -327,13 +327,21 @@ class ImpliedRows(MicroConstraint):
 
 
 class KineticEnergy(_OfTerms):
-    """``T = sum m V^2 / 2`` of the rates V of bodies, and the velocity-dependent terms."""
+    """``T = sum m V_f^2 / 2`` of the rates V_f of bodies that depend on fast coordinates, and the velocity-dependent terms."""
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
         bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
-        mass = params[MASS]
-        constant = (jnp.sum(mass["slow"] * rates[0] ** 2) + jnp.sum(mass["fast"] * rates[1] ** 2)) / 2
-        return total([constant, *(term.kinetic(*bodies, *rates, params) for term in self.terms)])
+        of_bodies = jnp.sum(params[MASS]["fast"] * rates[1] ** 2) / 2
+        return total([of_bodies, *(term.kinetic(*bodies, *rates, params) for term in self.terms)])
+
+
+class SlowKineticEnergy(_OfTerms):
+    """``T_s = sum m V_s^2 / 2`` of the rates V_s of bodies that depend on slow coordinates alone."""
+
+    def __call__(self, q_s, v_s, params):
+        none = jnp.zeros(0 if self.kinematics is None else self.kinematics.sizes[1])
+        (rates, _) = self.motions(q_s, none, v_s, none, params)[1]
+        return jnp.sum(params[MASS]["slow"] * rates**2) / 2
 
 
 class TotalForce(_OfTerms):
@@ -370,6 +378,7 @@ class Actuation(_OfTerms):
 
 FUNCTIONS = {
     "kinetic": KineticEnergy,
+    "slow_kinetic": SlowKineticEnergy,
     "slow_potential": SlowPotential,
     "fast_potential": FastPotential,
     "constraint": MicroConstraint,

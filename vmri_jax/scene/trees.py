@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, library
-from vmri_jax.mechanics.kinematics import GRIDS, UNMOVED, Frames, Grid, Kinematics, Move
+from vmri_jax.mechanics.kinematics import UNMOVED, Frames, Grid, Kinematics, Move
 from vmri_jax.mechanics.rows import Part, Place, Rows
 from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
 from vmri_jax.scene.effect import Effect
@@ -226,26 +226,47 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, own, fr
         depths[branch.child] = depths.get(branch.parent, 0) + 1
     roots = list(dict.fromkeys(branch.parent for branch in branches if branch.parent in places))
     numbers = {GROUND: -1} | {name: i for i, name in enumerate(roots)}
-    frames, links, carried = [], [], []
-    for grid in GRIDS:
-        some = [branch for branch in branches if grids[branch.child] == grid]
+    carriers = _carriers_of_fast(branches, grids)
+    # by grid, and whether fast bodies need them; in the order of `Kinematics.frames`
+    groups: dict[tuple[Grid, bool], list[Branch]] = {
+        ("s", True): [],
+        ("f", True): [],
+        ("sf", True): [],
+        ("s", False): [],
+    }
+    for branch in branches:
+        grid = grids[branch.child]
+        groups[grid, grid != "s" or branch.child in carriers].append(branch)
+    frames, links, carried, num_fast = [], [], [], 0
+    for (grid, is_needed), some in groups.items():
         some.sort(key=lambda branch: depths[branch.child])  # as the frames are: taken by few slices
         if some:
-            made, ordered = _frames(grid, some, bodies, freedoms, numbers)
+            made, ordered = _frames(grid, len(links), some, bodies, freedoms, numbers)
             numbers |= {branch.child: len(roots) + len(carried) + i for i, branch in enumerate(some)}
             frames.append(made)
             links += ordered
             carried += [branch.child for branch in some]
-    kinematics = Kinematics(tuple(places[name] for name in roots), tuple(frames), sizes)
+            num_fast += is_needed
+    kinematics = Kinematics(tuple(places[name] for name in roots), tuple(frames), sizes, num_fast)
     where = dict(zip(carried, kinematics.places, strict=True))
     everywhere = {name: places.get(name) or where[name] for name in bodies}
     return Layout(everywhere, own, freedoms, kinematics), tuple(links)
 
 
-def _frames(grid: Grid, branches: Sequence[Branch], bodies: Bodies, freedoms, numbers: Mapping[str, int]):
+def _carriers_of_fast(branches: Sequence[Branch], grids: Mapping[str, Grid]) -> set[str]:
+    """The bodies that carry, at any depth, bodies which depend on fast coordinates."""
+    found: set[str] = set()
+    for branch in reversed(branches):  # children before parents
+        if grids[branch.child] != "s" or branch.child in found:
+            found.add(branch.parent)
+    return found
+
+
+def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, freedoms, numbers: Mapping[str, int]):
     """The frames of bodies that depend on the same coordinates, and their links in the same order, None beyond the end of a way.
 
     Args:
+        first: number of their first frame.
         branches: parents before children.
         numbers: of the bodies that they may hang on.
     """
@@ -258,6 +279,7 @@ def _frames(grid: Grid, branches: Sequence[Branch], bodies: Bodies, freedoms, nu
     which = iter(range(len(coordinates)))
     frames = Frames(
         grid,
+        first,
         tuple(numbers[way[0].branch.parent] for way in ways),
         Rows.of(coordinates) if coordinates else None,
         tuple(-1 if link is None or link.key is None else next(which) for link in links),

@@ -14,6 +14,9 @@ for the fast increments and the scaled multipliers mu. It hands on ``F_r`` and `
 
     p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)        g_s = 0 at S_1..S_r
 
+The part of A that slow variables alone enter, such as their own kinetic energy, has no share in an interval: it enters the slow
+equations themselves, once for all intervals.
+
 These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them.
 """
 
@@ -25,20 +28,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vmri_jax.kernels import matmul
+from vmri_jax.mechanics.rows import Entries
+from vmri_jax.mechanics.structure import entries_seen
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations, slow_basis_at_control_nodes
-from vmri_jax.schemes.path import NodeGroup, Nodes, control_nodes, lagrange_basis, lagrange_derivative
+from vmri_jax.schemes.path import NodeGroup, Nodes, Path, control_nodes, lagrange_basis, lagrange_derivative
 
 
 class IntervalPath(NamedTuple):
-    """The path over one micro interval.
+    """The path over one micro interval; n_v of the slow variables are seen in it, see `Intervals`.
 
     slow_start, slow: start and increments of the slow control points, of the whole macro step.
     fast_start, fast: start and increments of the fast control points of this interval.
     """
 
-    slow_start: Float[Array, "n_s"]
-    slow: Float[Array, "r n_s"]
+    slow_start: Float[Array, "n_v"]
+    slow: Float[Array, "r n_v"]
     fast_start: Float[Array, "n_f"]
     fast: Float[Array, "r n_f"]
 
@@ -52,8 +57,8 @@ class Arriving(NamedTuple):
 
     q_f: Float[Array, "n_f"]
     p_f: Float[Array, "n_f"]
-    start: Float[Array, "n_s"]
-    slow: Float[Array, "r n_s"]
+    start: Float[Array, "n_v"]
+    slow: Float[Array, "r n_v"]
 
 
 class IntervalUnknowns(NamedTuple):
@@ -113,8 +118,11 @@ class IntervalNodes:
         parts += [[row] for row in rows if row not in everywhere]
         return [cls(part, nodes.num_micro, nodes.degree) for part in parts]
 
-    def sample(self, path: IntervalPath, equations: StepEquations, m, names: tuple[str, ...]) -> list:
-        """By name, of the path at the nodes of interval m: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
+    def sample(self, path: IntervalPath, equations: StepEquations, seen: Entries, m, names: tuple[str, ...]) -> list:
+        """By name, of the path at the nodes of interval m: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n).
+
+        Slow variables that are not seen stay at the start of the macro step.
+        """
 
         def values_at_nodes(name: str):
             if name == "t":
@@ -122,10 +130,18 @@ class IntervalNodes:
             start, increments = (path.slow_start, path.slow) if name[2] == "s" else (path.fast_start, path.fast)
             moved = matmul(of_interval(self.tables[name], m), increments)
             if name[0] == "q":
-                return start + moved
-            return moved / (equations.macro_dt if name[2] == "s" else equations.micro_dt)
+                values = start + moved
+            else:
+                values = moved / (equations.macro_dt if name[2] == "s" else equations.micro_dt)
+            return with_unseen(values, name, equations, seen) if name[2] == "s" else values
 
         return [values_at_nodes(name) for name in names]
+
+
+def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
+    """(k, n_s) slow positions or velocities, "q_s" or "v_s", of those that are seen (k, n_v); others are at rest at the start."""
+    rest = equations.q_s if name == "q_s" else jnp.zeros_like(equations.q_s)
+    return seen.put(values, jnp.broadcast_to(rest, (len(values), rest.size)))
 
 
 def _padded(group: NodeGroup, num_micro: int):
@@ -143,8 +159,15 @@ def of_interval(table, m):
 class Intervals:
     """The equations of the micro intervals of a macro step, and the slow ones.
 
+    The terms on the micro grid may see some of the slow variables alone: of a satellite those of the hub that carries vibrating panels,
+    and not the angles of its wheels. The intervals then exchange nothing that belongs to the others, so that they do not cost more with
+    more slow variables.
+
     Args:
         equations: of the macro step.
+
+    Attributes:
+        seen: the slow variables that intervals see; all of them where there are forces, which push whatever they like.
     """
 
     def __init__(self, equations: StepEquations):
@@ -155,12 +178,32 @@ class Intervals:
             if isinstance(term, QuadraticKinetic):
                 slow, fast = term.mass.slow_mass, term.mass.fast_mass
                 self._masses = (slow, term.slow_form[1:, 1:]), (fast, term.fast_form[1:, 1:])
-        others = (term for term in terms if isinstance(term, Term) and term.inside.groups)
-        self._terms = [(term, nodes) for term in others for nodes in IntervalNodes.of(term.inside)]
+        others = [term for term in terms if isinstance(term, Term) and term.inside.groups]
+        of_slow = [all(name.endswith("_s") for name in term.arguments) for term in others]
+        self._slow_terms = [term for term, alone in zip(others, of_slow, strict=True) if alone]
+        both = (term for term, alone in zip(others, of_slow, strict=True) if not alone)
+        self._terms = [(term, nodes) for term in both for nodes in IntervalNodes.of(term.inside)]
         has_force = equations.system.force is not None
         self._force_nodes = IntervalNodes.of(equations.force_nodes) if has_force else []
+        self.seen = self._seen()
         n, r = equations.scheme.num_micro, equations.scheme.degree
         self._slow_basis = slow_basis_at_control_nodes(n, r)[..., 1:]  # at the control nodes, by slow increments
+
+    def _seen(self) -> Entries:
+        """The slow variables whose positions or velocities the functions on the micro grid can depend on."""
+        equations, system = self.equations, self.equations.system
+        n_s = equations.q_s.size
+
+        def values(slow):
+            """Of all of these functions, by slow positions and velocities one after the other."""
+            at = {"q_s": slow[:n_s], "v_s": slow[n_s:], "q_f": equations.q_f, "v_f": equations.q_f}
+            integrands = [term.integrand(*(at[name] for name in term.arguments)) for term, _ in self._terms]
+            return integrands, system.g(equations.t, at["q_s"], at["q_f"])
+
+        if self._force_nodes:
+            return Entries.of([True] * n_s)
+        marked = entries_seen(values, jnp.concatenate([equations.q_s, equations.q_s]))
+        return Entries.of((marked[:n_s] | marked[n_s:]).tolist())
 
     def evaluate(self, m, x: IntervalUnknowns, arriving: Arriving, slow) -> tuple[IntervalUnknowns, Arriving]:
         """Residual of interval m, and what it hands on.
@@ -169,10 +212,10 @@ class Intervals:
             m: number of the interval.
             x: its unknowns.
             arriving: from the intervals before.
-            slow: (r, n_s) increments of the slow path.
+            slow: (r, n_v) increments of the slow path that are seen.
         """
         equations = self.equations
-        path = IntervalPath(equations.q_s, slow, arriving.q_f, x.fast)
+        path = IntervalPath(self.seen.take(equations.q_s), slow, arriving.q_f, x.fast)
         d = jax.grad(self._action)(path, path, x.multiplier, m)
         d_fast = d.fast
         if self._masses is not None:
@@ -190,7 +233,7 @@ class Intervals:
         for term, nodes in self._terms:
 
             def of_term(path, term=term, nodes=nodes):
-                values = jax.vmap(term.integrand)(*nodes.sample(path, equations, m, term.arguments))
+                values = jax.vmap(term.integrand)(*nodes.sample(path, equations, self.seen, m, term.arguments))
                 return term.sign * term.times_step(equations.macro_dt) * jnp.sum(of_interval(nodes.weights, m) * values)
 
             total += _where_there_are_nodes(nodes, m, of_term, path)
@@ -206,12 +249,19 @@ class Intervals:
             total -= jnp.sum(mu * self._constraints(path, m, slice(0, -1)))
         return total
 
+    def _slow_action(self, slow_start, slow):
+        """h times the action of the terms of slow variables alone, ``h H sum_i w_i T_s(S(c_i H), S'(c_i H))``."""
+        equations = self.equations
+        none = jnp.zeros((equations.scheme.num_micro, 0))
+        path = Path(equations.t, equations.macro_dt, slow_start, slow, none, none[:, None])
+        return equations.micro_dt * sum(term.at_nodes_inside(path) for term in self._slow_terms)
+
     def _virtual_work(self, path: IntervalPath, held: IntervalPath, nodes: IntervalNodes, m):
         """``H sum_i w_i F(t_i, q_i, v_i) . q_i``."""
         equations = self.equations
-        at_nodes = nodes.sample(held, equations, m, ("t", "q_s", "q_f", "v_s", "v_f"))
+        at_nodes = nodes.sample(held, equations, self.seen, m, ("t", "q_s", "q_f", "v_s", "v_f"))
         f_s, f_f = jax.vmap(equations.system.forces)(*at_nodes)
-        q_s, q_f = nodes.sample(path, equations, m, ("q_s", "q_f"))
+        q_s, q_f = nodes.sample(path, equations, self.seen, m, ("q_s", "q_f"))
         work = jnp.sum(f_s * q_s, axis=1) + jnp.sum(f_f * q_f, axis=1)
         return equations.macro_dt * jnp.sum(of_interval(nodes.weights, m) * work)
 
@@ -221,6 +271,7 @@ class Intervals:
         c = control_nodes(equations.scheme.degree)[nodes]
         times = equations.t + equations.micro_dt * (m + c)
         q_s = path.slow_start + matmul(of_interval(self._slow_basis, m)[nodes], path.slow)
+        q_s = with_unseen(q_s, "q_s", equations, self.seen)
         q_f = jnp.concatenate([path.fast_start[None], path.fast_start + path.fast])[nodes]
         return jax.vmap(equations.system.g)(times, q_s, q_f)
 
@@ -235,18 +286,21 @@ class Intervals:
             arriving: what the last micro interval hands on.
         """
         equations = self.equations
-        d = arriving.slow
+        start, d = (
+            self.seen.put(a, jnp.zeros((*a.shape[:-1], equations.q_s.size))) for a in (arriving.start, arriving.slow)
+        )
         if self._masses is not None:
             mass, form = self._masses[0]
             d += matmul(form, mass.times(slow)) / equations.scheme.num_micro
+        if self._slow_terms:
+            by_start, by_slow = jax.grad(self._slow_action, argnums=(0, 1))(equations.q_s, slow)
+            start, d = start + by_start, d + by_slow
         times = equations.t + equations.macro_dt * control_nodes(equations.scheme.degree)
         nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow])
         pull = jax.vjp(lambda q: jax.vmap(equations.system.g_slow)(times[:-1], q), nodes[:-1])[1]
         impulses = pull(multiplier / equations.scheme.num_micro)[0]
-        rows = (
-            jnp.concatenate([(equations.micro_dt * equations.p_s + arriving.start - d.sum(0))[None], d[:-1]]) - impulses
-        )
-        p_s = equations.p_s + (arriving.start - impulses.sum(0)) / equations.micro_dt
+        rows = jnp.concatenate([(equations.micro_dt * equations.p_s + start - d.sum(0))[None], d[:-1]]) - impulses
+        p_s = equations.p_s + (start - impulses.sum(0)) / equations.micro_dt
         return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
 
 

@@ -9,7 +9,6 @@ two nearly equal positions: momenta keep full relative precision however small t
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import groupby
 from typing import Any
 
@@ -136,7 +135,7 @@ class Nodes:
     num_micro: int
     degree: int
 
-    @cached_property
+    @property
     def weights(self):
         """Of all nodes, group after group."""
         return jnp.concatenate([jnp.asarray(g.weights) for g in self.groups])
@@ -183,6 +182,12 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
                     "where the velocity is not defined; place this term with micro(...) or choose another rule."
                 )
     return Nodes(groups, num_micro, degree)
+
+
+def slow_velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
+    """Nodes of a term that depends on slow positions and velocities alone: those of the rule, once on the macro interval."""
+    groups = (_on_one_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
+    return Nodes(tuple(groups), num_micro, degree)
 
 
 def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any, Nodes, Any]:

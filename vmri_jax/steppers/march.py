@@ -19,6 +19,7 @@ the next steps, keep all matrices while the corrections shrink, and cost one gra
 Nothing here remembers a step before: the guess and the matrices that are kept come from `vmri_jax.steppers.marched`.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -31,7 +32,7 @@ from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 
 
 class IntervalMatrices(NamedTuple):
-    """The equations of a micro interval, linearised: k unknowns, r n_s slow increments; o numbers are handed on besides q_f.
+    """The equations of a micro interval, linearised: k unknowns, r n_v slow increments that are seen; o numbers are handed on besides q_f.
 
     inverse: of the derivative of its residual by its unknowns.
     by_position, by_slow: derivative of the residual by the position that arrives and by the slow increments.
@@ -40,23 +41,23 @@ class IntervalMatrices(NamedTuple):
 
     inverse: Float[Array, "k k"]
     by_position: Float[Array, "k n_f"]
-    by_slow: Float[Array, "k r*n_s"]
+    by_slow: Float[Array, "k r*n_v"]
     hands_on: Float[Array, "o k"]
     hands_on_by_position: Float[Array, "o n_f"]
-    hands_on_by_slow: Float[Array, "o r*n_s"]
+    hands_on_by_slow: Float[Array, "o r*n_v"]
 
 
 class Matrices(NamedTuple):
     """What an exact pass leaves for further passes.
 
     inverse, hands_on: of the intervals, as of `IntervalMatrices`, with the intervals as first axis.
-    response: ``dx_m/dz`` by the slow increments.
+    response: ``dx_m/dz`` by the slow increments that intervals see.
     slow: inverse of the slow equations once the intervals are eliminated.
     """
 
     inverse: Float[Array, "num_micro k k"]
     hands_on: Float[Array, "num_micro o k"]
-    response: Float[Array, "num_micro k r*n_s"]
+    response: Float[Array, "num_micro k r*n_v"]
     slow: Float[Array, "b b"]
 
 
@@ -85,7 +86,8 @@ class MarchEquations:
         self.n, self.r = equations.scheme.num_micro, equations.scheme.degree
         self.n_s, self.n_f = equations.q_s.size, equations.q_f.size
         self.n_g, self.n_gs = equations.system.num_constraints(equations.q_s, equations.q_f)
-        self.num_fast, self.num_slow = self.r * self.n_f, self.r * self.n_s
+        self.n_v = self.intervals.seen.count  # the slow variables that intervals see
+        self.num_fast, self.num_slow, self.num_seen = self.r * self.n_f, self.r * self.n_s, self.r * self.n_v
 
     def rows(self, x: Unknowns):
         """(z, x) of the unknowns by name."""
@@ -101,25 +103,29 @@ class MarchEquations:
             x[:, self.num_fast :].reshape(self.n, self.r, self.n_g),
         )
 
+    def seen(self, z):
+        """(r n_v,) the slow increments in z that intervals see."""
+        return self.intervals.seen.take(z[: self.num_slow].reshape(self.r, self.n_s)).reshape(self.num_seen)
+
     def start(self) -> Handed:
         """What arrives at the first interval."""
         equations = self.equations
         return Handed(
-            equations.q_f, jnp.concatenate([equations.micro_dt * equations.p_f, jnp.zeros(self.n_s + self.num_slow)])
+            equations.q_f, jnp.concatenate([equations.micro_dt * equations.p_f, jnp.zeros(self.n_v + self.num_seen)])
         )
 
     def no_matrices(self) -> Matrices:
         """The shapes of the matrices, all zero."""
-        n, k, o = self.n, self.num_fast + self.r * self.n_g, self.n_f + self.n_s + self.num_slow
+        n, k, o = self.n, self.num_fast + self.r * self.n_g, self.n_f + self.n_v + self.num_seen
         b = self.num_slow + self.r * self.n_gs
-        return Matrices(*map(jnp.zeros, ((n, k, k), (n, o, k), (n, k, self.num_slow), (b, b))))
+        return Matrices(*map(jnp.zeros, ((n, k, k), (n, o, k), (n, k, self.num_seen), (b, b))))
 
     def interval(self, m, x, arriving: Handed, slow):
         """Residual (k,) of interval m, and the rest (o,) that it hands on."""
         unknowns = IntervalUnknowns(
             x[: self.num_fast].reshape(self.r, self.n_f), x[self.num_fast :].reshape(self.r, self.n_g)
         )
-        residual, on = self.intervals.evaluate(m, unknowns, self._apart(arriving), slow.reshape(self.r, self.n_s))
+        residual, on = self.intervals.evaluate(m, unknowns, self._apart(arriving), slow.reshape(self.r, self.n_v))
         return jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)]), _together(on).rest
 
     def slow_equations(self, z, arriving: Handed):
@@ -129,8 +135,8 @@ class MarchEquations:
         return jnp.concatenate([rows.reshape(-1), g.reshape(-1)]), p_s
 
     def _apart(self, arriving: Handed) -> Arriving:
-        p_f, start, slow = jnp.split(arriving.rest, [self.n_f, self.n_f + self.n_s])
-        return Arriving(arriving.position, p_f, start, slow.reshape(self.r, self.n_s))
+        p_f, start, slow = jnp.split(arriving.rest, [self.n_f, self.n_f + self.n_v])
+        return Arriving(arriving.position, p_f, start, slow.reshape(self.r, self.n_v))
 
     def interval_matrices(self, m, x, arriving: Handed, slow) -> IntervalMatrices:
         """The derivatives of interval m."""
@@ -149,14 +155,19 @@ class MarchEquations:
         """Inverse (b, b) of the slow equations.
 
         Args:
-            answers: how what arrives at them changes with the slow increments, one column for each.
+            answers: how what arrives at them changes with the slow increments, one column for each that intervals see.
         """
 
         def slow_residual_change(dz, answer: Handed):
             return jax.jvp(lambda z, a: self.slow_equations(z, a)[0], (z, arriving), (dz, answer))[1]
 
-        # multipliers of the slow constraints change nothing that arrives
-        answers = jax.tree.map(lambda a: jnp.pad(a, [(0, 0), (0, z.size - self.num_slow)]), answers)
+        # other slow increments and multipliers of the slow constraints change nothing that arrives
+        def for_all(answer):
+            none = jnp.zeros((len(answer), self.r, self.n_s))
+            seen = self.intervals.seen.put(answer.reshape(len(answer), self.r, self.n_v), none)
+            return jnp.pad(seen.reshape(len(answer), self.num_slow), [(0, 0), (0, z.size - self.num_slow)])
+
+        answers = jax.tree.map(for_all, answers)
         matrix = jax.vmap(slow_residual_change, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)
         return self.inverse(matrix, self.num_slow)
 
@@ -195,7 +206,7 @@ class MarchEquations:
         """A pass that has met all intervals, with the correction of the slow unknowns."""
         residual, p_s = self.slow_equations(z, end)
         dz = -matvec(matrices.slow, residual)
-        dx = jnp.sum(matrices.response * dz[: self.num_slow], axis=-1)
+        dx = jnp.sum(matrices.response * self.seen(dz), axis=-1)
         return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, worst.moved))
 
 
@@ -258,21 +269,21 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
         last: (k,) unknowns of the last interval of the step before.
         from_last: whether each interval starts from the unknowns of the interval before, instead of those in x.
     """
-    slow, unit = z[: march.num_slow], jnp.eye(march.num_slow)
+    slow, unit = march.seen(z), jnp.eye(march.num_seen)
 
     def interval(carry, given):
         arriving, answers, last, worst = carry
         m, x = given
         x = jnp.where(from_last, last, x)
-        (residual, rest), push = jax.linearize(lambda x: march.interval(m, x, arriving, slow), x)
-        by_x, hands_on = jax.vmap(push, out_axes=-1)(jnp.eye(x.size))
+        (residual, rest), push = jax.linearize(partial(march.interval, m), x, arriving, slow)
+
+        # columns: the unknowns of the interval, then the slow increments with the answers of the intervals before. One program for both:
+        # the tangents of the action are most of what there is to compile
+        by_unknowns = jnp.eye(x.size, x.size + march.num_seen)
+        by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, 0))), (answers, unit))
+        by_both, on_by_both = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, *by_slow)
+        (by_x, rows), (hands_on, rests) = (jnp.split(a, [x.size], axis=1) for a in (by_both, on_by_both))
         inverse = march.inverse(by_x, march.num_fast)
-
-        # how the interval answers to the slow increments: at fixed x, and by its own unknowns
-        def interval_change(answer: Handed, dslow):
-            return jax.jvp(lambda a, s: march.interval(m, x, a, s), (arriving, slow), (answer, dslow))[1]
-
-        rows, rests = jax.vmap(interval_change, in_axes=-1, out_axes=-1)(answers, unit)
         response = -matmul(inverse, rows)
         answers = Handed(answers.position + march.last_increment(response), rests + matmul(hands_on, response))
 
@@ -281,7 +292,7 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
         return carry, (x + d, inverse, hands_on, response)
 
     start = march.start()
-    none = Handed(*(jnp.zeros((a.size, march.num_slow)) for a in start))
+    none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
     carry = start, none, last, Worst.none()
     (end, answers, _, worst), kept = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
     x, inverse, hands_on, response = kept
@@ -291,7 +302,7 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
 
 def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
     """A pass with the matrices of an earlier one, of this step or of one before. Arguments as of `exact_pass`."""
-    slow = z[: march.num_slow]
+    slow = march.seen(z)
 
     def interval(carry, given):
         arriving, last, worst = carry
@@ -314,24 +325,24 @@ class Factors(NamedTuple):
     """
 
     intervals: IntervalMatrices
-    response: Float[Array, "num_micro k r*n_s"]
+    response: Float[Array, "num_micro k r*n_v"]
     slow: Float[Array, "b b"]
 
 
 def factor(march: MarchEquations, z, x) -> Factors:
     """The matrix ``dR/d(z, x)`` at the solution, factored. A macro step is solved with it once, for the derivative of the solution."""
-    slow, unit = z[: march.num_slow], jnp.eye(march.num_slow)
+    slow, unit = march.seen(z), jnp.eye(march.num_seen)
 
     def interval(carry, given):
         arriving, answers = carry
         m, x = given
         rest = march.interval(m, x, arriving, slow)[1]
         matrices = march.interval_matrices(m, x, arriving, slow)
-        response, answers = march.answer(matrices, jnp.zeros((x.size, march.num_slow)), answers, unit)
+        response, answers = march.answer(matrices, jnp.zeros((x.size, march.num_seen)), answers, unit)
         return (Handed(arriving.position + march.last_increment(x), rest), answers), (matrices, response)
 
     start = march.start()
-    none = Handed(*(jnp.zeros((a.size, march.num_slow)) for a in start))
+    none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
     (end, answers), (matrices, response) = jax.lax.scan(interval, (start, none), (jnp.arange(march.n), x))
     return Factors(matrices, response, march.slow_inverse(z, end, answers))
 
@@ -351,4 +362,4 @@ def solve(march: MarchEquations, factors: Factors, rows_z, rows_x):
     zero = jnp.zeros_like(rows_z)
     change = jax.jvp(lambda a: march.slow_equations(zero, a)[0], (march.start(),), (along,))[1]
     dz = -matvec(factors.slow, rows_z + change)
-    return dz, dx + jnp.sum(factors.response * dz[: march.num_slow], axis=-1)
+    return dz, dx + jnp.sum(factors.response * march.seen(dz), axis=-1)

@@ -26,6 +26,7 @@ from vmri_jax.mechanics.structure import depends_on
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
+from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed
@@ -95,7 +96,11 @@ class Plan:
         has = {"T": system.kinetic, "V": system.slow_potential, "W": system.fast_potential, "F": system.force}
         has |= {"g": system.constraint, "g_s": system.slow_constraint}
         scheme = self.scheme.describe()
-        scheme = replace(scheme, rules={name: rule for name, rule in scheme.rules.items() if has[name] is not None})
+        rules = {name: rule for name, rule in scheme.rules.items() if has[name] is not None}
+        if system.slow_kinetic is not None:
+            slow = macro(stage_scheme(self.scheme).kinetic.rule).in_words()
+            rules = {"T": rules.pop("T"), "T_s": slow} | rules
+        scheme = replace(scheme, rules=rules)
         return "\n".join([str(scheme), "a step:", *indented(self.stepper.describe())])
 
     def __str__(self) -> str:

@@ -84,6 +84,7 @@ def _operations(system: System, start: State) -> dict[str, str]:
     }
     if isinstance(system.kinetic, KineticFunction):
         functions["kinetic"] = system.kinetic.function, (q_s, q_f, q_s, q_f, params)
+        functions["slow_kinetic"] = system.slow_kinetic, (q_s, q_s, params)
     return {name: _traced(function, args) for name, (function, args) in functions.items() if function is not None}
 
 
