@@ -102,6 +102,14 @@ def test_rotors_and_couplings_are_the_same_by_directors(tie):
             np.testing.assert_allclose(a, b, atol=1e-11)
 
 
+def test_a_joint_follows_by_its_gear():
+    scene = replace(driven(), effects=[*driven().effects, Gear(["shoulder", "wrist"], ratios=[1.0, -2.0])])
+    start = scene.with_joints({"shoulder": (0.4, 0.8)}).start
+    np.testing.assert_allclose(np.concatenate(start), [0.4, 0.2, 0.8, 0.4], atol=1e-15)
+    with pytest.raises(ValueError, match=r"keeps gear .*stays open by 0\.2"):
+        scene.with_joints({"shoulder": 0.4, "wrist": 0.3})
+
+
 def test_a_rotor_slows_a_pendulum():
     """A point of mass m at the length l with a rotor J in its hinge: ``(m l^2 + J) x'' = -m g l sin x``."""
     bob = RigidBody("bob", 2.0, (1e-9, 1e-9, 1e-9), [0.5, 0.0, 0.0])

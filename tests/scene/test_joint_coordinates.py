@@ -283,6 +283,25 @@ def test_a_loop_is_cut_at_one_joint():
     assert jnp.abs(scene.system().constraint_rates(0.0, *cranked.start)).max() < 1e-12
 
 
+def test_joints_of_a_loop_follow_those_that_are_named():
+    """Within reach, on the branch of the start and with their rates; beyond, and where all are named, by how much the loop is open."""
+    scene = four_bar()
+    moved = scene.with_joints({"pin 0": (-0.5, 1.0)})
+    q, _, v, _ = moved.start
+    assert (q[0], v[0]) == (-0.5, 1.0)
+    assert jnp.abs(scene.system().slow_constraint(q, scene.system().params)).max() < 1e-13
+    assert jnp.abs(scene.system().constraint_rates(0.0, *moved.start)).max() < 1e-13
+    assert np.abs(q[1:]).max() < 1.0  # the other branch, and whole turns, are further away
+    with pytest.raises(
+        ValueError, match=r"keeps pin 2 rod-rocker .*stays open by 0\.894\. It is kept up to pin 0 at 0 and pin 1 at 0"
+    ):
+        scene.with_joints({"pin 0": 0.5, "pin 1": 0.0})
+    with pytest.raises(
+        ValueError, match=r"stays open by \d\.\d+\. It is kept up to pin 3 at 0\.24; give values within"
+    ):
+        scene.with_joints({"pin 3": 0.4})
+
+
 def test_of_a_loop_the_joint_with_the_fewest_rows_is_cut():
     assert {branch.joint.name for branch in four_bar().branches} == {"pin 0", "pin 1", "pin 3"}
     assert {branch.joint.name for branch in four_bar(second=Cylindrical).branches} == {"pin 0", "pin 2", "pin 3"}

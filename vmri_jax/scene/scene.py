@@ -357,7 +357,8 @@ class Scene:
 
             scene.with_joints({"shoulder": 0.3, "elbow": (-0.5, 2.0), "axle": {"turn": (0.0, 10.0), "slide": 0.1}})
 
-        Angles and ways stay zero where the bodies are as they are given, and so do rest positions that springs measure there.
+        Angles and ways stay zero where the bodies are as they are given, and so do rest positions that springs measure there. In loops, and by gears,
+        the joints that are not named follow.
 
         Args:
             joints: by the name of the joint: an angle (rad) or a way (m), or a pair of it and its rate, which is zero by default; of a joint
@@ -365,7 +366,8 @@ class Scene:
 
         Raises:
             TypeError: no mapping.
-            ValueError: no joint of this name, one that leaves no such freedom or has no coordinate of its own, numbers that are not finite.
+            ValueError: no joint of this name, one that leaves no such freedom or has no coordinate of its own, numbers that are not finite, a
+                loop that does not close with them, and by how much.
         """
         return replace(self, joint_starts={**self.joint_starts, **joint_starts(self.sorting, self.effects, joints)})
 

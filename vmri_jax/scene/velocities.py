@@ -1,4 +1,4 @@
-"""Velocities of all bodies that fit the joints, from the rates of a few of them."""
+"""Starts that fit the joints: velocities of all bodies from the rates of a few joints, closed loops from the values of a few."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.constraints import RANK
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
@@ -15,10 +16,18 @@ from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, AnyBody, Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import FREEDOMS
 from vmri_jax.scene.effects.joints import Joint, freedom_of
+from vmri_jax.scene.rows import ConstraintRows
 from vmri_jax.scene.sorting import Sorting
 
 REACHED = 1e-8
 """Part of the rates by which they may be missed."""
+PARTS = 20
+"""Parts of the way from the start of a joint to its new value, after each of which loops are closed anew: with fewer a loop may fold over
+into its other configuration."""
+CLOSED = 1e-12
+"""Largest value of a row, in parts of its size, with which a loop counts as closed."""
+CORRECTIONS = 20
+"""Most corrections of Newton's iteration for a part; four are needed where a loop closes."""
 
 
 def with_rates(
@@ -124,7 +133,61 @@ def joint_starts(
                         )
                     )
                 found[key] = tuple(number if number.ndim == 0 else number[i] for number in numbers)
-    return found
+    return with_closed_loops(sorting, found)
+
+
+def with_closed_loops(
+    sorting: Sorting, wanted: dict[tuple[str, int, str], tuple[Any, Any]]
+) -> dict[tuple[str, int, str], tuple[Any, Any]]:
+    """Starts of freedoms, and with them those of all others that rows of loops and couplings tie to them.
+
+    Newton's iteration on ``g(q) = 0`` moves the freedoms x that are not wanted, ``dx = -(dg/dx)^+ g``, while the wanted ones go to their values
+    in parts; then rates of x keep ``dg/dq v = 0``.
+
+    Args:
+        sorting: bodies at their places, effects at their homes.
+        wanted: value and rate by the keys of `Layout.freedoms`.
+
+    Raises:
+        ValueError: a loop that does not close.
+    """
+    rows = ConstraintRows.of(sorting)
+    if rows is None or not is_concrete((sorting.start, wanted)):
+        return wanted
+    n_s = sorting.layout.sizes[0]
+    at = {key: place.start + (n_s if place.part == "f" else 0) for key, place in sorting.layout.freedoms.items()}
+    held, others = [at[key] for key in wanted], [at[key] for key in at if key not in wanted]
+    q, v = (np.concatenate(parts) for parts in (sorting.start[:2], sorting.start[2:]))
+    begin, end = q[held], np.array([float(value) for value, _ in wanted.values()])
+    for part in np.linspace(0.0, 1.0, PARTS + 1)[1:]:
+        before, q[held] = q[held], begin + part * (end - begin)
+        opened = _close(rows, q, others)
+        if opened is not None:
+            named = " and ".join(
+                f"{joint} at {value:.4g}" for (joint, *_), value in zip(wanted, before.tolist(), strict=True)
+            )
+            q[held] = end
+            row, gap = _close(rows, q, others) or opened
+            raise ValueError(
+                f"Scene.with_joints: no configuration of the other joints keeps {row}, which stays open by {gap:.3g}. It is kept up to "
+                f"{named}; give values within, or fewer of them."
+            )
+    v[held] = [float(rate) for _, rate in wanted.values()]
+    jacobian = rows.at(0.0, q)[1]
+    v[others] -= np.linalg.lstsq(jacobian[:, others], jacobian @ v, rcond=RANK)[0]
+    moved = {key: (q[i], v[i]) for key, i in at.items() if key not in wanted and jacobian[:, i].any()}
+    return wanted | moved
+
+
+def _close(rows: ConstraintRows, q: np.ndarray, free: Sequence[int]) -> tuple[str, float] | None:
+    """Move some coordinates of q, in place, until all rows are zero; the name and value of the row that is furthest off, where they do not close."""
+    for _ in range(CORRECTIONS):
+        values, jacobian = rows.at(0.0, q)
+        worst = int(np.argmax(np.abs(values / rows.sizes)))
+        if abs(values[worst] / rows.sizes[worst]) <= CLOSED:
+            return None
+        q[free] -= np.linalg.lstsq(jacobian[:, free], values, rcond=RANK)[0]
+    return rows.rows[worst].name, abs(values[worst])
 
 
 def _rates(effects: Sequence[Effect], bodies: Bodies, wanted: Mapping[str, Any]):
