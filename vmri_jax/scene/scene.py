@@ -27,7 +27,7 @@ from vmri_jax.scene.redundancy import check_constraints, dropped_rows, without_r
 from vmri_jax.scene.rigid import RigidBody, Rigidity
 from vmri_jax.scene.sorting import Sorting, sort
 from vmri_jax.scene.terms import RESERVED, Actuation
-from vmri_jax.scene.trees import Branch, check_frames, grow
+from vmri_jax.scene.trees import Branch, check_frames, grow, shallow
 from vmri_jax.scene.velocities import joint_starts, with_rates
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -64,7 +64,8 @@ class Scene:
         coordinates: of rigid bodies, "directors" for a centre and directors each, tied by joints as constraints; "joint" for bodies that
             are functions of the freedoms of joints, along trees. Then every such joint adds a coordinate for each of its freedoms, zero at
             the start, and no row; roots of trees that are not the ground keep directors, a joint that closes a loop its rows, and
-            a `Spherical` one, too.
+            a `Spherical` one, too. "auto" for joint coordinates of trees that are not deep, where they are faster, see
+            `vmri_jax.scene.trees.LONGEST`.
         joint_starts: values and rates of their coordinates at the start, see `with_joints`, which sets them.
 
     Raises:
@@ -76,7 +77,7 @@ class Scene:
     effects: Any = ()
     project: bool = False
     redundant: Literal["refuse", "drop"] = "refuse"
-    coordinates: Literal["joint", "directors"] = "directors"
+    coordinates: Literal["joint", "directors", "auto"] = "directors"
     joint_starts: Mapping[tuple[str, int, str], tuple[Any, Any]] = field(default_factory=dict, repr=False)
 
     def __repr__(self) -> str:
@@ -91,8 +92,8 @@ class Scene:
         require_x64()
         if self.redundant not in ("refuse", "drop"):
             raise ValueError(f"Scene: redundant is {self.redundant!r}; it must be 'refuse' or 'drop'.")
-        if self.coordinates not in ("joint", "directors"):
-            raise ValueError(f"Scene: coordinates is {self.coordinates!r}; it must be 'joint' or 'directors'.")
+        if self.coordinates not in ("joint", "directors", "auto"):
+            raise ValueError(f"Scene: coordinates is {self.coordinates!r}; it must be 'joint', 'directors' or 'auto'.")
         for name, kind in (("bodies", AnyBody), ("effects", Effect)):
             items = getattr(self, name)
             if isinstance(items, kind) or not isinstance(items, Iterable):
@@ -167,7 +168,10 @@ class Scene:
     @cached_property
     def branches(self) -> tuple[Branch, ...]:
         """The bodies that are functions of the freedoms of joints."""
-        return grow(self.by_name, self.effects) if self.coordinates == "joint" else ()
+        if self.coordinates == "directors":
+            return ()
+        branches = grow(self.by_name, self.effects)
+        return branches if self.coordinates == "joint" else shallow(branches)
 
     @cached_property
     def everything(self) -> tuple[Effect, ...]:
