@@ -45,6 +45,10 @@ def sphere(q, params):
     return jnp.sum((q[0] - params["point"]) ** 2) / 2 - params["half"]
 
 
+def held(x, params):
+    return params["f"] * jnp.sin(x[0])
+
+
 EFFECTS = [
     sc.NBodyGravity(1.0),
     sc.Spring(("a", "b"), 3.0, name="other spring"),
@@ -103,6 +107,9 @@ RIGID_EFFECTS = [
     sc.JointDrive("pin", torque, {"f": 1.0}),
     sc.Controlled("pin", "torque", name="controlled pin"),
     sc.JointMotion("pin", torque, {"f": 1.0}),
+    sc.RotorInertia("pin", 0.2),
+    sc.Gear(["pin"], ratios=[2.0]),
+    sc.JointCoupling(["pin"], held, {"f": 0.5}),
 ]
 """Joints, and what acts in them."""
 

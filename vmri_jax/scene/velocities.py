@@ -159,24 +159,24 @@ def with_closed_loops(
     held, others = [at[key] for key in wanted], [at[key] for key in at if key not in wanted]
     q, v = (np.concatenate(parts) for parts in (sorting.start[:2], sorting.start[2:]))
     begin, end = q[held], np.array([float(value) for value, _ in wanted.values()])
+    reached, opened = begin, None
     for part in np.linspace(0.0, 1.0, PARTS + 1)[1:]:
-        before, q[held] = q[held], begin + part * (end - begin)
-        opened = _close(rows, q, others)
-        if opened is not None:
-            named = " and ".join(
-                f"{joint} at {value:.4g}" for (joint, *_), value in zip(wanted, before.tolist(), strict=True)
-            )
-            q[held] = end
-            row, gap = _close(rows, q, others) or opened
-            raise ValueError(
-                f"Scene.with_joints: no configuration of the other joints keeps {row}, which stays open by {gap:.3g}. It is kept up to "
-                f"{named}; give values within, or fewer of them."
-            )
+        moved = q.copy()
+        moved[held] = begin + part * (end - begin)
+        opened = _close(rows, moved, others)
+        if opened is None:  # between the start and values that fit each other rows may be open
+            q, reached = moved, moved[held]
+    if opened is not None:
+        row, gap = opened
+        named = " and ".join(f"{joint} at {value:.4g}" for (joint, *_), value in zip(wanted, reached, strict=True))
+        raise ValueError(
+            f"Scene.with_joints: no configuration of the other joints keeps {row}, which stays open by {gap:.3g}. It is kept up to "
+            f"{named}; give values within, or fewer of them."
+        )
     v[held] = [float(rate) for _, rate in wanted.values()]
     jacobian = rows.at(0.0, q)[1]
     v[others] -= np.linalg.lstsq(jacobian[:, others], jacobian @ v, rcond=RANK)[0]
-    moved = {key: (q[i], v[i]) for key, i in at.items() if key not in wanted and jacobian[:, i].any()}
-    return wanted | moved
+    return wanted | {key: (q[i], v[i]) for key, i in at.items() if key not in wanted and jacobian[:, i].any()}
 
 
 def _close(rows: ConstraintRows, q: np.ndarray, free: Sequence[int]) -> tuple[str, float] | None:
