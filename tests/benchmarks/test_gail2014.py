@@ -207,7 +207,7 @@ def test_the_command_one_figure(gail2014, tmp_path, monkeypatch):
 def test_the_command_refuses_unknown_figures(gail2014, tmp_path):
     code, text = gail2014("--only", "fig11")
     assert code == 2
-    assert "no figure 'fig11'; there are fig4, fig5" in text
+    assert "no figure 'fig11'; there are fig4, fig4-minimal, fig5" in text
     assert not (tmp_path / "out").exists()
 
 
