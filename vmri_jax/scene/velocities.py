@@ -142,7 +142,8 @@ def with_closed_loops(
     """Starts of freedoms, and with them those of all others that rows of loops and couplings tie to them.
 
     Newton's iteration on ``g(q) = 0`` moves the freedoms x that are not wanted, ``dx = -(dg/dx)^+ g``, while the wanted ones go to their values
-    in parts; then rates of x keep ``dg/dq v = 0``.
+    in parts; then rates of x keep ``dg/dq v = 0``. Rows that bodies with coordinates of their own can keep, such as those behind a ball joint,
+    are left to the state at the start.
 
     Args:
         sorting: bodies at their places, effects at their homes.
@@ -158,12 +159,13 @@ def with_closed_loops(
     at = {key: place.start + (n_s if place.part == "f" else 0) for key, place in sorting.layout.freedoms.items()}
     held, others = [at[key] for key in wanted], [at[key] for key in at if key not in wanted]
     q, v = (np.concatenate(parts) for parts in (sorting.start[:2], sorting.start[2:]))
+    numbers = _of_joints_alone(sorting, rows)
     begin, end = q[held], np.array([float(value) for value, _ in wanted.values()])
     reached, opened = begin, None
     for part in np.linspace(0.0, 1.0, PARTS + 1)[1:]:
         moved = q.copy()
         moved[held] = begin + part * (end - begin)
-        opened = _close(rows, moved, others)
+        opened = _close(rows, numbers, moved, others)
         if opened is None:  # between the start and values that fit each other rows may be open
             q, reached = moved, moved[held]
     if opened is not None:
@@ -174,20 +176,39 @@ def with_closed_loops(
             f"{named}; give values within, or fewer of them."
         )
     v[held] = [float(rate) for _, rate in wanted.values()]
-    jacobian = rows.at(0.0, q)[1]
+    jacobian = rows.at(0.0, q)[1][numbers]
     v[others] -= np.linalg.lstsq(jacobian[:, others], jacobian @ v, rcond=RANK)[0]
     return wanted | {key: (q[i], v[i]) for key, i in at.items() if key not in wanted and jacobian[:, i].any()}
 
 
-def _close(rows: ConstraintRows, q: np.ndarray, free: Sequence[int]) -> tuple[str, float] | None:
-    """Move some coordinates of q, in place, until all rows are zero; the name and value of the row that is furthest off, where they do not close."""
+def _of_joints_alone(sorting: Sorting, rows: ConstraintRows) -> np.ndarray:
+    """Numbers of the rows that no motion of bodies with coordinates of their own changes: those of loops and couplings of joints."""
+    n_s, changes = sorting.layout.sizes[0], np.zeros(len(rows.rows), bool)
+    for name, place in sorting.layout.own.items():
+        if name in sorting.bodies:
+            first = place.start + (n_s if place.part == "f" else 0)
+            by_motions = rows.jacobian[:, first : first + place.size] @ sorting.bodies[name].motions
+            changes |= np.linalg.norm(by_motions, axis=1) > RANK * np.linalg.norm(rows.jacobian, axis=1)
+    return np.flatnonzero(~changes)
+
+
+def _close(rows: ConstraintRows, numbers: np.ndarray, q: np.ndarray, free: Sequence[int]) -> tuple[str, float] | None:
+    """Move coordinates of q, in place, until rows are zero; where they do not close, the name and value of the one that is furthest off.
+
+    Args:
+        numbers: of the rows.
+        free: the coordinates.
+    """
+    opened = None
     for _ in range(CORRECTIONS):
-        values, jacobian = rows.at(0.0, q)
-        worst = int(np.argmax(np.abs(values / rows.sizes)))
-        if abs(values[worst] / rows.sizes[worst]) <= CLOSED:
+        values, jacobian = (x[numbers] for x in rows.at(0.0, q))
+        sizes = np.abs(values / rows.sizes[numbers])
+        if sizes.max(initial=0.0) <= CLOSED:
             return None
+        worst = int(np.argmax(sizes))
+        opened = rows.rows[numbers[worst]].name, float(abs(values[worst]))
         q[free] -= np.linalg.lstsq(jacobian[:, free], values, rcond=RANK)[0]
-    return rows.rows[worst].name, abs(values[worst])
+    return opened
 
 
 def _rates(effects: Sequence[Effect], bodies: Bodies, wanted: Mapping[str, Any]):
