@@ -90,7 +90,7 @@ def their_centres(model: Any, qpos: np.ndarray, qvel: np.ndarray) -> dict[str, n
 
 
 def compare(file: Path) -> dict[str, Any]:
-    """What becomes of one file."""
+    """The row of one file."""
     from vmri_jax.scene import Scene
 
     mujoco = _mujoco()

@@ -24,7 +24,7 @@ PUBLISHED = np.array(
 
 # --- a satellite with two booms --------------------------------------------------------------------------------------
 def satellite(panels: int) -> Mechanism:
-    """A hub that floats, slow, and so many panels on springs in hinges on each side, fast."""
+    """A hub that floats, slow, and a number of panels on springs in hinges on each side, fast."""
     hub, length, sides = 1.0, 0.8, ("left", "right")
     bars = {"hub": Bar(100.0, 100.0 * 2 * hub**2 / 12)}
     hinges, before = [], dict.fromkeys(sides, "hub")

@@ -201,6 +201,10 @@ def test_limits_as_springs():
         Scene.from_mujoco(model, limits="soft")  # pyright: ignore[reportArgumentType]
     names = [effect.name for effect in Scene.from_mujoco(model, limits="spring").effects]
     assert [name for name in names if name.endswith("limit")] == ["hip pitch limit", "knee limit"]
+    limited = '<tendon><fixed name="t" limited="true" range="0 1"><joint joint="hinge" coef="1"/></fixed></tendon>'
+    with pytest.raises(ValueError, match=r"for limits of hinges and slides, and t have others\. .*ignore=\['limits'\]"):
+        Scene.from_mujoco(arm(limited), limits="spring")
+    assert Scene.from_mujoco(arm(limited), limits="spring", ignore=["limits"]).bodies
     pendulum = arm(joint='range="-20 20" solreflimit="0.1 1"', option='gravity="0 0 0"')
     scene = Scene.from_mujoco(pendulum, qpos=[np.radians(25)], limits="spring")
     inertia = 1 / pendulum.dof_invweight0[0]

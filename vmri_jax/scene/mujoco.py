@@ -69,7 +69,7 @@ def bodies_and_effects(
     compiled.refuse([*ignore, "limits"] if limits == "spring" and not isinstance(ignore, str) else ignore)
     reader = _Reader(compiled, _start(compiled, qpos, qvel, key))
     bodies = reader.bodies()
-    springs = reader.limits() if limits == "spring" else ()
+    springs = list(reader.limits("limits" in ignore)) if limits == "spring" else []
     tied = couplings(compiled, reader.data)
     return bodies, [*reader.joints(), *springs, *reader.equalities(), *tied, *reader.gravity(bodies)]
 
@@ -185,15 +185,30 @@ class _Reader:
         """What the frame between a joint and the next one of the same body is called."""
         return f"{self.compiled.name('joint', j)} frame"
 
-    def limits(self) -> Iterator[JointLimit]:
+    def limits(self, ignored: bool) -> Iterator[JointLimit]:
         """Limits of joints as springs: MuJoCo's stiffness for the inertia that the joint moves at qpos0.
 
         By its reference of solref, a limit pulls back with the acceleration ``d / (T z)^2`` at the depth d, of the time constant T and the
         damping ratio z; negative numbers are its stiffness and damping. The inertia is ``1 / dof_invweight0``.
+
+        Args:
+            ignored: whether limits of ball joints and of tendons may be left out.
+
+        Raises:
+            ValueError: limits of ball joints or of tendons that may not.
         """
         compiled, model = self.compiled, self.compiled.model
         if compiled.off(CONSTRAINTS, "LIMIT"):
             return
+        others = [
+            model.joint(int(j)).name or f"joint {j}" for j in np.flatnonzero(model.jnt_limited & compiled.turning)
+        ]
+        others += [model.tendon(int(i)).name or f"tendon {i}" for i in np.flatnonzero(model.tendon_limited)]
+        if others and not ignored:
+            raise ValueError(
+                f"Scene.from_mujoco: limits='spring' is for limits of hinges and slides, and {', '.join(others)} have others. Leave these "
+                "out of the motion, ignore=['limits'], or change the model."
+            )
         for j in np.flatnonzero(np.asarray(model.jnt_limited) & ~compiled.turning).tolist():
             time, ratio = model.jnt_solref[j]
             rate = -time if time < 0 else 1 / (time * ratio) ** 2
