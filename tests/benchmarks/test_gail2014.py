@@ -95,6 +95,7 @@ def test_the_full_study_marks_the_minima_of_the_paper():
 def test_choosing_figures():
     figures = reference_figures()
     assert [figure.name for figure in choose_figures(figures, ["fig9", "fig6"])] == ["fig6", "fig9"]
+    assert [figure.name for figure in choose_figures(figures, [])] == [name for name in ALL if name != "fig4-minimal"]
     with pytest.raises(ValueError, match=r"no figure 'fig11'; there are fig4, .*tsp-degree"):
         choose_figures(figures, ["fig11"])
 
