@@ -1,4 +1,4 @@
-"""Random trees of rigid bodies on joints: roots on the ground or free, every kind of joint, springs, dampers, forces."""
+"""Random trees and rings of rigid bodies on joints: roots on the ground or free, every kind of joint, springs, dampers, forces."""
 
 from typing import Any
 
@@ -25,6 +25,8 @@ from vmri_jax.scene import (
 
 JOINTS = (Revolute, Prismatic, Cylindrical, Universal, Fixed, Spherical, Screw, Planar)
 BODIES = 4
+FREEDOMS = 8
+"""Fewest freedoms of the joints of a ring: six close it, and two more let it move and let one joint start elsewhere."""
 
 
 def random_scene(seed: int) -> tuple[Scene, dict[str, tuple[float, float]]]:
@@ -49,6 +51,27 @@ def random_scene(seed: int) -> tuple[Scene, dict[str, tuple[float, float]]]:
     ends = ("body 2", random.normal(size=3) / 5), ("body 3", random.normal(size=3) / 5)
     effects += [Gravity([0.3, 0.2, -1.0]), Spring(ends, 3.0, 0.4)]
     return Scene(bodies, effects, coordinates="joint"), starts
+
+
+def random_ring(seed: int) -> tuple[Scene, dict[str, dict[str, tuple[float, float]]]]:
+    """As `random_scene`, of bodies in one closed loop, from the ground back to the ground or from a free body back to it.
+
+    Args:
+        seed: of the random numbers; the ground is in rings of odd ones.
+    """
+    random = np.random.default_rng(seed)
+    names = (["ground"] if seed % 2 else []) + [f"body {i}" for i in range(BODIES)]
+    kinds: list[Any] = []
+    while sum(max(1, len(kind.freedoms)) for kind in kinds) < FREEDOMS:
+        kinds = [JOINTS[i] for i in random.integers(len(JOINTS), size=len(names))]
+    bodies, effects, starts = [], [], {}
+    for name in names[-BODIES:]:
+        shape = Box(tuple(random.uniform(0.5, 1.5, size=3)))
+        bodies.append(RigidBody(name, random.uniform(0.5, 2.0), shape, random.normal(size=3), random.normal(size=3)))
+    for i, kind in enumerate(kinds):
+        pair = names[i], names[(i + 1) % len(names)]
+        effects += _on_joint(kind, pair[:: random.choice((-1, 1))], f"joint {i}", random, starts)
+    return Scene(bodies, [Gravity([0.3, 0.2, -1.0]), *effects], coordinates="joint"), starts
 
 
 def _on_joint(kind, pair, name: str, random, starts) -> list[Effect]:

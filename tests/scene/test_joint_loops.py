@@ -1,10 +1,29 @@
 """Joints between slow and fast bodies, and in loops."""
 
+import jax
 import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.scene import Cylinder, Gravity, JointSpring, Revolute, RigidBody, Scene, Spherical
+from tests.scene.test_joint_coordinates import (
+    accelerations,
+    assert_accelerates_as_by_directors,
+    by_directors,
+    state_of,
+)
+from vmri_jax.mechanics.motion import reaction_force
+from vmri_jax.scene import (
+    Box,
+    Cylinder,
+    Gravity,
+    JointSpring,
+    Prismatic,
+    Revolute,
+    RigidBody,
+    Scene,
+    Spherical,
+    Universal,
+)
 
 MOMENTS = [1.0, 2.0, 2.5]
 ONE = vm.fully_implicit(num_micro=1)
@@ -70,3 +89,122 @@ def test_a_fast_body_between_two_slow_ones_cannot_follow():
         ValueError, match='only middle can move; leave one out, or make left or right fast too, pace="fast"'
     ):
         Scene(bodies, [joints])
+
+
+BAR = RigidBody("bar", 1.0, Box((1, 0.1, 0.1)), [0.5, 0, 0])
+
+
+def hinge(name, pairs=("ground", "bar")):
+    """At the origin, about z."""
+    return Revolute(pairs, [0, 0, 0], axis=[0, 0, 1], name=name)
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"),
+    [
+        ([hinge("pin"), hinge("pin")], r"the name 'pin' occurs twice; give each body and effect its own, e.g. name="),
+        (
+            [hinge("pin"), hinge("again", ("bar", "ground"))],
+            r"again bar-ground \[0\].* are 5 constraints of rank 0; joints join the same bodies: bar and ground by pin and again; leave one",
+        ),
+        (
+            [hinge("pin", [("ground", "bar")] * 2)],
+            "join the same bodies: bar and ground by pin ground-bar and pin ground-bar; leave",
+        ),
+    ],
+)
+def test_joints_that_are_given_twice_are_refused(joints, message):
+    with pytest.raises(ValueError, match=message):
+        Scene([BAR], joints, coordinates="joint")
+
+
+def test_a_joint_that_is_given_twice_may_be_dropped():
+    scene = Scene([BAR], [hinge("pin"), hinge("again")], coordinates="joint", redundant="drop")
+    assert (len(scene.dropped), scene.names.slow | scene.names.fast) == (5, {"pin": 1})
+
+
+def test_what_hangs_on_the_ground_at_both_ends_is_one_tree():
+    """The ground is the root, even of a body that is said to be slow, and the second way down to it closes a loop."""
+    names, ends = ("left", "right"), [[-1, 0, 0], [0, 0.5, 0], [1, 0, 0]]
+    bodies = [
+        RigidBody(name, 1.0, Box((1, 0.1, 0.1)), np.add(*ends[i : i + 2]) / 2, pace="slow")
+        for i, name in enumerate(names)
+    ]
+    pairs = ("ground", "left"), ("left", "right"), ("right", "ground")
+    joints = [Revolute(pair, at, axis=Z, name="-".join(pair)) for pair, at in zip(pairs, ends, strict=True)]
+    slide = Prismatic(("right", "ground"), ends[2], axis=X, name="slide")
+    scene = Scene(bodies, [*joints[:2], slide, Gravity([0, -9.81, 0])], coordinates="joint", redundant="drop")
+    assert [branch.parent for branch in scene.branches] == ["ground", "ground"]
+    assert sum(x.size for x in scene.start[:2]) == 2
+    with pytest.raises(ValueError, match="do not fit the joints"):
+        scene.replace("left", velocity=X).problem()  # no body floats
+    assert Scene(bodies[:1], joints[:1], coordinates="joint").branches[0].parent == "ground"
+
+
+def test_a_universal_joint_goes_through_a_right_angle():
+    """Where its axes of both bodies, or those of Euler angles, would be parallel."""
+    bar = RigidBody("bar", 1.0, Box((0.1, 0.2, 1.0)), [0, 0, -0.5], pace="slow")
+    cross = Universal(("ground", "bar"), [0, 0, 0], axis=Z, second=X, name="cross")
+    scene = Scene([bar], [Gravity(), cross], coordinates="joint")
+    start = {"cross": {"turn": (0.3, 2.0), "tilt": (1.3, 6.0)}}
+    run = vm.simulate(scene.with_joints(start), ONE, macro_dt=0.005, num_steps=20)
+    tilt = run.position("cross tilt")[:, 0]
+    assert tilt[0] < np.pi / 2 < tilt[-1]
+    assert np.ptp(run.energy) < 2e-4  # J, of 5; measured 8e-5
+    assert_accelerates_as_by_directors(scene.with_joints({"cross": {"turn": (0.3, 2.0), "tilt": (np.pi / 2, 2.0)}}))
+
+
+def slider_crank():
+    """A crank that turns, a rod and a piston, in a plane."""
+    pin, wrist = np.array([0.3, 0.4, 0]), np.array([1.5, 0, 0])
+    bodies = [
+        RigidBody("crank", 2.0, Box((0.5, 0.1, 0.1)), pin / 2, [0, 0, np.arctan2(4, 3)], pace="slow"),
+        RigidBody("rod", 1.0, Box((1.26, 0.05, 0.05)), (pin + wrist) / 2, [0, 0, np.arctan2(-4, 12)], pace="slow"),
+        RigidBody("piston", 0.8, Box((0.2, 0.2, 0.2)), wrist, pace="slow"),
+    ]
+    joints = [
+        Revolute(("ground", "crank"), [0, 0, 0], axis=Z, name="bearing"),
+        Revolute(("crank", "rod"), pin, axis=Z, name="crank pin"),
+        Revolute(("rod", "piston"), wrist, axis=Z, name="wrist pin"),
+        Prismatic(("ground", "piston"), wrist, axis=X, name="cylinder"),
+    ]
+    scene = Scene(bodies, [Gravity([0, -9.81, 0]), *joints], coordinates="joint", redundant="drop")
+    return scene.with_rates({"bearing": 5.0})
+
+
+def test_reaction_forces_of_a_slider_crank():
+    """The balance of each body in joint coordinates, by the angles and accelerations alone, has the forces that multipliers give by directors.
+
+    Nine equations in the plane for eight unknowns: two forces in each hinge, a force and a moment in the cylinder.
+    """
+    scene, names = slider_crank(), ("crank", "rod", "piston")
+    moved = accelerations(scene, state_of(scene))
+    twin, state = by_directors(scene, moved)
+    centres = np.array([moved[name][0][:2] for name in names])
+    pins = np.array(
+        [[0, 0], 2 * centres[0], centres[2]]
+    )  # where the hinges are, of a crank whose centre is in its middle
+    equations, known = np.zeros((9, 8)), np.zeros(9)
+
+    def lever(pin, body):
+        """Of the moment of a force about the centre of a body."""
+        x, y = pins[pin] - centres[body]
+        return np.array([-y, x])
+
+    for body, name in enumerate(names):
+        q, _, a = moved[name]
+        turning = np.cross(q[3:].reshape(3, 3), a[3:].reshape(3, 3)).sum(axis=0)[2] / 2  # sum d_i x d_i'' / 2
+        made = scene.by_name[name]
+        known[3 * body : 3 * body + 3] = [made.mass * a[0], made.mass * (a[1] + 9.81), made.moments[2] * turning]
+        for pin, sign in ((body, 1.0), (body + 1, -1.0)):
+            if pin < 3:
+                equations[3 * body : 3 * body + 2, 2 * pin : 2 * pin + 2] = sign * np.eye(2)
+                equations[3 * body + 2, 2 * pin : 2 * pin + 2] = sign * lever(pin, body)
+    equations[7, 6] = equations[8, 7] = 1.0
+    forces, residual, *_ = np.linalg.lstsq(equations, known, rcond=None)
+    assert residual < 1e-20
+    force_of = jax.jit(reaction_force)
+    for joint, name, mine in (("crank pin", "rod", forces[2:4]), ("cylinder", "piston", [0.0, forces[6]])):
+        theirs, _ = force_of(twin.system(), state, np.asarray(twin.names.rows[joint]))
+        start = twin.places[name].start
+        np.testing.assert_allclose(theirs[start : start + 2], mine, atol=1e-8)  # N, values of 10 to 100

@@ -175,6 +175,48 @@ def test_a_robot_accelerates_as_in_mujoco():
     np.testing.assert_array_equal(again.bodies[-1].velocity, scene.bodies[-1].velocity)
 
 
+def urdf() -> str:
+    """An arm of six axes as robots have them, without meshes: lengths, masses and moments of inertia of links of a small one."""
+    links, joints = ['<link name="base"/>'], []
+    axes = "0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0"
+    places = "0 0 0.2", "0.05 0 0.15", "0 0 0.4", "0.1 0 0.05", "0.3 0 0", "0.08 0 0"
+    parent = "base"
+    for i, (axis, place) in enumerate(zip(axes, places, strict=True)):
+        mass = 6.0 - 0.9 * i
+        links.append(
+            f'<link name="link{i}"><inertial><origin xyz="{0.02 * i} 0.01 0.1" rpy="0.1 {0.2 * i} 0"/><mass value="{mass}"/>'
+            f'<inertia ixx="{0.04 * mass}" iyy="{0.03 * mass}" izz="{0.02 * mass}" ixy="{0.002 * mass}" ixz="0" iyz="0"/></inertial></link>'
+        )
+        joints.append(
+            f'<joint name="axis{i}" type="{"continuous" if i % 3 else "revolute"}"><parent link="{parent}"/><child link="link{i}"/>'
+            f'<origin xyz="{place}" rpy="0 {0.1 * i} 0"/><axis xyz="{axis}"/><limit lower="-3" upper="3" effort="90" velocity="3"/>'
+            f'<dynamics damping="{0.3 - 0.04 * i}"/></joint>'
+        )
+        parent = f"link{i}"
+    return f'<robot name="arm">{"".join(links + joints)}</robot>'
+
+
+def test_an_arm_from_a_urdf_moves_as_in_mujoco(tmp_path):
+    """Half a second from a random start, against Runge-Kutta steps of 0.1 ms; limits, which a scene does not have, are switched off."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(urdf())
+    with pytest.raises(ValueError, match=r"limits \(joint axis0, joint axis3\)"):
+        Scene.from_mujoco(path)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    model.opt.integrator, model.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, 1e-4
+    random = np.random.default_rng(0)
+    qpos, qvel = random.normal(size=6) / 2, random.normal(size=6)
+    scene = Scene.from_mujoco(path, qpos=qpos, qvel=qvel, ignore=["limits"])
+    assert sum(x.size for x in scene.start[:2]) == 6
+    scheme = vm.compose(vm.fully_implicit(1), "suzuki4")
+    run = vm.simulate(scene, scheme, macro_dt=0.005, num_steps=100, save_every=100)
+    end = motion(model, qpos, qvel, 0.5)
+    for i in range(6):
+        np.testing.assert_allclose(qpos[i] + scene.joint_motion(run, f"axis{i}")[-1], end.qpos[i], atol=1e-6)
+        np.testing.assert_allclose(run.position(f"link{i}")[-1, :3], end.xipos[model.body(f"link{i}").id], atol=1e-6)
+
+
 def test_joints_and_tendons_that_equalities_tie():
     """MuJoCo's motion with equalities ten times stiffer than by default is that of the scene, which keeps them to round-off."""
     model = mujoco.MjModel.from_xml_string(ROBOT.format(flags='limit="disable"'))

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from vmri_jax.mechanics.constraints import RANK, rank_of
+from vmri_jax.scene.effects.joints import Joint
 from vmri_jax.scene.rigid import Rigidity
 from vmri_jax.scene.rows import HOMES, ConstraintRows
 from vmri_jax.scene.sorting import Sorting
@@ -179,8 +180,22 @@ def _cure(sorting: Sorting) -> str:
     rows = ConstraintRows.of(without_redundant(sorting))
     opening = None if rows is None else find_opening(rows)
     if rows is None or opening is None:
-        return 'leave one of them out, or let the scene choose, redundant="drop"'
+        return f'{_joined_twice(sorting)}leave one of them out, or let the scene choose, redundant="drop"'
     return f"nor can any be left out: {_told(rows, opening)}"
+
+
+def _joined_twice(sorting: Sorting) -> str:
+    """Which joints are between the same two bodies: in joint coordinates the one that carries a body has no rows that could be named."""
+    joints = {branch.joint.name: branch.joint for branch in sorting.branches}
+    joints |= {part.effect.name: part.effect for part in sorting.placed if isinstance(part.effect, Joint)}
+    labels: dict[frozenset[str], list[str]] = {}
+    for joint in joints.values():
+        for i, pair in enumerate(joint.elements(sorting.bodies)):
+            labels.setdefault(frozenset(pair), []).append(joint.label(i, sorting.bodies))
+    twice = [
+        f"{' and '.join(sorted(pair))} by {' and '.join(names)}" for pair, names in labels.items() if len(names) > 1
+    ]
+    return f"joints join the same bodies: {_listed(twice)}; " if twice else ""
 
 
 def _told(rows: ConstraintRows, opening: Opening) -> str:
