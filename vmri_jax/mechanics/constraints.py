@@ -75,10 +75,12 @@ def project_positions(system: System, t, q_s, q_f):
 
     mass = jax.jacfwd(momentum)(jnp.zeros_like(q0))
     directions = jnp.linalg.solve(mass, jax.jacrev(constraints)(q0).T)
-    q = q0
-    for _ in range(PROJECTION_STEPS):
+
+    def corrected(_, q):
         g = constraints(q)
-        q = q - directions @ jnp.linalg.lstsq(jax.jacrev(constraints)(q) @ directions, g)[0]
+        return q - directions @ jnp.linalg.lstsq(jax.jacrev(constraints)(q) @ directions, g)[0]
+
+    q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)  # a loop compiles a fraction of what its passes would one by one
     return q[:n_s], q[n_s:]
 
 
