@@ -9,6 +9,7 @@ import ast
 import importlib
 import json
 import os
+import runpy
 import sys
 import time
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ import numpy as np
 import vmri_jax as vm
 
 SYSTEMS = {"FPU": "fermi_pasta_ulam", "TSP": "triple_spherical_pendulum", "SAM": "simple_atomic_model"}
+SCENES = {"satellite": "notebooks/scenes/rigid_satellite.py"}
+"""Files of scenes, whose kinetic energy is a function of joint coordinates."""
 PROCESSOR_TIME = "--processor-time"
 """The option that counts seconds in which this process runs, where others share its core."""
 CLOCK = time.process_time if PROCESSOR_TIME in sys.argv else time.perf_counter
@@ -43,7 +46,7 @@ class Case:
     """What is run.
 
     kind: a key of `KINDS`.
-    system: ``"TSP"``, ``"SAM"`` or ``"FPU l=3"``.
+    system: ``"TSP"``, ``"SAM"``, ``"FPU l=3"`` or ``"satellite"``.
     scheme: a constructor and its arguments, ``"galerkin 1 8 lobatto"``, after the name of a composition if it is one,
         ``"kahan-li8 of fully_explicit 2"``.
     num_steps: macro steps; 0 to find how many take `seconds`.
@@ -62,6 +65,8 @@ class Case:
 
     def problem(self):
         """System and start."""
+        if self.system in SCENES:
+            return runpy.run_path(SCENES[self.system])["scene"].problem()
         name, _, springs = self.system.partition(" l=")
         return getattr(vm.systems, SYSTEMS[name])(*([int(springs)] if springs else []))
 

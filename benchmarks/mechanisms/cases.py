@@ -207,6 +207,27 @@ def four_bar() -> Mechanism:
     return Mechanism("four-bar", bars, hinges, poses, q, np.array([8.0]), 2.0, 1.0, 64, gravity=9.81)
 
 
+def four_bars(loops: int) -> Mechanism:
+    """Cranks of 1 kg and 1 m in a row, joined by rods, fall from upright: case A02 of the IFToMM library of benchmarks.
+
+    Where all bars lie in a line, each loop could fold another way: the rows of its joints depend on each other there.
+    """
+
+    def poses(q):
+        """The angle of all cranks; rods do not turn."""
+        x, tip = jnp.arange(loops + 1.0), turn(q[0], 1.0, 0.0)
+        cranks = jnp.stack([x + tip[0] / 2, jnp.full_like(x, tip[1] / 2), jnp.full_like(x, q[0])], axis=1)
+        rods = jnp.stack([x + 0.5 + tip[0], jnp.full_like(x, tip[1]), jnp.zeros_like(x)], axis=1)[:-1]
+        return jnp.concatenate([cranks, rods])
+
+    bars = {f"crank {i}": bar(1.0, 1.0) for i in range(loops + 1)} | {f"rod {i}": bar(1.0, 1.0) for i in range(loops)}
+    hinges = [Hinge(GROUND, f"crank {i}", (float(i), 0.0)) for i in range(loops + 1)]
+    for i in range(loops):
+        hinges += [Hinge(a, f"rod {i}", (float(x), 1.0)) for a, x in ((f"crank {i}", i), (f"crank {i + 1}", i + 1))]
+    q, v = np.array([np.pi / 2]), np.array([-1.0])  # the tip of the first crank moves with 1 m/s
+    return Mechanism(f"{loops} four-bars", bars, tuple(hinges), poses, q, v, 2.0, 1.0, 64, gravity=9.81)
+
+
 def chain(bodies: int) -> Mechanism:
     """Bars of 1 kg and 1 m in a row, the first hinged to the ground, at rest under gravity."""
 
@@ -228,5 +249,6 @@ CASES: dict[str, Callable[[], Mechanism]] = {
     "engine": engine,
     "squeezer": squeezer,
     "four-bar": four_bar,
+    **{f"four-bars {n}": partial(four_bars, n) for n in (1, 10, 40)},
     **{f"chain {n}": partial(chain, n) for n in (1, 3, 10, 30, 100)},
 }

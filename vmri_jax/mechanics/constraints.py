@@ -80,7 +80,9 @@ def project_positions(system: System, t, q_s, q_f):
         g = constraints(q)
         return q - directions @ jnp.linalg.lstsq(jax.jacrev(constraints)(q) @ directions, g)[0]
 
-    q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)  # a loop compiles a fraction of what its passes would one by one
+    q = jax.lax.fori_loop(
+        0, PROJECTION_STEPS, corrected, q0
+    )  # a loop compiles a fraction of what its passes would one by one
     return q[:n_s], q[n_s:]
 
 
