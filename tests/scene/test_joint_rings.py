@@ -1,10 +1,20 @@
-"""Random closed loops in joint coordinates: the same mechanics as by directors."""
+"""Closed loops in joint coordinates, random ones and a slider-crank: the same mechanics and reaction forces as by directors."""
 
+import jax
+import numpy as np
 import pytest
 
 from tests.scene.random_trees import random_ring
-from tests.scene.test_joint_coordinates import assert_accelerates_as_by_directors
+from tests.scene.test_joint_coordinates import (
+    accelerations,
+    assert_accelerates_as_by_directors,
+    by_directors,
+    state_of,
+)
+from vmri_jax.mechanics.motion import reaction_force
+from vmri_jax.scene import Box, Gravity, Prismatic, Revolute, RigidBody, Scene
 
+X, _, Z = np.eye(3)
 GROUNDED = 3
 """Seed of a ring that the ground closes, with joints of three kinds."""
 
@@ -19,3 +29,59 @@ def test_bodies_of_random_rings_accelerate_as_by_directors(seed):
     scene = scene.with_joints({first: {freedom: start}})
     assert sum(scene.system().num_constraints(*scene.start[:2])) > 0
     assert_accelerates_as_by_directors(scene)
+
+
+def slider_crank():
+    """A crank that turns, a rod and a piston, in a plane."""
+    pin, wrist = np.array([0.3, 0.4, 0]), np.array([1.5, 0, 0])
+    bodies = [
+        RigidBody("crank", 2.0, Box((0.5, 0.1, 0.1)), pin / 2, [0, 0, np.arctan2(4, 3)], pace="slow"),
+        RigidBody("rod", 1.0, Box((1.26, 0.05, 0.05)), (pin + wrist) / 2, [0, 0, np.arctan2(-4, 12)], pace="slow"),
+        RigidBody("piston", 0.8, Box((0.2, 0.2, 0.2)), wrist, pace="slow"),
+    ]
+    joints = [
+        Revolute(("ground", "crank"), [0, 0, 0], axis=Z, name="bearing"),
+        Revolute(("crank", "rod"), pin, axis=Z, name="crank pin"),
+        Revolute(("rod", "piston"), wrist, axis=Z, name="wrist pin"),
+        Prismatic(("ground", "piston"), wrist, axis=X, name="cylinder"),
+    ]
+    scene = Scene(bodies, [Gravity([0, -9.81, 0]), *joints], coordinates="joint", redundant="drop")
+    return scene.with_rates({"bearing": 5.0})
+
+
+def test_reaction_forces_of_a_slider_crank():
+    """The balance of each body in joint coordinates, by the angles and accelerations alone, has the forces that multipliers give by directors.
+
+    Nine equations in the plane for eight unknowns: two forces in each hinge, a force and a moment in the cylinder.
+    """
+    scene, names = slider_crank(), ("crank", "rod", "piston")
+    moved = accelerations(scene, state_of(scene))
+    twin, state = by_directors(scene, moved)
+    centres = np.array([moved[name][0][:2] for name in names])
+    pins = np.array(
+        [[0, 0], 2 * centres[0], centres[2]]
+    )  # where the hinges are, of a crank whose centre is in its middle
+    equations, known = np.zeros((9, 8)), np.zeros(9)
+
+    def lever(pin, body):
+        """Of the moment of a force about the centre of a body."""
+        x, y = pins[pin] - centres[body]
+        return np.array([-y, x])
+
+    for body, name in enumerate(names):
+        q, _, a = moved[name]
+        turning = np.cross(q[3:].reshape(3, 3), a[3:].reshape(3, 3)).sum(axis=0)[2] / 2  # sum d_i x d_i'' / 2
+        made = scene.by_name[name]
+        known[3 * body : 3 * body + 3] = [made.mass * a[0], made.mass * (a[1] + 9.81), made.moments[2] * turning]
+        for pin, sign in ((body, 1.0), (body + 1, -1.0)):
+            if pin < 3:
+                equations[3 * body : 3 * body + 2, 2 * pin : 2 * pin + 2] = sign * np.eye(2)
+                equations[3 * body + 2, 2 * pin : 2 * pin + 2] = sign * lever(pin, body)
+    equations[7, 6] = equations[8, 7] = 1.0
+    forces, residual, *_ = np.linalg.lstsq(equations, known, rcond=None)
+    assert residual < 1e-20
+    force_of = jax.jit(reaction_force)
+    for joint, name, mine in (("crank pin", "rod", forces[2:4]), ("cylinder", "piston", [0.0, forces[6]])):
+        theirs, _ = force_of(twin.system(), state, np.asarray(twin.names.rows[joint]))
+        start = twin.places[name].start
+        np.testing.assert_allclose(theirs[start : start + 2], mine, atol=1e-8)  # N, values of 10 to 100
