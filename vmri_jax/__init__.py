@@ -5,6 +5,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from vmri_jax import diagnostics
+from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.configure import NotConfiguredWarning, configure
 from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.names import Names
@@ -14,7 +15,7 @@ from vmri_jax.running.batch import FailedLanesWarning, simulate_batch
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.lost_energy import LostEnergyWarning
 from vmri_jax.running.macro_step import macro_step
-from vmri_jax.running.simulate import Simulation, prepare, simulate
+from vmri_jax.running.simulation import Simulation, prepare
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes import quadrature

@@ -20,7 +20,7 @@ from vmri_jax.catalogue import SCHEMES, find_problem, find_scheme
 from vmri_jax.check import Outcome
 from vmri_jax.cli.run import _energy_balance
 from vmri_jax.running.quantities import Work
-from vmri_jax.running.simulate import Simulation
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.study import ReferenceSolution, WorkPrecision, families, reference_solution
 from vmri_jax.study.table import StudyInterrupted
 

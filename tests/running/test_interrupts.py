@@ -10,7 +10,7 @@ import pytest
 
 from vmri_jax import Interrupted, fully_explicit, simulate
 from vmri_jax.running.interrupts import interrupts_noted
-from vmri_jax.running.simulate import Simulation
+from vmri_jax.running.simulation import Simulation
 
 
 def interrupt():

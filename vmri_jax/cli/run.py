@@ -14,12 +14,12 @@ from rich.console import Console
 from rich.markup import escape
 
 from vmri_jax import plots
+from vmri_jax.accuracy.simulate import simulate as run_at_once
 from vmri_jax.catalogue import find_problem, find_scheme
 from vmri_jax.cli import options
 from vmri_jax.cli.common import PICTURES, RUN, check_target_file, console, plain_table, print_failure, refusals
 from vmri_jax.running.arguments import nothing_fast
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.simulate import simulate as run_at_once
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.newton import Newton

@@ -11,7 +11,7 @@ from vmri_jax.control.search import Point, Search
 from vmri_jax.control.transcription import Transcription
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.state import start_of
-from vmri_jax.running.simulate import prepare
+from vmri_jax.running.simulation import prepare
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import plan
 

@@ -13,7 +13,7 @@ from vmri_jax.ensembles.work import Work, all_groups
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.batch import lanes_at_once
-from vmri_jax.running.simulate import Simulation
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store.identity import changed_conditions, describe, differences, environment, identity
 from vmri_jax.steppers.results import Result
 

@@ -10,7 +10,7 @@ from vmri_jax.catalogue import imported
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.export import DIMENSIONS
-from vmri_jax.running.simulate import Simulation
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 
 LEVELS = (0.05, 0.5, 0.95)

@@ -20,7 +20,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import steps_until
 from vmri_jax.running.batch import simulate_batch
-from vmri_jax.running.simulate import Simulation, simulation
+from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.trajectory import STATUS, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme

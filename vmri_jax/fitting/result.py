@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.simulate import simulate
 from vmri_jax.running.trajectory import Trajectory
 
 UNDETERMINED = 1e-7

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vmri_jax.accuracy.simulate import simulate
 from vmri_jax.fitting.measured import Measured
 from vmri_jax.fitting.unknowns import Unknowns
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State, initial_state
-from vmri_jax.running.simulate import simulate
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton

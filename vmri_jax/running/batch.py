@@ -15,7 +15,7 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.engine import Engine
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import Working
-from vmri_jax.running.simulate import Simulation, simulation
+from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory, from_arrays
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme

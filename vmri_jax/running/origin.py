@@ -10,6 +10,7 @@ from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.settings import Settings
 
 
 class Origin(NamedTuple):
@@ -19,12 +20,14 @@ class Origin(NamedTuple):
     system: what moved; None of a run that was read from a file.
     params: parameters of the run, as of its system.
     lanes: whether these have a batch axis.
+    settings: scheme and steps, where they were chosen for an accuracy.
     """
 
     names: Names | None = None
     system: System | None = None
     params: Any = None
     lanes: bool = False
+    settings: Settings | None = None
 
     @classmethod
     def of(cls, what: System | Problem | HasProblem) -> "Origin":

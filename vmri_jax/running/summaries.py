@@ -10,7 +10,7 @@ from vmri_jax.mechanics.summary import coordinates, listed, numbers, summary
 from vmri_jax.steppers.results import Result
 
 if TYPE_CHECKING:
-    from vmri_jax.running.simulate import Simulation
+    from vmri_jax.running.simulation import Simulation
     from vmri_jax.running.trajectory import Trajectory
 
 
@@ -28,6 +28,8 @@ def summary_of(run: "Trajectory") -> tuple[str, dict[str, str]]:
         "status": statuses(np.asarray(run.result), np.asarray(run.failed_at)),
         **named_coordinates(run.origin.names, run),
         "energy": energy_in_words(energy, run.keeps_energy),
+        "chosen": "" if run.settings is None else str(run.settings),
+        "error": "" if run.error is None else run.error.in_words(),
         "constraints": _constraints(residual.reshape(-1, residual.shape[-1])),
         "solver": run.info.in_words(),
         "micro nodes": "" if run.t_micro is None else f"t_micro and q_f_micro, {run.t_micro.shape[-1]} per saved node",

@@ -11,7 +11,7 @@ from vmri_jax.running.engine import Engine
 from vmri_jax.running.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from vmri_jax.running.simulate import Simulation
+    from vmri_jax.running.simulation import Simulation
 
 
 def traced_run(run: "Simulation", adjoint: str) -> Trajectory:

@@ -17,6 +17,8 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import Exports
 from vmri_jax.running.files import replaced
 from vmri_jax.running.origin import Origin
+from vmri_jax.running.run_error import RunError
+from vmri_jax.running.settings import Settings
 from vmri_jax.running.summaries import summary_of
 from vmri_jax.steppers.results import Method, Result, Status
 
@@ -25,7 +27,9 @@ NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 """Fields with one entry per saved node; all others but `STATUS` have one per saved interval."""
 STATUS = ("result", "failed_at")
 MICRO = ("t_micro", "q_f_micro")
-"""Fields that may be None."""
+"""Fields with one entry per saved interval that may be None."""
+ERROR = tuple(f"error_{name}" for name in RunError._fields)
+"""The estimated error, which may be None, as arrays."""
 STATUS_ARRAYS = jax.Array, np.ndarray
 """What the status of a run comes as."""
 
@@ -71,6 +75,7 @@ class Trajectory(Exports, eqx.Module):
             asked for.
         result: status of the run, the number of a `Result`, as which it prints; the first that was no success.
         failed_at: index of the macro step that failed, -1 if none did.
+        error: estimated error of the positions, a `RunError`; None unless asked for.
     """
 
     t: Float[Numbers, "k"]
@@ -85,6 +90,7 @@ class Trajectory(Exports, eqx.Module):
     failed_at: Int[Numbers, ""]
     t_micro: Float[Numbers, "k-1 num_micro"] = None
     q_f_micro: Float[Numbers, "k-1 num_micro n_f"] = None
+    error: RunError | None = None
 
     def __repr__(self) -> str:
         fields = [getattr(self, name) for name in (*NODES, *STATUS)]
@@ -95,6 +101,11 @@ class Trajectory(Exports, eqx.Module):
     @property
     def origin(self) -> Origin:
         return vars(self).get("_origin", Origin())
+
+    @property
+    def settings(self) -> Settings | None:
+        """Scheme and steps of a run with an accuracy, for which they were chosen."""
+        return self.origin.settings
 
     def of(self, what: System | Problem | HasProblem | Origin) -> "Trajectory":
         """The same run, which knows what it is of: its system, and the names of its parts.
@@ -133,7 +144,9 @@ class Trajectory(Exports, eqx.Module):
         if not is_concrete(self.energy):
             raise TypeError("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
         first, last, stride = ends_of("Trajectory", nodes, len(self))
-        return from_named_arrays(part_of(named_arrays(self), first, last, stride)).of(self.origin)
+        part = from_named_arrays(part_of(named_arrays(self), first, last, stride)).of(self.origin)
+        error = None if self.error is None else self.error.part(slice(first, last + 1, stride))
+        return know(part, self.origin, {"error": error})
 
     def lane(self, i: int) -> "Trajectory":
         """One run of a batch.
@@ -216,7 +229,7 @@ class Trajectory(Exports, eqx.Module):
         for name in ("drawing", "slow_names", "fast_names"):
             arrays.pop(name, None)
         missing = _FIELDS - set(arrays) - set(MICRO)
-        if missing or set(arrays) - _FIELDS:
+        if missing or set(arrays) - _FIELDS - set(ERROR):
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
@@ -270,7 +283,8 @@ def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
         starts = range(0, last - first, stride)
         return np.maximum.reduceat(between, starts, axis=len(lanes)) if starts else between
 
-    found: dict = {name: None if a is None else part(name, a) for name, a in arrays.items() if name not in STATUS}
+    aside = (*STATUS, *ERROR)
+    found: dict = {name: None if a is None else part(name, a) for name, a in arrays.items() if name not in aside}
     failed = np.isnan(found["energy"]).any(axis=-1)
     before = (np.asarray(arrays["failed_at"]) >= 0) & ~failed
     found["failed_at"] = np.where(before, -1, arrays["failed_at"])
@@ -299,13 +313,15 @@ def join(pieces: list[Trajectory]) -> Trajectory:
 def named_arrays(trajectory: Trajectory) -> dict:
     """All arrays of a trajectory by name, those of `info` among them; None for what was not asked for."""
     fields = {field.name: getattr(trajectory, field.name) for field in dataclasses.fields(trajectory)}
-    return fields | fields.pop("info")._asdict()
+    info, error = fields.pop("info"), fields.pop("error")
+    return fields | info._asdict() | ({} if error is None else dict(zip(ERROR, error, strict=True)))
 
 
 def from_named_arrays(arrays: dict) -> Trajectory:
     """The inverse of `named_arrays`; those that may be None may be absent."""
     info = RunInfo(**{name: arrays.pop(name) for name in RunInfo._fields})
-    return Trajectory(**arrays, info=info)
+    errors = [arrays.pop(name, None) for name in ERROR]
+    return Trajectory(**arrays, info=info, error=None if errors[0] is None else RunError(*errors))
 
 
 def from_arrays(arrays: list) -> Trajectory:
@@ -313,7 +329,7 @@ def from_arrays(arrays: list) -> Trajectory:
     return jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
 
 
-_FIELDS = {field.name for field in dataclasses.fields(Trajectory)} - {"info"} | set(RunInfo._fields)
+_FIELDS = {field.name for field in dataclasses.fields(Trajectory)} - {"info", "error"} | set(RunInfo._fields)
 _ONE = np.zeros(())
 _STRUCTURES = {
     len(jax.tree.leaves(trajectory)): jax.tree.structure(trajectory)

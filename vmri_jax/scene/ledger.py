@@ -17,7 +17,7 @@ from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.summary import name_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.printed import PrintedTable
-from vmri_jax.running.simulate import Simulation, prepare
+from vmri_jax.running.simulation import Simulation, prepare
 from vmri_jax.running.timing import interleaved, seconds_each
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.sorting import Sorting

@@ -143,6 +143,10 @@ class Composition(eqx.Module):
         """
         return _order(np.asarray(self.coefficients), self.scheme.order, self.scheme.is_symmetric)
 
+    def with_num_micro(self, num_micro: int) -> "Composition":
+        """The same composition of a scheme with another number of micro steps in every stage."""
+        return Composition(self.scheme.with_num_micro(num_micro), self.coefficients)
+
     def describe(self) -> Description:
         """As of a `Scheme`; the rules are those of a stage."""
         return self.scheme.describe().repeated(self.num_stages, self.order, self.is_symmetric)

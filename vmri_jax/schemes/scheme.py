@@ -124,6 +124,10 @@ class Scheme(eqx.Module):
         """(num_micro,) ends of the micro steps in units of the macro step."""
         return np.arange(1, self.num_micro + 1) / self.num_micro
 
+    def with_num_micro(self, num_micro: int) -> "Scheme":
+        """The same rules with another number of micro steps."""
+        return replace(self, num_micro=num_micro)
+
     def describe(self) -> "Description":
         """Rules, order, symmetry, evaluations and solves per macro step; prints as a table.
 

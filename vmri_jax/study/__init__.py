@@ -1,10 +1,10 @@
 """Studies of schemes: convergence, work and precision, advice, computing time."""
 
+from vmri_jax.accuracy.families import Family, families
 from vmri_jax.study.advisor import Recommendation, recommend
 from vmri_jax.study.convergence import ConvergenceRow, ConvergenceStudy, convergence_study
 from vmri_jax.study.cost import CostRow, CostStudy, cost_study
 from vmri_jax.study.cost_report import CostReport, cost_report
-from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable, StudyInterrupted

@@ -16,12 +16,12 @@ import jax
 import numpy as np
 
 from vmri_jax import diagnostics
+from vmri_jax.accuracy.families import Family, families
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study.families import Family, families
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import ResultTable, StudyInterrupted

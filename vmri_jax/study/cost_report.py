@@ -16,13 +16,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from vmri_jax import diagnostics, plots
+from vmri_jax.accuracy.families import Family, families
 from vmri_jax.mechanics.invariants import potentials
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import Progress, part, silent
 from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.advisor import MARGIN, Search, Setting, round_off
-from vmri_jax.study.families import Family, families
 from vmri_jax.study.html import embedded, write_page
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable

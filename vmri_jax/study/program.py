@@ -8,7 +8,7 @@ import numpy as np
 
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.arguments import check_run
-from vmri_jax.running.simulate import Simulation, prepare
+from vmri_jax.running.simulation import Simulation, prepare
 from vmri_jax.running.timing import MIN_SECONDS, interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition

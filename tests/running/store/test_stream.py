@@ -25,7 +25,7 @@ from vmri_jax import (
     fully_implicit,
     simulate,
 )
-from vmri_jax.running.simulate import Simulation
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.trajectory import join
 

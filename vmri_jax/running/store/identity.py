@@ -14,7 +14,7 @@ import numpy as np
 from vmri_jax.mechanics.functions import TracedOnce, with_time
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import KineticFunction, System
-from vmri_jax.running.simulate import Simulation
+from vmri_jax.running.simulation import Simulation
 
 IN_FULL = 8
 """Arrays of so many numbers are compared in sight, larger ones by a digest."""

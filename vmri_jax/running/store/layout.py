@@ -32,7 +32,7 @@ import numpy as np
 
 from vmri_jax.running.export import DIMENSIONS, FILL, rows_of
 from vmri_jax.running.files import made_beside, replaced, synchronize
-from vmri_jax.running.simulate import Checkpoint
+from vmri_jax.running.simulation import Checkpoint
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
 

@@ -13,7 +13,7 @@ from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.files import check_writable, clear_partial
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, Working, progress_shown
-from vmri_jax.running.simulate import Simulation, simulation
+from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import changed_conditions, differences, environment, identity
 from vmri_jax.running.store.layout import Record

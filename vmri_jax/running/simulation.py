@@ -1,4 +1,4 @@
-"""Many macro steps: one compiled nested scan, with a status per step and nothing lost when one fails."""
+"""A run whose arguments have been checked, and its programs: at once, or in pieces that runs of all lengths share."""
 
 import warnings
 from collections.abc import Callable
@@ -12,23 +12,20 @@ import numpy as np
 
 from vmri_jax.configure import warn_if_slow
 from vmri_jax.mechanics.arrays import is_concrete, of_one_type
-from vmri_jax.mechanics.checks import check_closures, check_flags, check_params, check_system
+from vmri_jax.mechanics.checks import check_closures, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.adjoints import check_adjoint
 from vmri_jax.running.arguments import check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Engine, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import Working, progress_shown
 from vmri_jax.running.saved import room_of_a_piece
 from vmri_jax.running.summaries import summary_of_prepared
-from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -43,120 +40,6 @@ FALLING_BACK = (
     "a step that the first method does not solve: the run is made again with exact matrices, compiled if they are new"
 )
 """What a run says of itself when it takes long."""
-
-
-def simulate(
-    system: Movable,
-    scheme: Scheme | Composition,
-    state: State | None = None,
-    *,
-    macro_dt=None,
-    micro_dt=None,
-    num_steps: int | None = None,
-    t_end: float | None = None,
-    save_every: int = 1,
-    save_micro: bool = False,
-    newton: Newton | None = None,
-    throw: bool = True,
-    progress: bool = False,
-    adjoint: str = "auto",
-) -> Trajectory:
-    """Simulate `num_steps` macro steps, or up to `t_end`, and save every `save_every`-th macro node.
-
-        run = vm.simulate(problem, vm.fully_implicit(10), macro_dt=0.01, t_end=10.0)
-
-    Compiled once per system structure and scheme structure: step sizes, parameters, rule weights, initial states, numbers of steps and of
-    saved nodes may vary without compiling again. Works under ``jax.vmap`` over state,
-    params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised, and names
-    work inside of the function that is transformed: ``run.position("load")``.
-    Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "nested".
-
-    Args:
-        system: what moves and where it starts, a `Problem` or a scene; or a `System`, with a state.
-        scheme: how.
-        state: start, from `initial_state` or a former run; None for that of the problem.
-        macro_dt, micro_dt: step size, exactly one of them (``macro_dt = num_micro * micro_dt``).
-        num_steps, t_end: macro steps, a multiple of `save_every`, or the time that they end at; exactly one of them.
-        save_every: macro steps from one saved node to the next.
-        save_micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
-        newton: how implicit equations are solved.
-        throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
-            NaN from the failure on.
-        progress: show a progress bar. Without it a run that takes more than two seconds says so by a line now and then.
-        adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
-            "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
-
-    A run of a system that keeps its energy is told about by a `LostEnergyWarning` if the energy has changed by half of the largest kinetic energy.
-
-    Returns:
-        The `Trajectory`, with ``num_steps / save_every + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
-        the step number k, never accumulated.
-
-    Raises:
-        ValueError, TypeError: bad arguments, before anything is computed.
-        SimulationError: a step failed.
-        Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
-    """
-    check_flags(throw=throw, progress=progress)
-    check_adjoint(adjoint, scheme)
-    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
-    if not run.is_concrete:
-        check_system(run.system, run.state.q_s, run.state.q_f)
-        return know(traced_run(run, adjoint), run.origin)
-    run.check()
-    check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
-    trajectory = run.in_pieces(progress)
-    if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
-        check_constraints(run.system, run.state, "simulate: the state")
-    if throw and int(trajectory.failed_at) >= 0:
-        raise simulation_error(trajectory, run.macro_dt, save_every, scheme.num_micro)
-    lost = lost_energy(trajectory, float(run.macro_dt)) if int(trajectory.failed_at) < 0 else ""
-    if lost:
-        warnings.warn(f"simulate: {lost}", LostEnergyWarning, stacklevel=2)
-    return trajectory
-
-
-def prepare(
-    system: Movable,
-    scheme: Scheme | Composition,
-    state: State | None = None,
-    *,
-    macro_dt=None,
-    micro_dt=None,
-    num_steps: int | None = None,
-    t_end: float | None = None,
-    save_every: int = 1,
-    save_micro: bool = False,
-    newton: Newton | None = None,
-) -> "Simulation":
-    """Check and compile what `simulate` would run, to be run again and again.
-
-        run = vm.prepare(system, scheme, state, macro_dt=0.01, num_steps=1000, save_every=10)
-        trajectory = run()
-        other = run(other_state, macro_dt=0.02, params=other_params)
-
-    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The
-    fallback of the method "auto" is not compiled here, but by the first call that needs it, which says so and takes as long as this.
-    Arguments as of `simulate`.
-
-    Returns:
-        The `Simulation`.
-
-    Raises:
-        ValueError, TypeError: bad arguments, as of `simulate`.
-    """
-    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
-    if not run.is_concrete:
-        raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
-    run.check()
-    check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
-    leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
-    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start)
-    with Working("prepare: compiling the run"):
-        jax.block_until_ready(
-            run._program(False)(leaves, run.start_arrays, macro_dt, 0, 0)
-        )  # no steps: it only compiles
-    return run
 
 
 class Checkpoint(NamedTuple):
@@ -279,6 +162,12 @@ class Simulation:
     def __repr__(self) -> str:
         return summary_of_prepared(self)
 
+    def with_scheme(self, scheme: Scheme | Composition) -> "Simulation":
+        """The same run by another scheme."""
+        newton, scheme, system = of_one_type((self.newton, scheme, self.system))
+        leaves, structure = jax.tree.flatten((newton, scheme, system))
+        return replace(self, system=system, scheme=scheme, newton=newton, leaves=leaves, structure=structure)
+
     @property
     def num_saves(self) -> int:
         """Saved intervals."""
@@ -383,6 +272,49 @@ class Simulation:
     def _joined(self, pieces: list[Trajectory]) -> Trajectory:
         """One run, as arrays of JAX; `jax.numpy.asarray` would compile a program for every length."""
         return know(jax.device_put(join(pieces)), self.origin)
+
+
+def prepare(
+    system: Movable,
+    scheme: Scheme | Composition,
+    state: State | None = None,
+    *,
+    macro_dt=None,
+    micro_dt=None,
+    num_steps: int | None = None,
+    t_end: float | None = None,
+    save_every: int = 1,
+    save_micro: bool = False,
+    newton: Newton | None = None,
+) -> "Simulation":
+    """Check and compile what `simulate` would run, to be run again and again.
+
+        run = vm.prepare(system, scheme, state, macro_dt=0.01, num_steps=1000, save_every=10)
+        trajectory = run()
+        other = run(other_state, macro_dt=0.02, params=other_params)
+
+    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The
+    fallback of the method "auto" is not compiled here, but by the first call that needs it, which says so and takes as long as this.
+    Arguments as of `simulate`.
+
+    Returns:
+        The `Simulation`.
+
+    Raises:
+        ValueError, TypeError: bad arguments, as of `simulate`.
+    """
+    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    if not run.is_concrete:
+        raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
+    run.check()
+    check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
+    leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
+    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start)
+    with Working("prepare: compiling the run"):
+        jax.block_until_ready(
+            run._program(False)(leaves, run.start_arrays, macro_dt, 0, 0)
+        )  # no steps: it only compiles
+    return run
 
 
 def simulation(

@@ -17,12 +17,14 @@ class Family:
     name: in tables and figures.
     make: the scheme with so many micro steps (per stage, in a composition).
     options: the same on the command line.
+    python: the same in a program, with ``{}`` for num_micro.
     first: the num_micro that a search tries first.
     """
 
     name: str
     make: Callable[[int], Scheme | Composition]
     options: str
+    python: str
     first: int = 5
 
     def composed(self, coefficients: str) -> "Family":
@@ -31,7 +33,8 @@ class Family:
         def make(num_micro: int) -> Composition:
             return compose(self.make(num_micro), coefficients)
 
-        return Family(f"{self.name}, {coefficients}", make, f"{self.options} --compose {coefficients}")
+        options, python = f"{self.options} --compose {coefficients}", f'vm.compose({self.python}, "{coefficients}")'
+        return Family(f"{self.name}, {coefficients}", make, options, python)
 
     def label(self, num_micro: int) -> str:
         """With num_micro."""
@@ -55,15 +58,23 @@ def families(
         compositions: their names, see `vmri_jax.compose`.
         degrees: of the Galerkin schemes, which have Lobatto quadrature.
     """
-    bases = [
-        Family("fully explicit", fully_explicit, "--scheme fully-explicit"),
-        Family("explicit slow", explicit_slow, "--scheme explicit-slow"),
-        Family("fully implicit", fully_implicit, "--scheme fully-implicit"),
-        Family("takahashi imada", takahashi_imada, "--scheme takahashi-imada"),
-    ]
+    bases = [of_order_2(make) for make in (fully_explicit, explicit_slow, fully_implicit, takahashi_imada)]
     menu = bases + [base.composed(name) for base in bases[:2] for name in compositions]
-    for degree in degrees:
-        make = partial(galerkin, degree=degree, rule="lobatto")
-        first = 1 if degree > 2 else Family.first  # high degrees resolve the fast variables with a single interval
-        menu.append(Family(f"galerkin {degree}", make, f"--scheme galerkin --degree {degree} --rule lobatto", first))
-    return menu
+    return menu + [of_degree(degree) for degree in degrees]
+
+
+def of_order_2(make: Callable[[int], Scheme]) -> Family:
+    """The family of one of the schemes of order 2, which are made from num_micro alone."""
+    name = make.__name__
+    return Family(name.replace("_", " "), make, f"--scheme {name.replace('_', '-')}", f"vm.{name}({{}})")
+
+
+def of_degree(degree: int) -> Family:
+    """The Galerkin schemes of a degree, with Lobatto quadrature."""
+    return Family(
+        f"galerkin {degree}",
+        partial(galerkin, degree=degree, rule="lobatto"),
+        f"--scheme galerkin --degree {degree} --rule lobatto",
+        f'vm.galerkin({{}}, {degree}, "lobatto")',
+        1 if degree > 2 else Family.first,  # high degrees resolve the fast variables with a single interval
+    )

@@ -1,0 +1,1 @@
+"""The error of a run, and the steps that keep it."""

@@ -1,0 +1,177 @@
+"""The error of a run and its slow and fast shares, from two companion runs.
+
+A run with macro steps H and micro steps h = H / N has, with a scheme of order p, the error
+
+    x_{H,h}(t) - x(t) = S(t) H^p + F(t) h^p + ...
+
+Its slow share ``S H^p`` is the part that smaller macro steps with the same micro step take away, its fast share ``F h^p`` the part that
+more micro steps take away. Two companions from the same start separate them, with ``r = 2^p / (2^p - 1)`` (Richardson's extrapolation):
+
+    half the macro step:        S H^p + F h^p = r (x_{H,h} - x_{H/2,h/2})
+    twice the micro steps:              F h^p = r (x_{H,h} - x_{H,h/2})
+
+Where a scheme does not reach its order p, as on vibrations that its steps do not resolve, the first estimate is wrong by at most the factor
+``(2^p - 1) / (2^q - 1)`` of the order q that it has. Positions that are wrong by a good part of the whole motion are not certified.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from vmri_jax.running.run_error import RunError, largest_of
+from vmri_jax.running.simulation import Simulation
+from vmri_jax.running.trajectory import RunInfo, Trajectory, know
+from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.results import Result
+
+LARGEST_CERTIFIED = 0.1
+"""Part of the extent of the motion: from the first node on whose estimated error is above it no error is certified. Beyond it the leading
+term of the error is not the error; a larger part certifies numbers that mean nothing."""
+FASTER_THAN_POWERS = 32.0
+"""Growth of the error from half of a time to that time, above which the motion is called chaotic. Errors of regular motions grow like t or
+t^2, by 2 or 4; those of a chaotic motion like exp(L t). A larger growth overlooks chaos that begins late."""
+
+
+class UncertifiedWarning(UserWarning):
+    """The error of a run is not certified over all of its length."""
+
+
+def with_error(run: Simulation, trajectory: Trajectory, of: Callable | None = None) -> Trajectory:
+    """The same trajectory with its `RunError`; warns where it is not certified over the whole run.
+
+    Args:
+        run: that the trajectory is of, without a failure.
+        trajectory: its nodes.
+        of: function of a run, whose error is estimated too.
+    """
+    halved = companion(run, run.scheme, 2)
+    if int(halved.failed_at) >= 0:
+        warnings.warn(
+            f"simulate: the error is not known; the same run with half the macro step failed at t = {_failure(halved, run):.4g}.",
+            UncertifiedWarning,
+            stacklevel=3,
+        )
+        return trajectory
+    scheme = run.scheme
+    refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1)
+    total, fast = extrapolated(scheme, trajectory, halved), extrapolated(scheme, trajectory, refined)
+    certified, growth = certified_nodes(trajectory, total)
+    until = np.asarray(trajectory.t)[certified][-1]
+    total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
+    of_error = None if of is None else ratio(scheme) * (np.asarray(of(trajectory)) - np.asarray(of(halved)))
+    parts = np.split(total, [trajectory.q_s.shape[-1]], axis=1)
+    error = RunError(*parts, largest_of(slow), largest_of(fast), of_error, np.asarray(until), np.asarray(growth))
+    if not certified.all():
+        warnings.warn(f"simulate: {_uncertified(error, trajectory)}", UncertifiedWarning, stacklevel=3)
+    return know(replace(trajectory, error=error), trajectory.origin)
+
+
+def ratio(scheme: Scheme | Composition) -> float:
+    """``r = 2^p / (2^p - 1)`` of a scheme of order p."""
+    return 1.0 / (1.0 - 2.0**-scheme.order)
+
+
+def extrapolated(scheme: Scheme | Composition, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
+    """(k, n_s + n_f) the part of the error of the positions that a companion with steps half as long takes away, in the limit."""
+    return ratio(scheme) * (_positions(trajectory) - _positions(finer))
+
+
+def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarray, float]:
+    """(k,) which nodes have a certified error, and the growth of the error in the second half of their time.
+
+    Args:
+        trajectory: the run.
+        error: (k, n_s + n_f) of its positions.
+    """
+    t, extent = np.asarray(trajectory.t), extent_of(trajectory)
+    envelope = np.maximum.accumulate(largest_of(error))
+    certified = envelope <= LARGEST_CERTIFIED * extent if extent > 0 else np.isfinite(envelope)
+    certified[0] = True
+    last = np.flatnonzero(certified)[-1]
+    half = np.searchsorted(t, (t[0] + t[last]) / 2)
+    return certified, float(envelope[last] / envelope[half]) if envelope[half] > 0 else 1.0
+
+
+def extent_of(trajectory: Trajectory) -> float:
+    """Largest way of a coordinate from its smallest to its largest value in a run."""
+    return float(np.ptp(_positions(trajectory), axis=0).max(initial=0.0))
+
+
+def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> None:
+    """Refuse a function of a run that does not return numbers; it is tried on a run that rests at the start.
+
+    Args:
+        of, error: as of `simulate`.
+        run: that they are given with.
+
+    Raises:
+        TypeError: no function, or one that returns something else than numbers.
+        ValueError: a function without ``error=True``.
+    """
+    if of is None:
+        return
+    if not error:
+        raise ValueError("simulate: of is the function whose error is estimated; give error=True with it.")
+    if not callable(of):
+        raise TypeError(f"simulate: of is {of!r}; give a function of a run, such as lambda run: run.q_f[:, 0].")
+    value = of(resting(run))
+    if np.asarray(value).dtype.kind not in "fiu":
+        raise TypeError(f"simulate: of returned {value!r} for a run; it must return a number or an array of numbers.")
+
+
+def resting(run: Simulation) -> Trajectory:
+    """A run of the same nodes that stays at the start: for a look at functions of runs."""
+    start, k = run.state, run.num_saves + 1
+    nodes = {name: np.repeat(np.asarray(value)[None], k, axis=0) for name, value in vars(start).items()}
+    nodes["t"] = start.t + np.arange(k) * run.save_every * run.macro_dt
+    none = np.zeros(k - 1, int)
+    micro = run.scheme.num_micro
+    inside = {"t_micro": np.zeros((k - 1, micro)), "q_f_micro": np.zeros((k - 1, micro, len(start.q_f)))}
+    arrays = nodes | (inside if run.save_micro else {})
+    info = RunInfo(none, none, np.zeros(k - 1))
+    status = {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
+    residual = np.zeros((k, 2))
+    return know(Trajectory(**arrays, energy=np.zeros(k), constraint_residual=residual, info=info, **status), run.origin)
+
+
+def companion(run: Simulation, scheme: Scheme | Composition, parts: int) -> Trajectory:
+    """The same run with another scheme, each macro step in equal parts, at the same saved nodes; it may fail."""
+    finer = replace(
+        run,
+        macro_dt=run.macro_dt / parts,
+        num_steps=run.num_steps * parts,
+        save_every=run.save_every * parts,
+        save_micro=False,
+    )
+    return (finer if scheme is run.scheme else finer.with_scheme(scheme)).in_pieces()
+
+
+def _positions(trajectory: Trajectory) -> np.ndarray:
+    """(k, n_s + n_f)"""
+    return np.concatenate([trajectory.q_s, trajectory.q_f], axis=1)
+
+
+def _failure(trajectory: Trajectory, run: Simulation) -> float:
+    """Time of the step of a run with half the macro step that failed."""
+    return float(trajectory.t[0]) + int(trajectory.failed_at) * float(run.macro_dt) / 2
+
+
+def _uncertified(error: RunError, trajectory: Trajectory) -> str:
+    """Why, and what to do."""
+    t = float(error.certified_until)
+    energy = np.asarray(trajectory.energy)
+    kept = (
+        f" The energy has changed by at most {np.abs(energy - energy[0]).max():.1e}." if trajectory.keeps_energy else ""
+    )
+    if float(error.growth) > FASTER_THAN_POWERS:
+        return (
+            f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the time until t = {t:.4g}: "
+            f"from there on an error of positions means nothing.{kept}"
+        )
+    return (
+        f"from t = {t:.4g} on positions are wrong by more than {LARGEST_CERTIFIED:.0%} of the extent of the motion, and no error is "
+        f"certified; take smaller steps, or a scheme of higher order.{kept}"
+    )

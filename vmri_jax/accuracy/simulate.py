@@ -1,0 +1,137 @@
+"""Runs: `simulate` and `prepare`."""
+
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+from vmri_jax.accuracy.companions import check_function_of_run, with_error
+from vmri_jax.accuracy.steps import with_accuracy
+from vmri_jax.mechanics.arrays import whole_number
+from vmri_jax.mechanics.checks import check_flags, check_system
+from vmri_jax.mechanics.constraints import check_constraints
+from vmri_jax.mechanics.state import Movable, State
+from vmri_jax.running.adjoints import check_adjoint
+from vmri_jax.running.failures import simulation_error
+from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
+from vmri_jax.running.memory import check_memory
+from vmri_jax.running.simulation import simulation
+from vmri_jax.running.traced import traced_run
+from vmri_jax.running.trajectory import Trajectory, know
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
+
+
+def simulate(
+    system: Movable,
+    scheme: Scheme | Composition | None = None,
+    state: State | None = None,
+    *,
+    macro_dt=None,
+    micro_dt=None,
+    num_steps: int | None = None,
+    t_end: float | None = None,
+    save_every: int = 1,
+    save_micro: bool = False,
+    newton: Newton | None = None,
+    throw: bool = True,
+    progress: bool = False,
+    adjoint: str = "auto",
+    error: bool = False,
+    of: Callable[[Trajectory], Any] | None = None,
+    accuracy: float | None = None,
+    num_saves: int | None = None,
+) -> Trajectory:
+    """Simulate `num_steps` macro steps, or up to `t_end`, and save every `save_every`-th macro node.
+
+        run = vm.simulate(problem, vm.fully_implicit(10), macro_dt=0.01, t_end=10.0)
+        run = vm.simulate(problem, accuracy=1e-5, t_end=10.0)
+
+    With an accuracy the steps, and without a scheme the scheme, are chosen by trial runs, see `vmri_jax.accuracy.steps`; the choice is
+    ``run.settings``, and ``run.error`` tells the error of the run.
+
+    Compiled once per system structure and scheme structure: step sizes, parameters, rule weights, initial states, numbers of steps and of
+    saved nodes may vary without compiling again. Works under ``jax.vmap`` over state,
+    params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised, and names
+    work inside of the function that is transformed: ``run.position("load")``.
+    Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "nested".
+
+    Args:
+        system: what moves and where it starts, a `Problem` or a scene; or a `System`, with a state.
+        scheme: how; None for one that is chosen, with an accuracy.
+        state: start, from `initial_state` or a former run; None for that of the problem.
+        macro_dt, micro_dt: step size, exactly one of them (``macro_dt = num_micro * micro_dt``).
+        num_steps, t_end: macro steps, a multiple of `save_every`, or the time that they end at; exactly one of them.
+        save_every: macro steps from one saved node to the next.
+        save_micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
+        newton: how implicit equations are solved.
+        throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
+            NaN from the failure on.
+        progress: show a progress bar. Without it a run that takes more than two seconds says so by a line now and then.
+        adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
+            "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
+        error: estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`. It takes two more runs: one with
+            half the macro step, one with twice the micro steps, which is compiled for itself.
+        of: with `error`, a function of a run whose error is estimated too, ``run.error.of``: it returns numbers, such as
+            ``lambda run: run.position("load")``.
+        accuracy: largest error of a position at a saved node, in the unit of the positions; in place of step sizes, with `t_end`.
+        num_saves: with an accuracy, saved intervals, equally spaced; None for at most a thousand.
+
+    A run of a system that keeps its energy is told about by a `LostEnergyWarning` if the energy has changed by half of the largest kinetic energy.
+
+    Returns:
+        The `Trajectory`, with ``num_steps / save_every + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
+        the step number k, never accumulated.
+
+    Raises:
+        ValueError, TypeError: bad arguments, before anything is computed.
+        SimulationError: a step failed.
+        Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
+    """
+    check_flags(throw=throw, progress=progress, error=error)
+    if accuracy is not None:
+        steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
+        _check_chosen(steps, t_end, save_every, save_micro, num_saves)
+        run, trajectory, settings = with_accuracy(system, scheme, state, newton, accuracy, t_end, num_saves)
+        trajectory = know(trajectory, trajectory.origin._replace(settings=settings))
+        return with_error(run, trajectory, of) if error else trajectory
+    if scheme is None or num_saves is not None:
+        missing = "scheme is None" if scheme is None else f"num_saves is {num_saves}"
+        raise ValueError(
+            f"simulate: {missing} without an accuracy; give accuracy=1e-5 with it, or a scheme and save_every."
+        )
+    check_adjoint(adjoint, scheme)
+    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    if not run.is_concrete:
+        if error:
+            raise ValueError(
+                "simulate: error=True compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
+            )
+        check_system(run.system, run.state.q_s, run.state.q_f)
+        return know(traced_run(run, adjoint), run.origin)
+    run.check()
+    check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
+    check_function_of_run(of, error, run)
+    trajectory = run.in_pieces(progress)
+    if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
+        check_constraints(run.system, run.state, "simulate: the state")
+    if throw and int(trajectory.failed_at) >= 0:
+        raise simulation_error(trajectory, run.macro_dt, save_every, scheme.num_micro)
+    lost = lost_energy(trajectory, float(run.macro_dt)) if int(trajectory.failed_at) < 0 else ""
+    if lost:
+        warnings.warn(f"simulate: {lost}", LostEnergyWarning, stacklevel=2)
+    return with_error(run, trajectory, of) if error and int(trajectory.failed_at) < 0 else trajectory
+
+
+def _check_chosen(steps: dict[str, Any], t_end, save_every: int, save_micro: bool, num_saves) -> None:
+    """Refuse arguments of steps beside an accuracy, from which the steps follow."""
+    given = [name for name, value in steps.items() if value is not None]
+    given += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro
+    if given:
+        raise ValueError(
+            f"simulate: got {' and '.join(given)} with an accuracy, from which the steps follow; leave one of them out."
+        )
+    if t_end is None:
+        raise ValueError("simulate: an accuracy needs t_end, the time until which it is to be kept.")
+    if num_saves is not None:
+        whole_number("simulate: num_saves", num_saves)

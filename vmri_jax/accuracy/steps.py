@@ -1,0 +1,292 @@
+"""Steps for an accuracy: H and num_micro of a scheme, and the scheme from a small menu, by the errors of trial runs.
+
+A trial is a run over the whole time with large macro steps, and one with half of them; their difference is its error e, see
+`vmri_jax.accuracy.companions`. A scheme of order p keeps the error ``eps`` in
+
+    n = n_trial (e / eps)^(1 / p)
+
+macro steps. With the slow share ``S H^p`` and the fast share ``F (H/N)^p`` of e, and a time of ``a + b N`` for a macro step of N micro
+steps, the least time for an error is reached with
+
+    N^(p + 1) = (a / b) (F / S),
+
+where the time that is spent on each grid goes with the share that it leaves.
+"""
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vmri_jax.accuracy.companions import certified_nodes, companion, extent_of, extrapolated
+from vmri_jax.accuracy.families import Family, of_degree, of_order_2
+from vmri_jax.mechanics.checks import check_number
+from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.mechanics.system import System
+from vmri_jax.running.run_error import largest_of
+from vmri_jax.running.settings import Settings
+from vmri_jax.running.simulation import Simulation, simulation
+from vmri_jax.running.timing import seconds_per_call
+from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
+from vmri_jax.stability.linear import small_motions
+from vmri_jax.stability.multipliers import multipliers
+from vmri_jax.steppers.newton import Newton
+
+AIM = 0.5
+"""Part of the accuracy that steps are chosen for. Trials predict errors of finer runs to about a factor of 2; with a larger part more runs
+miss the accuracy and are made again, with a smaller one all take more steps."""
+SAVED = 1000
+"""Most saved nodes of a run whose number of steps is chosen; more make long runs fill the memory."""
+FEWEST_STEPS, FIRST_MICRO = 16, 5
+"""Macro steps and micro steps of first trials; trials that do not see the motion are made again with twice the steps."""
+MOST_STEPS = 2**22
+"""Macro steps of the longest run that is tried. A larger number lets searches for what cannot be reached take minutes."""
+LONGEST = 20.0
+"""Seconds of a run and its companion, compiling included, after which steps are not halved further. A larger value makes a search for
+an error that cannot be certified, as of chaotic motion, take longer."""
+MOST_MICRO = 64
+"""Most micro steps that are chosen; more save little where slow forces are not a hundred times as dear as fast ones."""
+SAME = 1.3
+"""Factor within which two numbers of micro steps cost the same: the second is not compiled. A larger one misses savings."""
+REPEATS = 5
+"""Runs after the first one that may miss the accuracy before the search gives up."""
+RESONANT = 1e-6
+"""Growth of disturbances in a macro step above which a step is resonant, see `vmri_jax.stability.advise`."""
+SHORTER = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
+"""Macro steps that are looked at for one without resonance, in units of the one that accuracy asks for."""
+
+
+COMPOSED = ((2.5, None), (5.0, "suzuki4"), (8.0, "kahan-li6"), (np.inf, "kahan-li8"))
+"""Compositions by the digits of accuracy up to which they are taken: higher orders need fewer steps for many digits, and more for few."""
+ROUNDOFF = 100 * np.finfo(float).eps
+"""Part of the largest position below which errors are round-off."""
+
+
+class AccuracyNotReached(UserWarning):
+    """A run has a larger error than it was asked for, or one that is not certified."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A run of a scheme and its error.
+
+    Attributes:
+        family, num_micro: the scheme.
+        run, trajectory: with its number of macro steps.
+        errors: (k, n_s + n_f) of its positions.
+        error: the largest of them; infinite where one is not certified.
+        seconds: time of a macro step.
+    """
+
+    family: Family
+    num_micro: int
+    run: Simulation
+    trajectory: Trajectory
+    errors: np.ndarray
+    error: float
+    seconds: float
+
+    def steps_for(self, error: float) -> int:
+        """Macro steps that keep this error, by the order of the scheme."""
+        return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / self.run.scheme.order))))
+
+    def time_for(self, error: float) -> float:
+        """Seconds of a run that keeps this error."""
+        return self.steps_for(error) * self.seconds
+
+
+class Search:
+    """Trials of one start over one time.
+
+    Args:
+        make: a `Simulation` of a scheme and a number of macro steps, with all nodes saved.
+        length: time that is simulated, s.
+        num_saves: saved intervals; None for at most `SAVED`.
+    """
+
+    def __init__(self, make: Callable[[Scheme | Composition, int], Simulation], length: float, num_saves: int | None):
+        self.make, self.length, self.num_saves = make, length, num_saves
+        self.runs: dict[tuple[str, int], Simulation] = {}
+
+    def run(self, family: Family, num_micro: int, num_steps: int) -> Simulation:
+        """The run with at least so many macro steps: a multiple of the saved intervals."""
+        key = family.python, num_micro
+        if key not in self.runs:
+            self.runs[key] = self.make(family.make(num_micro), 1)
+        saves = self.num_saves or min(num_steps, SAVED)
+        save_every = -(-num_steps // saves)
+        if self.num_saves is None:
+            saves = -(-num_steps // save_every)
+        num_steps = saves * save_every
+        return replace(
+            self.runs[key], macro_dt=np.asarray(self.length / num_steps), num_steps=num_steps, save_every=save_every
+        )
+
+    def trial(self, family: Family, num_micro: int, num_steps: int) -> Trial:
+        """A run of about so many macro steps; more where its error is not certified.
+
+        Steps that are too large for the motion fail or diverge, and need no fallback: it is compiled only where no number of steps is enough.
+        """
+        trial = self._doubled(family, num_micro, num_steps, falls_back=False)
+        has_failed = int(trial.trajectory.failed_at) >= 0
+        return self._doubled(family, num_micro, num_steps, falls_back=True) if has_failed else trial
+
+    def _doubled(self, family: Family, num_micro: int, num_steps: int, falls_back: bool) -> Trial:
+        """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; else the last one in the time there is."""
+        while True:
+            run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
+            before = time.perf_counter()
+            trajectory, finer = run.in_pieces(), companion(run, run.scheme, 2)
+            seconds = time.perf_counter() - before
+            errors = extrapolated(run.scheme, trajectory, finer)
+            done = max(int(trajectory.failed_at), int(finer.failed_at)) < 0
+            certified = bool(done and certified_nodes(trajectory, errors)[0].all())
+            is_last = 2 * num_steps > MOST_STEPS or (seconds > LONGEST and num_steps > FEWEST_STEPS)
+            if certified or is_last:
+                error = float(largest_of(errors).max()) if certified else np.inf
+                return Trial(family, num_micro, run, trajectory, errors, error, _seconds_of_a_step(run))
+            num_steps *= 2
+
+    def with_best_num_micro(self, trial: Trial, accuracy: float) -> Trial:
+        """A trial with the number of micro steps of the least time for an accuracy, if that differs."""
+        num_micro, p = trial.num_micro, trial.run.scheme.order
+        finer = self.run(trial.family, 2 * num_micro, trial.run.num_steps)
+        finer_trajectory = finer.in_pieces()
+        if int(finer_trajectory.failed_at) >= 0:
+            return trial
+        by_fast = extrapolated(trial.run.scheme, trial.trajectory, finer_trajectory)
+        fast, slow = (float(largest_of(part).max()) for part in (by_fast, trial.errors - by_fast))
+        of_two = _seconds_of_a_step(finer)
+        # a + b N at N and 2 N; a clock that errs makes neither of them vanish
+        micro_seconds = max(of_two - trial.seconds, 0.02 * trial.seconds) / num_micro
+        macro_seconds = max(trial.seconds - num_micro * micro_seconds, 0.02 * trial.seconds)
+        fast_over_slow = num_micro**p * fast / max(slow, 1e-3 * fast)
+        best = int(np.clip(round((macro_seconds / micro_seconds * fast_over_slow) ** (1 / (p + 1))), 1, MOST_MICRO))
+        if max(best, num_micro) <= SAME * min(best, num_micro):
+            return trial
+        other = self.trial(trial.family, best, max(1, round(trial.run.num_steps * num_micro / best)))
+        return min((trial, other), key=lambda one: one.time_for(AIM * accuracy))
+
+
+def with_accuracy(
+    system: Movable,
+    scheme: Scheme | Composition | None,
+    state: State | None,
+    newton: Newton | None,
+    accuracy: float,
+    t_end: float,
+    num_saves: int | None,
+) -> tuple[Simulation, Trajectory, Settings]:
+    """A run whose largest estimated error of a position is at most `accuracy`.
+
+    Args:
+        system, scheme, state, newton, t_end: as of `vmri_jax.simulate`; None for a scheme from the menu.
+        accuracy: in the unit of the positions.
+        num_saves: saved intervals, equally spaced; None for at most `SAVED`.
+
+    Returns:
+        The `Simulation`, its `Trajectory`, and its `Settings`. A run that misses the accuracy is told about by `AccuracyNotReached`.
+
+    Raises:
+        ValueError: an accuracy below round-off, or above the extent of the motion.
+    """
+    opened_system, start = start_of("simulate", system, state)
+    length = float(t_end - start.t)
+    _check(accuracy, length, start)
+
+    def make(scheme: Scheme | Composition, num_steps: int) -> Simulation:
+        return simulation(system, scheme, state, newton, length / num_steps, None, num_steps, None, 1, False)
+
+    search = Search(make, length, num_saves)
+    trials = [
+        search.trial(family, num_micro, FEWEST_STEPS)
+        for family, num_micro in _menu(scheme, opened_system, start, accuracy, length)
+    ]
+    extent = max(extent_of(trial.trajectory) for trial in trials)
+    if accuracy > extent:
+        raise ValueError(
+            f"simulate: accuracy is {accuracy:g}, and no position moves by more than {extent:.3g} until t = {t_end:g}: any run is as "
+            "accurate. Give a smaller one, in the unit of the positions."
+        )
+    best = min(trials, key=lambda trial: trial.time_for(AIM * accuracy))
+    if start.q_s.size and start.q_f.size and stage_scheme(best.run.scheme).degree == 1:
+        best = search.with_best_num_micro(best, accuracy)
+    num_steps = best.steps_for(AIM * accuracy) if np.isfinite(best.error) else best.run.num_steps
+    for _ in range(REPEATS):
+        num_steps = _beside_resonances(opened_system, start, best, length, num_steps)
+        best = search.trial(best.family, best.num_micro, num_steps)
+        if best.error <= accuracy or 2 * num_steps > MOST_STEPS:
+            break
+        num_steps = int(np.clip(best.steps_for(AIM * accuracy), 1.1 * best.run.num_steps, 4 * best.run.num_steps))
+    if not best.error <= accuracy:
+        reached = (
+            f"its error is {best.error:.1e}" if np.isfinite(best.error) else "no error is certified over its length"
+        )
+        warnings.warn(
+            f"simulate: accuracy {accuracy:g} is not reached with {best.run.num_steps} macro steps, {reached}; give a shorter t_end, a "
+            "larger accuracy, or another scheme.",
+            AccuracyNotReached,
+            stacklevel=3,
+        )
+    run, family = best.run, best.family
+    numbers = float(run.macro_dt), run.num_steps, run.save_every
+    settings = Settings(run.scheme, family.python.format(best.num_micro), family.options, *numbers)
+    return run, best.trajectory, settings
+
+
+def _check(accuracy: float, length: float, start: State) -> None:
+    """Refuse accuracies that no run can have."""
+    check_number("simulate: accuracy", accuracy)
+    size = max(np.abs(np.asarray(q)).max(initial=0.0) for q in (start.q_s, start.q_f))
+    floor = ROUNDOFF * size
+    if not (np.isfinite(accuracy) and accuracy > floor):
+        raise ValueError(
+            f"simulate: accuracy is {accuracy:g}; round-off of float64 alone is about {floor:.0e}, since the largest position is {size:.3g}. "
+            "Give a larger one, in the unit of the positions."
+        )
+    if not length > 0:
+        raise ValueError(f"simulate: t_end is {length:g} after the start; it must be later.")
+
+
+def _menu(scheme, system: System, start: State, accuracy: float, length: float) -> list[tuple[Family, int]]:
+    """Families and their first numbers of micro steps.
+
+    A scheme of the user's is the only one. Else there are two: kicks, for masses that depend on the configuration the midpoint rule, composed
+    to an order of about the number of digits that are asked for; and a single interval of high degree.
+    """
+    if scheme is not None:
+        family = Family("own", scheme.with_num_micro, "", "scheme.with_num_micro({})")
+        return [(family, stage_scheme(scheme).num_micro)]
+    q, v = (start.q_s, start.q_f), velocity(system, start.q_s, start.q_f, start.p_s, start.p_f)
+    size, speed = (max(np.abs(np.asarray(a)).max(initial=0.0) for a in pair) for pair in (q, v))
+    digits = np.log10(max((size or speed * length) / accuracy, 10.0))
+    base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
+    name = next((name for most, name in COMPOSED if digits <= most), None)
+    num_micro = FIRST_MICRO if start.q_s.size and start.q_f.size else 1
+    return [
+        (base if name is None else base.composed(name), num_micro),
+        (of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1),
+    ]
+
+
+def _seconds_of_a_step(run: Simulation) -> float:
+    """Seconds of a macro step: the difference of runs of n and of 2 n steps, without what a call takes besides."""
+    double = replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every)
+    once, twice = (min(seconds_per_call(each.in_pieces, 1) for _ in range(2)) for each in (run, double))
+    return max(twice - once, 0.1 * twice) / run.num_steps
+
+
+def _beside_resonances(system: System, start: State, trial: Trial, length: float, num_steps: int) -> int:
+    """This number of macro steps, or the next larger one at which small motions about the start do not grow."""
+    if trial.num_micro == 1:
+        return num_steps
+    motions = small_motions(system, start)
+    numbers = [int(np.ceil(num_steps / shorter)) for shorter in SHORTER]
+    radii = multipliers(motions, trial.run.scheme, [length / n for n in numbers]).radius
+    return next((n for n, radius in zip(numbers, radii, strict=True) if radius <= 1 + RESONANT), num_steps)

@@ -1,0 +1,69 @@
+"""Estimated errors of a run at its saved nodes."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from vmri_jax.mechanics.arrays import Numbers
+
+
+class RunError(NamedTuple):
+    """Estimated error of a run at its k saved nodes, NaN where it is not certified.
+
+    Attributes:
+        q_s, q_f: (k, n_s), (k, n_f) positions of the run minus those of the motion.
+        slow, fast: (k,) largest slow and fast share of the error over all coordinates; NaN where the companion run failed.
+        of: error of the function that was asked for, in its shape; None if there was none.
+        certified_until: time of the last node whose error is certified.
+        growth: of the error in the second half of the time until then.
+    """
+
+    q_s: Float[Numbers, "k n_s"]
+    q_f: Float[Numbers, "k n_f"]
+    slow: Float[Numbers, "k"]
+    fast: Float[Numbers, "k"]
+    of: Any
+    certified_until: Float[Numbers, ""]
+    growth: Float[Numbers, ""]
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(k,) largest error of a coordinate at each node."""
+        return largest_of(np.concatenate([self.q_s, self.q_f], axis=-1))
+
+    @property
+    def is_certified(self) -> bool:
+        """Whether the error of every node is."""
+        return bool(np.isfinite(self.positions).all())
+
+    @property
+    def largest(self) -> float:
+        """Largest error of a position over all nodes; infinite where a node is not certified."""
+        return float(self.positions.max(initial=0.0)) if self.is_certified else float("inf")
+
+    def part(self, nodes: slice) -> "RunError":
+        """The error at some of the nodes; that of the function stays whole unless it has a value for each node."""
+        k = len(self.slow)
+        of = self.of[nodes] if np.shape(self.of)[:1] == (k,) else self.of
+        return RunError(*(a[nodes] for a in self[:4]), of, self.certified_until, self.growth)
+
+    def __repr__(self) -> str:
+        return f"RunError: {self.in_words()}"
+
+    def in_words(self) -> str:
+        """The largest error and its shares, and up to which time they are certified."""
+        known = np.isfinite(self.positions)
+        total, slow, fast = (np.max(a[known], initial=0.0) for a in (self.positions, self.slow, self.fast))
+        shares = "" if np.isnan(slow) else f", slow share {slow:.1e}, fast share {fast:.1e}"
+        whole = f"positions are wrong by about {total:.1e}{shares}"
+        return whole if self.is_certified else f"until t = {float(self.certified_until):.4g} {whole}"
+
+
+def largest_of(values) -> np.ndarray:
+    """(..., k) largest modulus over the coordinates at each node; NaN where one of them is NaN.
+
+    Args:
+        values: (..., k, n).
+    """
+    return np.abs(values).max(axis=-1, initial=0.0)

@@ -1,0 +1,36 @@
+"""Scheme and steps of a run that were chosen for an accuracy."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The arguments of `vmri_jax.simulate` that make the same run again: ``vm.simulate(problem, **run.settings.arguments)``.
+
+    Attributes:
+        scheme: the scheme or composition.
+        python: the expression that makes it.
+        options: the same on the command line; empty for a scheme of one's own.
+        macro_dt: H.
+        num_steps, save_every: macro steps, and those from one saved node to the next.
+    """
+
+    scheme: Scheme | Composition
+    python: str
+    options: str
+    macro_dt: float
+    num_steps: int
+    save_every: int
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `vmri_jax.simulate` by name."""
+        steps = {"macro_dt": self.macro_dt, "num_steps": self.num_steps, "save_every": self.save_every}
+        return {"scheme": self.scheme, **steps}
+
+    def __str__(self) -> str:
+        return f"{self.python}, macro_dt={self.macro_dt!r}, num_steps={self.num_steps}, save_every={self.save_every}"
