@@ -39,15 +39,17 @@ class UncertifiedWarning(UserWarning):
     """The error of a run is not certified over all of its length."""
 
 
-def with_error(run: Simulation, trajectory: Trajectory, of: Callable | None = None) -> Trajectory:
+def with_error(run: Simulation, trajectory: Trajectory, of: Callable | None = None, shares: bool = True) -> Trajectory:
     """The same trajectory with its `RunError`; warns where it is not certified over the whole run.
 
     Args:
         run: that the trajectory is of, without a failure.
         trajectory: its nodes.
         of: function of a run, whose error is estimated too.
+        shares: whether the slow and the fast share are, which takes a program of their own.
     """
-    halved = companion(run, run.scheme, 2)
+    scheme = run.scheme
+    halved = companion(run, scheme, 2)
     if int(halved.failed_at) >= 0:
         warnings.warn(
             f"simulate: the error is not known; the same run with half the macro step failed at t = {_failure(halved, run):.4g}.",
@@ -55,9 +57,11 @@ def with_error(run: Simulation, trajectory: Trajectory, of: Callable | None = No
             stacklevel=3,
         )
         return trajectory
-    scheme = run.scheme
-    refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1)
-    total, fast = extrapolated(scheme, trajectory, halved), extrapolated(scheme, trajectory, refined)
+    total = extrapolated(scheme, trajectory, halved)
+    fast = np.full_like(total, np.nan)
+    if shares:
+        refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1)
+        fast = extrapolated(scheme, trajectory, refined)
     certified, growth = certified_nodes(trajectory, total)
     until = np.asarray(trajectory.t)[certified][-1]
     total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))

@@ -94,7 +94,7 @@ def simulate(
         _check_chosen(steps, t_end, save_every, save_micro, num_saves)
         run, trajectory, settings = with_accuracy(system, scheme, state, newton, accuracy, t_end, num_saves)
         trajectory = know(trajectory, trajectory.origin._replace(settings=settings))
-        return with_error(run, trajectory, of) if error else trajectory
+        return with_error(run, trajectory, of, shares=error)
     if scheme is None or num_saves is not None:
         missing = "scheme is None" if scheme is None else f"num_saves is {num_saves}"
         raise ValueError(

@@ -97,8 +97,8 @@ class Trial:
         return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / self.run.scheme.order))))
 
     def time_for(self, error: float) -> float:
-        """Seconds of a run that keeps this error."""
-        return self.steps_for(error) * self.seconds
+        """Seconds of a run that keeps this error; infinite where none is certified."""
+        return self.steps_for(error) * self.seconds if np.isfinite(self.error) else np.inf
 
 
 class Search:
@@ -217,13 +217,17 @@ def with_accuracy(
     best = min(trials, key=lambda trial: trial.time_for(AIM * accuracy))
     if start.q_s.size and start.q_f.size and stage_scheme(best.run.scheme).degree == 1:
         best = search.with_best_num_micro(best, accuracy)
-    num_steps = best.steps_for(AIM * accuracy) if np.isfinite(best.error) else best.run.num_steps
+    fewest = 1
     for _ in range(REPEATS):
-        num_steps = _beside_resonances(opened_system, start, best, length, num_steps)
-        best = search.trial(best.family, best.num_micro, num_steps)
-        if best.error <= accuracy or 2 * num_steps > MOST_STEPS:
+        if not np.isfinite(best.error) or fewest > MOST_STEPS:
             break
-        num_steps = int(np.clip(best.steps_for(AIM * accuracy), 1.1 * best.run.num_steps, 4 * best.run.num_steps))
+        num_steps = max(best.steps_for(AIM * accuracy), fewest)
+        best = search.trial(
+            best.family, best.num_micro, _beside_resonances(opened_system, start, best, length, num_steps)
+        )
+        if best.error <= accuracy:
+            break
+        fewest = best.run.num_steps + 1
     if not best.error <= accuracy:
         reached = (
             f"its error is {best.error:.1e}" if np.isfinite(best.error) else "no error is certified over its length"

@@ -22,6 +22,7 @@ from vmri_jax.running.arguments import nothing_fast
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, SimulationError
 
@@ -43,15 +44,28 @@ app = typer.Typer()
 )
 def simulate(
     system: options.System,
-    steps: Annotated[int, typer.Option(help="Number of macro steps.")],
+    steps: Annotated[int | None, typer.Option(help="Number of macro steps; not with --accuracy.")] = None,
     macro_dt: options.MacroStep = None,
     micro_dt: options.MicroStep = None,
-    scheme: options.Scheme = "fully-implicit",
+    scheme: Annotated[
+        str | None,
+        typer.Option(
+            help="See [bold]vmri schemes[/bold]. [dim]fully-implicit; with --accuracy one that is chosen[/dim]"
+        ),
+    ] = None,
     num_micro: options.NumMicro = 10,
     alpha: options.Alpha = None,
     degree: options.Degree = None,
     rule: options.Rule = None,
     compose: options.Compose = None,
+    accuracy: Annotated[
+        float | None,
+        typer.Option(help="Largest error of a position; steps, and without --scheme the scheme, are chosen for it."),
+    ] = None,
+    t_end: Annotated[float | None, typer.Option(help="End of the run, with --accuracy.")] = None,
+    error: Annotated[
+        bool, typer.Option("--error", help="Estimate the error of the positions, its slow and its fast share.")
+    ] = False,
     save_every: Annotated[
         int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
     ] = None,
@@ -72,9 +86,13 @@ def simulate(
         streamed = _check_out(out, resume, overwrite)
         check_target_file("--plot", plot, PICTURES)
         problem = find_problem(system)
-        chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
+        _check_steps(steps, accuracy, t_end, streamed, error)
+        chosen = None
+        if scheme is not None or accuracy is None:
+            scheme = scheme or "fully-implicit"
+            chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
-        if save_every is None and save_micro:
+        if save_every is None and (save_micro or steps is None):
             save_every = 1
         elif save_every is None:
             save_every = default_save_every(steps) if before is None else before.save_every
@@ -89,6 +107,8 @@ def simulate(
         }
         if streamed:
             arguments |= {"out": out, "resume": resume, "overwrite": overwrite, "drawing": problem.drawing}
+        else:
+            arguments |= {"accuracy": accuracy, "t_end": t_end, "error": error}
         compiling = _compile_clock()
         start = time.perf_counter()
         trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
@@ -102,15 +122,19 @@ def simulate(
                 nodes = (
                     trajectory if isinstance(trajectory, Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
                 )
-                plots.save(plots.plot_trajectory(nodes, f"{system}, {scheme}, {num_micro} micro steps"), plot)
+                title = (
+                    f"{system}, accuracy {accuracy:g}" if accuracy else f"{system}, {scheme}, {num_micro} micro steps"
+                )
+                plots.save(plots.plot_trajectory(nodes, title), plot)
                 saved.append(str(plot))
         finally:
             if stopped is None:
-                done = (steps - (0 if before is None else before.step)) * chosen.num_micro
+                stepped = _steps_in_words(trajectory, chosen, steps, system)
+                done = 0 if steps is None else (steps - (0 if before is None else before.step)) * chosen.num_micro
                 _print_named(
                     {
-                        "macro steps": f"{steps}, of {chosen.num_micro} micro steps each",
-                        "": nothing_fast(chosen, problem.q_f.size),
+                        **stepped,
+                        "": "" if chosen is None else nothing_fast(chosen, problem.q_f.size),
                         "wall time": f"{seconds:.2f} s, of which {compiled:.2f} s compiling",
                         "per micro step": f"{1e6 * max(seconds - compiled, 0.0) / done:.3g} µs" if done else "",
                         **_summary(trajectory, problem.system.is_constrained),
@@ -125,6 +149,31 @@ def simulate(
             step = {"macro-dt": macro_dt, "micro-dt": micro_dt, "scheme": scheme, "num-micro": num_micro}
             _print_advice(system, step | {"alpha": alpha, "degree": degree, "rule": rule, "compose": compose})
         raise typer.Exit(code)
+
+
+def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None, streamed: bool, error: bool) -> None:
+    """Refuse options that say nothing of the length of a run, or too much."""
+    if (steps is None) == (accuracy is None):
+        got = "neither" if steps is None else "both"
+        raise ValueError(f"got {got} of --steps and --accuracy; give exactly one of them.")
+    if (t_end is None) != (accuracy is None):
+        raise ValueError("--accuracy and --t-end go together: the largest error, and the time until which it is kept.")
+    if streamed and (error or accuracy is not None):
+        option = "--error" if error else "--accuracy"
+        raise ValueError(f"{option} compares runs that are in memory; give --out with a file that ends in .npz.")
+
+
+def _steps_in_words(trajectory, scheme, steps: int | None, system: str) -> dict[str, str]:
+    """How many steps a run took; of one with an accuracy the scheme and steps that were chosen, and the command that takes them."""
+    if steps is not None:
+        return {"macro steps": f"{steps}, of {scheme.num_micro} micro steps each"}
+    chosen = trajectory.settings
+    options = f"{chosen.options} --num-micro {stage_scheme(chosen.scheme).num_micro} --macro-dt {chosen.macro_dt!r}"
+    again = f"vmri simulate {system} {options} --steps {chosen.num_steps} --save-every {chosen.save_every}"
+    return {
+        "chosen": f"{chosen.python}, macro_dt {chosen.macro_dt:.6g}, {chosen.num_steps} steps",
+        "again": again if chosen.options else "",
+    }
 
 
 def _print_named(texts: dict[str, str]) -> None:
@@ -201,8 +250,14 @@ def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> di
         "simulated time": f"{times[0, 0]:g} to {times[-1, 1]:g}",
         "Newton iterations": f"at most {int(iterations)} per step, {Method(int(method)).name.lower()}",
         **(_energy_error(energies) if trajectory.keeps_energy else _energy_balance(trajectory)),
+        "error": _error(trajectory),
         "constraint residual": f"{position:.2e} in positions, {velocity:.2e} in velocities" if constrained else "",
     }
+
+
+def _error(trajectory: Trajectory | StoredTrajectory) -> str:
+    """The estimated error of the positions, if there is an estimate."""
+    return trajectory.error.in_words() if isinstance(trajectory, Trajectory) and trajectory.error is not None else ""
 
 
 def _energy_error(energies: np.ndarray) -> dict[str, str]:

@@ -14,6 +14,8 @@ from vmri_jax.plots.theme import DARK, LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Th
 
 MOST_NAMED = 12
 """Of more curves than this in one panel so many are named."""
+BAND = 0.25
+"""Opacity of bands of errors; more opaque ones hide the curves of other coordinates."""
 ROUNDOFF = 1e-13
 """Axes span this part of the values at least."""
 
@@ -27,6 +29,7 @@ class Run(Protocol):
     p_f: Any
     energy: Any
     constraint_residual: Any
+    error: Any
 
     @property
     def names(self) -> Names: ...
@@ -39,6 +42,8 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
     """Slow and fast positions, energy and, where there are constraints, their residual, against time.
 
     Of rigid bodies it shows the centres of mass.
+
+    A run with an estimated error has bands of it about its positions, and a panel of the largest error and its shares.
 
     The energy of a system that keeps it is shown as an error. Of one with forces or moving constraints the figure shows its
     change, their work, and what is left of the balance.
@@ -58,16 +63,21 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
     constrained = bool(np.any(residual > 0))
     positions = position_panels(trajectory)
     driven = trajectory.keeps_energy is False
-    count = len(positions) + (2 if driven else 1) + constrained
+    has_error = getattr(trajectory, "error", None) is not None
+    count = len(positions) + has_error + (2 if driven else 1) + constrained
     with new_figure(7.2, 0.4 + 1.85 * count, title, theme) as figure:
         axes = figure.subplots(count, sharex=True, squeeze=False)[:, 0]
-        for panel, (values, labels, what) in zip(axes, positions, strict=False):
-            coordinates(panel, t, values, labels, theme)
+        for panel, (values, labels, what, error) in zip(axes, positions, strict=False):
+            coordinates(panel, t, values, labels, theme, error)
             panel.set_ylabel(what)
+        below = axes[len(positions) :]
+        if has_error:
+            _position_error(below[0], t, trajectory.error, theme)
+            below = below[1:]
         if driven:
-            _energy_balance(axes[len(positions)], axes[len(positions) + 1], trajectory, theme)
+            _energy_balance(below[0], below[1], trajectory, theme)
         else:
-            _energy_error(axes[len(positions)], trajectory, theme)
+            _energy_error(below[0], trajectory, theme)
         if constrained:
             shown = np.maximum(residual, ROUNDOFF_FLOOR)  # NaN stays
             axes[-1].semilogy(t, shown[:, 0], "-", linewidth=_thin(t), label="position $|g|$")
@@ -101,20 +111,26 @@ def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Th
     return figure
 
 
-def position_panels(run: Run) -> list[tuple[np.ndarray, list[str], str]]:
-    """Slow and fast positions with their names and what they are called; of rigid bodies the centres, without directors.
+def position_panels(run: Run) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
+    """Slow and fast positions with their names, what they are called, and their errors; of rigid bodies the centres, without directors.
 
     Args:
         run: one run.
     """
-    names = run.names
+    names, error = run.names, getattr(run, "error", None)
+    slow, fast = (None, None) if error is None else (error.q_s, error.q_f)
     panels = (
-        (run.q_s, names.positions("s"), names.slow_coordinates, r"slow positions $q_s$"),
-        (run.q_f, names.positions("f"), names.fast_coordinates, r"fast positions $q_f$"),
+        (run.q_s, names.positions("s"), names.slow_coordinates, r"slow positions $q_s$", slow),
+        (run.q_f, names.positions("f"), names.fast_coordinates, r"fast positions $q_f$", fast),
     )
     return [
-        (np.asarray(values)[:, shown], [labels[i] for i in shown], what)
-        for values, shown, labels, what in panels
+        (
+            np.asarray(values)[:, shown],
+            [labels[i] for i in shown],
+            what,
+            None if wrong is None else np.asarray(wrong)[:, shown],
+        )
+        for values, shown, labels, what, wrong in panels
         if shown
     ]
 
@@ -126,8 +142,8 @@ def limit_times(axes: Axes, t) -> None:
         axes.set_xlim(reached[0], reached[-1])
 
 
-def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> None:
-    """One line per coordinate with its name beside the panel; of very many every so manieth is named."""
+def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error=None) -> None:
+    """One line per coordinate with its name beside the panel; of very many every so manieth is named. About each a band of its error."""
     n = values.shape[1]
     colors: Any = theme.curves
     if n > len(theme.curves):
@@ -137,6 +153,9 @@ def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> No
     for i in range(n):
         label = names[i] if i in named else f"_{names[i]}"  # which legends leave out
         axes.plot(t, values[:, i], color=colors[i], linewidth=_thin(t), label=label)
+        if error is not None:
+            half = np.abs(error[:, i])
+            axes.fill_between(t, values[:, i] - half, values[:, i] + half, color=colors[i], alpha=BAND, linewidth=0)
     if n:
         legend_beside(axes, f"{len(named)} of {n}" if n > MOST_NAMED else None, 9.0 if n <= len(theme.curves) else 6.5)
 
@@ -144,6 +163,18 @@ def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme) -> No
 def _thin(t) -> float:
     """Line width for so many nodes: oscillations must not run into a solid band."""
     return 1.2 if len(t) <= 300 else 0.7
+
+
+def _position_error(axes: Axes, t, error: Any, theme: Theme) -> None:
+    """Largest error of a position and its shares; where no error is certified, a shaded part."""
+    curves = {"error": error.positions, "slow share": error.slow, "fast share": error.fast}
+    for (name, values), look in zip(curves.items(), ("-", "--", ":"), strict=True):
+        if np.isfinite(values).any():
+            axes.semilogy(t, np.where(values > 0, values, np.nan), look, linewidth=_thin(t), label=name)
+    if not np.isfinite(error.positions).all():
+        axes.axvspan(float(error.certified_until), t[-1], color=theme.faint, label="not certified")
+    axes.set_ylabel("error of positions")
+    legend_beside(axes)
 
 
 def _energy_error(axes: Axes, trajectory: Run, theme: Theme) -> None:

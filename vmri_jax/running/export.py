@@ -27,6 +27,10 @@ DIMENSIONS = {
     "method": ("t",),
     "iterations": ("t",),
     "residual": ("t",),
+    "error_q_s": ("t", "slow"),
+    "error_q_f": ("t", "fast"),
+    "error_slow": ("t",),
+    "error_fast": ("t",),
     "t_micro": ("t", "micro"),
     "q_f_micro": ("t", "micro", "fast"),
 }
@@ -42,6 +46,9 @@ def rows_of(run: "Trajectory") -> dict[str, np.ndarray]:
         run: one run, or a batch.
     """
     known = {name: getattr(run, name, None) for name in DIMENSIONS} | run.info._asdict()
+    error = getattr(run, "error", None)
+    if error is not None:
+        known |= {name: getattr(error, name.removeprefix("error_")) for name in DIMENSIONS if name.startswith("error_")}
     arrays = {name: np.asarray(value) for name, value in known.items() if value is not None}
     axis = arrays["t"].ndim - 1
     for name, array in arrays.items():
@@ -76,6 +83,9 @@ class Exports(Quantities):
             found |= {letter + name: column for name, column in zip(labels, [*slow.T, *fast.T], strict=True)}
         position, velocity = rows["constraint_residual"].T
         found |= {"energy": rows["energy"], "constraint residual": position, "constraint rate": velocity}
+        if run.error is not None:
+            shares = {"slow share": rows["error_slow"], "fast share": rows["error_fast"]}
+            found |= {"error": run.error.positions} | {f"error, {name}": share for name, share in shares.items()}
         return found | {name: rows[name] for name in ("method", "iterations", "residual")}
 
     def to_csv(self, path) -> None:

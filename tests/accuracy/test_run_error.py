@@ -1,0 +1,148 @@
+"""Estimated errors of runs against references, their shares against the limits of each grid, and how they are told."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.small_systems import NONE, SYSTEMS
+from vmri_jax.accuracy.companions import UncertifiedWarning
+from vmri_jax.study import reference_solution
+
+LENGTH, NODES = 2.0, 10
+
+
+def positions(run) -> np.ndarray:
+    return np.concatenate([run.q_s, run.q_f], axis=1)
+
+
+def largest_difference(a, b) -> float:
+    return float(np.abs(positions(a) - positions(b)).max())
+
+
+CASES = {
+    "kicks": ("no_constraint", vm.fully_explicit(8), 20),
+    "midpoint": ("no_constraint", vm.fully_implicit(5), 40),
+    "composition": ("no_constraint", vm.compose(vm.fully_explicit(2), "suzuki4"), 20),
+    "order 6": ("fast_alone", vm.compose(vm.fully_explicit(2), "kahan-li6"), 20),
+    "slow alone": ("slow_alone", vm.fully_explicit(1), 20),
+    "one coordinate": ("one_coordinate", vm.galerkin(1, 2), 10),
+    "constraint": ("constraint", vm.fully_implicit(5), 40),
+    "constraint, order 8": ("constraint", vm.galerkin(1, 4, "lobatto"), 10),
+    "damped": ("damped", vm.explicit_slow(8), 20),
+    "driven": ("driven", vm.fully_explicit(8), 20),
+    "moving constraints": ("moving_constraints", vm.fully_implicit(5), 40),
+    "own kinetic energy": ("kinetic_function", vm.fully_implicit(4), 40),
+    "scene": ("scene_of_points", vm.fully_implicit(6), 40),
+    "rigid bodies": ("scene_of_rigid_bodies", vm.fully_implicit(5), 40),
+}
+
+
+QUICK = ("kicks", "composition", "slow alone", "constraint, order 8", "damped")
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in QUICK else pytest.param(case, marks=pytest.mark.full) for case in CASES]
+)
+def test_estimate_over_true_error(case):
+    name, scheme, num_steps = CASES[case]
+    steps = {"macro_dt": LENGTH / num_steps, "num_steps": num_steps, "save_every": num_steps // NODES}
+    run = vm.simulate(SYSTEMS[name], scheme, **steps, error=True)
+    true = reference_solution(SYSTEMS[name], LENGTH, num_saves=NODES).errors(run)[0]
+    assert true > 1e-6  # an error of the scheme, not of the reference
+    assert run.error.largest == pytest.approx(true, rel=0.1)  # 0.1 % to 7 % measured
+
+
+def test_shares_are_the_limits_of_each_grid():
+    """The fast share goes with many micro steps; with N single steps for each macro step, the slow share."""
+    problem, num_micro, num_steps = SYSTEMS["no_constraint"], 8, 20
+
+    def run(scheme, parts=1, **more):
+        steps = {"macro_dt": 0.1 / parts, "num_steps": num_steps * parts, "save_every": 2 * parts}
+        return vm.simulate(problem, scheme, **steps, **more)
+
+    whole = run(vm.fully_explicit(num_micro), error=True)
+    without_fast, without_slow = run(vm.fully_explicit(16 * num_micro)), run(vm.fully_explicit(1), num_micro)
+    assert whole.error.fast.max() == pytest.approx(largest_difference(whole, without_fast), rel=0.05)
+    assert whole.error.slow.max() == pytest.approx(largest_difference(whole, without_slow), rel=0.05)
+
+
+def test_error_of_a_function():
+    problem = SYSTEMS["no_constraint"]
+    steps = {"macro_dt": 0.05, "num_steps": 20, "error": True}
+    each = vm.simulate(problem, vm.fully_explicit(4), **steps, of=lambda run: run.q_f[:, 1])
+    np.testing.assert_array_equal(each.error.of, each.error.q_f[:, 1])
+    assert each[::5].error.of.shape == (5,)
+    end = vm.simulate(problem, vm.fully_explicit(4), **steps, of=lambda run: jnp.sum(run.q_s[-1]))
+    assert end.error.of == pytest.approx(end.error.q_s[-1].sum())
+    assert end[::5].error.of == end.error.of
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        ({"of": lambda run: "far", "error": True}, TypeError, "returned 'far'"),
+        ({"of": lambda run: run.q_f}, ValueError, "give error=True"),
+        ({"of": 3.0, "error": True}, TypeError, "give a function of a run"),
+        ({"error": 1e-3}, TypeError, "must be True or False"),
+    ],
+)
+def test_refused(arguments, kind, message):
+    with pytest.raises(kind, match=message):
+        vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(4), macro_dt=0.05, num_steps=2, **arguments)
+
+
+def test_not_in_transformations():
+    def end(macro_dt):
+        return vm.simulate(SYSTEMS["slow_alone"], vm.fully_explicit(1), macro_dt=macro_dt, num_steps=2, error=True).q_s
+
+    with pytest.raises(ValueError, match=r"outside of jax\.jit"):
+        jax.jit(end)(0.1)
+
+
+def test_parts_and_files(tmp_path):
+    problem = SYSTEMS["no_constraint"]
+    run = vm.simulate(problem, vm.fully_explicit(4), macro_dt=0.05, num_steps=20, error=True)
+    assert "slow share" in repr(run)
+    part = run[4::4]
+    np.testing.assert_array_equal(part.error.positions, run.error.positions[4::4])
+    run.save(tmp_path / "run.npz")
+    read = vm.Trajectory.load(tmp_path / "run.npz")
+    for a, b in zip(read.error[:4], run.error[:4], strict=True):
+        np.testing.assert_array_equal(a, b)
+    columns = run.columns()
+    np.testing.assert_array_equal(columns["error"], run.error.positions)
+    assert {"error, slow share", "error, fast share"} <= set(columns)
+    dataset = run.to_xarray()
+    np.testing.assert_array_equal(dataset["error_q_f"], run.error.q_f)
+    assert jax.tree.map(lambda a: a, run).error.is_certified
+
+
+def double_pendulum() -> vm.Problem:
+    """Two rods of unit length and masses at their ends, in angles; released from above, the motion is chaotic."""
+
+    def kinetic(q_s, q_f, v_s, v_f, params):
+        (a, b), (u, w) = q_s, v_s
+        return u**2 + w**2 / 2 + u * w * jnp.cos(a - b)
+
+    def weight(q_s, q_f, params):
+        return -9.81 * (2 * jnp.cos(q_s[0]) + jnp.cos(q_s[1]))
+
+    return vm.Problem(vm.System(kinetic, weight), [2.5, 2.0], NONE, [0.0, 0.0], NONE)
+
+
+def test_chaotic_motion_is_not_certified():
+    with pytest.warns(UncertifiedWarning, match=r"the motion is chaotic.*The energy has changed by at most"):
+        run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), macro_dt=0.05, t_end=30.0, error=True)
+    until = float(run.error.certified_until)
+    assert 2.0 < until < 30.0
+    np.testing.assert_array_equal(np.isnan(run.error.positions), np.asarray(run.t) > until)
+    assert run.error.largest == np.inf
+    assert f"until t = {until:.4g}" in run.error.in_words()
+
+
+def test_steps_that_do_not_see_the_motion_are_not_certified():
+    with pytest.warns(UncertifiedWarning, match="take smaller steps"):
+        run = vm.simulate(SYSTEMS["slow_alone"], vm.fully_explicit(1), macro_dt=0.6, num_steps=40, error=True)
+    assert not run.error.is_certified

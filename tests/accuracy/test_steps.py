@@ -1,0 +1,85 @@
+"""Runs of an accuracy: their true errors, the choice as arguments, resonant steps, and requests that nothing can meet."""
+
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from tests.accuracy.test_run_error import double_pendulum
+from tests.small_systems import SYSTEMS
+from vmri_jax.accuracy import steps
+from vmri_jax.stability import linear_model
+from vmri_jax.study import reference_solution
+
+LENGTH = 2.0
+
+
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-7])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "no_constraint",
+        "slow_alone",
+        *(pytest.param(n, marks=pytest.mark.full) for n in ("constraint", "damped", "kinetic_function")),
+    ],
+)
+def test_true_error_is_below_the_accuracy(name, accuracy):
+    run = vm.simulate(SYSTEMS[name], accuracy=accuracy, t_end=LENGTH)
+    reference = reference_solution(SYSTEMS[name], LENGTH, num_saves=len(run) - 1)
+    true = reference.errors(run)[0]
+    assert true <= accuracy
+    assert run.error.largest == pytest.approx(true, rel=0.2)
+    again = vm.simulate(SYSTEMS[name], **run.settings.arguments)
+    np.testing.assert_array_equal(again.q_f, run.q_f)
+
+
+def test_a_scheme_of_ones_own_keeps_its_rules():
+    run = vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(2), accuracy=1e-4, t_end=LENGTH, error=True)
+    assert run.error.largest <= 1e-4
+    assert run.settings.scheme == vm.fully_explicit(2).with_num_micro(run.settings.scheme.num_micro)
+    assert "scheme.with_num_micro(" in repr(run)
+    assert np.isfinite(run.error.slow).all()
+
+
+def test_number_of_saved_nodes():
+    run = vm.simulate(SYSTEMS["slow_alone"], vm.fully_explicit(1), accuracy=1e-4, t_end=LENGTH, num_saves=7)
+    assert len(run) == 8
+    assert run.t[-1] == pytest.approx(LENGTH)
+
+
+def test_steps_beside_resonances():
+    """A slow kick once in half a turn of the fast oscillator is resonant; a few percent more steps are not."""
+    problem, length = linear_model(omega=50.0, kappa=25.0), 20.0
+    scheme = vm.explicit_slow(40)
+    resonant = round(length / 0.0625)  # within the window from 0.06223 to 0.06286 of `vmri_jax.stability.advise`
+    family = steps.Family("own", scheme.with_num_micro, "", "scheme.with_num_micro({})")
+    trial = steps.Trial(family, 40, vm.prepare(problem, scheme, macro_dt=0.1, num_steps=1), None, None, 0.0, 0.0)  # pyright: ignore[reportArgumentType]
+    beside = steps._beside_resonances(problem.system, problem.state(), trial, length, resonant)
+    assert resonant < beside < 1.3 * resonant
+    assert steps._beside_resonances(problem.system, problem.state(), trial, length, beside) == beside
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"accuracy": 1e-20, "t_end": 1.0}, "round-off of float64"),
+        ({"accuracy": -1.0, "t_end": 1.0}, "round-off of float64"),
+        ({"accuracy": 50.0, "t_end": 1.0}, "no position moves by more than"),
+        ({"accuracy": 1e-3}, "needs t_end"),
+        ({"accuracy": 1e-3, "t_end": -1.0}, "it must be later"),
+        ({"accuracy": 1e-3, "t_end": 1.0, "macro_dt": 0.1}, "got macro_dt with an accuracy"),
+        ({"accuracy": 1e-3, "t_end": 1.0, "save_every": 2}, "got save_every with an accuracy"),
+        ({"t_end": 1.0, "macro_dt": 0.1}, "scheme is None without an accuracy"),
+        ({"accuracy": 1e-3, "t_end": 1.0, "num_saves": 0}, "num_saves"),
+    ],
+)
+def test_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        vm.simulate(SYSTEMS["slow_alone"], **arguments)
+
+
+def test_chaotic_motion_misses_the_accuracy(monkeypatch):
+    monkeypatch.setattr(steps, "LONGEST", 0.0)
+    monkeypatch.setattr(steps, "FEWEST_STEPS", 1024)
+    with pytest.warns(steps.AccuracyNotReached, match="no error is certified"), pytest.warns(match="chaotic"):
+        run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), accuracy=1e-3, t_end=40.0)
+    assert run.error.largest == np.inf
