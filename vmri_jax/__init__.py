@@ -5,7 +5,9 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from vmri_jax import diagnostics
+from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.simulate import simulate
+from vmri_jax.accuracy.steps import AccuracyNotReached
 from vmri_jax.configure import NotConfiguredWarning, configure
 from vmri_jax.mechanics.functions import CompiledAgainWarning
 from vmri_jax.mechanics.names import Names
@@ -15,6 +17,8 @@ from vmri_jax.running.batch import FailedLanesWarning, simulate_batch
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.lost_energy import LostEnergyWarning
 from vmri_jax.running.macro_step import macro_step
+from vmri_jax.running.run_error import RunError
+from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, prepare
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
@@ -75,6 +79,7 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
+    "AccuracyNotReached",
     "CompiledAgainWarning",
     "Composition",
     "ConstantMass",
@@ -89,7 +94,9 @@ __all__ = [
     "Problem",
     "Result",
     "Rheonomic",
+    "RunError",
     "Scheme",
+    "Settings",
     "Simulation",
     "SimulationError",
     "State",
@@ -97,6 +104,7 @@ __all__ = [
     "StoredTrajectory",
     "System",
     "Trajectory",
+    "UncertifiedWarning",
     "__version__",
     "compose",
     "configure",

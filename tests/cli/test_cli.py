@@ -5,6 +5,7 @@ import errno
 import importlib
 import os
 import re
+import shlex
 import signal
 from types import SimpleNamespace
 from typing import Any
@@ -362,6 +363,11 @@ def test_cost_writes_its_page(vmri, short_menu, tmp_path):
         (("cost", "user.py:my_problem", "--error", "-1"), "round-off alone"),
         (("cost", "user.py:my_problem", "--t-end", "0"), "t_end is 0.0"),
         (("simulate", "fpu", *RUN, "--compose", "yoshida5"), "there is no composition"),
+        (("simulate", "fpu", "--macro-dt", "0.1"), "got neither of --steps and --accuracy"),
+        (("simulate", "fpu", *RUN, "--accuracy", "1e-3"), "got both of --steps and --accuracy"),
+        (("simulate", "fpu", "--accuracy", "1e-3"), "--accuracy and --t-end go together"),
+        (("simulate", "fpu", *RUN, "--error", "--out", "run.zarr"), "--error compares runs that are in memory"),
+        (("simulate", "fpu", "--accuracy", "1e-30", "--t-end", "1"), "round-off of float64"),
     ],
 )
 def test_what_the_search_refuses(vmri, arguments, message):
@@ -375,6 +381,19 @@ def test_schemes_are_found_with_dashes_and_underscores(name):
     options: dict[str, Any] = {"degree": 2} if name == "galerkin" else {}
     found = find_scheme(name.replace("-", "_"), 3, **options)
     assert found == SCHEMES[name].factory(3, **options)
+
+
+def test_simulate_for_an_accuracy(vmri):
+    code, text = vmri("simulate", "fpu", "--accuracy", "1e-3", "--t-end", "0.4", "--error", "--out", "run.npz")
+    assert code == 0
+    assert "positions are wrong by about" in text
+    command = re.search(r"vmri (simulate fpu .*--save-every \d+)", text)
+    assert command is not None
+    code, _ = vmri(*shlex.split(command[1]), "--out", "again.npz")
+    assert code == 0
+    run, again = (vm.Trajectory.load(name) for name in ("run.npz", "again.npz"))
+    assert run.error.largest <= 1e-3
+    np.testing.assert_array_equal(run.q_f, again.q_f)
 
 
 def test_simulate_composes(vmri):

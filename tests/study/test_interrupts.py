@@ -1,5 +1,6 @@
 """Ctrl-C in a study keeps what is done; a cost report of a system at rest says so."""
 
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -7,9 +8,9 @@ import pytest
 
 import vmri_jax as vm
 from tests.small_systems import one_coordinate
+from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.study import (
     ConvergenceStudy,
-    Family,
     Program,
     ReferenceSolution,
     StudyInterrupted,
@@ -91,7 +92,7 @@ def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_p
     monkeypatch.setattr(module, "reference_solution", lambda *_, **__: reference)
     monkeypatch.setattr(module, "_draw", drawing)
     monkeypatch.setattr("vmri_jax.study.advisor.NUM_MICRO", (1,))
-    menu = [Family("fully explicit", vm.fully_explicit, "--scheme fully-explicit", 1)]
+    menu = [replace(of_order_2(vm.fully_explicit), first=1)]
     with pytest.raises(StudyInterrupted) as caught:
         cost_report(one_coordinate(), "mass", tmp_path, t_end=T_END, errors=[1e-3], menu=menu)
     assert caught.value.runs.rows

@@ -7,7 +7,7 @@ number of nodes, so that they share compiled programs.
 
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
@@ -16,8 +16,9 @@ import pytest
 
 import vmri_jax as vm
 from tests.small_systems import SYSTEMS
+from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.mechanics.state import problem_of
-from vmri_jax.study import Family, ReferenceSolution, reference_solution
+from vmri_jax.study import ReferenceSolution, reference_solution
 
 SCHEME = vm.fully_explicit(1)
 MACRO_DT, STEPS = 0.01, 24
@@ -26,7 +27,7 @@ T_END, REFERENCE_STEPS = 0.08, 512
 """Of all studies; the reference is good to 1e-6."""
 ERROR = 1e-3
 """What searches ask for."""
-MENU = [Family("fully explicit", vm.fully_explicit, "--scheme fully-explicit", 1)]
+MENU = [replace(of_order_2(vm.fully_explicit), first=1)]
 
 Tools = Mapping[str, Callable[["Cell"], object]]
 Refused = Mapping[tuple[str, str], str]

@@ -22,7 +22,7 @@ import numpy as np
 
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.trajectory import RunInfo, Trajectory, know
+from vmri_jax.running.trajectory import Trajectory, from_named_arrays, know
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -66,8 +66,9 @@ def with_error(run: Simulation, trajectory: Trajectory, of: Callable | None = No
     until = np.asarray(trajectory.t)[certified][-1]
     total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
     of_error = None if of is None else ratio(scheme) * (np.asarray(of(trajectory)) - np.asarray(of(halved)))
-    parts = np.split(total, [trajectory.q_s.shape[-1]], axis=1)
-    error = RunError(*parts, largest_of(slow), largest_of(fast), of_error, np.asarray(until), np.asarray(growth))
+    q_s, q_f = np.split(total, [trajectory.q_s.shape[-1]], axis=1)
+    shares_at_nodes = largest_of(slow), largest_of(fast)
+    error = RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
     if not certified.all():
         warnings.warn(f"simulate: {_uncertified(error, trajectory)}", UncertifiedWarning, stacklevel=3)
     return know(replace(trajectory, error=error), trajectory.origin)
@@ -134,11 +135,11 @@ def resting(run: Simulation) -> Trajectory:
     none = np.zeros(k - 1, int)
     micro = run.scheme.num_micro
     inside = {"t_micro": np.zeros((k - 1, micro)), "q_f_micro": np.zeros((k - 1, micro, len(start.q_f)))}
-    arrays = nodes | (inside if run.save_micro else {})
-    info = RunInfo(none, none, np.zeros(k - 1))
-    status = {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
-    residual = np.zeros((k, 2))
-    return know(Trajectory(**arrays, energy=np.zeros(k), constraint_residual=residual, info=info, **status), run.origin)
+    status = {"result": int(Result.CONVERGED), "failed_at": -1}
+    kept = {"energy": np.zeros(k), "constraint_residual": np.zeros((k, 2)), "residual": np.zeros(k - 1)}
+    solver = {"method": none, "iterations": none}
+    arrays = nodes | kept | solver | (inside if run.save_micro else {})
+    return from_named_arrays(arrays | {name: np.asarray(value) for name, value in status.items()}).of(run.origin)
 
 
 def companion(run: Simulation, scheme: Scheme | Composition, parts: int) -> Trajectory:

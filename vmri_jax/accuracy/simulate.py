@@ -91,8 +91,8 @@ def simulate(
     check_flags(throw=throw, progress=progress, error=error)
     if accuracy is not None:
         steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
-        _check_chosen(steps, t_end, save_every, save_micro, num_saves)
-        run, trajectory, settings = with_accuracy(system, scheme, state, newton, accuracy, t_end, num_saves)
+        end = _end(steps, t_end, save_every, save_micro, num_saves)
+        run, trajectory, settings = with_accuracy(system, scheme, state, newton, accuracy, end, num_saves)
         trajectory = know(trajectory, trajectory.origin._replace(settings=settings))
         return with_error(run, trajectory, of, shares=error)
     if scheme is None or num_saves is not None:
@@ -123,8 +123,8 @@ def simulate(
     return with_error(run, trajectory, of) if error and int(trajectory.failed_at) < 0 else trajectory
 
 
-def _check_chosen(steps: dict[str, Any], t_end, save_every: int, save_micro: bool, num_saves) -> None:
-    """Refuse arguments of steps beside an accuracy, from which the steps follow."""
+def _end(steps: dict[str, Any], t_end: float | None, save_every: int, save_micro: bool, num_saves) -> float:
+    """`t_end`; arguments of steps beside an accuracy, from which the steps follow, are refused."""
     given = [name for name, value in steps.items() if value is not None]
     given += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro
     if given:
@@ -135,3 +135,4 @@ def _check_chosen(steps: dict[str, Any], t_end, save_every: int, save_micro: boo
         raise ValueError("simulate: an accuracy needs t_end, the time until which it is to be kept.")
     if num_saves is not None:
         whole_number("simulate: num_saves", num_saves)
+    return t_end

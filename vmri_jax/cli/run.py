@@ -94,7 +94,7 @@ def simulate(
         before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
         if save_every is None and (save_micro or steps is None):
             save_every = 1
-        elif save_every is None:
+        elif save_every is None and steps is not None:
             save_every = default_save_every(steps) if before is None else before.save_every
         arguments = {
             "macro_dt": macro_dt,
@@ -130,7 +130,11 @@ def simulate(
         finally:
             if stopped is None:
                 stepped = _steps_in_words(trajectory, chosen, steps, system)
-                done = 0 if steps is None else (steps - (0 if before is None else before.step)) * chosen.num_micro
+                done = (
+                    0
+                    if steps is None or chosen is None
+                    else (steps - (0 if before is None else before.step)) * chosen.num_micro
+                )
                 _print_named(
                     {
                         **stepped,

@@ -32,7 +32,7 @@ def plot_control(optimum: "Optimum", *, title: str = "", theme: Theme = LIGHT) -
         above.set(ylabel="controls $u$")
         limit_times(above, t)
         legend_beside(above)
-        for axes, (values, labels, what) in zip(middle, panels, strict=True):
+        for axes, (values, labels, what, _) in zip(middle, panels, strict=True):
             coordinates(axes, t, values, labels, theme)
             axes.set(ylabel=what)
             limit_times(axes, t)

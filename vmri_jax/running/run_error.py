@@ -46,7 +46,8 @@ class RunError(NamedTuple):
         """The error at some of the nodes; that of the function stays whole unless it has a value for each node."""
         k = len(self.slow)
         of = self.of[nodes] if np.shape(self.of)[:1] == (k,) else self.of
-        return RunError(*(a[nodes] for a in self[:4]), of, self.certified_until, self.growth)
+        at_nodes = {name: getattr(self, name)[nodes] for name in ("q_s", "q_f", "slow", "fast")}
+        return self._replace(of=of, **at_nodes)
 
     def __repr__(self) -> str:
         return f"RunError: {self.in_words()}"

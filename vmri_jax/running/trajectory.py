@@ -90,7 +90,7 @@ class Trajectory(Exports, eqx.Module):
     failed_at: Int[Numbers, ""]
     t_micro: Float[Numbers, "k-1 num_micro"] = None
     q_f_micro: Float[Numbers, "k-1 num_micro n_f"] = None
-    error: RunError | None = None
+    error: RunError = None  # pyright: ignore[reportAssignmentType] as t_micro, None unless asked for
 
     def __repr__(self) -> str:
         fields = [getattr(self, name) for name in (*NODES, *STATUS)]
@@ -103,9 +103,9 @@ class Trajectory(Exports, eqx.Module):
         return vars(self).get("_origin", Origin())
 
     @property
-    def settings(self) -> Settings | None:
-        """Scheme and steps of a run with an accuracy, for which they were chosen."""
-        return self.origin.settings
+    def settings(self) -> Settings:
+        """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run."""
+        return self.origin.settings  # pyright: ignore[reportReturnType]
 
     def of(self, what: System | Problem | HasProblem | Origin) -> "Trajectory":
         """The same run, which knows what it is of: its system, and the names of its parts.
@@ -321,7 +321,7 @@ def from_named_arrays(arrays: dict) -> Trajectory:
     """The inverse of `named_arrays`; those that may be None may be absent."""
     info = RunInfo(**{name: arrays.pop(name) for name in RunInfo._fields})
     errors = [arrays.pop(name, None) for name in ERROR]
-    return Trajectory(**arrays, info=info, error=None if errors[0] is None else RunError(*errors))
+    return Trajectory(**arrays, info=info, **({} if errors[0] is None else {"error": RunError(*errors)}))
 
 
 def from_arrays(arrays: list) -> Trajectory:
