@@ -21,14 +21,10 @@ ELEMENTWISE = 16
 SLOW_ORDER = 10
 """Highest order of the polynomial through the slow unknowns of the last steps, from which the next step starts. With less, small steps take
 more passes; a higher one is never the best."""
-CONTRACTION = 0.03
-"""Largest ratio of the corrections of two passes with which exact matrices are kept. An exact pass costs about as much as four others. With a
-larger ratio steps take more passes, with a smaller one more exact passes; run times change little between 0.01 and 0.1."""
-CONTRACTION_PER_COLUMN = 0.0075
-"""The same for each column of the matrices of an interval, where the kinetic energy is a function: there an exact pass costs about as much as
-one further pass for each column, 21 of a satellite with 18 columns, whose steps take 0.6 of the time at 0.1 to 0.2."""
-LARGEST_CONTRACTION = 0.2
-"""And at most this. With more, a step takes more than twelve passes, and no time is won."""
+CONTRACTION = 0.1
+"""Largest ratio of the corrections of two passes with which exact matrices are kept. With 0.03 the satellite of the gallery in
+joint coordinates takes 1.25 of the time, a double pendulum in angles 1.0 to 1.1, TSP with exact matrices 1.0; with a larger ratio steps take
+more passes."""
 LARGEST_RENEWED = 16
 """Rows of the matrix K of a micro interval up to which it is computed in every macro step; a larger one is kept while the number of passes
 does not rise. With more, macro steps of large systems spend their time on it."""

@@ -6,9 +6,6 @@ SLOW_ORDER = 0
 """Slow unknowns start from their last values."""
 CONTRACTION = -1.0
 """Matrices are never kept: the ratio of two corrections is not below zero."""
-CONTRACTION_PER_COLUMN = 0.0
-LARGEST_CONTRACTION = -1.0
-"""Nor of many columns."""
 LARGEST_RENEWED = 10**9
 """All are renewed."""
 DIAGONAL_MATRICES = LINEARISES_FORCES = COLLOCATES = DRIFTS = DEFERS_PROJECTION = False

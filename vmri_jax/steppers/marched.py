@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vmri_jax.kernels import CONTRACTION, CONTRACTION_PER_COLUMN, LARGEST_CONTRACTION, max_abs
+from vmri_jax.kernels import CONTRACTION, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import FLOOR_OF_NEWTON, Accepted, expected
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
@@ -126,7 +126,6 @@ class Marched(Solver):
         self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first: Any = True
     ) -> Progress:
         """Passes, at most `limit`: of the first attempt from what the steps before lead to, of others from the guess."""
-        contraction = _largest_contraction(march)
         accepted, fixed = Accepted.of(march.equations, self.newton), self.newton.fixed_iterations
         z, x = march.rows(guess)
         z = jnp.where(is_first, memory.slow.next(march.num_slow), z)
@@ -175,8 +174,8 @@ class Marched(Solver):
 
             Both are loops: in a batch, a branch of `jax.lax.cond` would be computed in every turn, whether or not a lane takes it.
             """
-            at = jax.lax.while_loop(lambda at: (at.result == RUNNING) & (at.rate <= contraction), further, at)
-            return jax.lax.while_loop(lambda at: (at.result == RUNNING) & ~(at.rate <= contraction), exact, at)
+            at = jax.lax.while_loop(lambda at: (at.result == RUNNING) & (at.rate <= CONTRACTION), further, at)
+            return jax.lax.while_loop(lambda at: (at.result == RUNNING) & ~(at.rate <= CONTRACTION), exact, at)
 
         return self.newton.iterate(passes if fixed is None else exact, at)
 
@@ -202,11 +201,3 @@ class Marched(Solver):
         parts = zip(("slow variables", "each micro interval"), counts[::2], counts[1::2], strict=True)
         few = [f"  unknowns of {what}: {r * (n - g)}, with multipliers {r * (n + g)}" for what, n, g in parts if g]
         return [head, *few]
-
-
-def _largest_contraction(march: MarchEquations) -> float:
-    """The largest ratio of the corrections of two passes with which matrices are kept: larger where exact passes cost more."""
-    if march.equations.system.has_constant_mass:
-        return CONTRACTION
-    columns = march.num_fast + march.r * march.n_g + march.num_seen
-    return min(max(CONTRACTION, CONTRACTION_PER_COLUMN * columns), LARGEST_CONTRACTION)
