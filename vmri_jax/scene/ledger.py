@@ -209,7 +209,7 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
     """All first derivatives that a step takes of a system, as a function of its positions that is shaped like these."""
 
     def lagrangian(q):
-        potentials = sum(invariants.potentials(system, q[:n_s], q[n_s:]))
+        potentials = invariants.potential_energy(system, q[:n_s], q[n_s:])
         if system.has_constant_mass:
             return -potentials
         return system.kinetic(q[:n_s], q[n_s:], v_s, v_f, system.params) - potentials

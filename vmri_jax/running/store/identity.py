@@ -81,6 +81,7 @@ def _operations(system: System, start: State) -> dict[str, str]:
         "slow_constraint": with_time(system.slow_constraint, start.t, q_s, params),
         "implied": with_time(system.implied, start.t, q_s, q_f, params),
         "force": (system.force, (start.t, q_s, q_f, q_s, q_f, params)),
+        **{f"potential {name}": (function, (q_s, q_f, params)) for name, function in system.potentials},
     }
     if isinstance(system.kinetic, KineticFunction):
         functions["kinetic"] = system.kinetic.function, (q_s, q_f, q_s, q_f, params)
