@@ -159,7 +159,8 @@ class Scheme(eqx.Module):
     def with_potentials(self, **rules: PlacedRule) -> "Scheme":
         """The same scheme with rules of `System.potentials` by name, besides those that it has.
 
-            vm.fully_explicit(32).with_potentials(bends=vm.micro(vm.trapezoidal, every=8), bonds=vm.micro(vm.trapezoidal))
+            kicks = vm.quadrature.trapezoidal
+            vm.fully_explicit(32).with_potentials(bends=vm.micro(kicks, every=8), bonds=vm.micro(kicks))
 
         Potentials that are placed with ``micro(trapezoidal, every=k)`` kick every k-th micro node; on fast variables alone, with kicks by V
         and W, that is r-RESPA of any number of levels (Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1992). Where they see slow
@@ -190,7 +191,7 @@ class Scheme(eqx.Module):
             return PlacedRule(placed.rule, placed.grid, every=placed.every)
         raise ValueError(
             f"Scheme: there is no rule for the potential {name!r} of the system; the scheme has rules for {list(self.potentials) or 'V and W only'}. "
-            f"Give it one, e.g. scheme.with_potentials({name}=vm.micro(vm.trapezoidal, every=2))."
+            f"Give it one, e.g. scheme.with_potentials({name}=vm.micro(vm.quadrature.trapezoidal, every=2))."
         )
 
     def describe(self) -> "Description":
