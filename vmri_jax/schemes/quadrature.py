@@ -284,8 +284,8 @@ def micro(rule: Rule, every: int = 1) -> PlacedRule:
             nodes at every fourth micro node. It must divide `num_micro` of the scheme; ``every=num_micro`` is `macro`.
 
     Raises:
-        TypeError: no Rule, or `every` no integer.
-        ValueError: `every` below 1.
+        TypeError: no Rule.
+        ValueError: `every` is no integer of at least 1.
     """
     whole_number("micro: every", every)
     return replace(_placed(rule, "micro"), every=int(every))
