@@ -111,7 +111,7 @@ def test_potentials_have_rules_by_name():
     ("make", "error", "message"),
     [
         (lambda: micro(quadrature.midpoint, every=0), ValueError, "micro: every"),
-        (lambda: micro(quadrature.midpoint, every=1.5), ValueError, "micro: every is 1.5"),
+        (lambda: micro(quadrature.midpoint, every=1.5), ValueError, "micro: every is 1.5"),  # pyright: ignore[reportArgumentType]
         (
             lambda: fully_explicit(8).with_potentials(bends=micro(quadrature.midpoint, every=3)),
             ValueError,
@@ -127,7 +127,7 @@ def test_potentials_have_rules_by_name():
             ValueError,
             r"no rule for the potential 'bends' .* scheme.with_potentials\(bends=",
         ),
-        (lambda: fully_explicit(8).with_potentials(bends=quadrature.midpoint), TypeError, "bends is a bare rule"),
+        (lambda: fully_explicit(8).with_potentials(bends=quadrature.midpoint), TypeError, "bends is a bare rule"),  # pyright: ignore[reportArgumentType]
         (
             lambda: Scheme(
                 4, kinetic=micro(quadrature.midpoint, every=2), slow=macro(quadrature.left), fast=micro(quadrature.left)

@@ -60,10 +60,11 @@ def respa(system: vm.System, q, p, num_steps: int, rows=None):
     """(q, p) after steps of nested velocity Verlet; with constraint `rows` its drifts are SHAKE's, and p is projected at the end."""
     inverse, (slow, between, fast) = 1 / np.asarray(MASS), [_force(f, system.params) for _, f in system.potentials]
     h = H / NUM_MICRO
-    value, jacobian = (None, None) if rows is None else (jax.jit(rows), jax.jit(jax.jacrev(rows)))
+    value = jax.jit(rows or (lambda q: q[:0]))
+    jacobian = jax.jit(jax.jacrev(value))
 
     def drift(q, p):
-        if value is None:
+        if rows is None:
             return q + h * inverse * p, p
         G, new = np.asarray(jacobian(q)), q + h * inverse * p
         for _ in range(12):
@@ -81,7 +82,7 @@ def respa(system: vm.System, q, p, num_steps: int, rows=None):
                 p = p + h / 2 * fast(q)
             p = p + EVERY * h / 2 * between(q)
         p = p + H / 2 * slow(q)
-    if value is not None:
+    if rows is not None:
         G = np.asarray(jacobian(q))
         p = p - G.T @ np.linalg.solve(G @ (inverse[:, None] * G.T), G @ (inverse * p))
     return q, p
