@@ -96,7 +96,9 @@ def test_further_potentials_count_in_the_energy():
     [
         (of_both, TypeError, "give functions by name"),
         ({0: of_both}, ValueError, "a whole number k of at least 1"),
-        ({"kinetic": of_both}, ValueError, "which is that of the kinetic energy"),
+        ({"kinetic": of_both}, ValueError, "the name of another term"),
+        ({"V_2": of_both, 2: of_both}, ValueError, "the name of another term"),
+        ({"W": of_both}, ValueError, "the name of another term"),
         ({"a": 1.0}, TypeError, r"potentials\['a'\] is 1.0; it must be a function"),
         ({"a": lambda q_f, params: 0.0}, TypeError, r"it is called with \(q_s, q_f, params\)"),
     ],

@@ -32,6 +32,8 @@ ARGUMENTS = {
     "potentials": "q_s, q_f, params",
 }
 """Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
+RESERVED = ("kinetic", "T", "T_s", "V", "W", "F", "g", "g_s")
+"""Names of other terms, which no potential in `System.potentials` may have."""
 _INSTEAD = {
     "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
     "moving": "Rheonomic(function), whose function gets t first",
@@ -148,7 +150,7 @@ class System(eqx.Module):
             "fast potential W": self.fast_potential,
             "constraint g": self.constraint,
             "slow constraint g_s": self.slow_constraint,
-            **{f"potential {name}": function for name, function in self.potentials},
+            **{f"potential {label(name)}": function for name, function in self.potentials},
             "force F": self.force,
         }
         terms = {name: "" if f is None else f"function {name_of(f)}" for name, f in functions.items()}
@@ -252,6 +254,11 @@ def _checked(name: str, function):
     return traced_once(function)
 
 
+def label(name: str | int) -> str:
+    """What a potential in `System.potentials` is called in texts: its name, of one on every k-th micro node V_k."""
+    return f"V_{name}" if isinstance(name, int) else name
+
+
 def _named_potentials(potentials) -> tuple[tuple[str | int, TracedOnce], ...]:
     """Pairs of a name and a function, from a mapping or from such pairs."""
     try:
@@ -266,9 +273,10 @@ def _named_potentials(potentials) -> tuple[tuple[str | int, TracedOnce], ...]:
                 f"System: potentials has the name {name!r}; give a text, or a whole number k of at least 1 for a potential on every k-th "
                 "micro node."
             )
-        if name == "kinetic":
+        if name in RESERVED or [label(other) for other in named].count(label(name)) > 1:
             raise ValueError(
-                "System: potentials has the name 'kinetic', which is that of the kinetic energy; take another name."
+                f"System: potentials has the name {name!r}, which is the name of another term: one of {', '.join(RESERVED)}, or V_k of the "
+                "potential k. Take another name."
             )
         if function is None or isinstance(function, ConstantMass) or not callable(function):
             raise TypeError(

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels import matmul
-from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.mechanics.system import ConstantMass, System, label
 from vmri_jax.schemes.path import (
     Nodes,
     Path,
@@ -194,7 +194,7 @@ def placed_potentials(system: System, scheme: Scheme) -> tuple[PlacedPotential, 
     """
     both = ("q_s", "q_f")
     known = ("V", system.slow_potential, both, scheme.slow), ("W", system.fast_potential, ("q_f",), scheme.fast)
-    others = ((str(name), function, both, scheme.rule_of(name)) for name, function in system.potentials)
+    others = ((label(name), function, both, scheme.rule_of(name)) for name, function in system.potentials)
     return tuple(
         PlacedPotential(name, function, arguments, placed)
         for name, function, arguments, placed in (*known, *others)

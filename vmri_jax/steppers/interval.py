@@ -13,7 +13,7 @@ from vmri_jax.kernels import DIAGONAL_MATRICES, Full, Sparsity, inverse, matvec,
 from vmri_jax.mechanics.constraint_pattern import fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.system import System, label
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
@@ -45,7 +45,7 @@ def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
             rules[name] = micro(midpoint)
             changes |= {} if name == "force" else {f"{name}_potential": None}
     if system.potentials:
-        local = [(str(name), function, scheme.rule_of(name)) for name, function in system.potentials]
+        local = [(label(name), function, scheme.rule_of(name)) for name, function in system.potentials]
         local = [potential for potential in local if potential[2].is_local]
         changes["potentials"] = {name: function for name, function, _ in local}
         rules["potentials"] = {name: placed for name, _, placed in local}

@@ -25,7 +25,7 @@ from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS, Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.system import System, label
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import PlacedPotential, Term, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
@@ -97,7 +97,7 @@ class Plan:
         system = self.system
         has = {"T": system.kinetic, "V": system.slow_potential, "W": system.fast_potential, "F": system.force}
         has |= {"g": system.constraint, "g_s": system.slow_constraint}
-        has |= {str(name): function for name, function in system.potentials}
+        has |= {label(name): function for name, function in system.potentials}
         scheme = with_rules_for(system, self.scheme).describe()
         rules = {name: rule for name, rule in scheme.rules.items() if has.get(name) is not None}
         if system.slow_kinetic is not None:
@@ -310,7 +310,7 @@ def with_rules_for(system: System, scheme: Scheme | Composition) -> Scheme | Com
     """A scheme with the rules of the further potentials of a system, also where it gives them by their names alone."""
     if isinstance(scheme, Composition):
         return replace(scheme, scheme=with_rules_for(system, scheme.scheme))
-    return replace(scheme, potentials={str(name): scheme.rule_of(name) for name, _ in system.potentials})
+    return replace(scheme, potentials={label(name): scheme.rule_of(name) for name, _ in system.potentials})
 
 
 def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None:
