@@ -71,12 +71,11 @@ def quadrature_nodes(placed: PlacedRule, num_micro: int):
     if placed.grid == "macro":
         interval = np.minimum(np.floor(nodes * num_micro + NODE_TOLERANCE).astype(int), num_micro - 1)
         return nodes, interval, jnp.asarray(placed.rule.weights)
-    interval = np.repeat(np.arange(num_micro), len(nodes))
-    return (
-        (interval + np.tile(nodes, num_micro)) / num_micro,
-        interval,
-        jnp.tile(placed.rule.weights, num_micro) / num_micro,
-    )
+    copies = num_micro // placed.every  # of the rule, each over `every` micro intervals
+    first = np.repeat(np.arange(copies), len(nodes)) * placed.every
+    inside = np.tile(nodes, copies) * placed.every
+    interval = first + np.minimum(np.floor(inside + NODE_TOLERANCE).astype(int), placed.every - 1)
+    return (first + inside) / num_micro, interval, jnp.tile(placed.rule.weights, copies) / copies
 
 
 def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
@@ -101,7 +100,7 @@ def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
 
 
 def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
-    """The discrete Lagrangian ``L_d = sum H w_i (T - V - W)`` of a macro step.
+    """The discrete Lagrangian ``L_d = sum H w_i (T - V - W - sum_j V_j)`` of a macro step.
 
     Args:
         slow: (r + 1, n_s) slow control points.
@@ -120,8 +119,11 @@ def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
     kinetic = action(scheme.kinetic, lambda q_s, q_f, v_s, v_f: T(q_s, q_f, v_s, v_f, system.params))
     if T_s is not None:
         kinetic += action(macro(scheme.kinetic.rule), lambda q_s, q_f, v_s, v_f: T_s(q_s, v_s, system.params))
-    kinetic -= action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
-    return kinetic - action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
+    L_d = kinetic - action(scheme.slow, lambda q_s, q_f, v_s, v_f: slow_potential(q_s, q_f))
+    L_d -= action(scheme.fast, lambda q_s, q_f, v_s, v_f: fast_potential(q_s, q_f))
+    for name, V in system.potentials:
+        L_d -= action(scheme.rule_of(name), lambda q_s, q_f, v_s, v_f, V=V: V(q_s, q_f, system.params))
+    return L_d
 
 
 def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Callable]:

@@ -3,8 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from vmri_jax import ConstantMass, System
+from vmri_jax.diagnostics import energy
 from vmri_jax.mechanics.functions import traced_once
 from vmri_jax.mechanics.structure import depends_on
 
@@ -69,3 +71,38 @@ def test_dependence_is_read_off_the_function():
     assert depends_on(unused, x, y) == (True, False)
     inner = jax.jit(lambda x, y: jnp.sin(x))
     assert depends_on(lambda tree: inner(tree["a"], tree["b"]), {"a": x, "b": x}) == (True,)
+
+
+def of_both(q_s, q_f, params):
+    return jnp.sum(q_s) * jnp.sum(q_f)
+
+
+def test_further_potentials_count_in_the_energy():
+    system = System(ConstantMass([1.0], [2.0]), potentials={"a": of_both, 4: of_both, "fast": of_both})
+    q_s, q_f = jnp.array([2.0]), jnp.array([3.0])
+    assert {name: float(value) for name, value in system.all_potentials(q_s, q_f).items()} == {
+        "slow": 0.0,
+        "fast": 6.0,
+        "a": 6.0,
+        4: 6.0,
+    }
+    assert float(energy(system, q_s, q_f, 0 * q_s, 0 * q_f)) == 18.0
+    assert system.replace(params=1.0).potentials == system.potentials
+    assert "potential a" in repr(system)
+
+
+@pytest.mark.parametrize(
+    ("potentials", "error", "message"),
+    [
+        (of_both, TypeError, "give functions by name"),
+        ({0: of_both}, ValueError, "a whole number k of at least 1"),
+        ({"kinetic": of_both}, ValueError, "the name of another term"),
+        ({"V_2": of_both, 2: of_both}, ValueError, "the name of another term"),
+        ({"W": of_both}, ValueError, "the name of another term"),
+        ({"a": 1.0}, TypeError, r"potentials\['a'\] is 1.0; it must be a function"),
+        ({"a": lambda q_f, params: 0.0}, TypeError, r"it is called with \(q_s, q_f, params\)"),
+    ],
+)
+def test_further_potentials_that_are_refused(potentials, error, message):
+    with pytest.raises(error, match=message):
+        System(ConstantMass([1.0], [2.0]), potentials=potentials)

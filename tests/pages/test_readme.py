@@ -92,7 +92,10 @@ def test_optimal_control(tmp_path, monkeypatch):
 def test_a_scheme_of_ones_own(capsys):
     program = "".join(re.findall(r"```python\n(.*?)```", (ROOT / "docs/how_to/schemes.md").read_text(), re.DOTALL))
     exec(program, {})
-    assert "order 2.0" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "order 2.0" in printed
+    (rates,) = re.findall(r"```text\n(.*?)```", (ROOT / "docs/how_to/schemes.md").read_text(), re.DOTALL)
+    assert printed.endswith(rates)
 
 
 def test_a_stepper_of_ones_own(capsys):

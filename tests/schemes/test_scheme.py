@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from vmri_jax import Scheme, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, quadrature
+from vmri_jax import Scheme, compose, explicit_slow, fully_explicit, fully_implicit, galerkin, macro, micro, quadrature
 
 
 @pytest.mark.parametrize(
@@ -86,3 +86,64 @@ def test_zero_constraint_weight_is_refused():
     rule = micro(quadrature.midpoint)
     with pytest.raises(ValueError, match="weight of the slow_constraint rule is zero"):
         Scheme(2, kinetic=rule, slow=rule, fast=rule, slow_constraint=macro(quadrature.Rule((0, 1), (0, 1))))
+
+
+def test_potentials_have_rules_by_name():
+    kicks = quadrature.trapezoidal
+    scheme = fully_explicit(12).with_potentials(a=micro(kicks, every=4), b=macro(kicks)).with_potentials(b=micro(kicks))
+    assert (scheme.rule_of("a").every, scheme.rule_of("b").every, scheme.rule_of(6).every) == (4, 1, 6)
+    assert (
+        scheme.rule_of(12).grid
+        == "macro"
+        == fully_explicit(4).with_potentials(a=micro(kicks, every=4)).rule_of("a").grid
+    )
+    assert scheme.rule_of("slow").grid == "macro"
+    assert scheme.rule_of("fast").rule.nodes == scheme.fast.rule.nodes
+    assert scheme.describe().evaluations == {"a": 3, "b": 12}
+    assert "gradients of a  3 per macro step" in str(scheme.describe())
+    assert compose(scheme, "suzuki4").describe().evaluations == {"a": 15, "b": 60}
+    assert scheme.describe().rules["a"] == "trapezoidal rule on every 4 micro intervals"
+    assert scheme.with_potentials(c=micro(quadrature.left)).order == 1
+    assert not scheme.with_potentials(c=micro(quadrature.left)).is_symmetric
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: micro(quadrature.midpoint, every=0), ValueError, "micro: every"),
+        (lambda: micro(quadrature.midpoint, every=1.5), ValueError, "micro: every is 1.5"),  # pyright: ignore[reportArgumentType]
+        (
+            lambda: fully_explicit(8).with_potentials(bends=micro(quadrature.midpoint, every=3)),
+            ValueError,
+            r"bends is placed with every=3, which does not divide num_micro=8: .* Take one of \[1, 2, 4, 8\]",
+        ),
+        (
+            lambda: fully_explicit(8).rule_of(3),
+            ValueError,
+            r"the potential 3 is placed with every=3, which does not divide",
+        ),
+        (
+            lambda: fully_explicit(8).rule_of("bends"),
+            ValueError,
+            r"no rule for the potential 'bends' .* scheme.with_potentials\(bends=",
+        ),
+        (lambda: fully_explicit(8).with_potentials(bends=quadrature.midpoint), TypeError, "bends is a bare rule"),  # pyright: ignore[reportArgumentType]
+        (
+            lambda: Scheme(
+                4, kinetic=micro(quadrature.midpoint, every=2), slow=macro(quadrature.left), fast=micro(quadrature.left)
+            ),
+            ValueError,
+            "kinetic is placed with every=2; only potentials can be",
+        ),
+        (
+            lambda: fully_explicit(8).with_potentials(
+                bends=quadrature.gradient_corrected(micro(quadrature.trapezoidal))
+            ),
+            ValueError,
+            "bends is corrected; only the rules of V and W can be",
+        ),
+    ],
+)
+def test_rates_that_are_refused(make, error, message):
+    with pytest.raises(error, match=message):
+        make()

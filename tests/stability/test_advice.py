@@ -122,3 +122,13 @@ def test_table_and_bad_input(fpu):
     for macro_dt in (0.0, np.nan, [0.1]):
         with pytest.raises(ValueError, match="macro_dt is"):
             advise(fpu, fully_explicit(1), macro_dt=macro_dt)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_further_potential_that_its_rate_does_not_resolve_is_named():
+    """Frequency 50, kicked every 0.08: Verlet's limit is 2."""
+    system = vm.System(vm.ConstantMass([1.0], [1.0]), potentials={"bends": lambda q_s, q_f, params: 1250 * q_f @ q_f})
+    scheme = vm.fully_explicit(16).with_potentials(bends=vm.micro(vm.quadrature.trapezoidal, every=8))
+    zero = jnp.zeros(1)
+    advice = advise(system, scheme, vm.State(0.0, zero, zero, zero, zero + 0.1), macro_dt=0.16)
+    assert "the bends potential alone: its frequency 50 times the step of 8 micro intervals is 4" in str(advice)
+    assert "stable below 2" in str(advice)

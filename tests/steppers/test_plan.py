@@ -1,5 +1,6 @@
 """Plans in words."""
 
+import jax.numpy as jnp
 import pytest
 
 from vmri_jax import (
@@ -7,6 +8,7 @@ from vmri_jax import (
     explicit_slow,
     fully_explicit,
     galerkin,
+    micro,
     mollified_impulse,
     plan,
     quadrature,
@@ -57,3 +59,45 @@ def test_only_terms_of_the_system_are_described(tsp):
 )
 def test_rules_in_words(scheme, words):
     assert scheme.describe().rules["V"] == words
+
+
+THREE_RATES = """\
+order               2, symmetric
+path                32 micro steps of degree 1 per macro step
+T                   midpoint on every micro interval
+V                   trapezoidal rule on the macro interval
+W                   trapezoidal rule on every micro interval
+bends               trapezoidal rule on every 8 micro intervals
+gradients of V      1 per macro step
+gradients of W      32 per macro step
+gradients of bends  4 per macro step
+solves              none per macro step; with constraints 1
+a step:
+  kicks of V at both ends
+    slow variables, one step:
+      free flight: q + H v, nothing to solve
+    fast variables, 4 steps:
+      kicks of bends at both ends
+        8 micro steps:
+          kicks of W at both ends
+            free flight: q + H v, nothing to solve"""
+
+
+def bends(q_s, q_f, params):
+    """Of fast variables alone."""
+    return jnp.sum(jnp.cos(q_f))
+
+
+def test_a_plan_of_three_rates(fpu):
+    scheme = fully_explicit(32).with_potentials(bends=micro(quadrature.trapezoidal, every=8))
+    described = plan(fpu.system.replace(potentials={"bends": bends}), scheme, fpu.state()).describe()
+    assert described == THREE_RATES
+
+
+def test_a_mollified_scheme_refuses_potentials_on_the_micro_grid(fpu):
+    with pytest.raises(ValueError, match=r"mollified, .* one of the potentials \['bends'\] is on the micro grid"):
+        plan(
+            fpu.system.replace(potentials={"bends": bends}),
+            mollified_impulse(4).with_potentials(bends=micro(quadrature.midpoint)),
+            fpu.state(),
+        )

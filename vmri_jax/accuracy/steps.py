@@ -13,6 +13,7 @@ steps, the least time for an error is reached with
 where the time that is spent on each grid goes with the share that it leaves.
 """
 
+import math
 import time
 import warnings
 from collections.abc import Callable
@@ -167,7 +168,9 @@ class Search:
         micro_seconds = max(of_two - trial.seconds, 0.02 * trial.seconds) / num_micro
         macro_seconds = max(trial.seconds - num_micro * micro_seconds, 0.02 * trial.seconds)
         fast_over_slow = num_micro**p * fast / max(slow, 1e-3 * fast)
-        best = int(np.clip(round((macro_seconds / micro_seconds * fast_over_slow) ** (1 / (p + 1))), 1, MOST_MICRO))
+        best = (macro_seconds / micro_seconds * fast_over_slow) ** (1 / (p + 1))
+        unit = _unit(trial.run.system, stage_scheme(trial.run.scheme))
+        best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
         if max(best, num_micro) <= SAME * min(best, num_micro):
             return trial
         other = self.trial(trial.family, best, max(1, round(trial.run.num_steps * num_micro / best)))
@@ -272,11 +275,17 @@ def _menu(scheme, system: System, start: State, accuracy: float, length: float) 
     digits = np.log10(max((size or speed * length) / accuracy, 10.0))
     base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
     name = next((name for most, name in COMPOSED if digits <= most), None)
-    num_micro = FIRST_MICRO if start.q_s.size and start.q_f.size else 1
+    unit = _unit(system, base.make(1))
+    num_micro = unit * -(-FIRST_MICRO // unit) if unit > 1 or (start.q_s.size and start.q_f.size) else 1
     return [
         (base if name is None else base.composed(name), num_micro),
         (of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1),
     ]
+
+
+def _unit(system: System, scheme: Scheme) -> int:
+    """The smallest number of micro steps that all rules on every k-th micro node fit into."""
+    return math.lcm(scheme.unit, *(name for name, _ in system.potentials if isinstance(name, int)))
 
 
 def _seconds_of_a_step(run: Simulation) -> float:

@@ -9,6 +9,7 @@ compared with differences of the gradient in the same way, and must be symmetric
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -45,7 +46,7 @@ def derivatives(problem: Problem, scheme: Scheme, macro_dt: float) -> Outcome:
     for name, function, points in _terms(problem, scheme, macro_dt):
         first, second, lopsided = _apart(function, points)
         worst[f"the gradient of {name} from differences of its values"] = first
-        if name in ("slow_potential", "fast_potential"):
+        if "potential" in name:
             worst[f"the second derivative of {name} from differences of its gradient"] = second
             worst[f"the second derivative of {name} from its transpose"] = lopsided
     wrong = {what: apart for what, apart in worst.items() if not apart < WRONG}
@@ -75,11 +76,19 @@ def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[Term]:
         yield Term("slow_potential", lambda q: slow(q[:n_s], q[n_s:], params)[None], found[:, :n])
     if (fast := system.fast_potential) is not None:
         yield Term("fast_potential", lambda q: fast(q, params)[None], found[:, n_s:n])
+    for name, potential in system.potentials:
+        function = partial(_of_joined, potential, n_s, params)
+        yield Term(f"potential {name!r}", function, found[:, :n])
     if not system.has_constant_mass:
         parts = (n_s, n, n + n_s)
         yield Term("kinetic", lambda z: system.kinetic(*jnp.split(z, parts), params)[None], found)
     if system.is_constrained:
         yield Term("the constraints", lambda q: system.constraints(t, q[:n_s], q[n_s:]), found[:, :n])
+
+
+def _of_joined(potential: Callable, n_s: int, params, q):
+    """(1,) value of a potential of all positions q."""
+    return potential(q[:n_s], q[n_s:], params)[None]
 
 
 def _apart(function: Callable, points: np.ndarray) -> tuple[float, float, float]:

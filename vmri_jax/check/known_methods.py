@@ -8,7 +8,7 @@ from jax.scipy.linalg import block_diag
 
 from vmri_jax.check.measures import difference, run
 from vmri_jax.diagnostics.linear import phase_vector
-from vmri_jax.mechanics.invariants import potentials
+from vmri_jax.mechanics.invariants import potential_energy
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.study.program import joined
@@ -20,7 +20,7 @@ ROUND_OFF = 4 * np.finfo(float).eps
 class Flat:
     """A problem with slow and fast variables joined, as functions of q that return numpy arrays.
 
-    q, p: the start. mass, inverse_mass: (n, n). force, slope: ``-grad U`` and its derivative, U = V + W. rows, jacobian: of
+    q, p: the start. mass, inverse_mass: (n, n). force, slope: ``-grad U`` and its derivative, U the sum of all potentials. rows, jacobian: of
     the constraints.
     """
 
@@ -28,7 +28,7 @@ class Flat:
         system, n_s, state = problem.system, problem.q_s.size, problem.state()
 
         def potential(q):
-            return sum(potentials(system, q[:n_s], q[n_s:]))
+            return potential_energy(system, q[:n_s], q[n_s:])
 
         def rows(q):
             return system.constraints(state.t, q[:n_s], q[n_s:])

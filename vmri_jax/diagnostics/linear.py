@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.invariants import all_constraints, potentials, velocity
+from vmri_jax.mechanics.invariants import all_constraints, potential_energy, velocity
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
@@ -70,7 +70,7 @@ def frequencies(system: Movable, state: State | None = None):
     v = jnp.concatenate(velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
 
     def potential(q):
-        return sum(potentials(system, q[:n_s], q[n_s:]))
+        return potential_energy(system, q[:n_s], q[n_s:])
 
     mass = jax.hessian(lambda v: system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params))(v)
     basis = np.asarray(_null_space(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q)))

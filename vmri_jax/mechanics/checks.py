@@ -85,6 +85,7 @@ def check_system(system: System, q_s, q_f) -> None:
         "slow_kinetic": (system.slow_kinetic, (q_s, q_s)),
         "slow_potential": (system.slow_potential, (q_s, q_f)),
         "fast_potential": (system.fast_potential, (q_f,)),
+        **{f"potentials[{name!r}]": (function, (q_s, q_f)) for name, function in system.potentials},
     }
     for name, (function, args) in scalars.items():
         if function is not None:
@@ -120,8 +121,7 @@ def check_closures(system: System, q_s, q_f) -> None:
     def all_functions():
         zero = jnp.zeros(())
         energies = [system.kinetic(q_s, q_f, q_s, q_f, system.params)]
-        energies += [] if system.slow_potential is None else [system.slow_potential(q_s, q_f, system.params)]
-        energies += [] if system.fast_potential is None else [system.fast_potential(q_f, system.params)]
+        energies += system.all_potentials(q_s, q_f).values()
         return energies, system.constraints(zero, q_s, q_f), system.forces(zero, q_s, q_f, q_s, q_f)
 
     if not is_concrete(jax.make_jaxpr(all_functions)().consts):

@@ -1,5 +1,8 @@
 """What a trajectory keeps: energy, momentum maps, constraints."""
 
+from functools import reduce
+from operator import add
+
 import jax
 import jax.numpy as jnp
 
@@ -10,31 +13,26 @@ from vmri_jax.mechanics.system import System
 
 
 def energy_parts(system: System, q_s, q_f, p_s, p_f) -> dict:
-    """Parts of the Hamiltonian ``p . v - T(q, v) + V + W``: "kinetic", "slow" and "fast"."""
+    """Parts of the Hamiltonian ``p . v - T(q, v) + V + W + sum_i V_i``: "kinetic", "slow", "fast" and the names of `System.potentials`."""
     v_s, v_f = velocity(system, q_s, q_f, p_s, p_f)
     kinetic = jnp.sum(p_s * v_s) + jnp.sum(p_f * v_f) - system.kinetic(q_s, q_f, v_s, v_f, system.params)
-    slow, fast = potentials(system, q_s, q_f)
-    return {"kinetic": kinetic, "slow": slow, "fast": fast}
+    return {"kinetic": kinetic, **system.all_potentials(q_s, q_f)}
 
 
-def potentials(system: System, q_s, q_f):
-    """Values of V and W, zero where there is none."""
-    zero = jnp.zeros(())
-    slow = zero if system.slow_potential is None else system.slow_potential(q_s, q_f, system.params)
-    fast = zero if system.fast_potential is None else system.fast_potential(q_f, system.params)
-    return slow, fast
+def potential_energy(system: System, q_s, q_f):
+    """``V + W + sum_i V_i``."""
+    return sum(system.all_potentials(q_s, q_f).values())
 
 
 def energy(system: System, q_s, q_f, p_s, p_f):
-    """Hamiltonian ``p . v - T(q, v) + V(q_s, q_f) + W(q_f)`` with v the velocity of p.
+    """Hamiltonian ``p . v - T(q, v) + V(q_s, q_f) + W(q_f) + sum_i V_i(q_s, q_f)`` with v the velocity of p.
 
     Args:
         system: masses, potentials and their parameters.
         q_s, q_f: (n_s,) and (n_f,) positions.
         p_s, p_f: (n_s,) and (n_f,) momenta.
     """
-    parts = energy_parts(system, q_s, q_f, p_s, p_f)
-    return parts["kinetic"] + parts["slow"] + parts["fast"]
+    return reduce(add, energy_parts(system, q_s, q_f, p_s, p_f).values())
 
 
 def oscillatory_energies(omega, q_f, p_f):

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.invariants import potentials
+from vmri_jax.mechanics.invariants import potential_energy
 from vmri_jax.mechanics.motion import motion
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import State
@@ -133,7 +133,7 @@ def _on_line(system, state, line, s):
 
     def lagrangian(q, v):
         q_s, q_f = q[:n_s], q[n_s:]
-        return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params) - sum(potentials(system, q_s, q_f))
+        return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params) - potential_energy(system, q_s, q_f)
 
     def force(s):
         here, velocity = q + s * dq, v + s * dv

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from vmri_jax.mechanics.invariants import velocity
+from vmri_jax.mechanics.invariants import potential_energy, velocity
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
@@ -48,12 +48,7 @@ def motion(system: System, state: State) -> Motion:
 
     def lagrangian(q, v):
         q_s, q_f = q[:n_s], q[n_s:]
-        value = system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params)
-        if system.slow_potential is not None:
-            value -= system.slow_potential(q_s, q_f, system.params)
-        if system.fast_potential is not None:
-            value -= system.fast_potential(q_f, system.params)
-        return value
+        return system.kinetic(q_s, q_f, v[:n_s], v[n_s:], system.params) - potential_energy(system, q_s, q_f)
 
     def constraints(t, q):
         return system.constraints(t, q[:n_s], q[n_s:])

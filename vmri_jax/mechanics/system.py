@@ -29,8 +29,11 @@ ARGUMENTS = {
     "slow_constraint": "q_s, params",
     "force": "t, q_s, q_f, v_s, v_f, params",
     "implied": "q_s, q_f, params",
+    "potentials": "q_s, q_f, params",
 }
 """Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
+RESERVED = ("kinetic", "T", "T_s", "V", "W", "F", "g", "g_s")
+"""Names of other terms, which no potential in `System.potentials` may have."""
 _INSTEAD = {
     "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
     "moving": "Rheonomic(function), whose function gets t first",
@@ -54,7 +57,7 @@ class KineticFunction(eqx.Module):
 
 
 class System(eqx.Module):
-    """Mechanical system with Lagrangian ``L = T - V - W``, constraints ``g = 0`` and forces ``F``.
+    """Mechanical system with Lagrangian ``L = T - V - W - sum_i V_i``, constraints ``g = 0`` and forces ``F``.
 
     Args:
         kinetic: `ConstantMass`, or ``kinetic(q_s, q_f, v_s, v_f, params) -> ()``, regular in the velocities.
@@ -71,6 +74,10 @@ class System(eqx.Module):
             at its saved nodes: they count in `constraint_residual`, and where one is not zero the run ends as `NOT_IMPLIED`.
         slow_kinetic: ``T_s(q_s, v_s, params) -> ()``, a part of the kinetic energy that slow variables alone have, besides the function
             `kinetic`. Schemes evaluate it on the macro grid, see `vmri_jax.schemes.discrete_lagrangian`; kept in `kinetic`.
+        potentials: further potentials ``V_i(q_s, q_f, params) -> ()`` by name, each with a rate of its own: a scheme says for each name which
+            rule it has, `vmri_jax.Scheme.with_potentials`. The names "slow" and "fast" have the rules of V and of W unless the scheme says
+            otherwise, so that ``{"fast": V_1}`` is a potential on the micro grid that may join slow and fast variables. The name k, a
+            whole number, has the trapezoidal rule on every k-th micro node. Kept as pairs of a name and a function.
 
     Functions are compared by identity: define them at module level (not inside a loop) and pass what varies
     through `params`, and everything is compiled once. They are kept as `TracedOnce`, so that ``system.force`` is called
@@ -85,6 +92,7 @@ class System(eqx.Module):
     force: TracedOnce | None = eqx.field(static=True, default=None)
     params: Any = None
     implied: TracedOnce | Rheonomic | None = eqx.field(static=True, default=None)
+    potentials: tuple[tuple[str | int, TracedOnce], ...] = eqx.field(static=True, default=())
 
     def __init__(
         self,
@@ -97,6 +105,7 @@ class System(eqx.Module):
         params=None,
         implied=None,
         slow_kinetic=None,
+        potentials=None,
     ):
         functions = {
             "slow_potential": slow_potential,
@@ -124,6 +133,7 @@ class System(eqx.Module):
             )
         self.kinetic = kinetic
         self.params = params
+        self.potentials = _named_potentials(potentials or ())
 
     def __repr__(self) -> str:
         return summary("System", self.terms())
@@ -140,6 +150,7 @@ class System(eqx.Module):
             "fast potential W": self.fast_potential,
             "constraint g": self.constraint,
             "slow constraint g_s": self.slow_constraint,
+            **{f"potential {label(name)}": function for name, function in self.potentials},
             "force F": self.force,
         }
         terms = {name: "" if f is None else f"function {name_of(f)}" for name, f in functions.items()}
@@ -151,6 +162,17 @@ class System(eqx.Module):
     def replace(self, **changes) -> "System":
         """The same system with some fields changed, e.g. ``system.replace(params=new)``."""
         return dataclasses.replace(self, **changes)
+
+    def all_potentials(self, q_s, q_f) -> dict:
+        """Values of V ("slow"), of W ("fast") and of `potentials` by name; zero without V or W, and those of one name together."""
+        zero = jnp.zeros(())
+        values: dict[str | int, Any] = {
+            "slow": zero if self.slow_potential is None else self.slow_potential(q_s, q_f, self.params),
+            "fast": zero if self.fast_potential is None else self.fast_potential(q_f, self.params),
+        }
+        for name, function in self.potentials:
+            values[name] = values.get(name, 0.0) + function(q_s, q_f, self.params)
+        return values
 
     def g(self, t, q_s, q_f):
         """Values of `constraint`, shape (n_g,); n_g = 0 where there is none."""
@@ -230,6 +252,38 @@ def _checked(name: str, function):
         raise TypeError(f"System: {name} is {function!r}; it must be a function or None.")
     _check_function(name, function)
     return traced_once(function)
+
+
+def label(name: str | int) -> str:
+    """What a potential in `System.potentials` is called in texts: its name, of one on every k-th micro node V_k."""
+    return f"V_{name}" if isinstance(name, int) else name
+
+
+def _named_potentials(potentials) -> tuple[tuple[str | int, TracedOnce], ...]:
+    """Pairs of a name and a function, from a mapping or from such pairs."""
+    try:
+        named = dict(potentials)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"System: potentials is {potentials!r}; give functions by name, e.g. potentials={{'bends': V_1, 'bonds': V_2}}."
+        ) from None
+    for name, function in named.items():
+        if isinstance(name, bool) or not isinstance(name, str | int) or (isinstance(name, int) and name < 1):
+            raise ValueError(
+                f"System: potentials has the name {name!r}; give a text, or a whole number k of at least 1 for a potential on every k-th "
+                "micro node."
+            )
+        if name in RESERVED or [label(other) for other in named].count(label(name)) > 1:
+            raise ValueError(
+                f"System: potentials has the name {name!r}, which is the name of another term: one of {', '.join(RESERVED)}, or V_k of the "
+                "potential k. Take another name."
+            )
+        if function is None or isinstance(function, ConstantMass) or not callable(function):
+            raise TypeError(
+                f"System: potentials[{name!r}] is {function!r}; it must be a function of (q_s, q_f, params)."
+            )
+        _check_function("potentials", function)
+    return tuple((name, traced_once(function)) for name, function in named.items())
 
 
 def _constrain(function, t, *arguments):

@@ -21,7 +21,7 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
     """
     bodies, where = sorting.bodies, sorting.layout
     potentials: dict[str, tuple] = {}
-    terms: dict[str, list] = {}
+    terms: dict[Any, list] = {}
     for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):  # forces may build on potentials
         name, made = part.effect.name, part.effect.terms(part.elements, bodies, where, potentials)
         if part.effect.kind == "potential":
@@ -38,6 +38,12 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
         for home in FUNCTIONS
         if terms.get(home) or ("kinetic" in home and home in terms)
     }
+    named = [home for home in terms if home == "fast" or isinstance(home, int)]
+    if named:
+        functions["potentials"] = {
+            home: FUNCTIONS["slow_potential"](tuple(terms[home]), _kinematics("potentials", terms[home], where))
+            for home in named
+        }
     for home in ("constraint", "slow_constraint", "implied"):
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])

@@ -55,8 +55,10 @@ class Effect(ABC):
 
     Args:
         name: of this effect in its scene; by default the name of its class.
-        rate: of a potential, "slow" (V), "fast" (W) or "auto", by stiffness; of a kinetic effect likewise, but it only
-            makes bodies fast: these terms are all on the micro grid.
+        rate: of a potential, "slow" (V), "fast" (on the micro grid, with the rule of W), a whole number k (on every k-th micro node), or
+            "auto", by stiffness. Of a kinetic effect "slow", "fast" or "auto", but it only makes bodies fast: these terms are all on the
+            micro grid. Bodies that a potential with the rate "fast" or k touches are fast, unless they are given as slow: then the
+            equations of the slow bodies are implicit in it.
     """
 
     kind: ClassVar[Kind]
@@ -82,7 +84,7 @@ class Effect(ABC):
     """What is drawn between neighbouring bodies of an element."""
 
     name: str = field(default="", kw_only=True)
-    rate: Literal["slow", "fast", "auto"] = field(default="auto", kw_only=True)
+    rate: Literal["slow", "fast", "auto"] | int = field(default="auto", kw_only=True)
 
     def __post_init__(self):
         for argument in fields(self):
@@ -95,8 +97,10 @@ class Effect(ABC):
                 if not callable(function):
                     raise TypeError(f"{what} is {function!r}; give a function of (t, params).")
                 check_arguments(what, function, "t, params")
-        if self.rate not in ("slow", "fast", "auto"):
-            raise ValueError(f"{self.name}: rate is {self.rate!r}; it must be 'slow', 'fast' or 'auto'.")
+        is_number = isinstance(self.rate, int) and not isinstance(self.rate, bool) and self.rate > 0
+        if not (is_number and self.kind == "potential") and self.rate not in ("slow", "fast", "auto"):
+            number = ", or of a potential a whole number k, for every k-th micro node"
+            raise ValueError(f"{self.name}: rate is {self.rate!r}; it must be 'slow', 'fast' or 'auto'{number}.")
 
     @property
     def declared(self) -> dict[str, Parameter]:

@@ -15,16 +15,17 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.summary import name_of
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.system import System, label
 from vmri_jax.running.printed import PrintedTable
 from vmri_jax.running.simulation import Simulation, prepare
 from vmri_jax.running.timing import interleaved, seconds_each
 from vmri_jax.scene.assembly import build
 from vmri_jax.scene.sorting import Sorting
 from vmri_jax.schemes.composition import Composition, stage_scheme
+from vmri_jax.schemes.quadrature import PlacedRule
 from vmri_jax.schemes.scheme import Scheme
 
-HOMES = {
+HOMES: dict[Any, str] = {
     "kinetic": "kinetic energy T",
     "slow_potential": "slow potential V",
     "fast_potential": "fast potential W",
@@ -32,8 +33,9 @@ HOMES = {
     "slow_constraint": "constraint g_s",
     "force": "force F",
     "control": "control u",
+    "fast": "potential on the micro grid",
 }
-RULES = {"slow_potential": "slow", "fast_potential": "fast", "control": "force"}
+RULES: dict[Any, str] = {"slow_potential": "slow", "fast_potential": "fast", "control": "force"}
 """What a scheme calls its rules of these parts."""
 STEPS = 20
 """Macro steps of a program that is timed."""
@@ -125,12 +127,20 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
         rows.append(Row(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
     whole, times = _measure(sorting, scheme, macro_dt) if measure else (None, [None] * len(sorting.placed))
     for part, nanoseconds in zip(sorting.placed, times, strict=True):
-        rule = getattr(one, RULES.get(part.home, part.home))
+        rule = _rule(one, part.home)
         multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
         count = 0 if part.home == "control" else stages * evaluations(rule, one.num_micro)
         own = None if nanoseconds is None else nanoseconds * count / 1e3
-        rows.append(Row(part.effect.name, HOMES[part.home], rule.grid, part.reason, 0, multipliers, count, own))
+        kind = HOMES.get(part.home, f"potential on every {part.home} micro nodes")
+        rows.append(Row(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, own))
     return Ledger(tuple(rows), whole)
+
+
+def _rule(scheme: Scheme, home) -> PlacedRule:
+    """The rule of the scheme for what is part of this argument of `System`, or of this one of its further potentials."""
+    if home == "fast" or isinstance(home, int):
+        return scheme.rule_of(home)
+    return getattr(scheme, RULES.get(home, home))
 
 
 def ledger_of_functions(
@@ -150,12 +160,12 @@ def ledger_of_functions(
     for name, (part, _, size) in names.bodies.items():
         pace, grid = ("fast", "micro") if part == "f" else ("slow", "macro")
         rows.append(Row(name, "body", grid, f"{pace}: it is in q_{part}", intervals[grid] * size, 0, 0))
-    terms = [home for home in HOMES if home != "control" and getattr(system, home) is not None]
+    terms = [home for home in HOMES if getattr(system, home, None) is not None]
     if system.has_constant_mass:
         terms.remove("kinetic")
     for home in terms:
         alone = _alone(system, home, state)
-        rule = getattr(one, RULES.get(home, home))
+        rule = _rule(one, home)
         multipliers = intervals[rule.grid] * sum(alone.num_constraints(state.q_s, state.q_f))
         count, time = stages * evaluations(rule, one.num_micro), None
         if measure:
@@ -163,13 +173,23 @@ def ledger_of_functions(
             time = 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
         why = f"the rule of the scheme for it is on the {rule.grid} grid"
         rows.append(Row(name_of(getattr(system, home)), HOMES[home], rule.grid, why, 0, multipliers, count, time))
+    for name, function in system.potentials:
+        rule = one.rule_of(name)
+        count, time = stages * evaluations(rule, one.num_micro), None
+        if measure:
+            alone = _alone(system, "", state).replace(potentials={name: function})
+            derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
+            time = 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
+        why = f"the rule of the scheme for it: {rule.in_words()}"
+        rows.append(Row(name_of(function), f"potential {label(name)}", rule.grid, why, 0, 0, count, time))
     return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, 10.0) if measure else None)
 
 
 def _alone(system: System, home: str, state: State) -> System:
     """The system with one of its functions, and unit masses unless that is the kinetic energy."""
     masses = ConstantMass(np.ones(state.q_s.size), np.ones(state.q_f.size))
-    others = {name: None for name in HOMES if name not in (home, "kinetic", "control")}
+    others = {name: None for name in HOMES if name not in (home, "kinetic", "control", "fast")}
+    others["potentials"] = None
     return system.replace(**others, **({} if home == "kinetic" else {"kinetic": masses}))
 
 
@@ -209,7 +229,7 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
     """All first derivatives that a step takes of a system, as a function of its positions that is shaped like these."""
 
     def lagrangian(q):
-        potentials = sum(invariants.potentials(system, q[:n_s], q[n_s:]))
+        potentials = invariants.potential_energy(system, q[:n_s], q[n_s:])
         if system.has_constant_mass:
             return -potentials
         return system.kinetic(q[:n_s], q[n_s:], v_s, v_f, system.params) - potentials

@@ -1,7 +1,8 @@
 """Who is slow and who is fast: bodies by pace, effects by what they touch and how stiff they are.
 
-A potential that touches a slow body is part of V. One that touches only fast bodies is part of W if it is stiff, else of
-V, where it is evaluated less often. A constraint that touches a fast body is held on the micro grid, one between slow
+A potential that touches a slow body is part of V, unless its rate is declared. One that touches only fast bodies is part of W if it is
+stiff, else of V, where it is evaluated less often. One of the declared rate k is evaluated at every k-th micro node, and one that is
+declared fast and touches a slow body is on the micro grid. A constraint that touches a fast body is held on the micro grid, one between slow
 bodies on the macro grid: on the micro grid it would be over-determined. Kinetic effects are on the micro grid always,
 because momenta need them there; the kinetic energy of bodies that depend on slow coordinates alone is on the macro grid.
 
@@ -32,7 +33,11 @@ from vmri_jax.scene.trees import Branch, Link, joint_numbers, layout, nearest_ra
 NAMED = 3
 """Most bodies that a reason names."""
 
-Home = Literal["kinetic", "slow_potential", "fast_potential", "constraint", "slow_constraint", "force", "control"]
+Home = (
+    Literal["kinetic", "slow_potential", "fast_potential", "constraint", "slow_constraint", "force", "control", "fast"]
+    | int
+)
+"""The argument of `System` that an element is part of; "fast" or a whole number: the potential of this name in `System.potentials`."""
 
 
 class Reason(NamedTuple):
@@ -204,8 +209,7 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
         branches: bodies that are functions of the freedoms of joints, parents before children.
 
     Raises:
-        ValueError: a potential that is to be fast but touches a slow body; something to be decided by numbers that are traced; joints
-            that leave no freedom.
+        ValueError: something to be decided by numbers that are traced; joints that leave no freedom.
     """
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
@@ -270,7 +274,8 @@ def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owner
             paces[name] = Pace("slow", f"touched by nothing stiff, above {limit:.3g} rad/s")
     for effect in energies:
         for i, (names, between) in enumerate(owned[effect.name]):
-            if effect.kind == "potential" and any(bodies[name].pace == "slow" for name in names):
+            declared = effect.rate == "fast" or isinstance(effect.rate, int)
+            if effect.kind == "potential" and not declared and any(bodies[name].pace == "slow" for name in names):
                 continue  # it is part of V
             why = _stiff(effect, i, measured, limit)
             for name in between if why else ():
@@ -281,6 +286,8 @@ def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owner
 
 def _stiff(effect: Effect, i: int, measured, limit) -> str:
     """Why an element makes bodies fast; empty if it does not."""
+    if isinstance(effect.rate, int):
+        return f"declared for every {effect.rate} micro nodes"
     if effect.rate != "auto":
         return "declared fast" if effect.rate == "fast" else ""
     if limit is None or effect.name not in measured or measured[effect.name].frequency[i] <= limit:
@@ -300,12 +307,11 @@ def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, li
         return "slow_constraint", Reason("between slow bodies")
     if effect.kind == "constraint":
         return "constraint", Reason("touches a fast body")
+    if isinstance(effect.rate, int):
+        return effect.rate, Reason("as given")
+    if slow and effect.rate == "fast":
+        return "fast", Reason("as given, and touches {}, which {} slow", slow)
     if slow:
-        if effect.rate == "fast":
-            raise ValueError(
-                f"{effect.name}: its rate is 'fast' but it touches {slow[0]}, which is slow; W sees fast bodies alone. Make "
-                f"{slow[0]} fast, or leave the rate to the scene."
-            )
         return "slow_potential", Reason("touches {}, which {} slow", slow)
     if effect.rate != "auto":
         return ("fast_potential" if effect.rate == "fast" else "slow_potential"), Reason("as given")

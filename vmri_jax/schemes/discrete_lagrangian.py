@@ -2,7 +2,7 @@
 
     L_d(S, F) = sum over terms, over nodes i of the term's rule:  H w_i term(q(theta_i), qdot(theta_i))
 
-`lagrangian` builds it by combinators, ``kinetic - slow - fast``, each term placed on its own nodes.
+`lagrangian` builds it by combinators, ``kinetic - slow - fast - others``, each term placed on its own nodes.
 
 A part ``T_s(q_s, q_s')`` of the kinetic energy that slow variables alone have, `System.slow_kinetic`, has the rule of the kinetic energy
 on the macro grid, as g_s has that of g:
@@ -17,14 +17,14 @@ micro steps.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.kernels import matmul
-from vmri_jax.mechanics.system import ConstantMass, System
+from vmri_jax.mechanics.system import ConstantMass, System, label
 from vmri_jax.schemes.path import (
     Nodes,
     Path,
@@ -33,6 +33,7 @@ from vmri_jax.schemes.path import (
     slow_velocity_nodes,
     velocity_nodes,
 )
+from vmri_jax.schemes.quadrature import PlacedRule
 from vmri_jax.schemes.scheme import Scheme
 
 
@@ -42,7 +43,7 @@ class Term:
 
     `integrand` takes the arguments it names, e.g. ``("q_s", "q_f")``. Weights at the ends of the macro interval
     are held apart for terms without velocities (None where there is no such node): those are kicks, from averaged
-    positions where `mollified`. `grid` is where its rule was placed; `name` is for people.
+    positions where `mollified`. `grid` and `every` are where its rule was placed; `name` is for people.
     """
 
     integrand: Callable
@@ -52,6 +53,7 @@ class Term:
     end: Any = None
     sign: float = 1.0
     grid: str = "micro"
+    every: int = 1
     mollified: bool = False
     power: int = 0
     name: str = ""
@@ -171,12 +173,41 @@ class Sum:
         return self + (-other)
 
 
+class PlacedPotential(NamedTuple):
+    """A potential of a system, with its rule: a function of the positions it names and of params. V and W have these names."""
+
+    name: str
+    function: Callable
+    arguments: tuple[str, ...]
+    placed: PlacedRule
+
+    def value(self, q_s, q_f, params):
+        """At positions of which it takes the ones that it names."""
+        return self.function(*({"q_s": q_s, "q_f": q_f}[name] for name in self.arguments), params)
+
+
+def placed_potentials(system: System, scheme: Scheme) -> tuple[PlacedPotential, ...]:
+    """All potentials of a system with the rules that a scheme gives them.
+
+    Raises:
+        ValueError: a potential without a rule.
+    """
+    both = ("q_s", "q_f")
+    known = ("V", system.slow_potential, both, scheme.slow), ("W", system.fast_potential, ("q_f",), scheme.fast)
+    others = ((label(name), function, both, scheme.rule_of(name)) for name, function in system.potentials)
+    return tuple(
+        PlacedPotential(name, function, arguments, placed)
+        for name, function, arguments, placed in (*known, *others)
+        if function is not None
+    )
+
+
 def lagrangian(system: System, scheme: Scheme) -> Sum:
-    """``T - V - W`` of a system, each term on the nodes the scheme gives it."""
-    kinetic = _kinetic(system, scheme)
-    slow = _on_position_nodes(system.slow_potential, ("q_s", "q_f"), scheme.slow, scheme, system, "V")
-    fast = _on_position_nodes(system.fast_potential, ("q_f",), scheme.fast, scheme, system, "W")
-    return kinetic - slow - fast + _corrections(system, scheme)
+    """``T - V - W - sum_i V_i`` of a system, each term on the nodes the scheme gives it."""
+    terms = _kinetic(system, scheme)
+    for name, function, arguments, placed in placed_potentials(system, scheme):
+        terms -= _on_position_nodes(function, arguments, placed, scheme, system, name)
+    return terms + _corrections(system, scheme)
 
 
 def _corrections(system: System, scheme: Scheme) -> Sum:
@@ -221,10 +252,15 @@ def _kinetic(system, scheme) -> Sum:
 
 
 def _on_position_nodes(function, arguments, placed, scheme, system, name: str) -> Sum:
-    if function is None:
-        return Sum(())
     start, inside, end = position_nodes(placed, scheme.num_micro, scheme.degree)
-    ends = {"start": start, "end": end, "grid": placed.grid, "mollified": placed.mollified, "name": name}
+    ends = {
+        "start": start,
+        "end": end,
+        "grid": placed.grid,
+        "every": placed.every,
+        "mollified": placed.mollified,
+        "name": name,
+    }
     return Sum((Term(lambda *q: function(*q, system.params), arguments, inside, **ends),))
 
 

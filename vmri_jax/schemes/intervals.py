@@ -72,7 +72,7 @@ class IntervalNodes:
     """Quadrature nodes of a term, as many in each of the micro intervals that have them.
 
     Args:
-        groups: of nodes at the same local coordinates; each group fills a range of intervals, and no two of a row the same interval.
+        groups: of nodes at the same local coordinates; no two of a row are in the same interval.
         num_micro, degree: of the scheme.
     """
 
@@ -82,8 +82,8 @@ class IntervalNodes:
         self.has_nodes = np.zeros(n, bool)
         for k, row in enumerate(groups):
             for group in row:
-                c[group.first : group.stop, k] = group.c
-                self.has_nodes[group.first : group.stop] = True
+                c[np.array(group.intervals), k] = group.c
+                self.has_nodes[np.array(group.intervals)] = True
         if self.has_nodes.all() and all(len(row) == 1 for row in groups):
             self.weights = jnp.stack([row[0].weights[0] for row in groups])[None]  # of all intervals
         else:
@@ -107,7 +107,7 @@ class IntervalNodes:
         """
         rows: list[list[NodeGroup]] = []
         for group in nodes.groups:
-            apart = (row for row in rows if all(g.stop <= group.first or group.stop <= g.first for g in row))
+            apart = (row for row in rows if not any(set(g.intervals) & set(group.intervals) for g in row))
             row = next(apart, None)
             if row is None:
                 rows.append([group])
@@ -146,6 +146,8 @@ def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
 
 def _padded(group: NodeGroup, num_micro: int):
     """(num_micro,) weights of a group, 0 in the intervals without it."""
+    if group.step > 1:
+        return jnp.zeros(num_micro).at[np.array(group.intervals)].set(group.weights)
     return jnp.pad(jnp.asarray(group.weights), (group.first, num_micro - group.stop))
 
 

@@ -110,17 +110,23 @@ class Path(eqx.Module):
 
 @dataclass(frozen=True)
 class NodeGroup:
-    """Nodes at one local coordinate ``c`` of the micro intervals ``first <= m < stop``."""
+    """Nodes at one local coordinate ``c`` of the micro intervals ``first <= m < stop``, of every `step`-th of them."""
 
     c: float
     first: int
     stop: int
     weights: Float[Numbers, "size"]
+    step: int = 1
+
+    @property
+    def intervals(self) -> range:
+        """Numbers of the micro intervals."""
+        return range(self.first, self.stop, self.step)
 
     @property
     def size(self) -> int:
         """Number of nodes."""
-        return self.stop - self.first
+        return len(self.intervals)
 
 
 @dataclass(frozen=True)
@@ -142,11 +148,11 @@ class Nodes:
 
     def theta(self, group: NodeGroup) -> np.ndarray:
         """Positions of a group's nodes on the macro interval."""
-        return (np.arange(group.first, group.stop) + group.c) / self.num_micro
+        return (np.array(group.intervals) + group.c) / self.num_micro
 
     def sample(self, path: Path, names: Iterable[str]) -> dict:
         """By name, of the path at all nodes, group after group: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
-        together = [tuple(groups) for _, groups in groupby(self.groups, key=lambda g: (g.first, g.stop))]
+        together = [tuple(groups) for _, groups in groupby(self.groups, key=lambda g: g.intervals)]
         return {name: jnp.concatenate([self._at(groups, path, name) for groups in together]) for name in names}
 
     def _at(self, groups: tuple[NodeGroup, ...], path: Path, name: str):
@@ -159,7 +165,7 @@ class Nodes:
         if name[2] == "s":
             moved = matmul(basis(self.degree, theta)[:, 1:], path.slow)
             return moved / path.macro_dt if velocity else path.slow_start + moved
-        inside = slice(groups[0].first, groups[0].stop)
+        inside = slice(groups[0].first, groups[0].stop, groups[0].step)
         moved = jnp.swapaxes(matmul(basis(self.degree, c)[:, 1:], path.fast[inside]), 0, 1)
         q_f = moved / (path.macro_dt / self.num_micro) if velocity else path.fast_start[inside] + moved
         return q_f.reshape(len(theta), path.fast.shape[-1])
@@ -172,7 +178,7 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
         ValueError: a macro rule with a node on the border of two micro intervals.
     """
     if placed.grid == "micro":
-        groups = tuple(_on_every_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
+        groups = tuple(_on_every_interval(placed, i, num_micro) for i in range(len(placed.rule.nodes)))
     else:
         groups = tuple(_on_one_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
         for g in groups:
@@ -194,10 +200,10 @@ def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any
     """Nodes of a term that depends on positions only: (weight at 0, nodes inside, weight at 1).
 
     Nodes at the ends of the macro interval are kicks: they act on given or final momenta and never
-    enter an equation to be solved. Their weight is None where the rule has no such node. Where micro
-    intervals meet, the right node of one and the left node of the next are one node.
+    enter an equation to be solved. Their weight is None where the rule has no such node. Where two
+    copies of the rule meet, the right node of one and the left node of the next are one node.
     """
-    rule, size = placed.rule, num_micro if placed.grid == "micro" else 1
+    rule, size, every = placed.rule, placed.copies(num_micro), placed.every
     has_start, has_end = rule.nodes[0] <= NODE_TOLERANCE, rule.nodes[-1] >= 1 - NODE_TOLERANCE
     start = rule.weights[0] / size if has_start else None
     end = rule.weights[-1] / size if has_end else None
@@ -205,21 +211,31 @@ def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any
     if placed.grid == "macro":
         groups = [_on_one_interval(rule, i, num_micro) for i in inside]
     else:
-        groups = [_on_every_interval(rule, i, num_micro) for i in inside]
-        if num_micro > 1 and (has_start or has_end):
+        groups = [_on_every_interval(placed, i, num_micro) for i in inside]
+        if size > 1 and (has_start or has_end):
             meeting = sum(w for w in (start, end) if w is not None)
-            groups.insert(0, NodeGroup(0.0, 1, num_micro, jnp.full(num_micro - 1, meeting)))
+            groups.insert(0, NodeGroup(0.0, every, num_micro, jnp.full(size - 1, meeting), every))
     return start, Nodes(tuple(groups), num_micro, degree), end
 
 
-def _on_every_interval(rule: Rule, i: int, num_micro: int) -> NodeGroup:
-    return NodeGroup(rule.nodes[i], 0, num_micro, jnp.full(num_micro, rule.weights[i] / num_micro))
+def _on_every_interval(placed: PlacedRule, i: int, num_micro: int) -> NodeGroup:
+    """Node i of the rule, in each of its copies."""
+    node, weight, copies = placed.rule.nodes[i], placed.rule.weights[i], placed.copies(num_micro)
+    weights = jnp.full(copies, weight / copies)
+    m, c = _interval_of(node, placed.every)
+    return NodeGroup(c, m, num_micro, weights, placed.every)
 
 
 def _on_one_interval(rule: Rule, i: int, num_micro: int) -> NodeGroup:
-    m = min(int(np.floor(rule.nodes[i] * num_micro + NODE_TOLERANCE)), num_micro - 1)
-    c = rule.nodes[i] * num_micro - m
-    return NodeGroup(0.0 if abs(c) <= NODE_TOLERANCE else c, m, m + 1, rule.weights[i : i + 1])
+    m, c = _interval_of(rule.nodes[i], num_micro)
+    return NodeGroup(c, m, m + 1, rule.weights[i : i + 1])
+
+
+def _interval_of(node: float, count: int) -> tuple[int, float]:
+    """The one of `count` equal intervals of [0, 1] that a node is in, and its local coordinate there."""
+    m = min(int(np.floor(node * count + NODE_TOLERANCE)), count - 1)
+    c = node * count - m
+    return m, 0.0 if abs(c) <= NODE_TOLERANCE else c
 
 
 def control_node_groups(num_micro: int, degree: int) -> Nodes:

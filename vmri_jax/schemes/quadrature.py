@@ -11,6 +11,7 @@ Nodes are static (they decide which equations exist), weights are arrays and may
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal
 
 import equinox as eqx
@@ -209,8 +210,9 @@ simpson = (left + 4 * midpoint + right) / 6
 
 
 class PlacedRule(eqx.Module):
-    """A rule and the grid it lives on: once per macro interval, or once per micro interval.
+    """A rule and the grid it lives on: once per macro interval, or once per `every` micro intervals.
 
+    every: micro intervals that one copy of a rule on the micro grid spans.
     mollified: whether its term is taken at averaged fast positions, see `mollified`.
     gradient_corrected: whether its term is less a square of its gradient, see `gradient_corrected`.
     """
@@ -219,10 +221,25 @@ class PlacedRule(eqx.Module):
     grid: Literal["macro", "micro"] = eqx.field(static=True)
     mollified: bool = eqx.field(static=True, default=False)
     gradient_corrected: bool = eqx.field(static=True, default=False)
+    every: int = eqx.field(static=True, default=1)
 
     def composite(self, num_micro: int) -> Rule:
         """The rule on the macro interval [0, 1] that this placement amounts to."""
-        return self.rule if self.grid == "macro" else self.rule.repeat(num_micro)
+        return self.rule if self.grid == "macro" else self.rule.repeat(self.copies(num_micro))
+
+    def copies(self, num_micro: int) -> int:
+        """Copies of the rule on the macro interval."""
+        return 1 if self.grid == "macro" else num_micro // self.every
+
+    @property
+    def is_local(self) -> bool:
+        """Whether every micro interval has a copy of the rule of its own."""
+        return self.grid == "micro" and self.every == 1
+
+    @property
+    def only_kicks(self) -> bool:
+        """Whether the rule has no nodes but the ends of the macro interval."""
+        return self.grid == "macro" and self.only_ends
 
     @property
     def only_ends(self) -> bool:
@@ -233,6 +250,8 @@ class PlacedRule(eqx.Module):
         """The rule by its name, and where it is."""
         how = ", at averaged fast positions" if self.mollified else ""
         how += ", corrected by its gradient" if self.gradient_corrected else ""
+        if self.every > 1:
+            return f"{_name(self.rule)} on every {self.every} micro intervals{how}"
         return f"{_name(self.rule)} on {'the macro' if self.grid == 'macro' else 'every micro'} interval{how}"
 
 
@@ -256,9 +275,20 @@ def macro(rule: Rule) -> PlacedRule:
     return _placed(rule, "macro")
 
 
-def micro(rule: Rule) -> PlacedRule:
-    """Place a rule on every micro interval: ``rule.repeat(num_micro)`` of the macro interval."""
-    return _placed(rule, "micro")
+def micro(rule: Rule, every: int = 1) -> PlacedRule:
+    """Place a rule on every micro interval: ``rule.repeat(num_micro / every)`` of the macro interval.
+
+    Args:
+        rule: on [0, 1].
+        every: micro intervals that one copy of the rule spans: a rate between those of the two grids. ``micro(trapezoidal, every=4)`` has its
+            nodes at every fourth micro node. It must divide `num_micro` of the scheme; ``every=num_micro`` is `macro`.
+
+    Raises:
+        TypeError: no Rule.
+        ValueError: `every` is no integer of at least 1.
+    """
+    whole_number("micro: every", every)
+    return replace(_placed(rule, "micro"), every=int(every))
 
 
 def _placed(rule: Rule, grid: Literal["macro", "micro"]) -> PlacedRule:
@@ -289,7 +319,7 @@ def gradient_corrected(placed: PlacedRule) -> PlacedRule:
     J. Comput. Phys. 97 (1991): errors of order 2 are a change of coordinates, of the start and of the result, in which the motion
     is of order 4. So are, as they are, the frequencies of harmonic vibrations, which no change of the start alters.
     """
-    if not isinstance(placed, PlacedRule) or not placed.only_ends or placed.mollified:
+    if not isinstance(placed, PlacedRule) or not placed.only_ends or placed.mollified or placed.every > 1:
         raise ValueError(
             f"gradient_corrected: got {placed!r}; give kicks at the nodes of a grid, e.g. micro(trapezoidal)."
         )

@@ -17,7 +17,9 @@ and symmetric, as in the methods of Verlet and r-RESPA. At 1 and at 0 there is o
 Euler methods, of order 1, each the adjoint of the other. Any other number has order 1, too. It may be traced, for sweeps and derivatives.
 """
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import numpy as np
@@ -54,11 +56,12 @@ class Scheme(eqx.Module):
             `kinetic` must be placed with micro, `force` defaults to the rule of `kinetic`.
         constraint: where g holds: micro(rule) whose nodes are the control nodes; default micro(lobatto(degree + 1)).
         slow_constraint: where g_s holds: macro(rule) on the same nodes; default macro(lobatto(degree + 1)).
+        potentials: placed rules of `System.potentials` by name, see `with_potentials`.
 
     Raises:
         TypeError: num_micro or degree not an integer, or a rule that was not placed with macro or micro.
-        ValueError: num_micro or degree below 1, weights that do not sum to 1, or constraint nodes that are not the
-            control nodes.
+        ValueError: num_micro or degree below 1, weights that do not sum to 1, constraint nodes that are not the
+            control nodes, or ``micro(rule, every=k)`` where k does not divide num_micro.
     """
 
     num_micro: int = eqx.field(static=True)
@@ -69,8 +72,21 @@ class Scheme(eqx.Module):
     constraint: PlacedRule
     slow_constraint: PlacedRule
     force: PlacedRule
+    potentials: dict[str, PlacedRule]
 
-    def __init__(self, num_micro, degree=1, *, kinetic, slow, fast, constraint=None, slow_constraint=None, force=None):
+    def __init__(
+        self,
+        num_micro,
+        degree=1,
+        *,
+        kinetic,
+        slow,
+        fast,
+        constraint=None,
+        slow_constraint=None,
+        force=None,
+        potentials=None,
+    ):
         self.num_micro = _positive_integer("num_micro", num_micro)
         self.degree = _positive_integer("degree", degree)
         self.kinetic, self.slow, self.fast = kinetic, slow, fast
@@ -79,6 +95,21 @@ class Scheme(eqx.Module):
         self.slow_constraint = macro(lobatto(degree + 1)) if slow_constraint is None else slow_constraint
         for name in ("kinetic", "slow", "fast", "force", "constraint", "slow_constraint"):
             _check_placed(name, getattr(self, name))
+            if getattr(self, name).every > 1 and name not in ("slow", "fast"):
+                raise ValueError(
+                    f"Scheme: {name} is placed with every={getattr(self, name).every}; only potentials can be: slow, fast, and those of "
+                    "with_potentials(...). Take micro(rule) or macro(rule)."
+                )
+        self.slow, self.fast = (_on_grid(name, getattr(self, name), self.num_micro) for name in ("slow", "fast"))
+        self.potentials = {}
+        for name, placed in dict(potentials or {}).items():
+            _check_placed(name, placed)
+            if placed.mollified or placed.gradient_corrected:
+                how = "mollified" if placed.mollified else "corrected"
+                raise ValueError(
+                    f"Scheme: {name} is {how}; only the rules of V and W can be. Give micro(rule) or macro(rule)."
+                )
+            self.potentials[name] = _on_grid(name, placed, self.num_micro)
         if self.kinetic.grid != "micro":
             raise ValueError(
                 "Scheme: the kinetic rule must be placed with micro(...); each micro interval has a velocity."
@@ -111,30 +142,77 @@ class Scheme(eqx.Module):
 
     @property
     def order(self) -> int:
-        """Order of convergence, ``min(2 degree, order of the rules of T, V and W)``; needs concrete weights."""
-        return min(2 * self.degree, *(placed.rule.order for placed in (self.kinetic, self.slow, self.fast)))
+        """Order of convergence, ``min(2 degree, order of the rules of T and all potentials)``; needs concrete weights."""
+        placed = self.kinetic, self.slow, self.fast, *self.potentials.values()
+        return min(2 * self.degree, *(placed.rule.order for placed in placed))
 
     @property
     def is_symmetric(self) -> bool:
         """Whether a step forward and a step back with -H lead back to the start; needs concrete weights."""
-        return all(placed.rule.is_symmetric for placed in (self.kinetic, self.slow, self.fast, self.force))
+        placed = self.kinetic, self.slow, self.fast, self.force, *self.potentials.values()
+        return all(placed.rule.is_symmetric for placed in placed)
 
     @property
     def micro_times(self) -> np.ndarray:
         """(num_micro,) ends of the micro steps in units of the macro step."""
         return np.arange(1, self.num_micro + 1) / self.num_micro
 
+    @property
+    def unit(self) -> int:
+        """The smallest number of micro steps that all rules on every k-th micro node fit into."""
+        return math.lcm(*(placed.every for placed in self.potentials.values()))
+
     def with_num_micro(self, num_micro: int) -> "Scheme":
         """The same rules with another number of micro steps."""
         return replace(self, num_micro=num_micro)
+
+    def with_potentials(self, **rules: PlacedRule) -> "Scheme":
+        """The same scheme with rules of `System.potentials` by name, besides those that it has.
+
+            kicks = vm.quadrature.trapezoidal
+            vm.fully_explicit(32).with_potentials(bends=vm.micro(kicks, every=8), bonds=vm.micro(kicks))
+
+        Potentials that are placed with ``micro(trapezoidal, every=k)`` kick every k-th micro node; on fast variables alone, with kicks by V
+        and W, that is r-RESPA of any number of levels (Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1992). Where they see slow
+        variables they are implicit in these: the slow path is one polynomial over the macro step. Evaluations per macro step:
+        num_micro / k.
+
+        Args:
+            rules: placed rules by name of the potential.
+
+        Raises:
+            TypeError: a rule that was not placed with macro or micro.
+            ValueError: ``every`` that does not divide num_micro, weights that do not sum to 1.
+        """
+        return replace(self, potentials=self.potentials | rules)
+
+    def rule_of(self, name: str | int) -> PlacedRule:
+        """The rule of a potential in `System.potentials`.
+
+        Raises:
+            ValueError: a name without a rule; a whole number that does not divide num_micro.
+        """
+        if name in self.potentials:
+            return self.potentials[str(name)]
+        if isinstance(name, int):
+            return _on_grid(f"the potential {name}", micro(trapezoidal, every=name), self.num_micro)
+        if name in ("slow", "fast"):
+            placed = self.slow if name == "slow" else self.fast
+            return PlacedRule(placed.rule, placed.grid, every=placed.every)
+        raise ValueError(
+            f"Scheme: there is no rule for the potential {name!r} of the system; the scheme has rules for {list(self.potentials) or 'V and W only'}. "
+            f"Give it one, e.g. scheme.with_potentials({name}=vm.micro(vm.quadrature.trapezoidal, every=2))."
+        )
 
     def describe(self) -> "Description":
         """Rules, order, symmetry, evaluations and solves per macro step; prints as a table.
 
         What it does with a system is in ``vm.plan(system, scheme, state).describe()``.
         """
+        others = self.potentials.values()
         drifts = self.degree == 1 and self.fast.only_ends and self.fast.grid == "micro"
-        kicked = self.degree == 1 and self.slow.only_ends and self.slow.grid == "macro"
+        drifts = drifts and all(placed.only_ends for placed in others)
+        kicked = self.degree == 1 and self.slow.only_kicks and all(p.grid == "micro" or p.only_ends for p in others)
         free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
         slow, fast = (
             _evaluations(placed, self.num_micro) * (1 + placed.gradient_corrected) for placed in (self.slow, self.fast)
@@ -143,7 +221,10 @@ class Scheme(eqx.Module):
         fast += self.slow.gradient_corrected and self.fast.gradient_corrected  # in the term of both
         placed = self.kinetic, self.slow, self.fast, self.force, self.constraint, self.slow_constraint
         rules = {name: rule.in_words() for name, rule in zip(TERMS, placed, strict=True)}
-        return Description(self.order, self.is_symmetric, rules, 1, self.num_micro, self.degree, slow, fast, free, 1)
+        rules |= {name: rule.in_words() for name, rule in self.potentials.items()}
+        evaluations = {name: _evaluations(rule, self.num_micro) for name, rule in self.potentials.items()}
+        costs = slow, fast, free, 1, evaluations
+        return Description(self.order, self.is_symmetric, rules, 1, self.num_micro, self.degree, *costs)
 
 
 TERMS = ("T", "V", "W", "F", "g", "g_s")
@@ -155,13 +236,15 @@ class Description:
     """What a scheme promises and what a macro step costs. Evaluations are per pass where equations are solved.
 
     order, symmetric: of convergence; whether time-reversible.
-    rules: in words, by what they integrate or where it is held, one of `TERMS`.
+    rules: in words, by what they integrate or where it is held: one of `TERMS`, or the name of a potential.
     stages, num_micro, degree: steps of the scheme per macro step, micro steps per macro step, degree of the path.
     slow_evaluations, fast_evaluations: gradients of V and of W, and products of their Hessians with a vector, which cost about
         as much; at a node that two macro steps share, once.
     solves: systems of equations with constant masses and no constraint or force: none for explicit schemes, one per
-        micro step (of the fast variables of one micro step) where V only kicks, else one per stage.
+        micro step (of the fast variables of one micro step) where V only kicks, else one per stage. Further potentials on the micro grid
+        are taken to be functions of fast variables alone.
     constrained_solves: the same with constraints on slow and fast variables together.
+    evaluations: gradients of the further potentials by name, as those of V and W.
     """
 
     order: int
@@ -174,31 +257,45 @@ class Description:
     fast_evaluations: int
     solves: int
     constrained_solves: int
+    evaluations: Mapping[str, int] = field(default_factory=dict)
 
     def repeated(self, stages: int, order: int, symmetric: bool) -> "Description":
         """Of a composition of so many stages."""
         counts = ("num_micro", "slow_evaluations", "fast_evaluations", "solves", "constrained_solves")
         more = {name: stages * getattr(self, name) for name in counts}
+        more |= {"evaluations": {name: stages * count for name, count in self.evaluations.items()}}
         return replace(self, order=order, symmetric=symmetric, stages=stages, **more)
 
     def __str__(self) -> str:
         per = "per macro step"
+        gradients = {"V": self.slow_evaluations, "W": self.fast_evaluations, **self.evaluations}
         rows = {
             "order": f"{self.order}, {'symmetric' if self.symmetric else 'not symmetric'}",
             "path": f"{self.num_micro} micro steps of degree {self.degree} {per}"
             + (f", in {self.stages} stages" if self.stages > 1 else ""),
             **self.rules,
-            "gradients of V": f"{self.slow_evaluations} {per}",
-            "gradients of W": f"{self.fast_evaluations} {per}",
+            **{f"gradients of {name}": f"{count} {per}" for name, count in gradients.items() if name in self.rules},
             "solves": f"{self.solves or 'none'} {per}; with constraints {self.constrained_solves}",
         }
-        return "\n".join(f"{name:<16}{value}" for name, value in rows.items())
+        width = max(16, *(len(name) + 2 for name in rows))
+        return "\n".join(f"{name:<{width}}{value}" for name, value in rows.items())
 
 
 def _evaluations(placed: PlacedRule, num_micro: int) -> int:
     nodes = placed.composite(num_micro).nodes
     shared = nodes[0] <= NODE_TOLERANCE and nodes[-1] >= 1 - NODE_TOLERANCE
     return len(nodes) - shared
+
+
+def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
+    """A placed rule as it is kept: on the macro grid where one copy of it spans the macro interval."""
+    if placed.every > 1 and num_micro % placed.every:
+        divisors = [k for k in range(1, num_micro + 1) if num_micro % k == 0]
+        raise ValueError(
+            f"Scheme: {name} is placed with every={placed.every}, which does not divide num_micro={num_micro}: its last copy would end in "
+            f"the next macro step. Take one of {divisors}, or another num_micro."
+        )
+    return PlacedRule(placed.rule, "macro") if placed.every == num_micro > 1 else placed
 
 
 def _positive_integer(name: str, value) -> int:

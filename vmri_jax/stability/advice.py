@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.diagnostics.linear import frequencies_of
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.running.origin import names_of
@@ -15,7 +16,7 @@ from vmri_jax.stability.labels import swapped
 from vmri_jax.stability.linear import SmallMotions, small_motions
 from vmri_jax.stability.map import TOLERANCE, Window, measure
 from vmri_jax.stability.multipliers import multipliers
-from vmri_jax.stability.oscillator import fast_limit, phase, slow_limit
+from vmri_jax.stability.oscillator import fast_limit, kick_limit, phase, slow_limit
 from vmri_jax.study.table import Column, ResultTable
 
 SCAN = (0.5, 1.25)
@@ -233,20 +234,28 @@ def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float)
 
 
 def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> str:
-    """What the fast or the slow potential alone does to the step; empty where it is stable for both."""
+    """What one of the potentials alone does to the step; empty where it is stable for each of them."""
     stage = stage_scheme(scheme)
     longest = macro_dt * np.abs(_stage_lengths(scheme)).max()
     of = " of the longest stage" if isinstance(scheme, Composition) else ""
-    for name, frequencies, grid, step, limit in (
-        ("fast", motions.fast_frequencies, "micro", longest / stage.num_micro, fast_limit(stage)),
-        ("slow", motions.slow_frequencies, "macro", longest, slow_limit(stage)),
-    ):
-        alone = multipliers(motions.only(name), scheme, [macro_dt * (1 + BEYOND)])
+    micro_dt = longest / stage.num_micro
+    cases = [
+        ("fast", motions.fast_frequencies, "the micro step", micro_dt, fast_limit(stage)),
+        ("slow", motions.slow_frequencies, "the macro step", longest, slow_limit(stage)),
+    ]
+    for name, _ in motions.system.potentials:
+        placed, key = stage.rule_of(name), f"potential {name}"
+        span = stage.num_micro if placed.grid == "macro" else placed.every
+        step = f"the step of {span} micro intervals"
+        cases.append((key, frequencies_of(motions.others[key]), step, span * micro_dt, kick_limit(placed)))
+    for key, frequencies, of_step, step, limit in cases:
+        name = key.removeprefix("potential ")
+        alone = multipliers(motions.only(key), scheme, [macro_dt * (1 + BEYOND)])
         if alone.radius[0] > 1 + TOLERANCE:
             bears = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
             return (
-                f"The step is unstable for the {name} potential alone: its frequency {frequencies[0]:.4g} times the {grid} "
-                f"step{of} is {frequencies[0] * step:.4g}{bears}."
+                f"The step is unstable for the {name} potential alone: its frequency {frequencies[0]:.4g} times {of_step}{of} "
+                f"is {frequencies[0] * step:.4g}{bears}."
             )
     return ""
 

@@ -5,7 +5,7 @@ expansion there; elsewhere the expansion stands for the *frozen* problem: the co
 forces. Either way it is a `System` like any other, so that every scheme applies to it unchanged.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.diagnostics.linear import frequencies_of, phase_splits
-from vmri_jax.mechanics.invariants import potentials, velocity
+from vmri_jax.mechanics.invariants import potential_energy, velocity
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.mechanics.system import ConstantMass, System
 
@@ -62,6 +62,7 @@ class SmallMotions:
     shapes: N, (n_s + n_f, d).
     embed, read: (2 n, 2 d) from (eta, pi) to (q_s, q_f, p_s, p_f), and (2 d, 2 n) back.
     slow, fast, stiffness: (d, d) Hessians of V with its own share of the constraint forces, of W, and of all together.
+    others: Hessians of further potentials, by "potential " and their name.
     damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
     rest: the state zero of the expansion.
     """
@@ -75,6 +76,7 @@ class SmallMotions:
     stiffness: np.ndarray
     damping: np.ndarray
     rest: State
+    others: dict[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def rates(self) -> np.ndarray:
@@ -110,12 +112,15 @@ class SmallMotions:
         return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
 
     def only(self, name: str) -> "SmallMotions":
-        """The same without the slow or without the fast potential; `name` says which one stays, "slow" or "fast"."""
-        other = "slow" if name == "fast" else "fast"
-        removed = getattr(self, other)
-        none = jax.tree.map(np.zeros_like, self.system.params[other])
-        system = self.system.replace(params=self.system.params | {other: none})
-        return replace(self, system=system, stiffness=self.stiffness - removed, **{other: np.zeros_like(removed)})
+        """The same with one potential alone: "slow" (V), "fast" (W), or one of `others`."""
+        left = {"slow": self.slow, "fast": self.fast, **self.others}
+        removed = [key for key in left if key != name]
+        none = {key: jax.tree.map(np.zeros_like, self.system.params[key]) for key in removed}
+        stiffness = self.stiffness - sum(left[key] for key in removed)
+        left |= {key: np.zeros_like(left[key]) for key in removed}
+        system = self.system.replace(params=self.system.params | none)
+        slow, fast = left.pop("slow"), left.pop("fast")
+        return replace(self, system=system, stiffness=stiffness, slow=slow, fast=fast, others=left)
 
 
 def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
@@ -153,6 +158,8 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
     def reduced(matrix):
         return shapes.T @ matrix @ shapes
 
+    others = {name: terms[name] for name, _ in _others(system)}
+    potentials = sum((terms["slow"], terms["fast"], *others.values()))
     gyroscopic = reduced(coupling)
     zero = np.zeros_like(shapes)
     return SmallMotions(
@@ -162,9 +169,10 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
         read=np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]]),
         slow=reduced(terms["slow"] + bent_by_slow),
         fast=reduced(terms["fast"]),
-        stiffness=reduced(terms["slow"] + terms["fast"] + bent - terms["kinetic"][:n, :n] - terms["force_q"]),
+        stiffness=reduced(potentials + bent - terms["kinetic"][:n, :n] - terms["force_q"]),
         damping=gyroscopic - gyroscopic.T - reduced(terms["force_v"]),
         rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), phase_splits(state))),
+        others={name: reduced(hessian) for name, hessian in others.items()},
     )
 
 
@@ -210,8 +218,15 @@ def _expanded_system(system: System, state: State, terms: dict, multiplier, of_s
             "constraint": (G[:n_g], curvature[:n_g]),
             "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
             "force": (rest, terms["force_q"], terms["force_v"]),
+            **{name: terms[name] for name, _ in _others(system)},
         },
+        potentials=[(name, _OtherPotential(f"potential {name}")) for name, _ in system.potentials],
     )
+
+
+def _others(system: System):
+    """The further potentials, with the names that they have among the terms."""
+    return [(f"potential {name}", function) for name, function in system.potentials]
 
 
 @partial(jax.jit, compiler_options=QUICK)
@@ -225,10 +240,15 @@ def _expansion(system: System, state: State) -> dict:
     v = jnp.concatenate(velocity(system, state.q_s, state.q_f, state.p_s, state.p_f))
 
     def slow(q):
-        return potentials(system, q[:n_s], q[n_s:])[0]
+        if system.slow_potential is None:
+            return jnp.zeros(())
+        return system.slow_potential(q[:n_s], q[n_s:], system.params)
 
     def fast(q):
-        return potentials(system, q[:n_s], q[n_s:])[1]
+        return jnp.zeros(()) if system.fast_potential is None else system.fast_potential(q[n_s:], system.params)
+
+    def energy(q):
+        return potential_energy(system, q[:n_s], q[n_s:])
 
     def kinetic(z):
         q, v = jnp.split(z, 2)
@@ -256,7 +276,8 @@ def _expansion(system: System, state: State) -> dict:
         "centripetal": jax.jacfwd(jax.jacfwd(constraints_in_motion))(0.0),
         "force_q": force_q,
         "force_v": force_v,
-        "impetus": slope[: q.size] - turn[q.size :] - jax.grad(lambda q: slow(q) + fast(q))(q) + force(q, v),
+        "impetus": slope[: q.size] - turn[q.size :] - jax.grad(energy)(q) + force(q, v),
+        **{name: jax.hessian(lambda q, f=f: f(q[:n_s], q[n_s:], system.params))(q) for name, f in _others(system)},
     }
 
 
@@ -273,6 +294,17 @@ def _slow_potential(q_s, q_f, params):
 
 def _fast_potential(q_f, params):
     return q_f @ params["fast"] @ q_f / 2
+
+
+@dataclass(frozen=True)
+class _OtherPotential:
+    """A further potential; its Hessian has this name in the params."""
+
+    name: str
+
+    def __call__(self, q_s, q_f, params):
+        q = jnp.concatenate([q_s, q_f])
+        return q @ params[self.name] @ q / 2
 
 
 def _constraint(q_s, q_f, params):

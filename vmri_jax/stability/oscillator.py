@@ -13,7 +13,7 @@ x^2 becomes ``x^2 (1 - x^2 / 12)``: stable for x < 2 sqrt(3).
 import numpy as np
 
 from vmri_jax.schemes.path import lagrange_basis, lagrange_derivative
-from vmri_jax.schemes.quadrature import Rule
+from vmri_jax.schemes.quadrature import PlacedRule, Rule, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
 RESOLUTION = 0.05
@@ -25,9 +25,9 @@ FARTHEST = 30.0
 def phase(scheme: Scheme, x: float) -> float:
     """Phase by which a fast vibration turns in a micro step, ``x = omega h``; NaN where the step is unstable.
 
-    Needs the fast potential on the micro grid; else NaN.
+    Needs the fast potential on every micro interval; else NaN.
     """
-    if scheme.fast.grid != "micro":
+    if not scheme.fast.is_local:
         return np.nan
     at = np.linspace(0.0, x, 2 + int(abs(x) / RESOLUTION))
     cosine, direction = _turn(scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.gradient_corrected, at)
@@ -40,7 +40,14 @@ def fast_limit(scheme: Scheme) -> float:
     """The smallest ``omega h`` at which the micro step is unstable for a fast vibration; infinite if there is none."""
     if scheme.fast.grid != "micro":
         return np.inf
+    if scheme.fast.every > 1:
+        return kick_limit(scheme.fast) / scheme.fast.every
     return _limit(scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.gradient_corrected)
+
+
+def kick_limit(placed: PlacedRule) -> float:
+    """The same for a vibration that kicks alone drive, omega times the time from kick to kick; infinite for other rules."""
+    return _limit(1, midpoint, placed.rule, False) if placed.only_ends else np.inf
 
 
 def slow_limit(scheme: Scheme) -> float:

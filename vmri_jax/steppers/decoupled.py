@@ -1,4 +1,4 @@
-"""Slow equations that do not see the fast unknowns: the slow variables make one step, then the fast ones num_micro steps."""
+"""Slow equations that do not see the fast unknowns: the slow variables make one step, then the fast ones some smaller steps."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.state import State
-from vmri_jax.steppers.kicked import Kicked
+from vmri_jax.steppers.kicked import Kicked, steps_in_words
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 
@@ -22,21 +22,21 @@ class Decoupled(Stepper):
     """Each part is a system of fast variables alone on a single interval; kicks that join them stay outside.
 
     slow: takes one step over the macro interval.
-    fast: takes `num_micro` steps over the micro intervals.
+    fast: takes `num_fast` steps.
     """
 
     slow: Kicked
     fast: Kicked
-    num_micro: int
+    num_fast: int
 
     def init(self, state: State, macro_dt) -> DecoupledState:
         slow, fast = apart(state)
-        return DecoupledState(self.slow.init(slow, macro_dt), self.fast.init(fast, macro_dt / self.num_micro))
+        return DecoupledState(self.slow.init(slow, macro_dt), self.fast.init(fast, macro_dt / self.num_fast))
 
     def advance(self, state: State, memory: DecoupledState, macro_dt) -> tuple[State, StepInfo, DecoupledState]:
         slow, fast = apart(state)
         slow, slow_info, slow_memory = self.slow.advance(slow, memory.slow, macro_dt)
-        fast, info, fast_memory = self.fast.advance_many(fast, memory.fast, macro_dt / self.num_micro, self.num_micro)
+        fast, info, fast_memory = self.fast.advance_many(fast, memory.fast, macro_dt / self.num_fast, self.num_fast)
         status = slow_info.status.worse(info.status)
         end = State(state.t + macro_dt, slow.q_f, fast.q_f, slow.p_f, fast.p_f)
         info = StepInfo(*status, info.q_f_micro, info.multiplier, slow_info.multiplier[0])
@@ -52,14 +52,14 @@ class Decoupled(Stepper):
         slow, fast = apart(state)
         return DecoupledState(
             self.slow.continued(memory.slow, last.slow, slow, macro_dt),
-            self.fast.continued(memory.fast, last.fast, fast, macro_dt / self.num_micro),
+            self.fast.continued(memory.fast, last.fast, fast, macro_dt / self.num_fast),
         )
 
     def describe(self) -> list[str]:
         return [
             "slow variables, one step:",
             *indented(self.slow.describe()),
-            f"fast variables, {self.num_micro} micro step{'s' * (self.num_micro > 1)}:",
+            f"fast variables, {steps_in_words(self.num_fast, self.fast)}:",
             *indented(self.fast.describe()),
         ]
 

@@ -13,7 +13,7 @@ from vmri_jax.kernels import DIAGONAL_MATRICES, Full, Sparsity, inverse, matvec,
 from vmri_jax.mechanics.constraint_pattern import fast_rows
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.structure import has_constant_hessian, has_diagonal_hessian, is_linear
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.system import System, label
 from vmri_jax.schemes.discrete_lagrangian import QuadraticKinetic, Term, lagrangian
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.path import Path, control_nodes, lagrange_basis
@@ -37,13 +37,18 @@ def constant_mass(system: System) -> ConstantMass:
 
 
 def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
-    """System and scheme of one micro interval: without the kicks at the macro nodes and the slow constraint."""
+    """System and scheme of one micro interval: without the kicks at nodes that only some intervals have, and the slow constraint."""
     changes: dict[str, Any] = {"slow_constraint": None}
-    rules = {"slow": scheme.slow, "fast": scheme.fast, "force": scheme.force}
+    rules: dict[str, Any] = {"slow": scheme.slow, "fast": scheme.fast, "force": scheme.force}
     for name, placed in rules.items():
-        if placed.grid == "macro":
+        if not placed.is_local:
             rules[name] = micro(midpoint)
             changes |= {} if name == "force" else {f"{name}_potential": None}
+    if system.potentials:
+        local = [(label(name), function, scheme.rule_of(name)) for name, function in system.potentials]
+        local = [potential for potential in local if potential[2].is_local]
+        changes["potentials"] = {name: function for name, function, _ in local}
+        rules["potentials"] = {name: placed for name, _, placed in local}
     local = Scheme(1, scheme.degree, kinetic=scheme.kinetic, constraint=scheme.constraint, **rules)
     return system.replace(**changes), local
 
@@ -120,6 +125,7 @@ class Interval:
         terms = implicit_terms(system, scheme)
         of_fast = [term for term in terms if term.arguments == ("q_f",)]
         sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
+        sums = sums and all(term.name in ("V", "W") for term in terms)  # further potentials may be stiff: K sees them
         straight = all(is_linear(partial(_of_fast, term, q_s), q_f) for term in terms)
         straight &= scheme.degree == 1 or q_f.size > SMALL  # few of high degree are taken together
         is_diagonal = DIAGONAL_MATRICES and isinstance(constant_mass(system).fast_mass, Diagonal) and (straight or sums)

@@ -46,6 +46,9 @@ class Kicked(Stepper):
     def init(self, state: State, macro_dt) -> KickedState:
         return KickedState(self._gradients(state, macro_dt), self.inner.init(state, macro_dt))
 
+    def renew(self, state: State, memory: KickedState, macro_dt) -> KickedState:
+        return memory._replace(inner=self.inner.renew(state, memory.inner, macro_dt))
+
     def advance(self, state: State, memory: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
         inner = self.inner.renew(state, memory.inner, macro_dt)
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
@@ -61,6 +64,12 @@ class Kicked(Stepper):
         self, state: State, memory: KickedState, macro_dt, count: int
     ) -> tuple[State, StepInfo, KickedState]:
         """`count` steps; the kicks of two steps at the node they share are one, and so are the matrices of all."""
+        return self.advance_with_matrices(state, self.renew(state, memory, macro_dt), macro_dt, count)
+
+    def advance_with_matrices(
+        self, state: State, memory: KickedState, macro_dt, count: int
+    ) -> tuple[State, StepInfo, KickedState]:
+        """The same with the matrices that `memory` has."""
 
         def step(state, inner, start: float):
             state, info, inner = self.inner.advance(state, inner, macro_dt)
@@ -71,9 +80,10 @@ class Kicked(Stepper):
         def between(carry, _):
             state, inner, worst = carry
             state, info, memory = step(state, inner, 1.0)
-            return (state, memory.inner, worst.worse(info.status)), (info.q_f_micro[0], info.multiplier[0])
+            along = info.q_f_micro, info.multiplier
+            return (state, memory.inner, worst.worse(info.status)), tuple(a[0] if len(a) == 1 else a for a in along)
 
-        inner = self.inner.renew(state, memory.inner, macro_dt)
+        inner = memory.inner
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
         none = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
         (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, inner, none), length=count - 1)
@@ -81,7 +91,7 @@ class Kicked(Stepper):
         state, last, memory = step(state, inner, 0.0)
         is_same = is_concrete(last.status)  # a status that is known before the step is that of all steps
         status = last.status if is_same else worst.worse(last.status)
-        q_f, multiplier = jnp.concatenate([q_f, last.q_f_micro]), jnp.concatenate([multiplier, last.multiplier])
+        q_f, multiplier = _all_steps(q_f, last.q_f_micro), _all_steps(multiplier, last.multiplier)
         return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), memory
 
     def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
@@ -112,6 +122,44 @@ class Kicked(Stepper):
         names = ", ".join(term.name for term in self.kicks)
         averaged = ", at averaged fast positions" if self.average is not None else ""
         return [f"kicks of {names} at both ends{averaged}", *indented(self.inner.describe()), *projected]
+
+
+@dataclass(frozen=True)
+class Repeated(Stepper):
+    """`count` smaller steps of a kicked stepper: what is between two kicks of a potential with a longer interval."""
+
+    inner: Kicked
+    count: int
+
+    def init(self, state: State, macro_dt) -> KickedState:
+        return self.inner.init(state, macro_dt / self.count)
+
+    def renew(self, state: State, memory: KickedState, macro_dt) -> KickedState:
+        return self.inner.renew(state, memory, macro_dt / self.count)
+
+    def advance(self, state: State, memory: KickedState, macro_dt) -> tuple[State, StepInfo, KickedState]:
+        return self.inner.advance_with_matrices(state, memory, macro_dt / self.count, self.count)
+
+    def project(self, state: State, memory: KickedState) -> tuple[State, KickedState]:
+        return self.inner.project(state, memory)
+
+    def continued(self, memory: KickedState, last: KickedState, state: State, macro_dt) -> KickedState:
+        return self.inner.continued(memory, last, state, macro_dt / self.count)
+
+    def describe(self) -> list[str]:
+        return [f"{steps_in_words(self.count, self.inner)}:", *indented(self.inner.describe())]
+
+
+def steps_in_words(count: int, stepper: Kicked) -> str:
+    """How many steps a stepper makes, and whether they are micro steps."""
+    return f"{count} {'' if isinstance(stepper.inner, Repeated) else 'micro '}step{'s' * (count > 1)}"
+
+
+def _all_steps(before, last):
+    """What is along the steps before, (count - 1, k, ...) or without the axis k = 1, and along the last one, (k, ...): in one row."""
+    if len(last) > 1:
+        before = before.reshape(before.shape[0] * len(last), *last.shape[1:])
+    return jnp.concatenate([before, last])
 
 
 def kicked(state: State, kicks: tuple[Term, ...], gradients, macro_dt, start: float = 0.0, end: float = 0.0) -> State:

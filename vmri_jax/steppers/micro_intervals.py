@@ -120,9 +120,21 @@ class MicroSweep(NamedTuple):
             d_s, d_f = term.gradient(equations.q_s + weighted_sum(basis[-1], slow), q_f)
             d_start, p_f = d_start + weight * d_s, p_f + weight * d_f
             d_increments += basis[-1][:, None] * (weight * d_s)
+        for term in lagrangian(equations.system, equations.scheme).kicks:
+            if term.every > 1:  # where two copies of its rule meet
+                meets = ((m + 1) % term.every == 0) & (m < n - 1)
+                weight = h * kick_weight(term, equations.macro_dt)
+                d_s, d_f = _gradient_where(meets, term, equations.q_s + weighted_sum(basis[-1], slow), q_f)
+                d_start, p_f = d_start + weight * d_s, p_f + weight * d_f
+                d_increments += basis[-1][:, None] * (weight * d_s)
 
         totals = SweepTotals(q_f, p_f, d_start, d_increments, jnp.maximum(arriving.moved, done.moved))
         return FastUnknowns(done.increments, done.multiplier, done.schur_inverse), totals
+
+
+def _gradient_where(condition, term: Term, q_s, q_f):
+    """The gradient of a term, evaluated only if the condition holds, else zero."""
+    return jax.lax.cond(condition, term.gradient, lambda *q: jax.tree.map(jnp.zeros_like, q), q_s, q_f)
 
 
 def kick_weight(term: Term, h):

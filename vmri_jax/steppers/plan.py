@@ -15,7 +15,9 @@ The cheapest stepper that the rules and the system allow is found from outside t
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -23,9 +25,9 @@ from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS, Sparsity
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
-from vmri_jax.mechanics.system import System
+from vmri_jax.mechanics.system import System, label
 from vmri_jax.schemes.composition import Composition, stage_scheme
-from vmri_jax.schemes.discrete_lagrangian import Term, lagrangian
+from vmri_jax.schemes.discrete_lagrangian import PlacedPotential, Term, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.collocation import Collocation
@@ -34,7 +36,7 @@ from vmri_jax.steppers.coupled import Coupled
 from vmri_jax.steppers.decoupled import Decoupled
 from vmri_jax.steppers.free_flight import FreeFlight
 from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
-from vmri_jax.steppers.kicked import Kicked, average_over_fast_motion
+from vmri_jax.steppers.kicked import Kicked, Repeated, average_over_fast_motion
 from vmri_jax.steppers.linear import Linear
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.nested import Nested
@@ -95,8 +97,9 @@ class Plan:
         system = self.system
         has = {"T": system.kinetic, "V": system.slow_potential, "W": system.fast_potential, "F": system.force}
         has |= {"g": system.constraint, "g_s": system.slow_constraint}
-        scheme = self.scheme.describe()
-        rules = {name: rule for name, rule in scheme.rules.items() if has[name] is not None}
+        has |= {label(name): function for name, function in system.potentials}
+        scheme = with_rules_for(system, self.scheme).describe()
+        rules = {name: rule for name, rule in scheme.rules.items() if has.get(name) is not None}
         if system.slow_kinetic is not None:
             slow = macro(stage_scheme(self.scheme).kinetic.rule).in_words()
             rules = {"T": rules.pop("T"), "T_s": slow} | rules
@@ -179,7 +182,8 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     if newton.method == "nested" and not can_be_nested:
         raise ValueError(
             "Newton: method 'nested' needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the "
-            "macro nodes; a term of this scheme has nodes inside the macro interval. Take 'auto' or 'arrowhead'."
+            "macro nodes or at every k-th micro node; a term of this scheme has other nodes inside the macro interval. Take 'auto' or "
+            "'arrowhead'."
         )
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)
@@ -211,9 +215,8 @@ def _first_choice(
 
 
 def _can_be_nested(system: System, scheme: Scheme) -> bool:
-    """Whether every term lives on single micro intervals or is a kick at the macro nodes, with constant masses."""
-    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
-    local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
+    """Whether every term lives on single micro intervals or is a kick at nodes where they meet, with constant masses."""
+    local = all(placed.is_local or placed.only_ends for *_, placed in placed_potentials(system, scheme))
     force = system.force is None or scheme.force.grid == "micro"
     return system.has_constant_mass and local and force
 
@@ -238,44 +241,88 @@ def _is_linear(system: System, scheme: Scheme, interval: Interval, q_s) -> bool:
 
 def is_decoupled(system: System, scheme: Scheme, q_s, q_f) -> bool:
     """Whether, kicks aside, the slow equations do not see the fast unknowns."""
-    params = system.params
     if scheme.degree > 1 or system.force is not None or not system.has_constant_mass:
         return False
     if scheme.num_micro == 1 and not q_s.shape[0]:
         return False  # a part already
-    slow_potential, fast_potential = _inside_potentials(system, scheme)
-    if slow_potential is not None:
-        coupled = depends_on(lambda q: slow_potential(q_s, q, params), q_f)[0]
-        if coupled or scheme.slow.grid == "micro":
-            return False
-    if fast_potential is not None and scheme.fast.grid == "macro":
-        return False
-    return not depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
+    inside = _Inside.of(system, scheme, q_s, q_f)
+    return inside is not None and not depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
 
 
-def _inside_potentials(system: System, scheme: Scheme) -> tuple[Callable | None, Callable | None]:
-    """V and W, None where they only kick at the macro nodes."""
-    potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
-    slow, fast = (None if placed.grid == "macro" and placed.only_ends else f for f, placed in potentials)
-    return slow, fast
+class _Inside(NamedTuple):
+    """The potentials with other nodes than the ends of the macro interval, where each sees the slow or the fast variables alone.
+
+    slow: on the macro grid.
+    fast: by the number of micro intervals that a copy of the rule spans, each a multiple of the one before; first those on every one.
+    """
+
+    slow: list[PlacedPotential]
+    fast: dict[int, list[PlacedPotential]]
+
+    @classmethod
+    def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "_Inside | None":
+        """None where a potential sees both, or is where such a part has no steps: the slow and the fast variables must be solved for together."""
+        slow, fast = [], {1: []}
+        for potential in placed_potentials(system, scheme):
+            placed = potential.placed
+            if placed.only_kicks:
+                continue
+            value = partial(potential.value, params=system.params)
+            if placed.grid == "macro":
+                if potential.name == "W" or depends_on(partial(value, q_s), q_f)[0]:
+                    return None
+                slow.append(potential)
+            elif potential.name == "V" and placed.every == 1:
+                return None
+            else:
+                may_see_slow = "q_s" in potential.arguments and q_s.size > 0
+                sees_slow = may_see_slow and depends_on(partial(value, q_f=q_f), q_s)[0]
+                if sees_slow or (placed.every > 1 and not placed.only_ends):
+                    return None
+                fast.setdefault(placed.every, []).append(potential)
+        fast = dict(sorted(fast.items()))
+        chain = all(longer % shorter == 0 for shorter, longer in pairwise(fast))
+        return cls(slow, fast) if chain else None
 
 
 def _decoupled(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Decoupled:
-    slow_potential, fast_potential = _inside_potentials(system, scheme)
-    slow, slow_scheme = slow_part(system, scheme, slow_potential, q_f.size)
-    fast, fast_scheme = fast_part(system, scheme, fast_potential, q_s.size)
-    none = jnp.zeros(0)
-    return Decoupled(
-        _whole_step(slow, slow_scheme, choice, none, q_s),
-        _whole_step(fast, fast_scheme, choice, none, q_f),
-        scheme.num_micro,
-    )
+    inside, none = _Inside.of(system, scheme, q_s, q_f), jnp.zeros(0)
+    assert inside is not None
+    slow, slow_scheme = slow_part(system, scheme, *_named(inside.slow, "V"), num_fast=q_f.size)
+    parts = {
+        every: fast_part(system, scheme, *_named(potentials, "W"), num_slow=q_s.size)
+        for every, potentials in inside.fast.items()
+    }
+    fast, length = _whole_step(*parts.pop(1), choice, none, q_f), 1
+    for every, part in parts.items():
+        fast = Kicked(lagrangian(*part).kicks, Repeated(fast, every // length))
+        length = every
+    return Decoupled(_whole_step(slow, slow_scheme, choice, none, q_s), fast, scheme.num_micro // length)
+
+
+def _named(potentials: list[PlacedPotential], name: str) -> tuple[Callable | None, list[PlacedPotential]]:
+    """The function of the potential of this name, None without it, and all other potentials."""
+    function = next((potential.function for potential in potentials if potential.name == name), None)
+    return function, [potential for potential in potentials if potential.name != name]
+
+
+def with_rules_for(system: System, scheme: Scheme | Composition) -> Scheme | Composition:
+    """A scheme with the rules of the further potentials of a system, also where it gives them by their names alone."""
+    if isinstance(scheme, Composition):
+        return replace(scheme, scheme=with_rules_for(system, scheme.scheme))
+    return replace(scheme, potentials={label(name): scheme.rule_of(name) for name, _ in system.potentials})
 
 
 def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None:
     """The filter of a mollified slow potential, if that is what the scheme has."""
     if not scheme.slow.mollified:
         return None
+    if scheme.fast.every > 1 or any(not scheme.rule_of(name).only_kicks for name, _ in system.potentials):
+        raise ValueError(
+            "Scheme: the slow potential is mollified, which averages over the motion under W alone; here W is on every "
+            f"{scheme.fast.every} micro intervals, or one of the potentials {[name for name, _ in system.potentials]} is on the micro grid. Give "
+            "W the rule micro(...) and the others macro(trapezoidal), or take a scheme without mollified kicks, e.g. explicit_slow(num_micro)."
+        )
     if not system.has_constant_mass or system.is_rheonomic:
         raise ValueError(
             "Scheme: a mollified slow potential needs a System whose kinetic is a ConstantMass, without Rheonomic constraints."

@@ -103,7 +103,7 @@ class SlowEquations(NamedTuple):
 
             ``(C dx)_i = h H sum_k w_k l_i(c_k) dF_s(sum_j l_j(c_k) dx_j, sum_j l_j'(c_k) dx_j / H)``
 
-        on a few Gauss nodes c_k, ``F_s = F - dV/dq_s`` of V and F on the micro grid, with the fast path as it is.
+        on a few Gauss nodes c_k, ``F_s = F - dV/dq_s`` of all potentials and forces inside the macro interval, with the fast path as it is.
 
         Args:
             d: (r n_s,) update.
@@ -122,10 +122,14 @@ class SlowEquations(NamedTuple):
         def sample(increments):
             return matmul(basis[:, 1:], increments), matmul(slopes[:, 1:], increments) / H
 
+        others = [f for name, f in equations.system.potentials if not equations.scheme.rule_of(name).only_kicks]
+
         def forces(q_s, v_s):
             total = jax.vmap(system.forces)(equations.t + c * H, q_s, q_f, v_s, v_f)[0]
             if system.slow_potential is not None:
                 total -= jax.vmap(jax.grad(system.slow_potential), (0, 0, None))(q_s, q_f, system.params)
+            for potential in others:
+                total -= jax.vmap(jax.grad(potential), (0, 0, None))(q_s, q_f, system.params)
             return total
 
         q_s, v_s = sample(x.slow)

@@ -3,14 +3,15 @@
 Functions of the parts are values that are equal where what they are made of is, so that they are traced once.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 
 from vmri_jax.mechanics.functions import Rheonomic, with_time
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.discrete_lagrangian import PlacedPotential
 from vmri_jax.schemes.quadrature import PlacedRule, micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.interval import constant_mass
@@ -25,6 +26,28 @@ class PotentialOfSlow:
 
     def __call__(self, q, params):
         return self.potential(q, jnp.zeros(self.num_fast), params)
+
+
+@dataclass(frozen=True)
+class FurtherOfSlow:
+    """A further potential where it does not see the fast variables, as a potential of a part with the slow ones."""
+
+    potential: Callable
+    num_fast: int
+
+    def __call__(self, _, q, params):
+        return self.potential(q, jnp.zeros(self.num_fast), params)
+
+
+@dataclass(frozen=True)
+class FurtherOfFast:
+    """A further potential where it does not see the slow variables, as a potential of a part with the fast ones."""
+
+    potential: Callable
+    num_slow: int
+
+    def __call__(self, _, q, params):
+        return self.potential(jnp.zeros(self.num_slow), q, params)
 
 
 @dataclass(frozen=True)
@@ -50,34 +73,44 @@ class ConstraintOfFast:
         return function(*arguments)
 
 
-def slow_part(system: System, scheme: Scheme, potential: Callable | None, num_fast: int) -> tuple[System, Scheme]:
+def slow_part(
+    system: System, scheme: Scheme, potential: Callable | None, others: Sequence[PlacedPotential], num_fast: int
+) -> tuple[System, Scheme]:
     """The slow variables, and the scheme of their step over the macro interval.
 
     Args:
         potential: V, None where it only kicks.
+        others: further potentials of slow variables alone that do not only kick.
+        num_fast: of the system.
     """
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).slow),
         fast_potential=None if potential is None else PotentialOfSlow(potential, num_fast),
         constraint=None if system.slow_constraint is None else Rheonomic(ConstraintOfSlow(system.slow_constraint)),
         params=system.params,
+        potentials={other.name: FurtherOfSlow(other.function, num_fast) for other in others},
     )
-    return alone, _single(PlacedRule(scheme.slow.rule, scheme.slow.grid))
+    return alone, _single(PlacedRule(scheme.slow.rule, scheme.slow.grid), others)
 
 
-def fast_part(system: System, scheme: Scheme, potential: Callable | None, num_slow: int) -> tuple[System, Scheme]:
-    """The fast variables, and the scheme of their steps over the micro intervals.
+def fast_part(
+    system: System, scheme: Scheme, potential: Callable | None, others: Sequence[PlacedPotential], num_slow: int
+) -> tuple[System, Scheme]:
+    """The fast variables, and the scheme of their steps over the micro intervals, or over the intervals that copies of rules span.
 
     Args:
-        potential: W, None where it only kicks at the macro nodes.
+        potential: W, None where it has no nodes of its own on these.
+        others: potentials of fast variables alone whose rules have a copy on each of these.
+        num_slow: of the system.
     """
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).fast),
         fast_potential=potential,
         constraint=None if system.constraint is None else Rheonomic(ConstraintOfFast(system.constraint, num_slow)),
         params=system.params,
+        potentials={other.name: FurtherOfFast(other.function, num_slow) for other in others},
     )
-    return alone, _single(scheme.fast)
+    return alone, _single(replace(scheme.fast, every=1), others)
 
 
 @dataclass(frozen=True)
@@ -112,7 +145,8 @@ def frozen_slow(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)
 
 
-def _single(fast: PlacedRule) -> Scheme:
+def _single(fast: PlacedRule, others: Sequence[PlacedPotential]) -> Scheme:
     """A scheme of fast variables alone on one interval."""
     drift = micro(midpoint)
-    return Scheme(1, kinetic=drift, slow=drift, fast=fast)
+    potentials = {other.name: micro(other.placed.rule) for other in others}
+    return Scheme(1, kinetic=drift, slow=drift, fast=fast, potentials=potentials)

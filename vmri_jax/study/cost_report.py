@@ -17,7 +17,6 @@ from matplotlib.ticker import EngFormatter
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.accuracy.families import Family, families
-from vmri_jax.mechanics.invariants import potentials
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import Progress, part, silent
@@ -291,16 +290,16 @@ def _multirate(report: CostReport) -> list[tuple[float, str, int, float]]:
 
 
 def _shares(problem: Problem, setting: Setting | None) -> dict[str, float]:
-    """Parts of the time of a run: gradients of V and of W, constraints with their Jacobian, all the rest."""
+    """Parts of the time of a run: gradients of V and of W, constraints with their Jacobian, all the rest, further potentials included."""
     if setting is None:
         return {}
     system, row, n_s = problem.system, setting.row, problem.q_s.size
 
     def slow(q):
-        return potentials(system, q[:n_s], q[n_s:])[0]
+        return system.slow_potential(q[:n_s], q[n_s:], system.params)  # pyright: ignore[reportOptionalCall]
 
     def fast(q):
-        return potentials(system, q[:n_s], q[n_s:])[1]
+        return system.fast_potential(q[n_s:], system.params)  # pyright: ignore[reportOptionalCall]
 
     def constraints(q):
         return system.constraints(problem.t, q[:n_s], q[n_s:])

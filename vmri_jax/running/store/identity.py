@@ -54,6 +54,9 @@ def describe(name: str, value) -> dict[str, str]:
     if dataclasses.is_dataclass(value) and not isinstance(value, TracedOnce):
         parts = [describe(f"{name}.{field.name}", getattr(value, field.name)) for field in dataclasses.fields(value)]
         return {key: text for part in parts for key, text in part.items()}
+    if isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):  # rules of potentials by name
+        parts = [describe(f"{name}[{key!r}]", part) for key, part in value.items()]
+        return {key: text for part in parts for key, text in part.items()}
     leaves, _ = jax.tree_util.tree_flatten_with_path(value)
     return {name + jax.tree_util.keystr(path): _words(leaf) for path, leaf in leaves}
 
@@ -81,6 +84,7 @@ def _operations(system: System, start: State) -> dict[str, str]:
         "slow_constraint": with_time(system.slow_constraint, start.t, q_s, params),
         "implied": with_time(system.implied, start.t, q_s, q_f, params),
         "force": (system.force, (start.t, q_s, q_f, q_s, q_f, params)),
+        **{f"potential {name}": (function, (q_s, q_f, params)) for name, function in system.potentials},
     }
     if isinstance(system.kinetic, KineticFunction):
         functions["kinetic"] = system.kinetic.function, (q_s, q_f, q_s, q_f, params)

@@ -1,0 +1,277 @@
+"""Potentials with rates of their own: r-RESPA of three levels written out in numpy, and what holds for every placement.
+
+A chain of four atoms in the plane, all of them fast: bonds on every micro node, bends on every fourth, pairs at the macro nodes.
+"""
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax import textbook
+from vmri_jax.schemes.quadrature import gauss, midpoint, simpson, trapezoidal
+
+NUM_MICRO, EVERY, H = 32, 8, 0.05
+MASS = jnp.array([2.0, 2.0, 1.0, 1.0, 1.5, 1.5, 1.0, 1.0])
+POINTS = jnp.array([0.0, 0.0, 1.0, 0.1, 1.9, -0.2, 2.9, 0.1])
+VELOCITY = jnp.array([0.1, 0.3, -0.2, -0.1, 0.05, -0.2, -0.1, 0.2])
+LENGTHS = jnp.linalg.norm(jnp.diff(POINTS.reshape(4, 2), axis=0), axis=1)
+NONE = jnp.zeros(0)
+
+
+def pairs(q_s, q_f, params):
+    """Soft repulsion of atoms that no bond joins."""
+    x = q_f.reshape(-1, 2)
+    i, j = np.array([0, 0, 1]), np.array([2, 3, 3])
+    return jnp.sum(1 / jnp.sum((x[i] - x[j]) ** 2, axis=1))
+
+
+def bends(q_s, q_f, params):
+    """Springs at the angles."""
+    d = jnp.diff(q_f.reshape(-1, 2), axis=0)
+    sine = d[:-1, 0] * d[1:, 1] - d[:-1, 1] * d[1:, 0]
+    return params["bends"] / 2 * jnp.sum(jnp.arctan2(sine, jnp.sum(d[:-1] * d[1:], axis=1)) ** 2)
+
+
+def bonds(q_s, q_f, params):
+    """Stiff springs between neighbours."""
+    lengths = jnp.linalg.norm(jnp.diff(q_f.reshape(-1, 2), axis=0), axis=1)
+    return params["bonds"] / 2 * jnp.sum((lengths - LENGTHS) ** 2)
+
+
+def rigid(q_s, q_f, params):
+    """Bonds of constant length."""
+    d = jnp.diff(q_f.reshape(-1, 2), axis=0)
+    return (jnp.sum(d * d, axis=1) - LENGTHS**2) / 2
+
+
+PARAMS = {"bends": jnp.asarray(40.0), "bonds": jnp.asarray(2000.0)}
+LEVELS = {"pairs": pairs, "bends": bends, "bonds": bonds}
+RULES = {"pairs": vm.macro(trapezoidal), "bends": vm.micro(trapezoidal, every=EVERY), "bonds": vm.micro(trapezoidal)}
+SCHEME = vm.fully_explicit(NUM_MICRO).with_potentials(**RULES)
+CHAIN = vm.System(vm.ConstantMass(NONE, MASS), params=PARAMS, potentials=LEVELS)
+START = vm.initial_state(CHAIN, NONE, POINTS, NONE, VELOCITY)
+
+
+def respa(system: vm.System, q, p, num_steps: int, rows=None):
+    """(q, p) after steps of nested velocity Verlet; with constraint `rows` its drifts are SHAKE's, and p is projected at the end."""
+    inverse, (slow, between, fast) = 1 / np.asarray(MASS), [_force(f, system.params) for _, f in system.potentials]
+    h = H / NUM_MICRO
+    value = jax.jit(rows or (lambda q: q[:0]))
+    jacobian = jax.jit(jax.jacrev(value))
+
+    def drift(q, p):
+        if rows is None:
+            return q + h * inverse * p, p
+        G, new = np.asarray(jacobian(q)), q + h * inverse * p
+        for _ in range(12):
+            mu = np.linalg.solve(np.asarray(jacobian(new)) @ (inverse[:, None] * G.T), np.asarray(value(new)))
+            new = new - inverse * (G.T @ mu)
+        return new, (new - q) / (h * inverse)
+
+    for _ in range(num_steps):
+        p = p + H / 2 * slow(q)
+        for _ in range(NUM_MICRO // EVERY):
+            p = p + EVERY * h / 2 * between(q)
+            for _ in range(EVERY):
+                p = p + h / 2 * fast(q)
+                q, p = drift(q, p)
+                p = p + h / 2 * fast(q)
+            p = p + EVERY * h / 2 * between(q)
+        p = p + H / 2 * slow(q)
+    if rows is not None:
+        G = np.asarray(jacobian(q))
+        p = p - G.T @ np.linalg.solve(G @ (inverse[:, None] * G.T), G @ (inverse * p))
+    return q, p
+
+
+def _force(potential, params):
+    compiled = jax.jit(jax.grad(lambda q: -potential(NONE, q, params)))
+    return lambda q: np.asarray(compiled(q))
+
+
+def test_equals_respa():
+    run = vm.simulate(CHAIN, SCHEME, START, macro_dt=H, num_steps=100, save_every=100)
+    q, p = respa(CHAIN, np.asarray(START.q_f), np.asarray(START.p_f), 100)
+    assert np.abs(run.q_f[-1] - q).max() < 1e-12  # measured 4e-14
+    assert np.abs(run.p_f[-1] - p).max() < 3e-12  # measured 3e-13
+    assert int(run.info.iterations[-1]) == 0
+
+
+def test_equals_respa_with_constraints():
+    system = CHAIN.replace(constraint=rigid)
+    start = vm.initial_state(system, NONE, POINTS, NONE, VELOCITY, project=True)
+    run = vm.simulate(system, SCHEME, start, macro_dt=H, num_steps=100, save_every=100)
+    q, p = respa(system, np.asarray(start.q_f), np.asarray(start.p_f), 100, lambda q: rigid(NONE, q, PARAMS))
+    assert np.abs(run.q_f[-1] - q).max() < 1e-10  # measured 8e-12
+    assert np.abs(run.p_f[-1] - p).max() < 1e-10  # measured 1e-11
+    assert np.abs(run.constraint_residual).max() < 1e-14  # measured 6e-16
+
+
+EVALUATIONS = Counter()
+
+
+def counted(name, function):
+    """The function, counting every evaluation at run time."""
+
+    def call(*args):
+        jax.debug.callback(lambda _: EVALUATIONS.update([name]), jnp.sum(args[1]))
+        return function(*args)
+
+    return call
+
+
+def test_evaluations():
+    """As `describe` says, and one more at the start of the run."""
+    system = CHAIN.replace(potentials={name: counted(name, function) for name, function in LEVELS.items()})
+    counts = []
+    for num_steps in (3, 13):
+        EVALUATIONS.clear()
+        vm.simulate(
+            system, SCHEME, START, macro_dt=H, num_steps=num_steps, save_every=num_steps
+        ).q_f.block_until_ready()
+        jax.effects_barrier()
+        counts.append(EVALUATIONS.copy())
+    per_step = {name: (counts[1][name] - counts[0][name]) / 10 for name in LEVELS}
+    assert per_step == {"pairs": 1, "bends": 4, "bonds": 32} == SCHEME.describe().evaluations
+
+
+@pytest.mark.parametrize(
+    ("scheme", "order", "steps"),
+    [(SCHEME, 2, (16, 24, 32)), (vm.compose(SCHEME, "suzuki4"), 4, (32, 48, 64))],
+    ids=["2", "4"],
+)
+def test_order(scheme, order, steps):
+    """Of positions and momenta together; measured 2.00 and 4.10."""
+    assert scheme.order == order
+    runs = [vm.simulate(CHAIN, scheme, START, macro_dt=0.8 / n, num_steps=n, save_every=n) for n in (*steps, 512)]
+    ends = np.array([np.concatenate([run.q_f[-1], run.p_f[-1]]) for run in runs])
+    errors = np.linalg.norm(ends[:-1] - ends[-1], axis=1)
+    assert abs(-np.polyfit(np.log(steps), np.log(errors), 1)[0] - order) < 0.2
+
+
+def invariants(state):
+    """Linear momentum in the plane, and the angular momentum."""
+    p, x = state.p_f.reshape(-1, 2), state.q_f.reshape(-1, 2)
+    return jnp.append(p.sum(0), jnp.sum(x[:, 0] * p[:, 1] - x[:, 1] * p[:, 0]))
+
+
+def test_symplectic_with_momentum_maps():
+    assert float(vm.diagnostics.symplectic_defect(CHAIN, SCHEME, START, macro_dt=H)) < 1e-13  # measured 9e-15
+    run = vm.simulate(CHAIN, SCHEME, START, macro_dt=H, num_steps=50)
+    values = jax.vmap(lambda q, p: invariants(vm.State(0.0, NONE, q, NONE, p)))(run.q_f, run.p_f)
+    assert np.abs(values - values[0]).max() < 2e-13  # measured 2e-14
+    assert np.ptp(run.energy) < 2e-2 * float(run.energy[0])  # measured 1.2e-2
+
+
+def test_batch_and_gradient():
+    """A batch is a loop of runs, and the gradient by a stiffness that of differences."""
+
+    def end(stiffness):
+        system = CHAIN.replace(params={**PARAMS, "bends": stiffness})
+        return vm.simulate(system, SCHEME, START, macro_dt=H, num_steps=10, save_every=10, throw=False).q_f[-1]
+
+    stiffness = jnp.array([30.0, 40.0])
+    together, apart = jax.vmap(end)(stiffness), jnp.stack([end(k) for k in stiffness])
+    assert np.abs(together - apart).max() < 1e-13
+    slope = jax.grad(lambda k: end(k)[-1])(40.0)
+    difference = (end(40.0 + 1e-3)[-1] - end(40.0 - 1e-3)[-1]) / 2e-3
+    assert float(slope) == pytest.approx(float(difference), rel=1e-6)
+
+
+def soft(q_s, q_f, params):
+    """Joins all variables."""
+    return 0.3 * (jnp.sum(q_s) - jnp.sum(q_f)) ** 2 + jnp.sum(jnp.cos(q_s))
+
+
+def hinge(q_s, q_f, params):
+    """Joins slow and fast variables stiffly."""
+    return 100 * jnp.sum((q_s - q_f) ** 2) + jnp.sum(q_f**3 * q_s)
+
+
+def middle(q_s, q_f, params):
+    """Of fast variables alone."""
+    return 10 * (q_f[1] - q_f[0]) ** 2 + jnp.sum(q_f**3)
+
+
+def stiff(q_f, params):
+    """Of fast variables alone."""
+    return 50 * jnp.sum(q_f**2 * (1 + q_f**2 / 10))
+
+
+def of_slow(q_s, q_f, params):
+    """Of slow variables alone."""
+    return jnp.sum(q_s**4)
+
+
+def rod(q_s, q_f, params):
+    """From the slow to the fast point."""
+    return jnp.array([(q_f - q_s) @ (q_f - q_s) - 1.0]) / 2
+
+
+def kinetic(q_s, q_f, v_s, v_f, params):
+    """Masses that depend on the configuration."""
+    return jnp.sum((2 + jnp.sin(q_s)) * v_s**2) / 2 + v_f @ v_f / 2 + 0.1 * v_s[0] * v_f[1] * jnp.cos(q_f[0])
+
+
+MASSES = vm.ConstantMass([2.0, 2.0], [1.0, 1.0])
+TWO = vm.System(MASSES, soft, stiff)
+FREE = jnp.array([0.1, 0.2]), jnp.array([0.05, -0.02]), jnp.array([1.0, 0.0]), jnp.array([0.5, 1.0])
+HELD = jnp.array([0.0, 0.0]), jnp.array([0.6, -0.8]), jnp.array([1.0, 0.0]), jnp.array([1.8, 0.6])
+EXPLICIT, IMPLICIT, KICKS = vm.fully_explicit(6), vm.explicit_slow(6), vm.micro(trapezoidal)
+PLACEMENTS = {
+    "no chain of rates": (TWO.replace(potentials={2: middle, 3: hinge}), EXPLICIT, FREE),
+    "another rule": (
+        TWO.replace(potentials={"a": hinge}),
+        IMPLICIT.with_potentials(a=vm.micro(simpson, every=3)),
+        FREE,
+    ),
+    "slow and fast, on the micro grid": (TWO.replace(potentials={"fast": hinge}), IMPLICIT, FREE),
+    "V between the grids": (
+        TWO,
+        vm.Scheme(6, kinetic=vm.micro(midpoint), slow=vm.micro(trapezoidal, every=2), fast=vm.micro(midpoint)),
+        FREE,
+    ),
+    "W between the grids": (
+        TWO.replace(potentials={"a": middle}),
+        vm.Scheme(
+            6, kinetic=vm.micro(midpoint), slow=vm.macro(trapezoidal), fast=vm.micro(trapezoidal, every=2)
+        ).with_potentials(a=KICKS),
+        FREE,
+    ),
+    "of slow variables alone": (
+        TWO.replace(slow_potential=None, potentials={"a": of_slow, 3: middle}),
+        IMPLICIT.with_potentials(a=vm.macro(midpoint)),
+        FREE,
+    ),
+    "a constraint between slow and fast": (TWO.replace(constraint=rod, potentials={2: hinge}), EXPLICIT, HELD),
+    "kinetic function": (
+        vm.System(kinetic, soft, stiff, potentials={2: hinge, "a": middle}),
+        EXPLICIT.with_potentials(a=vm.micro(midpoint)),
+        FREE,
+    ),
+    "degree 2": (
+        TWO.replace(potentials={"a": hinge}),
+        vm.galerkin(4, 2).with_potentials(a=vm.micro(gauss(2), every=2)),
+        FREE,
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=pytest.mark.full if n in ("another rule", "degree 2", "kinetic function") else ())
+        for n in PLACEMENTS
+    ],
+)
+def test_every_placement_is_that_of_the_textbook(name):
+    system, scheme, start = PLACEMENTS[name]
+    state = vm.initial_state(system, *start)
+    run = vm.simulate(system, scheme, state, macro_dt=0.04, num_steps=2)
+    right = jax.jit(lambda state: textbook.simulate(system, scheme, state, 0.04, 2))(state)
+    for part in ("q_s", "q_f", "p_s", "p_f"):
+        assert np.abs(getattr(run, part) - getattr(right, part)).max() < 2e-13  # measured 3e-14
