@@ -136,11 +136,12 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
     return Ledger(tuple(rows), whole)
 
 
-def _rule(scheme: Scheme, home) -> PlacedRule:
+def _rule(scheme: Scheme, home: Any) -> PlacedRule:
     """The rule of the scheme for what is part of this argument of `System`, or of this one of its further potentials."""
     if home == "fast" or isinstance(home, int):
         return scheme.rule_of(home)
-    return getattr(scheme, RULES.get(home, home))
+    name: str = RULES.get(home, home)  # pyright: ignore[reportAssignmentType]
+    return getattr(scheme, name)
 
 
 def ledger_of_functions(
