@@ -1,5 +1,8 @@
 """Runs of an accuracy: their true errors, the choice as arguments, resonant steps, and requests that nothing can meet."""
 
+from dataclasses import replace
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -7,6 +10,7 @@ import vmri_jax as vm
 from tests.accuracy.test_run_error import double_pendulum
 from tests.small_systems import SYSTEMS
 from vmri_jax.accuracy import steps
+from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
 from vmri_jax.study import reference_solution
 
@@ -38,6 +42,18 @@ def test_a_scheme_of_ones_own_keeps_its_rules():
     assert run.settings.scheme == vm.fully_explicit(2).with_num_micro(run.settings.scheme.num_micro)
     assert "scheme.with_num_micro(" in repr(run)
     assert np.isfinite(run.error.slow).all()
+
+
+def test_rates_of_potentials_divide_the_micro_steps():
+    system = SYSTEMS["no_constraint"].system
+    problem = replace(SYSTEMS["no_constraint"], system=system.replace(potentials={4: quartic}))
+    run = vm.simulate(problem, accuracy=1e-3, t_end=LENGTH)
+    assert run.error.largest <= 1e-3
+    assert stage_scheme(run.settings.scheme).num_micro % 4 == 0
+
+
+def quartic(q_s, q_f, params):
+    return jnp.sum(q_f**4)
 
 
 def test_number_of_saved_nodes():

@@ -277,10 +277,9 @@ def _menu(scheme, system: System, start: State, accuracy: float, length: float) 
     name = next((name for most, name in COMPOSED if digits <= most), None)
     unit = _unit(system, base.make(1))
     num_micro = unit * -(-FIRST_MICRO // unit) if unit > 1 or (start.q_s.size and start.q_f.size) else 1
-    return [
-        (base if name is None else base.composed(name), num_micro),
-        (of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1),
-    ]
+    kicks = base if name is None else base.composed(name), num_micro
+    single = of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1
+    return [kicks, single] if unit == 1 else [kicks]  # a single interval has no k-th micro node
 
 
 def _unit(system: System, scheme: Scheme) -> int:
