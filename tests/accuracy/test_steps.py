@@ -8,7 +8,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.accuracy.test_run_error import double_pendulum
-from tests.small_systems import SYSTEMS
+from tests.small_systems import SYSTEMS, no_constraint
 from vmri_jax.accuracy import steps
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
@@ -45,8 +45,8 @@ def test_a_scheme_of_ones_own_keeps_its_rules():
 
 
 def test_rates_of_potentials_divide_the_micro_steps():
-    system = SYSTEMS["no_constraint"].system
-    problem = replace(SYSTEMS["no_constraint"], system=system.replace(potentials={4: quartic}))
+    problem = no_constraint()
+    problem = replace(problem, system=problem.system.replace(potentials={4: quartic}))
     run = vm.simulate(problem, accuracy=1e-3, t_end=LENGTH)
     assert run.error.largest <= 1e-3
     assert stage_scheme(run.settings.scheme).num_micro % 4 == 0

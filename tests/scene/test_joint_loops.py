@@ -113,7 +113,7 @@ def test_joints_that_are_given_twice_are_refused(joints, message):
 
 def test_a_joint_that_is_given_twice_may_be_dropped():
     scene = Scene([BAR], [hinge("pin"), hinge("again")], coordinates="joint", redundant="drop")
-    assert (len(scene.dropped), scene.names.slow | scene.names.fast) == (5, {"pin": 1})
+    assert (len(scene.dropped), dict(scene.names.slow) | dict(scene.names.fast)) == (5, {"pin": 1})
 
 
 def test_what_hangs_on_the_ground_at_both_ends_is_one_tree():

@@ -1,5 +1,7 @@
 """Closed loops in joint coordinates, random ones and a slider-crank: the same mechanics and reaction forces as by directors."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -71,7 +73,7 @@ def test_reaction_forces_of_a_slider_crank():
     for body, name in enumerate(names):
         q, _, a = moved[name]
         turning = np.cross(q[3:].reshape(3, 3), a[3:].reshape(3, 3)).sum(axis=0)[2] / 2  # sum d_i x d_i'' / 2
-        made = scene.by_name[name]
+        made: Any = scene.by_name[name]
         known[3 * body : 3 * body + 3] = [made.mass * a[0], made.mass * (a[1] + 9.81), made.moments[2] * turning]
         for pin, sign in ((body, 1.0), (body + 1, -1.0)):
             if pin < 3:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax.mechanics.invariants import potentials
+from vmri_jax.mechanics.invariants import potential_energy
 from vmri_jax.scene import (
     Anchor,
     Angle,
@@ -32,7 +32,7 @@ BONDS = list(itertools.pairwise(CHAIN))
 def energy(*effects) -> float:
     scene = Scene(BODIES, effects)
     q_s, q_f, *_ = scene.start
-    return float(sum(potentials(scene.system(), q_s, q_f)))
+    return float(potential_energy(scene.system(), q_s, q_f))
 
 
 def test_a_negative_torsion_has_its_maximum_where_others_have_their_minimum():

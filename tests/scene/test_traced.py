@@ -9,7 +9,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.scene.effect_scenes import BASE, EFFECTS
-from vmri_jax.mechanics.invariants import potentials
+from vmri_jax.mechanics.invariants import potential_energy
 from vmri_jax.scene import (
     Body,
     Gravity,
@@ -57,7 +57,7 @@ def swinging(x) -> Scene:
 def test_scenes_of_rigid_bodies_may_be_traced():
     def start(x):
         state, system = swinging(x).state(), swinging(x).system()
-        return jnp.sum(state.p_s * jnp.arange(12.0)) + sum(potentials(system, state.q_s, state.q_f))
+        return jnp.sum(state.p_s * jnp.arange(12.0)) + potential_energy(system, state.q_s, state.q_f)
 
     x, step = 0.7, 1e-5
     difference = (start(x + step) - start(x - step)) / (2 * step)

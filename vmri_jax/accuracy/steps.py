@@ -275,7 +275,7 @@ def _menu(scheme, system: System, start: State, accuracy: float, length: float) 
     digits = np.log10(max((size or speed * length) / accuracy, 10.0))
     base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
     name = next((name for most, name in COMPOSED if digits <= most), None)
-    unit = _unit(system, base.make(1))
+    unit = _unit(system, stage_scheme(base.make(1)))
     num_micro = unit * -(-FIRST_MICRO // unit) if unit > 1 or (start.q_s.size and start.q_f.size) else 1
     kicks = base if name is None else base.composed(name), num_micro
     single = of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1
