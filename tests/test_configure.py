@@ -90,3 +90,10 @@ with warnings.catch_warnings(record=True) as caught:
 print(len(caught), caught[0].category is NotConfiguredWarning, "vm.configure()" in str(caught[0].message))
 """
     assert printed(program).split() == ["1", "True", "True"]
+
+
+def test_the_import_leaves_figures_and_studies_for_later():
+    """matplotlib and the rooms that draw take half a second; runs do not need them."""
+    program = "import sys, vmri_jax; print([name for name in ('matplotlib', 'vmri_jax.study') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

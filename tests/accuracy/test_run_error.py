@@ -1,12 +1,14 @@
 """Estimated errors of runs against references, their shares against the limits of each grid, and how they are told."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.small_systems import NONE, SYSTEMS
+from tests.small_systems import NONE, SYSTEMS, no_constraint
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.study import reference_solution
 
@@ -23,6 +25,8 @@ def largest_difference(a, b) -> float:
 
 CASES = {
     "kicks": ("no_constraint", vm.fully_explicit(8), 20),
+    "order 1": ("no_constraint", vm.fully_explicit(8, alpha=0.3), 400),
+    "averaged kicks": ("no_constraint", vm.mollified_impulse(8), 40),
     "midpoint": ("no_constraint", vm.fully_implicit(5), 40),
     "composition": ("no_constraint", vm.compose(vm.fully_explicit(2), "suzuki4"), 20),
     "order 6": ("fast_alone", vm.compose(vm.fully_explicit(2), "kahan-li6"), 20),
@@ -39,7 +43,7 @@ CASES = {
 }
 
 
-QUICK = ("kicks", "composition", "slow alone", "constraint, order 8", "damped")
+QUICK = ("kicks", "order 1", "composition", "slow alone", "constraint, order 8", "damped")
 
 
 @pytest.mark.parametrize(
@@ -132,17 +136,35 @@ def double_pendulum() -> vm.Problem:
     return vm.Problem(vm.System(kinetic, weight), [2.5, 2.0], NONE, [0.0, 0.0], NONE)
 
 
+def last(run):
+    return run.q_s[-1, 0]
+
+
 def test_chaotic_motion_is_not_certified():
     with pytest.warns(UncertifiedWarning, match=r"the motion is chaotic.*The energy has changed by at most"):
-        run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), macro_dt=0.05, t_end=30.0, error=True)
+        run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), macro_dt=0.05, t_end=30.0, error=True, of=last)
     until = float(run.error.certified_until)
     assert 2.0 < until < 30.0
     np.testing.assert_array_equal(np.isnan(run.error.positions), np.asarray(run.t) > until)
     assert run.error.largest == np.inf
     assert f"until t = {until:.4g}" in run.error.in_words()
+    assert np.isnan(run.error.of)
+    assert "no error is certified" in repr(run[-3:].error)
 
 
 def test_steps_that_do_not_see_the_motion_are_not_certified():
     with pytest.warns(UncertifiedWarning, match="take smaller steps"):
         run = vm.simulate(SYSTEMS["slow_alone"], vm.fully_explicit(1), macro_dt=0.6, num_steps=40, error=True)
     assert not run.error.is_certified
+
+
+def test_the_order_is_that_of_all_potentials():
+    """A potential on every second micro node has the trapezoidal rule, whatever the order of the scheme."""
+    problem = no_constraint()
+    problem = replace(problem, system=problem.system.replace(potentials={2: spring}))
+    assert vm.prepare(problem, vm.galerkin(2, 3), macro_dt=0.1, num_steps=1).order == 2
+    assert vm.prepare(no_constraint(), vm.galerkin(2, 3), macro_dt=0.1, num_steps=1).order == 6
+
+
+def spring(q_s, q_f, params):
+    return jnp.sum(q_f**2)

@@ -10,6 +10,7 @@ import vmri_jax as vm
 from tests.accuracy.test_run_error import double_pendulum
 from tests.small_systems import SYSTEMS, no_constraint
 from vmri_jax.accuracy import steps
+from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
 from vmri_jax.study import reference_solution
@@ -64,14 +65,50 @@ def test_number_of_saved_nodes():
 
 def test_steps_beside_resonances():
     """A slow kick once in half a turn of the fast oscillator is resonant; a few percent more steps are not."""
-    problem, length = linear_model(omega=50.0, kappa=25.0), 20.0
-    scheme = vm.explicit_slow(40)
+    problem, length, family = linear_model(omega=50.0, kappa=25.0), 20.0, of_order_2(vm.explicit_slow)
+    search = steps.Search(lambda scheme: vm.prepare(problem, scheme, macro_dt=length, num_steps=1), length, None)
+    trial = search.trial(family, 40, 2048)
     resonant = round(length / 0.0625)  # within the window from 0.06223 to 0.06286 of `vmri_jax.stability.advise`
-    family = steps.Family("own", scheme.with_num_micro, "", "scheme.with_num_micro({})")
-    trial = steps.Trial(family, 40, vm.prepare(problem, scheme, macro_dt=0.1, num_steps=1), None, None, 0.0, 0.0)  # pyright: ignore[reportArgumentType]
-    beside = steps._beside_resonances(problem.system, problem.state(), trial, length, resonant)
+    beside = steps._beside_resonances(search, trial, resonant)
     assert resonant < beside < 1.3 * resonant
-    assert steps._beside_resonances(problem.system, problem.state(), trial, length, beside) == beside
+    assert steps._beside_resonances(search, trial, beside) == beside
+
+
+def test_a_later_start_and_a_single_saved_interval():
+    problem = SYSTEMS["driven"]
+    start = vm.simulate(problem, vm.fully_explicit(8), macro_dt=0.01, t_end=1.0)[-1]
+    run = vm.simulate(problem, vm.fully_explicit(8), start, accuracy=1e-3, t_end=2.0, num_saves=1)
+    assert (len(run), float(run.t[0]), float(run.t[-1])) == (2, 1.0, pytest.approx(2.0))
+    fine = vm.simulate(problem, vm.galerkin(1, 6), start, macro_dt=0.05, t_end=2.0)
+    assert np.abs(run.q_f[-1] - fine.q_f[-1]).max() <= 1e-3
+
+
+def test_a_motion_without_error():
+    """Free flight in steps of 2^-k: no scheme has an error, and no share is divided by."""
+    free = vm.Problem(vm.System(vm.ConstantMass([1.0], [1.0])), [0.0], [0.0], [1.0], [1.0])
+    run = vm.simulate(free, vm.fully_explicit(4), accuracy=1e-3, t_end=1.0)
+    assert run.error.largest < 1e-15
+
+
+def wall(q_s, q_f, params):
+    """A potential that ends at q = 1."""
+    return jnp.sum(jnp.log(1.0 - q_s))
+
+
+def test_a_motion_that_ends_fails_as_without_an_accuracy():
+    falling = vm.Problem(vm.System(vm.ConstantMass([1.0], []), wall), [0.5], [], [1.0], [])
+    with pytest.raises(vm.SimulationError), pytest.warns(vm.AccuracyNotReached):
+        vm.simulate(falling, vm.fully_explicit(1), accuracy=1e-3, t_end=2.0)
+    with pytest.warns(vm.AccuracyNotReached):
+        run = vm.simulate(falling, vm.fully_explicit(1), accuracy=1e-3, t_end=2.0, throw=False)
+    assert np.isnan(run.q_s[-1]).all()
+
+
+def test_more_steps_than_there_may_be_are_not_tried(monkeypatch):
+    monkeypatch.setattr(steps, "MOST_STEPS", 2**12)
+    with pytest.warns(vm.AccuracyNotReached, match="its error is"):
+        run = vm.simulate(SYSTEMS["slow_alone"], vm.fully_explicit(1, alpha=0.3), accuracy=1e-9, t_end=1.0)
+    assert run.settings.num_steps <= 2**12
 
 
 @pytest.mark.parametrize(
@@ -86,11 +123,21 @@ def test_steps_beside_resonances():
         ({"accuracy": 1e-3, "t_end": 1.0, "save_every": 2}, "got save_every with an accuracy"),
         ({"t_end": 1.0, "macro_dt": 0.1}, "scheme is None without an accuracy"),
         ({"accuracy": 1e-3, "t_end": 1.0, "num_saves": 0}, "num_saves"),
+        ({"accuracy": 1e-3, "t_end": 1.0, "adjoint": "stored"}, "got adjoint with an accuracy"),
     ],
 )
 def test_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         vm.simulate(SYSTEMS["slow_alone"], **arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"scheme": vm.fully_explicit}, "give a Scheme"), ({"of": lambda run: "far"}, "returned 'far'")],
+)
+def test_wrong_types(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        vm.simulate(SYSTEMS["slow_alone"], accuracy=1e-3, t_end=1.0, **arguments)
 
 
 def test_chaotic_motion_misses_the_accuracy(monkeypatch):

@@ -4,14 +4,15 @@ A run with macro steps H and micro steps h = H / N has, with a scheme of order p
 
     x_{H,h}(t) - x(t) = S(t) H^p + F(t) h^p + ...
 
-Its slow share ``S H^p`` is the part that smaller macro steps with the same micro step take away, its fast share ``F h^p`` the part that
-more micro steps take away. Two companions from the same start separate them, with ``r = 2^p / (2^p - 1)`` (Richardson's extrapolation):
+Its slow share ``S H^p`` goes with H at fixed h, its fast share ``F h^p`` with h at fixed H. Two companions from the same start separate them:
+the first halves both, the second h alone. With ``r = 2^p / (2^p - 1)`` (Richardson's extrapolation)
 
     half the macro step:        S H^p + F h^p = r (x_{H,h} - x_{H/2,h/2})
     twice the micro steps:              F h^p = r (x_{H,h} - x_{H,h/2})
 
-Where a scheme does not reach its order p, as on vibrations that its steps do not resolve, the first estimate is wrong by at most the factor
-``(2^p - 1) / (2^q - 1)`` of the order q that it has. Positions that are wrong by a good part of the whole motion are not certified.
+Where a scheme has the order q instead of p, as on vibrations that its steps do not resolve, the true error over the estimate is
+``(1 - 2^-p) / (1 - 2^-q)``: 1.5 for p = 2 and q = 1. Above order 2 an error has terms ``H^a h^b``, too, which count in part to both shares.
+Positions that are wrong by a good part of the whole motion are not certified.
 """
 
 import warnings
@@ -39,17 +40,24 @@ class UncertifiedWarning(UserWarning):
     """The error of a run is not certified over all of its length."""
 
 
-def with_error(run: Simulation, trajectory: Trajectory, of: Callable | None = None, shares: bool = True) -> Trajectory:
+def with_error(
+    run: Simulation,
+    trajectory: Trajectory,
+    of: Callable | None = None,
+    shares: bool = True,
+    halved: Trajectory | None = None,
+) -> Trajectory:
     """The same trajectory with its `RunError`; warns where it is not certified over the whole run.
 
     Args:
-        run: that the trajectory is of, without a failure.
+        run: the simulation that made the trajectory; no step of it failed.
         trajectory: its nodes.
         of: function of a run, whose error is estimated too.
-        shares: whether the slow and the fast share are, which takes a program of their own.
+        shares: whether to estimate the slow and the fast share, too. Their companion has more micro steps and is compiled for itself.
+        halved: the companion with half the macro step, if it has been made.
     """
-    scheme = run.scheme
-    halved = companion(run, scheme, 2)
+    scheme, order = run.scheme, run.order
+    halved = companion(run, scheme, 2) if halved is None else halved
     if int(halved.failed_at) >= 0:
         warnings.warn(
             f"simulate: the error is not known; the same run with half the macro step failed at t = {_failure(halved, run):.4g}.",
@@ -57,15 +65,15 @@ def with_error(run: Simulation, trajectory: Trajectory, of: Callable | None = No
             stacklevel=3,
         )
         return trajectory
-    total = extrapolated(scheme, trajectory, halved)
+    total = extrapolated(order, trajectory, halved)
     fast = np.full_like(total, np.nan)
     if shares:
         refined = companion(run, scheme.with_num_micro(2 * stage_scheme(scheme).num_micro), 1)
-        fast = extrapolated(scheme, trajectory, refined)
+        fast = extrapolated(order, trajectory, refined)
     certified, growth = certified_nodes(trajectory, total)
     until = np.asarray(trajectory.t)[certified][-1]
     total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
-    of_error = None if of is None else ratio(scheme) * (np.asarray(of(trajectory)) - np.asarray(of(halved)))
+    of_error = None if of is None else _of_error(of, order, trajectory, halved, certified)
     q_s, q_f = np.split(total, [trajectory.q_s.shape[-1]], axis=1)
     shares_at_nodes = largest_of(slow), largest_of(fast)
     error = RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
@@ -74,14 +82,24 @@ def with_error(run: Simulation, trajectory: Trajectory, of: Callable | None = No
     return know(replace(trajectory, error=error), trajectory.origin)
 
 
-def ratio(scheme: Scheme | Composition) -> float:
+def ratio(order: int) -> float:
     """``r = 2^p / (2^p - 1)`` of a scheme of order p."""
-    return 1.0 / (1.0 - 2.0**-scheme.order)
+    return 1.0 / (1.0 - 2.0**-order)
 
 
-def extrapolated(scheme: Scheme | Composition, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
+def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
     """(k, n_s + n_f) the part of the error of the positions that a companion with steps half as long takes away, in the limit."""
-    return ratio(scheme) * (_positions(trajectory) - _positions(finer))
+    return ratio(order) * (_positions(trajectory) - _positions(finer))
+
+
+def _of_error(
+    of: Callable, order: int, trajectory: Trajectory, halved: Trajectory, certified: np.ndarray
+) -> np.ndarray:
+    """Error of a function of the run: NaN at nodes that are not certified, and if it is no function of nodes, unless all of them are."""
+    error = ratio(order) * (np.asarray(of(trajectory)) - np.asarray(of(halved)))
+    at_nodes = error.shape[:1] == certified.shape
+    kept = certified.reshape(-1, *(1,) * (error.ndim - 1)) if at_nodes else certified.all()
+    return np.where(kept, error, np.nan)
 
 
 def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarray, float]:
@@ -110,7 +128,7 @@ def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> 
 
     Args:
         of, error: as of `simulate`.
-        run: that they are given with.
+        run: the simulation whose error is estimated.
 
     Raises:
         TypeError: no function, or one that returns something else than numbers.
@@ -128,17 +146,15 @@ def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> 
 
 
 def resting(run: Simulation) -> Trajectory:
-    """A run of the same nodes that stays at the start: for a look at functions of runs."""
+    """A run of the same nodes, without micro nodes, that stays at the start: for a look at functions of runs."""
     start, k = run.state, run.num_saves + 1
     nodes = {name: np.repeat(np.asarray(value)[None], k, axis=0) for name, value in vars(start).items()}
     nodes["t"] = start.t + np.arange(k) * run.save_every * run.macro_dt
     none = np.zeros(k - 1, int)
-    micro = run.scheme.num_micro
-    inside = {"t_micro": np.zeros((k - 1, micro)), "q_f_micro": np.zeros((k - 1, micro, len(start.q_f)))}
     status = {"result": int(Result.CONVERGED), "failed_at": -1}
     kept = {"energy": np.zeros(k), "constraint_residual": np.zeros((k, 2)), "residual": np.zeros(k - 1)}
     solver = {"method": none, "iterations": none}
-    arrays = nodes | kept | solver | (inside if run.save_micro else {})
+    arrays = nodes | kept | solver
     return from_named_arrays(arrays | {name: np.asarray(value) for name, value in status.items()}).of(run.origin)
 
 

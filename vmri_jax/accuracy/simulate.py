@@ -67,13 +67,14 @@ def simulate(
         newton: how implicit equations are solved.
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN from the failure on.
-        progress: show a progress bar. Without it a run that takes more than two seconds says so by a line now and then.
+        progress: show a progress bar. Without it, and in trial runs for an accuracy, a run that takes more than two seconds says so by a line
+            now and then.
         adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
             "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
         error: estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`. It takes two more runs: one with
-            half the macro step, one with twice the micro steps, which is compiled for itself.
-        of: with `error`, a function of a run whose error is estimated too, ``run.error.of``: it returns numbers, such as
-            ``lambda run: run.position("load")``.
+            half the macro step, one with twice the micro steps, which is compiled for itself. A run that failed has none.
+        of: with `error` or `accuracy`, a function of a run, without its micro nodes, whose error is estimated too, ``run.error.of``: it returns
+            numbers, such as ``lambda run: run.position("load")``.
         accuracy: largest error of a position at a saved node, in the unit of the positions; in place of step sizes, with `t_end`.
         num_saves: with an accuracy, saved intervals, equally spaced; None for at most a thousand.
 
@@ -91,10 +92,14 @@ def simulate(
     check_flags(throw=throw, progress=progress, error=error)
     if accuracy is not None:
         steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
-        end = _end(steps, t_end, save_every, save_micro, num_saves)
-        run, trajectory, settings = with_accuracy(system, scheme, state, newton, accuracy, end, num_saves)
-        trajectory = know(trajectory, trajectory.origin._replace(settings=settings))
-        return with_error(run, trajectory, of, shares=error)
+        end = _end(steps, t_end, save_every, save_micro, adjoint, num_saves)
+        best, settings = with_accuracy(system, scheme, state, newton, accuracy, end, num_saves, of)
+        run, trajectory = best.run, know(best.trajectory, best.run.origin._replace(settings=settings))
+        if int(trajectory.failed_at) < 0:
+            return with_error(run, trajectory, of, shares=error, halved=best.halved)
+        if throw:
+            raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
+        return trajectory
     if scheme is None or num_saves is not None:
         missing = "scheme is None" if scheme is None else f"num_saves is {num_saves}"
         raise ValueError(
@@ -123,13 +128,15 @@ def simulate(
     return with_error(run, trajectory, of) if error and int(trajectory.failed_at) < 0 else trajectory
 
 
-def _end(steps: dict[str, Any], t_end: float | None, save_every: int, save_micro: bool, num_saves) -> float:
+def _end(
+    steps: dict[str, Any], t_end: float | None, save_every: int, save_micro: bool, adjoint: str, num_saves
+) -> float:
     """`t_end`; arguments of steps beside an accuracy, from which the steps follow, are refused."""
-    given = [name for name, value in steps.items() if value is not None]
-    given += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro
-    if given:
+    refused = [name for name, value in steps.items() if value is not None]
+    refused += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro + ["adjoint"] * (adjoint != "auto")
+    if refused:
         raise ValueError(
-            f"simulate: got {' and '.join(given)} with an accuracy, from which the steps follow; leave one of them out."
+            f"simulate: got {' and '.join(refused)} with an accuracy, from which the steps follow; leave one of them out."
         )
     if t_end is None:
         raise ValueError("simulate: an accuracy needs t_end, the time until which it is to be kept.")

@@ -18,16 +18,19 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from vmri_jax.accuracy.companions import certified_nodes, companion, extent_of, extrapolated
+from vmri_jax.accuracy.companions import certified_nodes, check_function_of_run, companion, extent_of, extrapolated
 from vmri_jax.accuracy.families import Family, of_degree, of_order_2
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.memory import check_memory
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
@@ -35,15 +38,13 @@ from vmri_jax.running.timing import seconds_per_call
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
-from vmri_jax.stability.linear import small_motions
-from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.steppers.newton import Newton
 
 AIM = 0.5
 """Part of the accuracy that steps are chosen for. Trials predict errors of finer runs to about a factor of 2; with a larger part more runs
 miss the accuracy and are made again, with a smaller one all take more steps."""
 SAVED = 1000
-"""Most saved nodes of a run whose number of steps is chosen; more make long runs fill the memory."""
+"""Most saved intervals of a run whose number of steps is chosen; more make long runs fill the memory."""
 FEWEST_STEPS, FIRST_MICRO = 16, 5
 """Macro steps and micro steps of first trials; trials that do not see the motion are made again with twice the steps."""
 MOST_STEPS = 2**22
@@ -55,6 +56,9 @@ MOST_MICRO = 64
 """Most micro steps that are chosen; more save little where slow forces are not a hundred times as dear as fast ones."""
 SAME = 1.3
 """Factor within which two numbers of micro steps cost the same: the second is not compiled. A larger one misses savings."""
+LEAST_TIME, LEAST_SHARE = 0.02, 1e-3
+"""Least time of a grid over that of a macro step, and least slow share over the fast one: numbers of micro steps stay finite where a measured
+time or a share vanishes."""
 REPEATS = 5
 """Runs after the first one that may miss the accuracy before the search gives up."""
 RESONANT = 1e-6
@@ -79,23 +83,28 @@ class Trial:
 
     Attributes:
         family, num_micro: the scheme.
-        run, trajectory: with its number of macro steps.
-        errors: (k, n_s + n_f) of its positions.
+        run: the simulation.
+        trajectory, halved: its result, and that with half the macro step.
+        errors: (k, n_s + n_f) of the positions.
         error: the largest of them; infinite where one is not certified.
-        seconds: time of a macro step.
     """
 
     family: Family
     num_micro: int
     run: Simulation
     trajectory: Trajectory
+    halved: Trajectory
     errors: np.ndarray
     error: float
-    seconds: float
+
+    @cached_property
+    def seconds(self) -> float:
+        """Time of a macro step."""
+        return _seconds_of_a_step(self.run)
 
     def steps_for(self, error: float) -> int:
         """Macro steps that keep this error, by the order of the scheme."""
-        return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / self.run.scheme.order))))
+        return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / self.run.order))))
 
     def time_for(self, error: float) -> float:
         """Seconds of a run that keeps this error; infinite where none is certified."""
@@ -106,28 +115,31 @@ class Search:
     """Trials of one start over one time.
 
     Args:
-        make: a `Simulation` of a scheme and a number of macro steps, with all nodes saved.
+        make: a `Simulation` of a scheme, of a single macro step.
         length: time that is simulated, s.
         num_saves: saved intervals; None for at most `SAVED`.
     """
 
-    def __init__(self, make: Callable[[Scheme | Composition, int], Simulation], length: float, num_saves: int | None):
+    def __init__(self, make: Callable[[Scheme | Composition], Simulation], length: float, num_saves: int | None):
         self.make, self.length, self.num_saves = make, length, num_saves
         self.runs: dict[tuple[str, int], Simulation] = {}
 
-    def run(self, family: Family, num_micro: int, num_steps: int) -> Simulation:
-        """The run with at least so many macro steps: a multiple of the saved intervals."""
-        key = family.python, num_micro
-        if key not in self.runs:
-            self.runs[key] = self.make(family.make(num_micro), 1)
+    def saving(self, num_steps: int) -> tuple[int, int]:
+        """At least so many macro steps, a multiple of the saved intervals, and the macro steps from one saved node to the next."""
         saves = self.num_saves or min(num_steps, SAVED)
         save_every = -(-num_steps // saves)
         if self.num_saves is None:
             saves = -(-num_steps // save_every)
-        num_steps = saves * save_every
-        return replace(
-            self.runs[key], macro_dt=np.asarray(self.length / num_steps), num_steps=num_steps, save_every=save_every
-        )
+        return saves * save_every, save_every
+
+    def run(self, family: Family, num_micro: int, num_steps: int) -> Simulation:
+        """The run with at least so many macro steps."""
+        key = family.python, num_micro
+        if key not in self.runs:
+            self.runs[key] = self.make(family.make(num_micro))
+        num_steps, save_every = self.saving(num_steps)
+        dt = np.asarray(self.length / num_steps)
+        return replace(self.runs[key], macro_dt=dt, num_steps=num_steps, save_every=save_every)
 
     def trial(self, family: Family, num_micro: int, num_steps: int) -> Trial:
         """A run of about so many macro steps; more where its error is not certified.
@@ -143,31 +155,32 @@ class Search:
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
             before = time.perf_counter()
-            trajectory, finer = run.in_pieces(), companion(run, run.scheme, 2)
+            trajectory, halved = run.in_pieces(), companion(run, run.scheme, 2)
             seconds = time.perf_counter() - before
-            errors = extrapolated(run.scheme, trajectory, finer)
-            done = max(int(trajectory.failed_at), int(finer.failed_at)) < 0
+            errors = extrapolated(run.order, trajectory, halved)
+            done = max(int(trajectory.failed_at), int(halved.failed_at)) < 0
             certified = bool(done and certified_nodes(trajectory, errors)[0].all())
-            is_last = 2 * num_steps > MOST_STEPS or (seconds > LONGEST and num_steps > FEWEST_STEPS)
+            is_last = 2 * run.num_steps > MOST_STEPS or (seconds > LONGEST and run.num_steps > FEWEST_STEPS)
             if certified or is_last:
                 error = float(largest_of(errors).max()) if certified else np.inf
-                return Trial(family, num_micro, run, trajectory, errors, error, _seconds_of_a_step(run))
-            num_steps *= 2
+                return Trial(family, num_micro, run, trajectory, halved, errors, error)
+            num_steps = 2 * run.num_steps
 
     def with_best_num_micro(self, trial: Trial, accuracy: float) -> Trial:
         """A trial with the number of micro steps of the least time for an accuracy, if that differs."""
-        num_micro, p = trial.num_micro, trial.run.scheme.order
+        num_micro, p = trial.num_micro, trial.run.order
         finer = self.run(trial.family, 2 * num_micro, trial.run.num_steps)
         finer_trajectory = finer.in_pieces()
         if int(finer_trajectory.failed_at) >= 0:
             return trial
-        by_fast = extrapolated(trial.run.scheme, trial.trajectory, finer_trajectory)
+        by_fast = extrapolated(p, trial.trajectory, finer_trajectory)
         fast, slow = (float(largest_of(part).max()) for part in (by_fast, trial.errors - by_fast))
         of_two = _seconds_of_a_step(finer)
-        # a + b N at N and 2 N; a clock that errs makes neither of them vanish
-        micro_seconds = max(of_two - trial.seconds, 0.02 * trial.seconds) / num_micro
-        macro_seconds = max(trial.seconds - num_micro * micro_seconds, 0.02 * trial.seconds)
-        fast_over_slow = num_micro**p * fast / max(slow, 1e-3 * fast)
+        # b = (time(2 N) - time(N)) / N and a = time(N) - N b; noise of the clock must not make one of them zero
+        least = LEAST_TIME * trial.seconds
+        micro_seconds = max(of_two - trial.seconds, least) / num_micro
+        macro_seconds = max(trial.seconds - num_micro * micro_seconds, least)
+        fast_over_slow = num_micro**p * fast / max(slow, LEAST_SHARE * fast)
         best = (macro_seconds / micro_seconds * fast_over_slow) ** (1 / (p + 1))
         unit = _unit(trial.run.system, stage_scheme(trial.run.scheme))
         best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
@@ -185,32 +198,44 @@ def with_accuracy(
     accuracy: float,
     t_end: float,
     num_saves: int | None,
-) -> tuple[Simulation, Trajectory, Settings]:
-    """A run whose largest estimated error of a position is at most `accuracy`.
+    of: Callable | None = None,
+) -> tuple[Trial, Settings]:
+    """The trial whose largest estimated error of a position is at most `accuracy`, and its settings.
+
+    Warns with `AccuracyNotReached` if no trial is as accurate.
 
     Args:
         system, scheme, state, newton, t_end: as of `vmri_jax.simulate`; None for a scheme from the menu.
         accuracy: in the unit of the positions.
         num_saves: saved intervals, equally spaced; None for at most `SAVED`.
-
-    Returns:
-        The `Simulation`, its `Trajectory`, and its `Settings`. A run that misses the accuracy is told about by `AccuracyNotReached`.
+        of: function of a run, refused before the trials if it returns no numbers.
 
     Raises:
-        ValueError: an accuracy below round-off, or above the extent of the motion.
+        TypeError: not a scheme.
+        ValueError: an accuracy below round-off, or above the extent of the motion; what `vmri_jax.simulate` refuses.
     """
+    if not isinstance(scheme, Scheme | Composition | None):
+        raise TypeError(
+            f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10), or None."
+        )
     opened_system, start = start_of("simulate", system, state)
+    if not is_concrete((vars(start), opened_system.params, t_end)):
+        raise ValueError(
+            "simulate: an accuracy compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
+        )
     length = float(t_end - start.t)
     _check(accuracy, length, start)
 
-    def make(scheme: Scheme | Composition, num_steps: int) -> Simulation:
-        return simulation(system, scheme, state, newton, length / num_steps, None, num_steps, None, 1, False)
+    def make(scheme: Scheme | Composition) -> Simulation:
+        run = simulation(system, scheme, state, newton, length, None, 1, None, 1, False)
+        run.check()
+        check_memory("simulate", run.state, scheme.num_micro, num_saves or SAVED, False)
+        check_function_of_run(of, True, run)
+        return run
 
     search = Search(make, length, num_saves)
-    trials = [
-        search.trial(family, num_micro, FEWEST_STEPS)
-        for family, num_micro in _menu(scheme, opened_system, start, accuracy, length)
-    ]
+    menu = _menu(scheme, opened_system, start, accuracy, length)
+    trials = [search.trial(family, num_micro, FEWEST_STEPS) for family, num_micro in menu]
     extent = max(extent_of(trial.trajectory) for trial in trials)
     if accuracy > extent:
         raise ValueError(
@@ -218,19 +243,10 @@ def with_accuracy(
             "accurate. Give a smaller one, in the unit of the positions."
         )
     best = min(trials, key=lambda trial: trial.time_for(AIM * accuracy))
-    if start.q_s.size and start.q_f.size and stage_scheme(best.run.scheme).degree == 1:
+    has_both = start.q_s.size and start.q_f.size and stage_scheme(best.run.scheme).degree == 1
+    if has_both and np.isfinite(best.error) and best.error > 0:
         best = search.with_best_num_micro(best, accuracy)
-    fewest = 1
-    for _ in range(REPEATS):
-        if not np.isfinite(best.error) or fewest > MOST_STEPS:
-            break
-        num_steps = max(best.steps_for(AIM * accuracy), fewest)
-        best = search.trial(
-            best.family, best.num_micro, _beside_resonances(opened_system, start, best, length, num_steps)
-        )
-        if best.error <= accuracy:
-            break
-        fewest = best.run.num_steps + 1
+    best = _accurate(search, best, accuracy)
     if not best.error <= accuracy:
         reached = (
             f"its error is {best.error:.1e}" if np.isfinite(best.error) else "no error is certified over its length"
@@ -241,10 +257,25 @@ def with_accuracy(
             AccuracyNotReached,
             stacklevel=3,
         )
-    run, family = best.run, best.family
-    numbers = float(run.macro_dt), run.num_steps, run.save_every
-    settings = Settings(run.scheme, family.python.format(best.num_micro), family.options, *numbers)
-    return run, best.trajectory, settings
+    numbers = float(best.run.macro_dt), best.run.num_steps, best.run.save_every
+    python = best.family.python.format(best.num_micro)
+    return best, Settings(best.run.scheme, python, best.family.options, *numbers)
+
+
+def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
+    """A trial of the same scheme with an error below `accuracy`, made again with more steps where it misses; else the last one."""
+    fewest = 1
+    for _ in range(REPEATS):
+        if not np.isfinite(best.error):
+            break
+        num_steps = _beside_resonances(search, best, max(best.steps_for(AIM * accuracy), fewest))
+        if num_steps > MOST_STEPS:
+            break
+        best = search.trial(best.family, best.num_micro, num_steps)
+        if best.error <= accuracy:
+            break
+        fewest = best.run.num_steps + 1
+    return best
 
 
 def _check(accuracy: float, length: float, start: State) -> None:
@@ -294,11 +325,19 @@ def _seconds_of_a_step(run: Simulation) -> float:
     return max(twice - once, 0.1 * twice) / run.num_steps
 
 
-def _beside_resonances(system: System, start: State, trial: Trial, length: float, num_steps: int) -> int:
+def _beside_resonances(search: Search, trial: Trial, num_steps: int) -> int:
     """This number of macro steps, or the next larger one at which small motions about the start do not grow."""
+    from vmri_jax.stability.linear import (
+        small_motions,  # only here: that room draws, and matplotlib takes half a second
+    )
+    from vmri_jax.stability.multipliers import multipliers
+
     if trial.num_micro == 1:
         return num_steps
-    motions = small_motions(system, start)
-    numbers = [int(np.ceil(num_steps / shorter)) for shorter in SHORTER]
-    radii = multipliers(motions, trial.run.scheme, [length / n for n in numbers]).radius
+    try:
+        motions = small_motions(trial.run.system, trial.run.state)
+    except ValueError:  # a start without small motions, as of a mechanism that is driven in all of its freedoms
+        return num_steps
+    numbers = [search.saving(int(np.ceil(num_steps / shorter)))[0] for shorter in SHORTER]
+    radii = multipliers(motions, trial.run.scheme, [search.length / n for n in numbers]).radius
     return next((n for n, radius in zip(numbers, radii, strict=True) if radius <= 1 + RESONANT), num_steps)

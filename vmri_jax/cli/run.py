@@ -87,10 +87,14 @@ def simulate(
         check_target_file("--plot", plot, PICTURES)
         problem = find_problem(system)
         _check_steps(steps, accuracy, t_end, streamed, error)
+        of_scheme = {"--compose": compose, "--alpha": alpha, "--degree": degree, "--rule": rule}
         chosen = None
         if scheme is not None or accuracy is None:
             scheme = scheme or "fully-implicit"
             chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
+        elif any(value is not None for value in of_scheme.values()):
+            without = " and ".join(name for name, value in of_scheme.items() if value is not None)
+            raise ValueError(f"got {without} without --scheme, which --accuracy chooses then; give --scheme with it.")
         before = StoredTrajectory(out) if out is not None and resume and out.exists() else None
         if save_every is None and (save_micro or steps is None):
             save_every = 1
@@ -173,7 +177,7 @@ def _steps_in_words(trajectory, scheme, steps: int | None, system: str) -> dict[
         return {"macro steps": f"{steps}, of {scheme.num_micro} micro steps each"}
     chosen = trajectory.settings
     options = f"{chosen.options} --num-micro {stage_scheme(chosen.scheme).num_micro} --macro-dt {chosen.macro_dt!r}"
-    again = f"vmri simulate {system} {options} --steps {chosen.num_steps} --save-every {chosen.save_every}"
+    again = f"vmri simulate {shlex.quote(system)} {options} --steps {chosen.num_steps} --save-every {chosen.save_every}"
     return {
         "chosen": f"{chosen.python}, macro_dt {chosen.macro_dt:.6g}, {chosen.num_steps} steps",
         "again": again if chosen.options else "",

@@ -32,8 +32,8 @@ ARGUMENTS = {
     "potentials": "q_s, q_f, params",
 }
 """Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
-RESERVED = ("kinetic", "T", "T_s", "V", "W", "F", "g", "g_s")
-"""Names of other terms, which no potential in `System.potentials` may have."""
+RESERVED = ("kinetic", "T", "T_s", "V", "W", "F", "g", "g_s", "path", "order", "solves")
+"""Names of other terms and of rows of a scheme's description, which no potential in `System.potentials` may have."""
 _INSTEAD = {
     "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
     "moving": "Rheonomic(function), whose function gets t first",

@@ -21,7 +21,7 @@ LOST = 0.5
 LOOKED_AT = 1000
 """Nodes at which the kinetic energy is computed."""
 ROUNDOFF = 1e-9
-"""Part of the terms T, V and W below which changes of their sum are round-off; a larger one hides losses of systems whose terms cancel."""
+"""Part of the kinetic energy and all potentials below which changes of their sum are round-off; a larger one hides losses of systems whose terms cancel."""
 DIGITS = 10 * np.finfo(float).eps
 """Part of the largest position that a step may move positions by round-off alone; a larger one hides slower motions."""
 
@@ -80,5 +80,5 @@ def _states(run: Trajectory, nodes: np.ndarray) -> State:
 
 
 def _size_of_terms(system: System, state: State):
-    """``|T| + |V| + |W|``."""
+    """``|T| + |V| + |W| + sum_i |V_i|``."""
     return sum(jnp.abs(part) for part in energy_parts(system, state.q_s, state.q_f, state.p_s, state.p_f).values())

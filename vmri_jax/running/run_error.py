@@ -13,7 +13,7 @@ class RunError(NamedTuple):
 
     Attributes:
         q_s, q_f: (k, n_s), (k, n_f) positions of the run minus those of the motion.
-        slow, fast: (k,) largest slow and fast share of the error over all coordinates; NaN where the companion run failed.
+        slow, fast: (k,) largest slow and fast share of the error over all coordinates; NaN if they were not asked for, or if their companion failed.
         of: error of the function that was asked for, in its shape; None if there was none.
         certified_until: time of the last node whose error is certified.
         growth: of the error in the second half of the time until then.
@@ -44,9 +44,9 @@ class RunError(NamedTuple):
 
     def part(self, nodes: slice) -> "RunError":
         """The error at some of the nodes; that of the function stays whole unless it has a value for each node."""
-        k = len(self.slow)
-        of = self.of[nodes] if np.shape(self.of)[:1] == (k,) else self.of
-        at_nodes = {name: getattr(self, name)[nodes] for name in ("q_s", "q_f", "slow", "fast")}
+        lanes = (slice(None),) * (np.ndim(self.slow) - 1)
+        of = self.of[*lanes, nodes] if np.shape(self.of)[: len(lanes) + 1] == np.shape(self.slow) else self.of
+        at_nodes = {name: getattr(self, name)[*lanes, nodes] for name in ("q_s", "q_f", "slow", "fast")}
         return self._replace(of=of, **at_nodes)
 
     def __repr__(self) -> str:
@@ -55,6 +55,8 @@ class RunError(NamedTuple):
     def in_words(self) -> str:
         """The largest error and its shares, and up to which time they are certified."""
         known = np.isfinite(self.positions)
+        if not known.any():
+            return "no error is certified"
         total, slow, fast = (np.max(a[known], initial=0.0) for a in (self.positions, self.slow, self.fast))
         shares = "" if np.isnan(slow) else f", slow share {slow:.1e}, fast share {fast:.1e}"
         whole = f"positions are wrong by about {total:.1e}{shares}"

@@ -9,7 +9,7 @@ from vmri_jax.schemes.scheme import Scheme
 
 @dataclass(frozen=True)
 class Settings:
-    """The arguments of `vmri_jax.simulate` that make the same run again: ``vm.simulate(problem, **run.settings.arguments)``.
+    """The arguments of `vmri_jax.simulate` that make the same run again, from the same start: ``vm.simulate(problem, **run.settings.arguments)``.
 
     Attributes:
         scheme: the scheme or composition.

@@ -30,7 +30,7 @@ from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
-from vmri_jax.steppers.plan import Plan, plan
+from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.results import Method, Result
 
 SHOWN = 50
@@ -167,6 +167,11 @@ class Simulation:
         newton, scheme, system = of_one_type((self.newton, scheme, self.system))
         leaves, structure = jax.tree.flatten((newton, scheme, system))
         return replace(self, system=system, scheme=scheme, newton=newton, leaves=leaves, structure=structure)
+
+    @property
+    def order(self) -> int:
+        """Order of convergence of its scheme, with the rules of all potentials of the system."""
+        return with_rules_for(self.system, self.scheme).order
 
     @property
     def num_saves(self) -> int:

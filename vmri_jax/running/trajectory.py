@@ -104,7 +104,7 @@ class Trajectory(Exports, eqx.Module):
 
     @property
     def settings(self) -> Settings:
-        """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run."""
+        """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run, and of one that was read from a file."""
         return self.origin.settings  # pyright: ignore[reportReturnType]
 
     def of(self, what: System | Problem | HasProblem | Origin) -> "Trajectory":

@@ -160,7 +160,7 @@ class Scheme(eqx.Module):
     @property
     def unit(self) -> int:
         """The smallest number of micro steps that all rules on every k-th micro node fit into."""
-        return math.lcm(*(placed.every for placed in self.potentials.values()))
+        return math.lcm(*(placed.every for placed in (self.slow, self.fast, *self.potentials.values())))
 
     def with_num_micro(self, num_micro: int) -> "Scheme":
         """The same rules with another number of micro steps."""
@@ -193,7 +193,7 @@ class Scheme(eqx.Module):
             ValueError: a name without a rule; a whole number that does not divide num_micro.
         """
         if name in self.potentials:
-            return self.potentials[str(name)]
+            return self.potentials[name]
         if isinstance(name, int):
             return _on_grid(f"the potential {name}", micro(trapezoidal, every=name), self.num_micro)
         if name in ("slow", "fast"):

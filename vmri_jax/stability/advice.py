@@ -9,6 +9,7 @@ import numpy as np
 from vmri_jax.diagnostics.linear import frequencies_of
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, start_of
+from vmri_jax.mechanics.system import label
 from vmri_jax.running.origin import names_of
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
@@ -243,18 +244,19 @@ def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_
         ("fast", motions.fast_frequencies, "the micro step", micro_dt, fast_limit(stage)),
         ("slow", motions.slow_frequencies, "the macro step", longest, slow_limit(stage)),
     ]
+    shown = {"fast": "fast", "slow": "slow"}
     for name, _ in motions.system.potentials:
+        shown[f"potential {name}"] = f"further {name}" if name in shown else label(name)
         placed, key = stage.rule_of(name), f"potential {name}"
         span = stage.num_micro if placed.grid == "macro" else placed.every
         step = f"the step of {span} micro intervals"
         cases.append((key, frequencies_of(motions.others[key]), step, span * micro_dt, kick_limit(placed)))
     for key, frequencies, of_step, step, limit in cases:
-        name = key.removeprefix("potential ")
         alone = multipliers(motions.only(key), scheme, [macro_dt * (1 + BEYOND)])
         if alone.radius[0] > 1 + TOLERANCE:
             bears = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
             return (
-                f"The step is unstable for the {name} potential alone: its frequency {frequencies[0]:.4g} times {of_step}{of} "
+                f"The step is unstable for the {shown[key]} potential alone: its frequency {frequencies[0]:.4g} times {of_step}{of} "
                 f"is {frequencies[0] * step:.4g}{bears}."
             )
     return ""
