@@ -146,26 +146,26 @@ def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     for case in cases:
         problem = case.problem()
         slow, fast = _prices(problem)
-        curves[case.title] = found = measured(case.title, problem, case.num_micro, tell)
-        to_target = {scheme: _time_to(TARGET, *curve) for scheme, curve in found.items()}
+        curves[case.title] = of_case = measured(case.title, problem, case.num_micro, tell)
+        to_target = {scheme: _time_to(TARGET, *curve) for scheme, curve in of_case.items()}
         best = min(to_target, key=to_target.__getitem__)
-        for scheme, (steps, errors, ms) in found.items():
+        for scheme, (steps, errors, ms) in of_case.items():
             family, _, num_micro = scheme.partition(", N = ")
             n = int(num_micro or 1)
-            single = found[f"{family}, N = 1"][1:] if num_micro else found[scheme][1:]
+            single = of_case[f"{family}, N = 1" if num_micro else scheme][1:]
             rows += [
                 {
                     "system": case.title,
                     "scheme": scheme,
                     "H": T_END / count if num_micro else None,
                     "error": error,
-                    "ms": time,
+                    "ms": duration,
                 }
-                | {"gain": ratio_at(single, error, time), "bound": n * (slow + fast) / (slow + n * fast)}
-                for count, error, time in zip(steps, errors, ms, strict=True)
+                | {"gain": ratio_at(single, error, duration), "bound": n * (slow + fast) / (slow + n * fast)}
+                for count, error, duration in zip(steps, errors, ms, strict=True)
             ]
         for family in ("kicks", "suzuki4"):
-            of_family = {scheme: time for scheme, time in to_target.items() if scheme.startswith(f"{family}, ")}
+            of_family = {scheme: ms for scheme, ms in to_target.items() if scheme.startswith(f"{family}, ")}
             fastest = min(of_family, key=of_family.__getitem__)
             claims.append(
                 _claim(
@@ -180,9 +180,9 @@ def run(cases: list[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
         yield Report("dear", name, list(rows), list(claims), list(notes), {"dear": partial(_draw, dict(curves))})
 
 
-def _claim(name: str, time: float, best: float) -> Claim:
+def _claim(name: str, ms: float, best: float) -> Claim:
     """Times to the target, one over the other."""
-    ratio = time / best
+    ratio = ms / best
     return Claim(f"{name} at {TARGET:g}", Ratio(ratio, ratio, ratio))
 
 
@@ -199,11 +199,11 @@ def measured(title: str, problem: vm.Problem, num_micro: tuple[int, ...], tell: 
     for scheme, chosen in schemes.items():
         program = Program(problem, chosen, T_END)
 
-        def at(n: int, program=program):
+        def error_and_run(n: int, program=program):
             q, _ = joined(program(n))
             return float(np.abs(q[-1] - exact[-1]).max()), program.timed(n)
 
-        calls[scheme] = _ladder(at, 8, lambda n, scheme=scheme: tell(f"{title}, {scheme}, {n} steps"))
+        calls[scheme] = _ladder(error_and_run, 8, lambda n, scheme=scheme: tell(f"{title}, {scheme}, {n} steps"))
     calls |= _diffrax(problem, exact[-1], lambda words: tell(f"{title}, {words}"))
     runs = {f"{scheme} {n}": run for scheme, ladder in calls.items() for n, (_, run) in ladder.items()}
     seconds = interleaved(runs, 3)
@@ -214,26 +214,24 @@ def measured(title: str, problem: vm.Problem, num_micro: tuple[int, ...], tell: 
             np.array([1e3 * np.median(seconds[f"{scheme} {n}"]) for n in ladder]),
         )
         for scheme, ladder in calls.items()
-        if ladder
     }
 
 
 def _ladder(
-    at: Callable[[int], tuple[float, Callable]], first: int, tell: Callable[[int], None]
+    error_and_run: Callable[[int], tuple[float, Callable]], first: int, tell: Callable[[int], None]
 ) -> dict[int, tuple[float, Callable]]:
     """Errors and runs for more and more steps, within the errors that are looked at."""
-
-    found, n = {}, first
+    rungs, n = {}, first
     while True:
         tell(n)
-        error, run = at(n)
+        error, run = error_and_run(n)
         start = time.perf_counter()
         run()
         seconds = time.perf_counter() - start
         if error <= LARGEST:
-            found[n] = error, run
+            rungs[n] = error, run
         if error < SMALLEST or seconds > SLOWEST:
-            return found
+            return rungs
         n = round(n * RATIO)
 
 
@@ -253,20 +251,20 @@ def _diffrax(
     @jax.jit
     def solve(tolerance):
         controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
-        found = diffrax.diffeqsolve(
+        solution = diffrax.diffeqsolve(
             term, diffrax.Dopri8(), 0.0, T_END, None, start, stepsize_controller=controller, max_steps=100_000
         )
-        return found.ys[0][-1]  # pyright: ignore[reportOptionalSubscript]
+        return solution.ys[0][-1]  # pyright: ignore[reportOptionalSubscript]
 
-    found = {}
+    rungs = {}
     for power in range(7, 40, 3):
         tell(f"diffrax, tolerance 2^-{power}")
         error = float(np.abs(np.asarray(solve(2.0**-power)) - exact).max())
         if error <= LARGEST:
-            found[power] = error, partial(lambda tolerance: solve(tolerance).block_until_ready(), 2.0**-power)
+            rungs[power] = error, partial(lambda tolerance: solve(tolerance).block_until_ready(), 2.0**-power)
         if error < SMALLEST:
             break
-    return {"diffrax Dopri8": found}
+    return {"diffrax Dopri8": rungs}
 
 
 def _prices(problem: vm.Problem) -> tuple[float, float]:
@@ -280,8 +278,8 @@ def _prices(problem: vm.Problem) -> tuple[float, float]:
 
 def _time_to(error: float, steps: np.ndarray, errors: np.ndarray, ms: np.ndarray) -> float:
     """Milliseconds at an error, between those measured; infinite outside of them."""
-    at = ratio_at((errors, ms), error, 1.0) if len(errors) else None
-    return np.inf if at is None else at
+    between = ratio_at((errors, ms), error, 1.0)
+    return np.inf if between is None else between
 
 
 def _draw(curves: dict[str, dict[str, Curve]]):

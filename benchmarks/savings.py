@@ -122,6 +122,8 @@ def measured(case: Case, repeats: int, tell: Tell) -> dict[int, tuple[np.ndarray
 
 def ratio_at(single: tuple[np.ndarray, np.ndarray], error: float, ms: float) -> float | None:
     """Time of single steps at this error, between those measured, over `ms`; None outside of them."""
+    if not len(single[0]):
+        return None
     errors, times = (np.log(part[np.argsort(single[0])]) for part in single)
     if not errors[0] <= np.log(error) <= errors[-1]:
         return None
