@@ -12,6 +12,7 @@ from tests.scene.gallery_scenes import FOLDER, gallery_scene
 from vmri_jax import simulate
 from vmri_jax.catalogue import find_scheme
 from vmri_jax.cli import app
+from vmri_jax.cli.run import DEFAULT_SCHEME
 
 SPEC = importlib.util.spec_from_file_location("gallery", FOLDER / "gallery.py")
 assert SPEC is not None
@@ -49,7 +50,9 @@ def run(name: str):
     """The scene and a short run with the scheme and step of its command."""
     options = parsed(gallery.docstring(FOLDER / f"{name}.py")[1][0])[1]
     names = ("alpha", "degree", "rule")
-    scheme = find_scheme(options["scheme"], options["num_micro"], options["compose"], **{n: options[n] for n in names})
+    scheme = find_scheme(
+        options["scheme"] or DEFAULT_SCHEME, options["num_micro"], options["compose"], **{n: options[n] for n in names}
+    )
     scene = gallery_scene(name)
     return scene, simulate(scene.system(), scheme, scene.state(), macro_dt=options["macro_dt"], num_steps=STEPS)
 

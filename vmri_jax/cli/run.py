@@ -26,6 +26,8 @@ from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, SimulationError
 
+DEFAULT_SCHEME = "fully-implicit"
+"""The scheme of a run without --scheme and --accuracy."""
 SAVED_NODES = 1000
 """About as many nodes are saved by default."""
 DRAWN = 10_000
@@ -90,7 +92,7 @@ def simulate(
         of_scheme = {"--compose": compose, "--alpha": alpha, "--degree": degree, "--rule": rule}
         chosen = None
         if scheme is not None or accuracy is None:
-            scheme = scheme or "fully-implicit"
+            scheme = scheme or DEFAULT_SCHEME
             chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)
         elif any(value is not None for value in of_scheme.values()):
             without = " and ".join(name for name, value in of_scheme.items() if value is not None)
