@@ -42,7 +42,7 @@ SLOWEST = 10.0
 """Seconds of a run after which a ladder ends."""
 T_END = 1.0
 BOND, STIFFNESS = 0.8, 5e4
-"""Length of a bond and its stiffness with unit masses: frequency 316, about 30 times that of neighbours in the lattice, as of nitrogen."""
+"""Length of a bond and its stiffness with unit masses: frequency 316, about 30 times the frequency of neighbours in the lattice, as of nitrogen."""
 SPACING, SPEED = 1.9, 0.5
 """Distance of the molecules of the lattice, in diameters of an atom, and the size of their random velocities."""
 WIDTHS = {"student": (16,), "teacher": (300, 300)}
@@ -51,7 +51,7 @@ WIDTHS = {"student": (16,), "teacher": (300, 300)}
 
 @dataclass(frozen=True)
 class Case:
-    """A system whose slow force has a price, and what is tried on it.
+    """A system whose slow force has a price, and the numbers of micro steps that are tried on it.
 
     title: of its curves.
     problem: the system with its start.

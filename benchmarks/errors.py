@@ -27,7 +27,7 @@ COLUMNS = (
 NODES = 10
 """Saved intervals of every run."""
 MANY = 16
-"""Micro steps of the limit of the fast share, over those of the run: what is left of the share is below half a percent at order 2."""
+"""Micro steps of the limit of the fast share, over those of the run: the rest of the share is below half a percent at order 2."""
 FEW = 4
 """Micro steps from which on the slow share has a limit to compare with: single steps of the length of a micro step."""
 SCENES = Path(__file__).parent.parent / "notebooks" / "scenes"

@@ -1,4 +1,4 @@
-"""Estimated errors of runs against references, their shares against the limits of each grid, and how they are told."""
+"""Estimated errors of runs against references, their shares against the limits of each grid, and how they are printed."""
 
 from dataclasses import replace
 

@@ -35,7 +35,7 @@ def test_a_potential_at_every_fourth_micro_node():
     assert {pace.value for pace in CHAIN.sorting.paces.values()} == {"fast"}
     rows = {row.name: row for row in CHAIN.explain(vm.fully_explicit(12), measure=False).rows}
     assert [rows[name].evaluations for name in ("gravity", "bends", "bonds")] == [1, 3, 12]
-    assert rows["bends"].kind == "potential on every 4th micro node"
+    assert rows["bends"].kind == "potential on one in 4 micro nodes"
     description = vm.plan(CHAIN, vm.fully_explicit(12)).describe()
     assert "kicks of V_4 at both ends" in description
     assert "V_4               trapezoidal rule on every 4 micro intervals" in description

@@ -135,7 +135,7 @@ def test_what_hangs_on_the_ground_at_both_ends_is_one_tree():
 
 
 def test_a_universal_joint_goes_through_a_right_angle():
-    """Where its axes of both bodies, or those of Euler angles, would be parallel."""
+    """Where its axes on both bodies, or the axes of Euler angles, would be parallel."""
     bar = RigidBody("bar", 1.0, Box((0.1, 0.2, 1.0)), [0, 0, -0.5], pace="slow")
     cross = Universal(("ground", "bar"), [0, 0, 0], axis=Z, second=X, name="cross")
     scene = Scene([bar], [Gravity(), cross], coordinates="joint")

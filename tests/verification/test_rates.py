@@ -168,7 +168,7 @@ def test_symplectic_with_momentum_maps():
 
 
 def test_batch_and_gradient():
-    """A batch is a loop of runs, and the gradient by a stiffness that of differences."""
+    """A batch equals a loop of runs, and the gradient by a stiffness equals finite differences."""
 
     def end(stiffness):
         system = CHAIN.replace(params={**PARAMS, "bends": stiffness})

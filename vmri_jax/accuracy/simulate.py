@@ -1,4 +1,4 @@
-"""Runs: `simulate` and `prepare`."""
+"""`simulate`: a run with steps that are given, or with steps that keep an accuracy; its error, if it is asked for."""
 
 import warnings
 from collections.abc import Callable
@@ -78,7 +78,7 @@ def simulate(
         accuracy: largest error of a position at a saved node, in the unit of the positions; in place of step sizes, with `t_end`.
         num_saves: with an accuracy, saved intervals, equally spaced; None for at most a thousand.
 
-    A run of a system that keeps its energy is told about by a `LostEnergyWarning` if the energy has changed by half of the largest kinetic energy.
+    A run of a system that keeps its energy, with steps that are given, is told about by a `LostEnergyWarning` if the energy has changed by half of the largest kinetic energy.
 
     Returns:
         The `Trajectory`, with ``num_steps / save_every + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from

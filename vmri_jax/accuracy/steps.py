@@ -112,7 +112,7 @@ class Trial:
 
 
 class Search:
-    """Trials of one start over one time.
+    """Trial runs from one start over one length of time.
 
     Args:
         make: a `Simulation` of a scheme, of a single macro step.

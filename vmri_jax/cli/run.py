@@ -20,6 +20,7 @@ from vmri_jax.cli import options
 from vmri_jax.cli.common import PICTURES, RUN, check_target_file, console, plain_table, print_failure, refusals
 from vmri_jax.running.arguments import nothing_fast
 from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.settings import Settings
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import stage_scheme
@@ -135,15 +136,12 @@ def simulate(
                 saved.append(str(plot))
         finally:
             if stopped is None:
-                stepped = _steps_in_words(trajectory, chosen, steps, system)
-                done = (
-                    0
-                    if steps is None or chosen is None
-                    else (steps - (0 if before is None else before.step)) * chosen.num_micro
-                )
+                done = 0  # micro steps; of a run with an accuracy the time has trials in it
+                if steps is not None and chosen is not None:
+                    done = (steps - (0 if before is None else before.step)) * chosen.num_micro
                 _print_named(
                     {
-                        **stepped,
+                        **_steps_in_words(trajectory, chosen, steps),
                         "": "" if chosen is None else nothing_fast(chosen, problem.q_f.size),
                         "wall time": f"{seconds:.2f} s, of which {compiled:.2f} s compiling",
                         "per micro step": f"{1e6 * max(seconds - compiled, 0.0) / done:.3g} µs" if done else "",
@@ -152,6 +150,8 @@ def simulate(
                         or "nothing" + ("" if out or plot else "; give --out run.npz or --plot run.png"),
                     }
                 )
+                if steps is None:
+                    _print_again(trajectory.settings, system, method)
             else:
                 code = _print_stop(stopped, saved, streamed)
     if stopped is not None:
@@ -173,17 +173,23 @@ def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None,
         raise ValueError(f"{option} compares runs that are in memory; give --out with a file that ends in .npz.")
 
 
-def _steps_in_words(trajectory, scheme, steps: int | None, system: str) -> dict[str, str]:
-    """How many steps a run took; of one with an accuracy the scheme and steps that were chosen, and the command that takes them."""
+def _steps_in_words(trajectory, scheme, steps: int | None) -> dict[str, str]:
+    """How many steps a run took; of one with an accuracy the scheme and steps that were chosen."""
     if steps is not None:
         return {"macro steps": f"{steps}, of {scheme.num_micro} micro steps each"}
     chosen = trajectory.settings
-    options = f"{chosen.options} --num-micro {stage_scheme(chosen.scheme).num_micro} --macro-dt {chosen.macro_dt!r}"
-    again = f"vmri simulate {shlex.quote(system)} {options} --steps {chosen.num_steps} --save-every {chosen.save_every}"
-    return {
-        "chosen": f"{chosen.python}, macro_dt {chosen.macro_dt:.6g}, {chosen.num_steps} steps",
-        "again": again if chosen.options else "",
-    }
+    return {"chosen": f"{chosen.python}, macro_dt {chosen.macro_dt:.6g}, {chosen.num_steps} steps"}
+
+
+def _print_again(chosen: Settings, system: str, method: str) -> None:
+    """The command that makes a run with the scheme and steps that were chosen; none for a scheme that was given."""
+    if not chosen.options:
+        return
+    numbers = f"--num-micro {stage_scheme(chosen.scheme).num_micro} --macro-dt {chosen.macro_dt!r}"
+    saved = f"--steps {chosen.num_steps} --save-every {chosen.save_every}"
+    other = "" if method == "auto" else f" --method {method}"
+    command = f"vmri simulate {shlex.quote(system)} {chosen.options} {numbers} {saved}{other}"
+    console.print(f"The same run again:\n[bold]{escape(command)}[/bold]", soft_wrap=True)
 
 
 def _print_named(texts: dict[str, str]) -> None:

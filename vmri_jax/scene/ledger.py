@@ -131,7 +131,7 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
         multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
         count = 0 if part.home == "control" else stages * evaluations(rule, one.num_micro)
         own = None if nanoseconds is None else nanoseconds * count / 1e3
-        kind = HOMES.get(part.home, f"potential on every {part.home}th micro node")
+        kind = HOMES.get(part.home, f"potential on one in {part.home} micro nodes")
         rows.append(Row(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, own))
     return Ledger(tuple(rows), whole)
 

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
-from vmri_jax.schemes.scheme import Description, Scheme
+from vmri_jax.schemes.description import Description
+from vmri_jax.schemes.scheme import Scheme
 
 
 @dataclass(frozen=True)
