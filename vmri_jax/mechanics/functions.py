@@ -57,6 +57,7 @@ def _traced(function: Callable) -> Callable:
 
 def _count(function: Callable) -> None:
     """Warn, once for each piece of code, that functions are made of it again and again."""
+    function = getattr(function, "function", function)  # of `vmri_jax.mechanics.by_name.ByName`
     code = getattr(function, "__code__", None)
     if code is None:
         return

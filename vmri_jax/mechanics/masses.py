@@ -1,5 +1,8 @@
 """Masses: a matrix that multiplies velocities, kept as its diagonal where nothing else is in it."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -92,18 +95,19 @@ class ConstantMass(eqx.Module):
     """Kinetic energy ``T = v_s^T M_s v_s / 2 + v_f^T M_f v_f / 2`` with constant masses.
 
     Args:
-        slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix.
+        slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix; or, where q_s and q_f are
+            dictionaries, a dictionary with the mass of each body: a number, or an array that is repeated over the shape of the body.
 
     Raises:
         TypeError: masses that are not real numbers.
         ValueError: a mass that is not positive, a matrix that is not symmetric positive definite, arrays of float32.
     """
 
-    slow: Float[Numbers, "n_s"] | Float[Numbers, "n_s n_s"]
-    fast: Float[Numbers, "n_f"] | Float[Numbers, "n_f n_f"]
+    slow: Float[Numbers, "n_s"] | Float[Numbers, "n_s n_s"] | dict[str, Any]
+    fast: Float[Numbers, "n_f"] | Float[Numbers, "n_f n_f"] | dict[str, Any]
 
     def __init__(self, slow, fast):
-        self.slow, self.fast = mass_array("slow", slow), mass_array("fast", fast)
+        self.slow, self.fast = _masses("slow", slow), _masses("fast", fast)
 
     @property
     def slow_mass(self) -> Diagonal | Dense:
@@ -128,5 +132,23 @@ class ConstantMass(eqx.Module):
         return self.slow_mass.solve(p_s), self.fast_mass.solve(p_f)
 
 
+def _masses(name: str, mass):
+    if isinstance(mass, Mapping):
+        return {body: _positive(f"ConstantMass: {name}[{body!r}]", value) for body, value in mass.items()}
+    return mass_array(name, mass)
+
+
+def _positive(name: str, mass):
+    mass = real_array(name, mass)
+    if is_concrete(mass) and not (np.isfinite(mass).all() and np.all(np.asarray(mass) > 0)):
+        raise ValueError(f"{name} = {mass}; every mass must be positive and finite.")
+    return mass
+
+
 def _operator(mass) -> Diagonal | Dense:
+    if isinstance(mass, dict):
+        raise ValueError(
+            f"ConstantMass: the masses of {', '.join(mass)} are given by name, and the sizes of these bodies are not known. Give the start "
+            "as dictionaries, too: vmri_jax.Problem(system, q_s={...}, q_f={...})."
+        )
     return Diagonal(mass) if mass.ndim == 1 else Dense(mass)

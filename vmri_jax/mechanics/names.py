@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vmri_jax.mechanics.by_name import Layout
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.mechanics.system import System
@@ -28,6 +29,7 @@ class Names:
         rigid: bodies whose coordinates are a centre and directors: "name x", "name y", "name z", "name d1 x" and so on.
         carried: bodies that are functions of the coordinates, by name their places in Q_s and Q_f.
         kinematics: the map to these, see `vmri_jax.mechanics.kinematics`; None without such bodies.
+        layouts: of q_s and of q_f where the user gave dictionaries of arrays, None where vectors; a run shows its positions alike.
 
     Raises:
         TypeError: no mapping from names to whole numbers.
@@ -42,6 +44,10 @@ class Names:
     rigid: Sequence[str] = ()
     carried: Mapping[str, Place] = field(default_factory=dict)
     kinematics: Kinematics | None = None
+    layouts: tuple[Layout | None, Layout | None] = (None, None)
+
+    def __hash__(self) -> int:
+        return hash((*map(tuple, (self.slow, self.fast, self.constraint, self.slow_constraint)), self.layouts))
 
     def __post_init__(self):
         for what in ("slow", "fast", "constraint", "slow_constraint"):
@@ -63,6 +69,16 @@ class Names:
         return {
             name: Place(part, start, size) for part, sizes in parts for name, start, size in _one_after_another(sizes)
         }
+
+    def shaped(self, part: Part, vectors):
+        """Vectors (..., n) as the user gave the start: a dictionary of arrays (..., *shape) by name, or the vectors themselves.
+
+        Args:
+            part: whether they are slow or fast.
+            vectors: positions, velocities or momenta.
+        """
+        layout = self.layouts[part == "f"]
+        return vectors if layout is None else layout.by_name(vectors)
 
     @property
     def slow_coordinates(self) -> list[str]:
@@ -175,6 +191,8 @@ class Names:
         found["carried"] = {name: Place(*place) for name, place in data.get("carried", {}).items()}
         if data.get("kinematics") is not None:
             found["kinematics"] = Kinematics.from_dict(data["kinematics"])
+        layouts = data.get("layouts", (None, None))
+        found["layouts"] = tuple(None if layout is None else Layout.from_dict(layout) for layout in layouts)
         return cls(**found)
 
 

@@ -1,7 +1,8 @@
 """States: time, positions and momenta on the constraint manifold, and how a run gets its first one."""
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import equinox as eqx
@@ -10,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from vmri_jax.mechanics import by_name
 from vmri_jax.mechanics.arrays import Number, Numbers, is_concrete, of_one_type, require_x64
 from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, check_params, check_system, check_type
 from vmri_jax.mechanics.constraints import check_constraints, check_mass, project_positions
+from vmri_jax.mechanics.functions import with_time
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers, summary
@@ -20,6 +23,8 @@ from vmri_jax.mechanics.system import System
 
 NOTICED, REFUSED = 1e-6, 1e-2
 """Parts of the velocities against the constraints that are said, and that are refused."""
+Layouts = tuple[by_name.Layout | None, by_name.Layout | None]
+"""Of q_s and of q_f, None where these are vectors."""
 MOST = 0.85
 """A part that is said where projecting it away is asked for."""
 
@@ -63,6 +68,12 @@ def initial_state(
     )
     check_params(system.params)
     system = of_one_type(system)
+    for name, value in {"q_s": q_s, "q_f": q_f, "v_s": v_s, "v_f": v_f}.items():
+        if isinstance(value, Mapping):
+            raise TypeError(
+                f"initial_state: {name} is a dictionary; give Problem(system, q_s, q_f, v_s, v_f), which knows the order of the bodies, and "
+                "its .state()."
+            )
     check_flags(project=project)
     t = check_number("t", t)
     check_number("tolerance", tolerance)
@@ -115,11 +126,21 @@ def tell_of_velocities(what: str, taken: float, project: bool, constraints: str 
 
 @dataclass(frozen=True)
 class Problem:
-    """A system with initial positions and velocities, which are kept as arrays; at rest by default.
+    """A system with initial positions and velocities, which are kept as vectors; at rest by default.
 
-    drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
-    project: whether `state` projects positions and velocities onto the constraints, see `initial_state`.
-    names: of bodies and constraints, `Names` or None; runs, figures and files are labelled by them.
+    Positions may be dictionaries, an array of any shape for each body, ``q_f={"hook": [3.0, -4.0], "load": [3.0, -5.0]}``. The functions of
+    the system then get such dictionaries, ``q_f["load"] - q_f["hook"]``, a force may return them (bodies left out have none), and a
+    constraint may return its rows by name, ``{"rope": ...}``. The problem makes vectors of them once, in the order of the dictionaries;
+    a run returns dictionaries again, ``run.q_f["load"]``.
+
+    Args:
+        system: what moves.
+        q_s, q_f: (n_s,), (n_f,) positions, or dictionaries of arrays.
+        v_s, v_f: velocities alike; None at rest. Of dictionaries bodies at rest may be left out.
+        t: start time.
+        drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
+        project: whether `state` projects positions and velocities onto the constraints, see `initial_state`.
+        names: of bodies and constraints of vectors, `Names` or None; runs, figures and files are labelled by them. Dictionaries have them.
 
     Raises:
         TypeError, ValueError: arrays as `initial_state` refuses them; names that do not add up to coordinates and constraints.
@@ -143,16 +164,51 @@ class Problem:
             System,
             "a vmri_jax.System; of a scene its .system(), of a problem its .system",
         )
-        for velocity, position in (("v_s", self.q_s), ("v_f", self.q_f)):
-            if getattr(self, velocity) is None:
-                object.__setattr__(self, velocity, np.zeros(np.shape(position)))
+        if self.names is not None:
+            check_type("Problem: names", self.names, Names, "vmri_jax.Names(slow={...}, fast={...})")
+        layouts = self._make_flat()
         names = "q_s", "q_f", "v_s", "v_f"
         for name, array in zip(names, check_arrays(**{name: getattr(self, name) for name in names}), strict=True):
             object.__setattr__(self, name, array)
-        if self.names is not None:
-            check_type("Problem: names", self.names, Names, "vmri_jax.Names(slow={...}, fast={...})")
+        if any(layouts):
+            object.__setattr__(self, "system", by_name.flat_system(self.system, *layouts))
+        if self.names is not None or any(layouts):
             check_system(self.system, self.q_s, self.q_f)
+        if any(layouts):
+            object.__setattr__(self, "names", self._names_of(layouts))
+        if self.names is not None:
             self.names.of(self.system, self.q_s.size, self.q_f.size)
+
+    def _make_flat(self) -> "Layouts":
+        """Vectors in place of dictionaries, velocities in place of None; and the layouts of q_s and of q_f."""
+        known, layouts = (self.names or Names()).layouts, []
+        for part, layout in zip("sf", known, strict=True):
+            position, velocity = (getattr(self, f"{kind}_{part}") for kind in "qv")
+            if isinstance(position, Mapping):
+                layout = layout or by_name.Layout.of(f"Problem: q_{part}", position)
+                position = layout.flat(f"Problem: q_{part}", position)
+            if velocity is None:
+                velocity = np.zeros(np.shape(position))
+            elif isinstance(velocity, Mapping):
+                if layout is None:
+                    raise TypeError(f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as arrays.")
+                velocity = layout.flat(f"Problem: v_{part}", velocity, missing=0.0)
+            object.__setattr__(self, f"q_{part}", position)
+            object.__setattr__(self, f"v_{part}", velocity)
+            layouts.append(layout)
+        return layouts[0], layouts[1]
+
+    def _names_of(self, layouts: "Layouts") -> Names:
+        """The names of the problem, with those of the dictionaries."""
+        names, system, t = self.names or Names(), self.system, jnp.zeros(())
+        arguments = {"constraint": (self.q_s, self.q_f), "slow_constraint": (self.q_s,)}
+        sizes = {}
+        for name, configuration in arguments.items():
+            function, all_arguments = with_time(getattr(system, name), t, *configuration, system.params)
+            sizes[name] = by_name.constraint_sizes(function, *all_arguments) or getattr(names, name)
+        for name, layout in zip(("slow", "fast"), layouts, strict=True):
+            sizes[name] = getattr(names, name) if layout is None else layout.sizes
+        return replace(names, **sizes, layouts=layouts)
 
     def __repr__(self) -> str:
         names = (self.names or Names()).of_coordinates(np.shape(self.q_s)[-1], np.shape(self.q_f)[-1])

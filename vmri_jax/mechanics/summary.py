@@ -47,7 +47,9 @@ def listed(items: Sequence[str]) -> str:
 
 
 def numbers(values) -> str:
-    """The numbers of a vector in a line; of a matrix, a tracer or anything else its shape."""
+    """The numbers of a vector in a line, with their names if they have some; of a matrix, a tracer or anything else its shape."""
+    if isinstance(values, Mapping):
+        return listed([f"{name} {numbers(value)}" for name, value in values.items()]) or "none"
     if not has_values(values) or np.ndim(values) > 1:
         return eqx.tree_pformat(values, width=1000)
     return listed([f"{x:.6g}" for x in np.atleast_1d(np.asarray(values))]) or "none"
@@ -62,8 +64,9 @@ def coordinates(names: Sequence[str]) -> str:
 
 def name_of(function) -> str:
     """What a function of a system is called; its class, where it has no name."""
-    inner = getattr(function, "function", function)  # of `TracedOnce`, `Rheonomic`, `KineticFunction`
-    inner = getattr(inner, "function", inner)
+    inner = function
+    while hasattr(inner, "function"):  # `TracedOnce`, `Rheonomic`, `KineticFunction`, `ByName`
+        inner = inner.function
     return getattr(inner, "__name__", type(inner).__name__)
 
 

@@ -1,0 +1,205 @@
+"""Configurations as dictionaries of arrays: functions of the user see ``q_f["load"]``, everything else one flat vector.
+
+A `Layout` says which array stands where in the flat vector. `flat_system` wraps every function of a system once, where its start is
+known (`vmri_jax.Problem`): the function gets dictionaries, and the forces and rows of constraints that it returns as dictionaries become
+vectors. Nothing behind the problem knows of dictionaries.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.arrays import library, real_array
+from vmri_jax.mechanics.functions import Rheonomic, TracedOnce, traced_once
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.system import ARGUMENTS, KineticFunction, System
+
+SLOW, FAST = ("q_s", "v_s"), ("q_f", "v_f")
+"""Arguments of functions that are slow and fast configurations or their velocities."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Arrays by name, and their order in a flat vector; compared by value.
+
+    Args:
+        shapes: name and shape of each array, in the order of the vector.
+    """
+
+    shapes: tuple[tuple[str, tuple[int, ...]], ...]
+
+    @classmethod
+    def of(cls, what: str, arrays: Mapping[str, Any]) -> "Layout":
+        """The layout of a dictionary, in its own order.
+
+        Args:
+            what: its name in messages.
+            arrays: real numbers by name.
+
+        Raises:
+            TypeError: a name that is no text, a value that is no array of real numbers.
+        """
+        for name in arrays:
+            if not isinstance(name, str) or not name:
+                raise TypeError(f"{what} has the key {name!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}.")
+        return cls(tuple((name, real_array(f"{what}[{name!r}]", array).shape) for name, array in arrays.items()))
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Layout":
+        """The inverse of `dataclasses.asdict`, also of what JSON makes of it."""
+        return cls(tuple((name, tuple(shape)) for name, shape in data["shapes"]))
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Number of coordinates of each array."""
+        return {name: math.prod(shape) for name, shape in self.shapes}
+
+    def flat(self, what: str, arrays: Mapping[str, Any], missing: float | None = None):
+        """The vector (n,) of a dictionary of arrays.
+
+        Args:
+            what: its name in messages.
+            arrays: by name; a value is repeated over the shape of its body, as NumPy broadcasts.
+            missing: value of the bodies that are left out; None refuses them.
+
+        Raises:
+            ValueError: names or shapes of another configuration.
+        """
+        names = dict(self.shapes)
+        unknown = [name for name in arrays if name not in names]
+        absent = [name for name in names if name not in arrays]
+        if unknown or (absent and missing is None):
+            raise ValueError(f"{what} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(names) or 'none'}.")
+        pieces = []
+        for name, shape in self.shapes:
+            value = real_array(f"{what}[{name!r}]", arrays.get(name, missing))
+            try:
+                pieces.append(library(value).broadcast_to(value, shape).reshape(-1))
+            except ValueError:
+                raise ValueError(f"{what}[{name!r}] has shape {value.shape}; the body has {shape}.") from None
+        return library(pieces).concatenate([*pieces, library(pieces).zeros(0)])
+
+    def by_name(self, vectors) -> dict[str, Any]:
+        """Arrays (..., *shape) by name of vectors (..., n)."""
+        arrays, start = {}, 0
+        for name, shape in self.shapes:
+            stop = start + math.prod(shape)
+            arrays[name] = vectors[..., start:stop].reshape(*vectors.shape[:-1], *shape)
+            start = stop
+        return arrays
+
+
+@dataclass(frozen=True)
+class ByName:
+    """A function of dictionaries as a function of flat vectors; two of these are equal if their functions and layouts are.
+
+    Args:
+        function: of the user.
+        arguments: names of its arguments, in order.
+        slow, fast: layouts of q_s, v_s and of q_f, v_f; None where these are vectors.
+    """
+
+    function: Callable
+    arguments: tuple[str, ...]
+    slow: Layout | None
+    fast: Layout | None
+
+    def __call__(self, *arguments):
+        value = self.by_name(*arguments)
+        if isinstance(value, Mapping):  # rows of constraints
+            return jnp.concatenate([jnp.reshape(rows, (-1,)) for rows in value.values()] or [jnp.zeros(0)])
+        if isinstance(value, tuple):  # forces
+            parts = zip(("F_s", "F_f"), value, (self.slow, self.fast), strict=False)
+            return tuple(
+                layout.flat(f"System: force: {name}", part, 0.0) if layout and isinstance(part, Mapping) else part
+                for name, part, layout in parts
+            )
+        return value
+
+    def by_name(self, *arguments):
+        """What the function returns, as the user wrote it."""
+        try:
+            return self.function(*map(self._argument, self.arguments, arguments))
+        except KeyError as error:
+            sides = {"q_s": self.slow, "q_f": self.fast}
+            there = [f"{side} has {', '.join(layout.sizes) or 'none'}" for side, layout in sides.items() if layout]
+            raise KeyError(f"{error.args[0]!r} is not there; {' and '.join(there)}") from error
+
+    def row_sizes(self, *arguments) -> dict[str, int]:
+        """Number of rows of each constraint that the function returns by name, in its order; empty if it returns a vector."""
+        sizes: dict[str, int] = {}
+
+        def noted(*arguments):
+            value = self.by_name(*arguments)
+            if isinstance(value, Mapping):
+                sizes.update({name: jnp.size(rows) for name, rows in value.items()})
+            return ()
+
+        jax.eval_shape(noted, *arguments)
+        return sizes
+
+    def _argument(self, name: str, value):
+        layout = self.slow if name in SLOW else self.fast if name in FAST else None
+        return value if layout is None else layout.by_name(value)
+
+
+def flat_system(system: System, slow: Layout | None, fast: Layout | None) -> System:
+    """The same system as functions of flat vectors.
+
+    Args:
+        system: with functions of dictionaries, or with such that have been wrapped already.
+        slow, fast: layouts of q_s and q_f; None where these are vectors.
+
+    Raises:
+        ValueError: masses of other bodies.
+    """
+
+    def wrapped(name: str, function):
+        if isinstance(function, Rheonomic):
+            return Rheonomic(_wrapped(function.function, ("t", *ARGUMENTS[name].split(", ")), slow, fast))
+        return None if function is None else _wrapped(function, tuple(ARGUMENTS[name].split(", ")), slow, fast)
+
+    kinetic, slow_kinetic = system.kinetic, None
+    if isinstance(kinetic, ConstantMass):
+        kinetic = ConstantMass(_flat_mass("slow", kinetic.slow, slow), _flat_mass("fast", kinetic.fast, fast))
+    elif isinstance(kinetic, KineticFunction):
+        slow_kinetic, kinetic = wrapped("slow_kinetic", kinetic.slow), wrapped("kinetic", kinetic.function)
+    names = "slow_potential", "fast_potential", "constraint", "slow_constraint", "force", "implied"
+    return System(
+        kinetic,
+        **{name: wrapped(name, getattr(system, name)) for name in names},
+        params=system.params,
+        slow_kinetic=slow_kinetic,
+        potentials=tuple((name, wrapped("potentials", function)) for name, function in system.potentials),
+    )
+
+
+def constraint_sizes(function: TracedOnce | None, *arguments) -> dict[str, int]:
+    """Names and numbers of rows of a constraint that returns rows by name; empty of any other.
+
+    Args:
+        function: as a flat system has it.
+        arguments: of the function.
+    """
+    inner = function.function if function is not None else None
+    return inner.row_sizes(*arguments) if isinstance(inner, ByName) else {}
+
+
+def _wrapped(function, arguments: tuple[str, ...], slow: Layout | None, fast: Layout | None) -> TracedOnce:
+    inner = function.function if isinstance(function, TracedOnce) else function
+    return traced_once(inner if isinstance(inner, ByName) else ByName(inner, arguments, slow, fast))
+
+
+def _flat_mass(name: str, mass, layout: Layout | None):
+    if not isinstance(mass, Mapping):
+        return mass
+    if layout is None:
+        raise ValueError(
+            f"ConstantMass: {name} has masses by name, {', '.join(mass)}, but the {name} coordinates are a vector; give both as dictionaries, "
+            "or both as arrays."
+        )
+    return layout.flat(f"ConstantMass: {name}", mass)
