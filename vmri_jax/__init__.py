@@ -1,4 +1,47 @@
-"""Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories."""
+"""Variational multirate integrators in JAX: write the physics, pick quadrature rules, get structure-preserving trajectories.
+
+The physics
+    System, ConstantMass, Rheonomic     energies, constraints and forces as functions
+    Problem, Names                      a system with its start
+    State, initial_state                time, positions and momenta; a consistent one from positions and velocities
+    scene                               bodies, joints and effects instead of functions
+    systems                             the systems of the reference study
+
+Schemes
+    fully_implicit, explicit_slow, fully_explicit, galerkin, mollified_impulse, takahashi_imada
+    compose                             of higher order from one of these
+    Scheme, Composition, macro, micro, quadrature       schemes of one's own, from quadrature rules
+
+Runs
+    simulate                            steps or an accuracy in, a Trajectory out; RunError, Settings
+    simulate_batch                      many starts, steps or parameters side by side
+    prepare                             the same run again and again, a Simulation
+    stream                              long runs on disk, a StoredTrajectory
+    ensemble, open_ensemble             many runs, by workers, into a store
+
+Questions
+    tune                                the cheapest scheme and steps for an error
+    advise                              stable steps, resonances, what is slow and what is fast
+    check                               hard cases put to a system
+    fit                                 parameters from measurements
+    minimize                            optimal control
+
+Rooms
+    plots, animation                    figures, films and pages
+    diagnostics, stability              invariants and defects of a step, maps of stable steps
+    study, hard_cases                   convergence, work and precision; cases
+    fitting, control, ensembles         measurements, optimal control, designs of many runs
+    solvers                             how implicit equations are solved
+    textbook                            the whole method on one page
+
+Inside of a step
+    plan, macro_step, discrete_lagrangian, discrete_legendre, Plan, StepInfo, Method, Result
+
+Settings, errors and warnings
+    configure, __version__
+    SimulationError, AccuracyNotReached, Interrupted
+    CompiledAgainWarning, FailedLanesWarning, LostEnergyWarning, NotConfiguredWarning, UncertifiedWarning
+"""
 
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -49,33 +92,51 @@ except PackageNotFoundError:  # a checkout on PYTHONPATH, as on a machine where 
 
 
 if TYPE_CHECKING:
+    from vmri_jax import animation, control, ensembles, fitting, hard_cases, plots, scene, stability, study, textbook
+    from vmri_jax.control.minimize import minimize
     from vmri_jax.ensembles import ensemble, open_ensemble
     from vmri_jax.fitting import fit
+    from vmri_jax.hard_cases import check
+    from vmri_jax.stability import advise
+    from vmri_jax.study import tune
 
-LATER = {
-    "plots": ("vmri_jax.plots", None),
-    "ensembles": ("vmri_jax.ensembles", None),
-    "ensemble": ("vmri_jax.ensembles.run", "ensemble"),
-    "control": ("vmri_jax.control", None),
-    "fit": ("vmri_jax.fitting.fit", "fit"),
-    "fitting": ("vmri_jax.fitting", None),
-    "open_ensemble": ("vmri_jax.ensembles.reading", "open_ensemble"),
+_LATER = {
+    "advise": "vmri_jax.stability:advise",
+    "animation": "vmri_jax.animation",
+    "check": "vmri_jax.hard_cases:check",
+    "control": "vmri_jax.control",
+    "ensemble": "vmri_jax.ensembles:ensemble",
+    "ensembles": "vmri_jax.ensembles",
+    "fit": "vmri_jax.fitting.fit:fit",
+    "fitting": "vmri_jax.fitting",
+    "hard_cases": "vmri_jax.hard_cases",
+    "minimize": "vmri_jax.control.minimize:minimize",
+    "open_ensemble": "vmri_jax.ensembles:open_ensemble",
+    "plots": "vmri_jax.plots",
+    "scene": "vmri_jax.scene",
+    "stability": "vmri_jax.stability",
+    "study": "vmri_jax.study",
+    "textbook": "vmri_jax.textbook",
+    "tune": "vmri_jax.study:tune",
 }
-"""Names that are imported when they are asked for: the module, and the name in it. matplotlib and scipy.stats take half a second."""
+"""Modules, and functions in modules, that are imported when they are asked for. matplotlib and scipy.stats take half a second."""
 
 
 def __getattr__(name: str) -> Any:
-    """What is in `LATER`."""
-    if name in LATER:
-        module, attribute = LATER[name]
-        found = import_module(module)
-        return found if attribute is None else getattr(found, attribute)
-    raise AttributeError(f"module 'vmri_jax' has no attribute {name!r}")
+    """Import a module or a function of `_LATER`."""
+    if name not in _LATER:
+        raise AttributeError(f"module 'vmri_jax' has no attribute {name!r}")
+    module, _, attribute = _LATER[name].partition(":")
+    value = import_module(module)
+    if attribute:
+        value = getattr(value, attribute)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:
-    """All names, those of `LATER` too."""
-    return sorted({*globals(), *LATER})
+    """The public names, and no others."""
+    return sorted(__all__)
 
 
 __all__ = [
@@ -106,29 +167,43 @@ __all__ = [
     "Trajectory",
     "UncertifiedWarning",
     "__version__",
+    "advise",
+    "animation",
+    "check",
     "compose",
     "configure",
+    "control",
     "diagnostics",
     "discrete_lagrangian",
     "discrete_legendre",
     "ensemble",
+    "ensembles",
     "explicit_slow",
     "fit",
+    "fitting",
     "fully_explicit",
     "fully_implicit",
     "galerkin",
+    "hard_cases",
     "initial_state",
     "macro",
     "macro_step",
     "micro",
+    "minimize",
     "mollified_impulse",
     "open_ensemble",
     "plan",
+    "plots",
     "prepare",
     "quadrature",
+    "scene",
     "simulate",
     "simulate_batch",
+    "stability",
     "stream",
+    "study",
     "systems",
     "takahashi_imada",
+    "textbook",
+    "tune",
 ]

@@ -1,7 +1,7 @@
 """The 28 hard cases: where multirate variational integrators break, and what counts as a pass."""
 
 from benchmarks.hard_cases import chains, constraints, encounters, guards, large_steps, long_runs, resonance, scales
-from vmri_jax.check import Case
+from vmri_jax.hard_cases import Case
 
 MODULES = (chains, constraints, encounters, guards, large_steps, long_runs, resonance, scales)
 

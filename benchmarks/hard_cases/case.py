@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable
 
-from vmri_jax.check import Case, Outcome
+from vmri_jax.hard_cases import Case, Outcome
 
 
 def hard_case(number: int, title: str, draw=None) -> Callable[..., Case]:

@@ -6,8 +6,8 @@ import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.pictures import draw_singular
 from benchmarks.hard_cases.systems import four_bar, link_chain, stiff_chain
-from vmri_jax.check import Outcome
-from vmri_jax.check.measures import constraints, energy, run, status
+from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.measures import constraints, energy, run, status
 
 
 @hard_case(11, "singular configuration", draw_singular)

@@ -8,8 +8,8 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.systems import four_bar, nearly_slow_constraint
-from vmri_jax.check import Outcome
-from vmri_jax.check.measures import constraints, difference, iterations, nodes, run, status
+from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.measures import constraints, difference, iterations, nodes, run, status
 from vmri_jax.systems.triple_spherical_pendulum import first_rod, second_rod
 
 

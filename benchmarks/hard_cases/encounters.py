@@ -9,8 +9,8 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.systems import bouncing_ball, two_body
-from vmri_jax.check import Outcome
-from vmri_jax.check.measures import energy, long_run, run, status
+from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.measures import energy, long_run, run, status
 from vmri_jax.study.timing import interleaved
 
 

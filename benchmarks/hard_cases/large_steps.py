@@ -7,9 +7,9 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
-from vmri_jax.check import Outcome
-from vmri_jax.check.measures import constraints, difference, energy, iterations, nodes, run, status
 from vmri_jax.diagnostics import step_condition
+from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.measures import constraints, difference, energy, iterations, nodes, run, status
 from vmri_jax.study.timing import interleaved
 
 EXACT = vm.Newton(method="arrowhead")

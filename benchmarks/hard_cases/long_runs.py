@@ -5,8 +5,8 @@ import numpy as np
 
 import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
-from vmri_jax.check import Outcome
-from vmri_jax.check.measures import (
+from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.measures import (
     constraints,
     difference,
     drift_meter,
@@ -18,7 +18,7 @@ from vmri_jax.check.measures import (
     smooth_shift,
     status,
 )
-from vmri_jax.check.pictures import draw_energy
+from vmri_jax.hard_cases.pictures import draw_energy
 
 CHAIN_DT = 0.03
 METERED = 20_000

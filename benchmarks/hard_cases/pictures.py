@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vmri_jax import plots
-from vmri_jax.check.case import Details
+from vmri_jax.hard_cases.case import Details
 
 
 def draw_windows(details: Details, theme: plots.Theme) -> Figure:

@@ -8,8 +8,8 @@ import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.pictures import draw_windows
 from benchmarks.hard_cases.systems import cubic_chain, swapped_chain
-from vmri_jax.check import Outcome
-from vmri_jax.check.measures import energy, long_run, status
+from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.measures import energy, long_run, status
 from vmri_jax.stability import advise, linear_model, stability_map
 
 FIRST_UNSTABLE = {2: 1.248, 3: 1.089, 5: 1.025, 10: 0.999, 20: 0.993}

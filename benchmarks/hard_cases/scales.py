@@ -9,9 +9,9 @@ import vmri_jax as vm
 from benchmarks.hard_cases.case import hard_case
 from benchmarks.hard_cases.pictures import draw_oscillatory_energies
 from benchmarks.hard_cases.systems import three_scales
-from vmri_jax.check import Outcome
-from vmri_jax.check.known_methods import apart_from, midpoint_integrator, rattle
-from vmri_jax.check.measures import difference, run, status
+from vmri_jax.hard_cases import Outcome
+from vmri_jax.hard_cases.known_methods import apart_from, midpoint_integrator, rattle
+from vmri_jax.hard_cases.measures import difference, run, status
 
 
 @hard_case(23, "three scales", draw_oscillatory_energies)

@@ -17,7 +17,7 @@ ROOMS = {
     "vmri_jax.diagnostics": "Diagnostics",
     "vmri_jax.stability": "Stability",
     "vmri_jax.study": "What accuracy costs",
-    "vmri_jax.check": "Checks of a system",
+    "vmri_jax.hard_cases": "Checks of a system",
     "vmri_jax.fitting": "Parameters from measurements",
     "vmri_jax.control": "Optimal control",
     "vmri_jax.ensembles": "Ensembles",

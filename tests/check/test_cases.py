@@ -11,8 +11,8 @@ from tests.check.broken_systems import no_potential, swapped_labels, wrong_gradi
 from tests.scene.gallery_scenes import SCENES, gallery_scene
 from tests.user_systems import two_oscillators
 from vmri_jax import ConstantMass, Problem, Rheonomic, System
-from vmri_jax.check import cases, cases_for, run_cases
-from vmri_jax.check.cases import resolved
+from vmri_jax.hard_cases import cases, cases_for, run_cases
+from vmri_jax.hard_cases.cases import resolved
 
 
 def weight(q_s, q_f, params):

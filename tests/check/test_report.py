@@ -7,9 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app
-from vmri_jax.check import Case, Outcome, run_cases
-from vmri_jax.check.pictures import draw_energy
 from vmri_jax.cli import app as vmri
+from vmri_jax.hard_cases import Case, Outcome, run_cases
+from vmri_jax.hard_cases.pictures import draw_energy
 from vmri_jax.running.progress import Working
 
 RAISES = "bad | luck"

@@ -18,12 +18,12 @@ import vmri_jax as vm
 from tests.animation.support import swinging
 from vmri_jax import cli
 from vmri_jax.catalogue import SCHEMES, find_problem, find_scheme
-from vmri_jax.check import Outcome
 from vmri_jax.cli.run import _energy_balance
+from vmri_jax.hard_cases import Outcome
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.quantities import Work
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.study import ReferenceSolution, WorkPrecision, families, reference_solution
-from vmri_jax.study.table import StudyInterrupted
 
 USER_FILE = """
 import jax.numpy as jnp
@@ -407,7 +407,7 @@ def test_simulate_composes(vmri):
 
 COMPUTING = {
     "cli.run": "_run",
-    "cli.study": "recommend",
+    "study": "tune",
     "study.cost_report": "reference_solution",
     "cli.stability": "stability_map",
     "cli.check": "cases_for",
@@ -475,7 +475,7 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
         return int("no figure")
 
     monkeypatch.setattr("vmri_jax.plots.plot_work_precision", broken)
-    monkeypatch.setattr("vmri_jax.cli.study.cost_report", failing)
+    monkeypatch.setattr("vmri_jax.study.cost_report", failing)
     result = CliRunner().invoke(cli.app, ["cost", "fpu", "--out", "page"])
     assert result.exit_code == 1
     assert isinstance(result.exception, ValueError)  # the fault itself, no usage error
@@ -486,9 +486,9 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
 
 def test_ctrl_c_leaves_the_runs_of_a_search(vmri, tmp_path, monkeypatch):
     def stopped(*_, **__):
-        raise StudyInterrupted(NOTHING)
+        raise Interrupted(NOTHING, 0, None, "runs")
 
-    monkeypatch.setattr("vmri_jax.cli.study.recommend", stopped)
+    monkeypatch.setattr("vmri_jax.study.tune", stopped)
     code, text = vmri("tune", "fpu", "--error", "1e-2", "--t-end", "0.2", "--out", "runs.csv")
     assert code == 130
     assert "the best of them are above" in text
@@ -499,8 +499,8 @@ def test_ctrl_c_leaves_the_cases_that_were_done(vmri, tmp_path, monkeypatch):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vmri_jax.check.cases.single_precision", lambda *_: Outcome("refused", True))
-    monkeypatch.setattr("vmri_jax.check.cases.bad_lane", stopped)
+    monkeypatch.setattr("vmri_jax.hard_cases.cases.single_precision", lambda *_: Outcome("refused", True))
+    monkeypatch.setattr("vmri_jax.hard_cases.cases.bad_lane", stopped)
     code, text = vmri("check", "user.py:my_problem", "--case", "10", "--case", "11", "--out", "cases")
     assert code == 130
     assert "1 of 1 criteria met" in text

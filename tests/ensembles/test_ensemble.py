@@ -10,7 +10,7 @@ import pytest
 
 import vmri_jax as vm
 from tests.ensembles import own
-from vmri_jax.ensembles import QUANTITIES, Axis, Draws, EnsembleError, Product, Stopped, Table, store
+from vmri_jax.ensembles import QUANTITIES, Axis, Draws, EnsembleError, Product, Table, store
 from vmri_jax.ensembles.run import Ensemble
 from vmri_jax.running import files
 from vmri_jax.steppers.results import Result
@@ -152,9 +152,9 @@ def test_others_are_not_tried_where_none_can_be_computed(tmp_path):
 def test_ctrl_c_keeps_the_chunk_at_work(tmp_path):
     design = {"q_s[0]": [1.0, own.POISON, 3.0]}
     arguments = {"design": design, "save": f"{OWN}:interrupts", "chunk": 1}
-    with pytest.raises(Stopped, match=r"stopped after 2 of 3 chunks; go on with resume=True") as caught:
+    with pytest.raises(vm.Interrupted, match=r"interrupted after 2 of 3 chunks; go on with resume=True") as caught:
         few(tmp_path / "runs.zarr", **arguments)
-    assert sorted(caught.value.ensemble.done) == [0, 1]
+    assert sorted(caught.value.done.done) == [0, 1]
     assert few(tmp_path / "runs.zarr", **arguments, resume=True).complete
 
 

@@ -21,7 +21,7 @@ import pytest
 import vmri_jax as vm
 from tests.ensembles import own
 from tests.ensembles.test_ensemble import OWN
-from vmri_jax.ensembles import EnsembleError, Stopped
+from vmri_jax.ensembles import EnsembleError
 from vmri_jax.ensembles.worker import NotAWorker, in_worker, known_versions
 
 distributed = pytest.importorskip("distributed")
@@ -110,7 +110,10 @@ def test_a_worker_that_is_killed(tmp_path, client, here_slowly):
 
 def test_ctrl_c(tmp_path, client, here_slowly):
     out = tmp_path / "runs.zarr"
-    with at_first_chunk(out, lambda: os.kill(os.getpid(), signal.SIGINT)), pytest.raises(Stopped, match="go on with"):
+    with (
+        at_first_chunk(out, lambda: os.kill(os.getpid(), signal.SIGINT)),
+        pytest.raises(vm.Interrupted, match="go on with"),
+    ):
         sweep(out, **SLOW, executor=client)
     assert sweep(out, **SLOW, executor=client, resume=True).complete
     assert contents(out) == here_slowly

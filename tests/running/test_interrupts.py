@@ -68,8 +68,8 @@ def test_a_run_hands_back_what_was_computed(fpu, monkeypatch):
     monkeypatch.setattr(Simulation, "advance", advance)
     with pytest.raises(Interrupted, match=r"interrupted after 6 of 100 macro steps") as caught:
         simulate(fpu.system, fully_explicit(2), fpu.state(), progress=True, **arguments)
-    found = caught.value.trajectory
+    found = caught.value.done
     assert found.success
     assert np.array_equal(found.q_f, expected.q_f[:7])
     again = pickle.loads(pickle.dumps(caught.value))
-    assert (again.step, again.num_steps, str(again)) == (6, 100, str(caught.value))
+    assert (again.number, again.total, str(again)) == (6, 100, str(caught.value))

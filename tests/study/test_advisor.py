@@ -12,18 +12,18 @@ import pytest
 import vmri_jax as vm
 from tests.small_systems import driven, moving_constraints
 from tests.study.test_convergence import PROBLEM
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.study import (
     Program,
     ReferenceSolution,
     cost_report,
     families,
-    recommend,
     reference_solution,
+    tune,
     work_precision,
 )
 from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search, another_start
 from vmri_jax.study.cost_report import default_t_end
-from vmri_jax.study.table import StudyInterrupted
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
 
@@ -35,7 +35,7 @@ def reference():
 
 @pytest.fixture(scope="module")
 def found(reference):
-    return recommend(PROBLEM, 1e-5, 1.0, menu=SHORT_MENU, reference=reference)
+    return tune(PROBLEM, 1e-5, 1.0, menu=SHORT_MENU, reference=reference)
 
 
 def test_a_reference_refines_itself_until_it_agrees(reference):
@@ -121,7 +121,7 @@ def test_schemes_that_fit_the_error_are_tried_first(reference, digits, orders):
 
 def test_exhaustive_search_tries_every_num_micro(reference):
     menu = [SHORT_MENU[0]]
-    found = recommend(PROBLEM, 1e-3, 1.0, menu=menu, reference=reference, exhaustive=True, verify=False)
+    found = tune(PROBLEM, 1e-3, 1.0, menu=menu, reference=reference, exhaustive=True, verify=False)
     assert {row.num_micro for row in found.runs.rows} == set(NUM_MICRO)
 
 
@@ -131,20 +131,20 @@ def test_exhaustive_search_tries_every_num_micro(reference):
 )
 def test_refuses(error, t_end, words):
     with pytest.raises(ValueError, match=words):
-        recommend(PROBLEM, error, t_end)
+        tune(PROBLEM, error, t_end)
 
 
 def test_refuses_what_the_reference_cannot_tell(reference):
     poor = dataclasses.replace(reference, error_q=1e-6)
     with pytest.raises(ValueError, match=r"only good to 1\.0e-06"):
-        recommend(PROBLEM, 1e-6, 1.0, reference=poor)
+        tune(PROBLEM, 1e-6, 1.0, reference=poor)
 
 
 def test_nothing_reached_hands_back_the_runs(reference, monkeypatch):
     monkeypatch.setattr("vmri_jax.study.advisor.LONGEST", 0.2)
     wrong = dataclasses.replace(reference, q=reference.q + 1.0)
     with pytest.raises(NothingReached, match=r"no setting reached 0\.0001") as caught:
-        recommend(PROBLEM, 1e-4, 1.0, menu=SHORT_MENU[:1], reference=wrong, verify=False)
+        tune(PROBLEM, 1e-4, 1.0, menu=SHORT_MENU[:1], reference=wrong, verify=False)
     assert len(caught.value.runs.rows) > 3
 
 
@@ -154,7 +154,7 @@ def test_a_system_that_fails_at_every_step_says_so():
 
     system = PROBLEM.system.replace(slow_potential=broken)
     with pytest.raises(vm.SimulationError, match="NON_FINITE"):
-        recommend(dataclasses.replace(PROBLEM, system=system), 1e-4, 0.1)
+        tune(dataclasses.replace(PROBLEM, system=system), 1e-4, 0.1)
 
 
 def test_a_program_is_compiled_once_for_all_numbers_of_steps():
@@ -249,6 +249,6 @@ def test_ctrl_c_keeps_the_runs(reference, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Search, "_timed", stopped)
-    with pytest.raises(StudyInterrupted, match="interrupted after") as caught:
-        recommend(PROBLEM, 1e-3, 1.0, menu=SHORT_MENU[:1], reference=reference, verify=False)
-    assert len(caught.value.runs.rows) > 3
+    with pytest.raises(Interrupted, match="interrupted after") as caught:
+        tune(PROBLEM, 1e-3, 1.0, menu=SHORT_MENU[:1], reference=reference, verify=False)
+    assert len(caught.value.done.rows) > 3

@@ -13,7 +13,6 @@ from vmri_jax.study import (
     ConvergenceStudy,
     Program,
     ReferenceSolution,
-    StudyInterrupted,
     convergence_study,
     cost_report,
     cost_study,
@@ -41,14 +40,14 @@ def reference() -> ReferenceSolution:
 
 def test_convergence_studies_keep_their_rows(reference):
     steps = [0.04, 0.02, 0.01]
-    with pytest.raises(StudyInterrupted, match="interrupted after 2 runs") as caught:
+    with pytest.raises(vm.Interrupted, match="interrupted after 2 runs") as caught:
         convergence_study(
             *(one_coordinate(), {"explicit": SCHEME}, steps, T_END),
             num_saves=1,
             reference=reference,
             progress=ctrl_c("H = 0.01"),
         )
-    study = caught.value.runs
+    study = caught.value.done
     assert isinstance(study, ConvergenceStudy)
     assert [row.macro_dt for row in study.rows] == steps[:2]
     assert study.order("explicit") == pytest.approx(2.0, abs=0.05)
@@ -56,20 +55,20 @@ def test_convergence_studies_keep_their_rows(reference):
 
 @pytest.mark.parametrize(("words", "rows"), [("4 steps", 1), ("measuring times", 3)])
 def test_work_and_precision_keeps_its_rows(reference, words, rows):
-    with pytest.raises(StudyInterrupted) as caught:
+    with pytest.raises(vm.Interrupted) as caught:
         work_precision(
             *(one_coordinate(), {"explicit": SCHEME}, T_END),
             num_steps=[2, 4, 8],
             reference=reference,
             progress=ctrl_c(words),
         )
-    kept = caught.value.runs.rows
+    kept = caught.value.done.rows
     assert [row.num_steps for row in kept] == [2, 4, 8][:rows]
     assert all(row.seconds > 0 and np.isfinite(row.error_q) for row in kept)
 
 
 def test_cost_studies_keep_their_rows():
-    with pytest.raises(StudyInterrupted) as caught:
+    with pytest.raises(vm.Interrupted) as caught:
         cost_study(
             *(one_coordinate(), vm.fully_explicit, [1]),
             micro_dt=0.01,
@@ -77,7 +76,7 @@ def test_cost_studies_keep_their_rows():
             methods=("auto",),
             progress=ctrl_c("measuring times"),
         )
-    (row,) = caught.value.runs.rows
+    (row,) = caught.value.done.rows
     assert row.result == "CONVERGED"
     assert np.isnan(row.us_per_micro_step)
 
@@ -93,9 +92,9 @@ def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_p
     monkeypatch.setattr(module, "_draw", drawing)
     monkeypatch.setattr("vmri_jax.study.advisor.NUM_MICRO", (1,))
     menu = [replace(of_order_2(vm.fully_explicit), first=1)]
-    with pytest.raises(StudyInterrupted) as caught:
+    with pytest.raises(vm.Interrupted) as caught:
         cost_report(one_coordinate(), "mass", tmp_path, t_end=T_END, errors=[1e-3], menu=menu)
-    assert caught.value.runs.rows
+    assert caught.value.done.rows
 
 
 @pytest.mark.parametrize("error", [0.0, 1e-17])

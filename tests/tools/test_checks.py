@@ -4,7 +4,7 @@ import pytest
 
 from tests.small_systems import SYSTEMS
 from tests.tools.table import Cell, cells, check
-from vmri_jax.check import cases_for, run_cases
+from vmri_jax.hard_cases import cases_for, run_cases
 
 TINY_STEPS, REDUCTIONS = 6, 9
 

@@ -1,4 +1,4 @@
-"""Every system through the studies of accuracy and cost; `recommend` and `cost_report` are run by the commands `tune` and `cost`."""
+"""Every system through the studies of accuracy and cost; `tune` and `cost_report` are run by the commands `tune` and `cost`."""
 
 import numpy as np
 import pytest

@@ -14,6 +14,7 @@ from vmri_jax.running.adjoints import check_adjoint
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
+from vmri_jax.running.progress import ShowsProgress
 from vmri_jax.running.simulation import simulation
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, know
@@ -35,7 +36,7 @@ def simulate(
     save_micro: bool = False,
     newton: Newton | None = None,
     throw: bool = True,
-    progress: bool = False,
+    progress: ShowsProgress = False,
     adjoint: str = "auto",
     error: bool = False,
     of: Callable[[Trajectory], Any] | None = None,
@@ -67,7 +68,7 @@ def simulate(
         newton: how implicit equations are solved.
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN from the failure on.
-        progress: show a progress bar. Without it, and in trial runs for an accuracy, a run that takes more than two seconds says so by a line
+        progress: True for a bar, or a function that is told (what, done, total). Without it, and in trial runs for an accuracy, a run that takes more than two seconds says so by a line
             now and then.
         adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
             "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
@@ -89,7 +90,7 @@ def simulate(
         SimulationError: a step failed.
         Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
     """
-    check_flags(throw=throw, progress=progress, error=error)
+    check_flags(throw=throw, error=error)
     if accuracy is not None:
         steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
         end = _end(steps, t_end, save_every, save_micro, adjoint, num_saves)

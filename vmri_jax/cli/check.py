@@ -7,9 +7,10 @@ from typing import Annotated
 import typer
 
 from vmri_jax.catalogue import find_problem
-from vmri_jax.check import Case, CasesInterrupted, cases_for, run_cases
 from vmri_jax.cli import options
 from vmri_jax.cli.common import check_target_folder, console, print_failure, refusals
+from vmri_jax.hard_cases import Case, cases_for, run_cases
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import progress_shown
 
 Numbers = Annotated[list[int] | None, typer.Option("--case", help="Number of a case; again for more of them.")]
@@ -34,8 +35,8 @@ def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out:
     with refusals(), progress_shown() as tell:
         try:
             report = run_cases(cases, numbers, full, tell)
-        except CasesInterrupted as interrupted:
-            report, stopped = interrupted.report, interrupted
+        except Interrupted as interrupted:
+            report, stopped = interrupted.done, interrupted
     console.print(report.table())
     judged = [row for row in report.rows if row.outcome.passed is not None]
     missed = [str(row.case.number) for row in judged if row.missed]
@@ -47,7 +48,7 @@ def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out:
             for path in report.write(out):
                 console.print(f"wrote {path}", soft_wrap=True)
     if stopped is not None:
-        print_failure("Interrupted", str(stopped))
+        print_failure("Interrupted", f"After {stopped.number} of {stopped.total} cases.")
         raise typer.Exit(130)
     if missed:
         raise typer.Exit(1)

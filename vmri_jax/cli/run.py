@@ -206,7 +206,7 @@ def _run(run, problem, scheme, arguments: dict):
     try:
         return jax.block_until_ready(run(problem, scheme, **arguments)), None
     except (SimulationError, Interrupted) as stopped:
-        return stopped.trajectory, stopped
+        return stopped.trajectory if isinstance(stopped, SimulationError) else stopped.done, stopped
 
 
 def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], streamed: bool) -> int:
@@ -217,7 +217,7 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
         reason = f"Macro step {stopped.step} at t = {stopped.time:.6g}: {stopped.result.message}{labels}{kept}"
         print_failure("The run failed", reason)
         return 1
-    print_failure("Interrupted", f"After {stopped.step} of {stopped.num_steps} macro steps.{kept}")
+    print_failure("Interrupted", f"After {stopped.number} of {stopped.total} macro steps.{kept}")
     if streamed:
         again = [word for word in sys.argv[1:] if word not in ("--resume", "--overwrite")]
         console.print(

@@ -9,6 +9,7 @@ import numpy as np
 import typer
 from rich.markup import escape
 
+from vmri_jax import study
 from vmri_jax.catalogue import find_problem
 from vmri_jax.cli import options
 from vmri_jax.cli.common import (
@@ -20,12 +21,12 @@ from vmri_jax.cli.common import (
     print_written,
     refusals,
 )
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, progress_shown
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study import cost_report, recommend
 from vmri_jax.study.advisor import NothingReached, check_target
 from vmri_jax.study.cost_report import PERIODS, PageFailed
-from vmri_jax.study.table import ResultTable, StudyInterrupted, rich_table
+from vmri_jax.study.table import ResultTable, rich_table
 from vmri_jax.study.work import duration
 
 app = typer.Typer()
@@ -49,7 +50,7 @@ def tune(
         check_target(error, t_end, problem)
         try:
             with _search(out) as tell:
-                found = recommend(problem, error, t_end, exhaustive=exhaustive, progress=tell)
+                found = study.tune(problem, error, t_end, exhaustive=exhaustive, progress=tell)
         except NothingReached as failure:
             console.print(failure.runs.table())
             _write_runs(failure.runs, out)
@@ -92,7 +93,7 @@ def cost(
         check_target_folder("--out", out)
         try:
             with _search(None) as tell:
-                report = cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
+                report = study.cost_report(problem, system, out, t_end=t_end, errors=error, progress=tell)
         except PageFailed as failure:
             console.print(failure.report.table())
             print_written("\nRuns", out / "cost.csv")
@@ -110,10 +111,10 @@ def _search(out: Path | None) -> Iterator[Progress]:
     except SimulationError as failure:
         print_failure("No reference solution", str(failure))
         raise typer.Exit(1) from failure
-    except StudyInterrupted as stopped:
-        console.print(stopped.runs.table())
-        _write_runs(stopped.runs, out)
-        print_failure("Interrupted", f"After {len(stopped.runs.rows)} runs; the best of them are above.")
+    except Interrupted as stopped:
+        console.print(stopped.done.table())
+        _write_runs(stopped.done, out)
+        print_failure("Interrupted", f"After {stopped.number} runs; the best of them are above.")
         raise typer.Exit(130) from stopped
 
 

@@ -24,11 +24,12 @@ from vmri_jax.cli.common import (
     print_written,
     refusals,
 )
-from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, Stopped, ensemble
+from vmri_jax.ensembles import Axis, Draw, Draws, Ensemble, EnsembleError, Product, ensemble
 from vmri_jax.ensembles.executors import local_workers
 from vmri_jax.ensembles.quantities import drawn_by_default
 from vmri_jax.mechanics.names import near
 from vmri_jax.running.export import extra
+from vmri_jax.running.interrupts import Interrupted
 
 EXAMPLE = Path("sweep.toml")
 SETTINGS = ("t_end", "num_steps", "macro_dt", "micro_dt", "num_micro", "save", "num_saves", "project", "chunk")
@@ -73,8 +74,8 @@ def sweep(
                 _print_summary(error.ensemble)
                 print_failure("Not all chunks could be computed", str(error))
                 raise typer.Exit(1) from error
-            except Stopped as stopped:
-                print_failure("Stopped", str(stopped).replace("resume=True", "--resume"))
+            except Interrupted as stopped:
+                print_failure("Interrupted", str(stopped).replace("resume=True", "--resume"))
                 raise typer.Exit(130) from stopped
             except RuntimeError as error:
                 print_failure("Stopped", str(error).replace("resume=True", "--resume"))

@@ -18,7 +18,7 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.origin import Origin, names_of
-from vmri_jax.running.progress import Working, progress_shown
+from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -45,7 +45,7 @@ def minimize(
     tolerance: float = 1e-8,
     max_iterations: int = 50,
     newton: Newton | None = None,
-    progress: bool = False,
+    progress: ShowsProgress = False,
 ) -> Optimum:
     """Minimise ``sum_k H (C(z_k, u_k) + C(z_{k+1}, u_k)) / 2 + final_cost(z_N)`` subject to the steps of the scheme and ``goal = 0``.
 
@@ -111,7 +111,7 @@ def minimize(
     search = Search(setup)
     point = started(search, start, num_steps, len(labels), grid)
     rho, history, nu = 1.0, [], np.zeros(0)
-    with progress_shown() if progress else Working("minimize") as tell:
+    with progress_to("minimize", progress) as tell:
         tell("compiling the steps and their derivatives", 0, max_iterations)
         for count in range(1, max_iterations + 1):
             try:

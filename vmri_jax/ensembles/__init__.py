@@ -3,7 +3,7 @@
 from vmri_jax.ensembles.design import Axis, Draw, Draws, Product, Table
 from vmri_jax.ensembles.quantities import QUANTITIES
 from vmri_jax.ensembles.reading import open_ensemble
-from vmri_jax.ensembles.run import Ensemble, EnsembleError, Stopped, ensemble
+from vmri_jax.ensembles.run import Ensemble, EnsembleError, ensemble
 
 __all__ = [
     "QUANTITIES",
@@ -13,7 +13,6 @@ __all__ = [
     "Ensemble",
     "EnsembleError",
     "Product",
-    "Stopped",
     "Table",
     "ensemble",
     "open_ensemble",

@@ -8,7 +8,7 @@ from typing import Any
 
 from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
 from vmri_jax.mechanics.arrays import whole_number
-from vmri_jax.running.interrupts import interrupts_noted
+from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 
 RETRIES = 2
 """Times that Dask tries a task again that raised an error. How often it does where workers died is its own setting."""
@@ -19,14 +19,6 @@ AHEAD = 4
 LOOK = 1.0
 """Seconds after which workers are counted anew, and futures looked at: `wait` does not see those that Dask cancels when its
 scheduler is gone."""
-
-
-class MappingInterrupted(KeyboardInterrupt):
-    """`mapped` was stopped by Ctrl-C; `.results` has a result for each call, None for those that were not done."""
-
-    def __init__(self, results: list):
-        self.results = results
-        super().__init__(f"interrupted after {sum(one is not None for one in results)} of {len(results)} calls.")
 
 
 class Here(Executor):
@@ -165,7 +157,7 @@ def mapped(
         told: ``told(done, number)``, how many are done when number `number` is handed over.
 
     Raises:
-        MappingInterrupted: Ctrl-C; carries the results until then.
+        Interrupted: Ctrl-C; carries the results until then.
     """
     given = list(arguments)
     found: list = [None] * len(given)
@@ -186,5 +178,6 @@ def mapped(
             for (i,), future in as_done(submit, room, calls, interrupted):
                 found[i] = future.result()
         except KeyboardInterrupt:
-            raise MappingInterrupted(found) from None
+            done = sum(result is not None for result in found)
+            raise Interrupted(found, done, len(found), "calls") from None
     return found

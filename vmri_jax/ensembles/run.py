@@ -19,8 +19,8 @@ from vmri_jax.ensembles.worker import NotAWorker, call_in_worker, known_versions
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import check_writable, clear_partial
-from vmri_jax.running.interrupts import interrupts_noted
-from vmri_jax.running.progress import Progress, progress_shown, silent
+from vmri_jax.running.interrupts import Interrupted, interrupts_noted
+from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
 from vmri_jax.running.store.layout import locked
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -49,16 +49,6 @@ class EnsembleError(RuntimeError):
             f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{more}. Chunk {first}: "
             f"{why.splitlines()[-1]} "
             f"{rest} in {ensemble.path}; with resume=True only those that are missing are tried again."
-        )
-
-
-class Stopped(KeyboardInterrupt):
-    """An ensemble was stopped by Ctrl-C; what was computed is in the store of its `.ensemble`."""
-
-    def __init__(self, ensemble: "Ensemble"):
-        self.ensemble = ensemble
-        super().__init__(
-            f"stopped after {len(ensemble.done)} of {ensemble.chunks.count} chunks; go on with resume=True, {ensemble.path}."
         )
 
 
@@ -127,7 +117,7 @@ def ensemble(
     resume: bool = False,
     overwrite: bool = False,
     throw: bool = True,
-    progress: bool = False,
+    progress: ShowsProgress = False,
 ) -> Ensemble:
     """Simulate a system many times, for all rows of a design, and keep what is asked for in a store on disk.
 
@@ -164,7 +154,7 @@ def ensemble(
         resume: go on with the ensemble that is in `out`, which must be the same; start it if there is none.
         overwrite: replace an ensemble that is in `out`.
         throw: raise `EnsembleError` at the end if chunks could not be computed.
-        progress: show how many runs are done, how fast, and how many failed.
+        progress: True for a bar that shows how many runs are done, how fast, and how many failed, or a function that is told.
 
     Returns:
         The `Ensemble`; ``.open()`` gives its results.
@@ -174,7 +164,7 @@ def ensemble(
         FileExistsError: there is something in `out`, and neither `resume` nor `overwrite` is asked for.
         OSError: `out` cannot be written; of a full disk what was there before is kept.
         EnsembleError: chunks could not be computed, the others are in the store.
-        Stopped: Ctrl-C; the chunks that were done are in the store.
+        Interrupted: Ctrl-C; the chunks that were done are in the store.
     """
     require_x64()
     path = Path(out)
@@ -217,7 +207,7 @@ def ensemble(
                 raise _unwritable(path, error, "Give another place.") from error
         opened.enter_context(locked(path))
         clear_partial(path)
-        tell = opened.enter_context(progress_shown()) if progress else silent
+        tell = opened.enter_context(progress_to("ensemble", progress))
         interrupted = opened.enter_context(interrupts_noted())
         found = Ensemble(path, chunks, store.committed(path))
         _compute(found, job_of(path, chunks, work, design), tasks, room, tell, interrupted)
@@ -250,7 +240,8 @@ def _compute(found: Ensemble, job: Job, tasks, room, tell: Progress, interrupted
             found.seconds = time.perf_counter() - begin
             tell(_progress(found), _lanes_done(found), job.chunks.lanes)
     except KeyboardInterrupt:
-        raise Stopped(found) from None
+        again = f"go on with resume=True, {found.path}"
+        raise Interrupted(found, len(found.done), found.chunks.count, "chunks", again) from None
     except CancelledError as gone:
         raise _gone(found) from gone
 

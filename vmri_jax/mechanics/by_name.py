@@ -45,7 +45,9 @@ class Layout:
         """
         for name in arrays:
             if not isinstance(name, str) or not name:
-                raise TypeError(f"{what} has the key {name!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}.")
+                raise TypeError(
+                    f"{what} has the key {name!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}."
+                )
         return cls(tuple((name, real_array(f"{what}[{name!r}]", array).shape) for name, array in arrays.items()))
 
     @classmethod
@@ -73,7 +75,9 @@ class Layout:
         unknown = [name for name in arrays if name not in names]
         absent = [name for name in names if name not in arrays]
         if unknown or (absent and missing is None):
-            raise ValueError(f"{what} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(names) or 'none'}.")
+            raise ValueError(
+                f"{what} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(names) or 'none'}."
+            )
         pieces = []
         for name, shape in self.shapes:
             value = real_array(f"{what}[{name!r}]", arrays.get(name, missing))
@@ -178,14 +182,14 @@ def flat_system(system: System, slow: Layout | None, fast: Layout | None) -> Sys
     )
 
 
-def constraint_sizes(function: TracedOnce | None, *arguments) -> dict[str, int]:
+def constraint_sizes(function: Callable | None, *arguments) -> dict[str, int]:
     """Names and numbers of rows of a constraint that returns rows by name; empty of any other.
 
     Args:
         function: as a flat system has it.
         arguments: of the function.
     """
-    inner = function.function if function is not None else None
+    inner = function.function if isinstance(function, TracedOnce) else function
     return inner.row_sizes(*arguments) if isinstance(inner, ByName) else {}
 
 

@@ -1,7 +1,6 @@
 """Masses: a matrix that multiplies velocities, kept as its diagonal where nothing else is in it."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -103,8 +102,8 @@ class ConstantMass(eqx.Module):
         ValueError: a mass that is not positive, a matrix that is not symmetric positive definite, arrays of float32.
     """
 
-    slow: Float[Numbers, "n_s"] | Float[Numbers, "n_s n_s"] | dict[str, Any]
-    fast: Float[Numbers, "n_f"] | Float[Numbers, "n_f n_f"] | dict[str, Any]
+    slow: Float[Numbers, "n_s"] | Float[Numbers, "n_s n_s"]
+    fast: Float[Numbers, "n_f"] | Float[Numbers, "n_f n_f"]
 
     def __init__(self, slow, fast):
         self.slow, self.fast = _masses("slow", slow), _masses("fast", fast)

@@ -191,7 +191,9 @@ class Problem:
                 velocity = np.zeros(np.shape(position))
             elif isinstance(velocity, Mapping):
                 if layout is None:
-                    raise TypeError(f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as arrays.")
+                    raise TypeError(
+                        f"Problem: v_{part} is a dictionary and q_{part} is none; give both as dictionaries, or both as arrays."
+                    )
                 velocity = layout.flat(f"Problem: v_{part}", velocity, missing=0.0)
             object.__setattr__(self, f"q_{part}", position)
             object.__setattr__(self, f"v_{part}", velocity)

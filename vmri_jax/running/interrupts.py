@@ -7,23 +7,24 @@ from contextlib import contextmanager
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run was stopped by Ctrl-C; what was computed before is in `.trajectory`.
+    """A run, a batch of tasks or a study was stopped by Ctrl-C; everything that was computed before is in `.done`.
 
     A `KeyboardInterrupt`: a program that does not expect it stops, as after any Ctrl-C.
 
     Attributes:
-        trajectory: the `Trajectory` up to there; of `stream` the `StoredTrajectory`.
-        step, num_steps: macro steps done, and asked for.
+        done: of `simulate` a `Trajectory`, of `stream` a `StoredTrajectory`, of `check` a `Report`, of an ensemble the `Ensemble`, of a
+            study its table of rows, of a mapping over tasks the list of results with None for tasks that were not done.
+        number, total: macro steps, tasks or rows that were done, and those asked for; `total` is None where it is not known before.
+        units: "macro steps", "cases", "chunks", "runs".
     """
 
-    def __init__(self, trajectory, step: int, num_steps: int):
-        self.trajectory, self.step, self.num_steps = trajectory, step, num_steps
-        super().__init__(
-            f"interrupted after {step} of {num_steps} macro steps; what was computed is in this exception's .trajectory."
-        )
+    def __init__(self, done, number: int, total: int | None, units: str, advice: str = ""):
+        self.done, self.number, self.total, self.units, self.advice = done, number, total, units, advice
+        count = f"{number} {units}" if total is None else f"{number} of {total} {units}"
+        super().__init__(f"interrupted after {count}; {advice or 'this exception has them in .done'}.")
 
     def __reduce__(self):
-        return type(self), (self.trajectory, self.step, self.num_steps)
+        return type(self), (self.done, self.number, self.total, self.units, self.advice)
 
 
 @contextmanager

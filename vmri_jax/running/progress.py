@@ -8,10 +8,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 Progress = Callable[[str, int, int], None]
 """Called as ``progress(what, done, total)`` before every piece of work and once at the end."""
+ShowsProgress = bool | Progress
+"""The argument ``progress`` of all functions that take long: True for a bar, False for a line now and then, or a function that is told."""
 
 
 SECONDS = 2.0
@@ -107,6 +109,23 @@ def progress_shown() -> Iterator[Progress]:
     with Bars(*columns, console=console, transient=True) as bars, Working("", shown=False):
         task = bars.add_task("starting")
         yield lambda what, done, total: bars.update(task, description=what, completed=done, total=total)
+
+
+def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Progress]:
+    """Within, whoever asked for progress is told about the work.
+
+    Args:
+        name: of the function that works, for lines that nobody asked for.
+        progress: the argument of that function.
+
+    Raises:
+        TypeError: neither True nor False nor a function.
+    """
+    if isinstance(progress, bool):
+        return progress_shown() if progress else Working(name)
+    if not callable(progress):
+        raise TypeError(f"{name}: progress is {progress!r}; give True, False, or a function of (what, done, total).")
+    return nullcontext(progress)
 
 
 def silent(what: str, done: int, total: int) -> None:

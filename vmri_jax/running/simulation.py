@@ -23,7 +23,7 @@ from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
-from vmri_jax.running.progress import Working, progress_shown
+from vmri_jax.running.progress import ShowsProgress, Working, progress_to
 from vmri_jax.running.saved import room_of_a_piece
 from vmri_jax.running.summaries import summary_of_prepared
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
@@ -259,19 +259,19 @@ class Simulation:
         failed = self.may_fall_back and int(piece.failed_at) >= 0 and int(piece.result) != Result.NOT_IMPLIED
         return failed and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
 
-    def in_pieces(self, progress: bool = False) -> Trajectory:
+    def in_pieces(self, progress: ShowsProgress = False) -> Trajectory:
         """The whole run; with a progress bar Ctrl-C raises `Interrupted` with what was computed."""
-        if not progress:
+        if progress is False:
             with Working(STEPPING):
                 return self._joined(self.advance(self.start(), self.num_saves)[0])
         size, at, pieces = -(-self.num_saves // SHOWN), self.start(), []
-        with interrupts_noted() as interrupted, progress_shown() as tell:
+        with interrupts_noted() as interrupted, progress_to("simulate", progress) as tell:
             for done in range(0, self.num_saves, size):
                 tell("simulating", done, self.num_saves)
                 more, at = self.advance(at, min(size, self.num_saves - done))
                 pieces += more
                 if interrupted():
-                    raise Interrupted(self._joined(pieces), at.step, self.num_steps)
+                    raise Interrupted(self._joined(pieces), at.step, self.num_steps, "macro steps")
         return self._joined(pieces)
 
     def _joined(self, pieces: list[Trajectory]) -> Trajectory:

@@ -1,13 +1,13 @@
 """Studies of schemes: convergence, work and precision, advice, computing time."""
 
 from vmri_jax.accuracy.families import Family, families
-from vmri_jax.study.advisor import Recommendation, recommend
+from vmri_jax.study.advisor import Recommendation, tune
 from vmri_jax.study.convergence import ConvergenceRow, ConvergenceStudy, convergence_study
 from vmri_jax.study.cost import CostRow, CostStudy, cost_study
 from vmri_jax.study.cost_report import CostReport, cost_report
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Column, ResultTable, StudyInterrupted
+from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.work import WorkPrecision, WorkRow, work_precision
 
 __all__ = [
@@ -22,14 +22,13 @@ __all__ = [
     "Recommendation",
     "ReferenceSolution",
     "ResultTable",
-    "StudyInterrupted",
     "WorkPrecision",
     "WorkRow",
     "convergence_study",
     "cost_report",
     "cost_study",
     "families",
-    "recommend",
     "reference_solution",
+    "tune",
     "work_precision",
 ]

@@ -19,12 +19,13 @@ from vmri_jax import diagnostics
 from vmri_jax.accuracy.families import Family, families
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import ResultTable, StudyInterrupted
+from vmri_jax.study.table import ResultTable
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration, timed_in_turn, work_row
 
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
@@ -231,11 +232,12 @@ class Search:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Within, Ctrl-C raises `StudyInterrupted`, with all runs so far."""
+        """Within, Ctrl-C raises `Interrupted`, with all runs so far."""
         try:
             yield
         except KeyboardInterrupt:
-            raise StudyInterrupted(self.rows()) from None
+            rows = self.rows()
+            raise Interrupted(rows, len(rows.rows), None, "runs") from None
 
     def not_tried(self) -> list[str]:
         """Families of which nothing has been run, as where the time of the search was over before."""
@@ -326,16 +328,16 @@ def round_off(problem: Problem) -> tuple[float, float]:
 def check_target(error: float, t_end: float, problem: Problem) -> None:
     """Refuse errors and times that no run can meet."""
     if not (np.isfinite(t_end) and t_end > 0):
-        raise ValueError(f"recommend: t_end is {t_end}; it must be a positive number.")
+        raise ValueError(f"tune: t_end is {t_end}; it must be a positive number.")
     size, floor = round_off(problem)
     if not (np.isfinite(error) and error > floor):
         raise ValueError(
-            f"recommend: error is {error:g}; the largest position is {size:.3g}, so that round-off alone is about "
+            f"tune: error is {error:g}; the largest position is {size:.3g}, so that round-off alone is about "
             f"{floor:.0e}. Give a larger error, in the unit of the positions."
         )
 
 
-def recommend(
+def tune(
     problem: Problem | HasProblem,
     error: float,
     t_end: float,
@@ -366,18 +368,18 @@ def recommend(
         ValueError: an error below round-off or below what the reference can tell.
         NothingReached: no setting keeps the error; carries the runs.
         SimulationError: the reference could not be computed.
-        StudyInterrupted: Ctrl-C during the search; carries the runs.
+        Interrupted: Ctrl-C during the search; carries the runs.
 
     Warns:
         UserWarning: the setting was found, but could not be checked from another start.
     """
-    problem = problem_of("recommend", problem)
+    problem = problem_of("tune", problem)
     check_target(error, t_end, problem)
     if reference is None:
         reference = reference_solution(problem, t_end, num_saves=num_saves, progress=progress)
     if error < MARGIN * reference.error_q:
         raise ValueError(
-            f"recommend: error is {error:g}, but the reference solution is only good to {reference.error_q:.1e}: runs with half the "
+            f"tune: error is {error:g}, but the reference solution is only good to {reference.error_q:.1e}: runs with half the "
             f"step come no closer, as where a motion is chaotic. Give a smaller t_end, an error of at least "
             f"{MARGIN * reference.error_q:.1e}, or a better reference."
         )
@@ -390,7 +392,7 @@ def recommend(
     else:
         best = min(search.settings.values(), key=lambda s: np.nan_to_num(s.row.error_q, nan=np.inf))
         raise NothingReached(
-            f"recommend: no setting reached {error:g} in {len(search.settings)} runs; the best error was "
+            f"tune: no setting reached {error:g} in {len(search.settings)} runs; the best error was "
             f"{best.row.error_q:.1e}, with {best.row.scheme} and {best.num_steps} steps. Give a larger error.",
             search.rows(),
         )
@@ -402,7 +404,7 @@ def recommend(
                 chosen, checked = _not_by_luck(found, _from_another_start(problem, t_end, reference, newton))
         except SimulationError as failure:
             warnings.warn(
-                f"recommend: the setting is not checked from another start, for the reference solution fails there: {failure}",
+                f"tune: the setting is not checked from another start, for the reference solution fails there: {failure}",
                 stacklevel=2,
             )
     progress("done", 1, 1)

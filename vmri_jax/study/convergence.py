@@ -16,10 +16,11 @@ import numpy as np
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.diagnostics import OrderFit
-from vmri_jax.ensembles.executors import MappingInterrupted, mapped
+from vmri_jax.ensembles.executors import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.export import extra
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
@@ -28,7 +29,7 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Column, ResultTable, StudyInterrupted
+from vmri_jax.study.table import Column, ResultTable
 
 FLOOR_FACTOR = 100.0
 """Errors below this many times the error of the reference say nothing about the scheme and are not fitted."""
@@ -232,7 +233,7 @@ def convergence_study(
 
     Raises:
         ValueError: no scheme, a step that does not divide `t_end` as above, a reference of another shape.
-        StudyInterrupted: Ctrl-C; carries the study of the runs that were done.
+        Interrupted: Ctrl-C; carries the study of the runs that were done.
     """
     problem = problem_of("convergence_study", problem)
     if not schemes:
@@ -257,8 +258,8 @@ def convergence_study(
             executor,
             lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][1]:g}", done, total),
         )
-    except MappingInterrupted as interrupted:
-        runs, stopped = interrupted.results, interrupted
+    except Interrupted as interrupted:
+        runs, stopped = interrupted.done, interrupted
     done = {label: run for label, run in zip(labels, runs, strict=True) if run is not None}
     energies = {case: _energies(changed, references[case]) for case, changed in cases.items()}
     rows = [
@@ -280,7 +281,7 @@ def convergence_study(
     ]
     study = ConvergenceStudy(tuple(rows), references)
     if stopped is not None:
-        raise StudyInterrupted(study) from None
+        raise Interrupted(study, len(study.rows), None, "runs") from None
     progress("done", total, total)
     return study
 

@@ -8,13 +8,14 @@ import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
-from vmri_jax.study.table import Column, ResultTable, StudyInterrupted
+from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.timing import interleaved
 
 
@@ -121,7 +122,7 @@ def cost_study(
 
     Raises:
         ValueError: an empty or bad argument.
-        StudyInterrupted: Ctrl-C; carries the programs that were run, with times where they were measured.
+        Interrupted: Ctrl-C; carries the programs that were run, with times where they were measured.
     """
     problem = problem_of("cost_study", problem)
     if not num_micro or not methods or repeats < 1 or not (micro_dt > 0 and t_end > 0):
@@ -148,7 +149,8 @@ def cost_study(
         calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}
         seconds = interleaved(calls, repeats, min_seconds, clock=clock)
     except KeyboardInterrupt:
-        raise StudyInterrupted(study()) from None
+        done = study()
+        raise Interrupted(done, len(done.rows), None, "runs") from None
     progress("done", total, total)
     return study()
 

@@ -156,7 +156,7 @@ def cost_report(
     Raises:
         ValueError: errors that are not positive; none are asked for, and the system does not move.
         SimulationError: no reference solution could be computed.
-        StudyInterrupted: Ctrl-C; the page has the errors that were searched for before.
+        Interrupted: Ctrl-C; the page has the errors that were searched for before.
         PageFailed: the page could not be drawn or written; carries the report.
     """
     problem = problem_of("cost_report", problem)

@@ -94,21 +94,6 @@ class ResultTable:
         Path(path).write_text(json.dumps(_plain(self.content()), indent=1))
 
 
-class StudyInterrupted(KeyboardInterrupt):
-    """A study was stopped by Ctrl-C; its rows until then are in `.runs`.
-
-    A `KeyboardInterrupt`: a program that does not expect it stops, as after any Ctrl-C.
-
-    Attributes:
-        runs: the table of what was done: of `convergence_study` a `ConvergenceStudy`, of `cost_study` a `CostStudy`, of all others a
-            `WorkPrecision`.
-    """
-
-    def __init__(self, runs: ResultTable):
-        self.runs = runs
-        super().__init__(f"interrupted after {len(runs.rows)} runs; they are in this exception's .runs.")
-
-
 def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = "", ruled: bool = False) -> Table:
     """Rows as a `rich.table.Table`, with lines between them if it is `ruled`."""
     columns, cells = _filled(columns, rows)

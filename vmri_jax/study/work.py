@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vmri_jax import diagnostics, plots
-from vmri_jax.ensembles.executors import MappingInterrupted, mapped
+from vmri_jax.ensembles.executors import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -16,7 +17,7 @@ from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
-from vmri_jax.study.table import Column, ResultTable, StudyInterrupted
+from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.timing import interleaved, machine
 
 FINEST_ERROR = 1e-10
@@ -193,7 +194,7 @@ def work_precision(
 
     Raises:
         ValueError: no scheme, or numbers of steps that are no multiples of num_saves.
-        StudyInterrupted: Ctrl-C; carries the runs that were done, with the time of one call where their turn had not come.
+        Interrupted: Ctrl-C; carries the runs that were done, with the time of one call where their turn had not come.
     """
     problem = problem_of("work_precision", problem)
     if not schemes:
@@ -220,11 +221,12 @@ def work_precision(
             timed = [(ladder, repeats) for ladder in ladders]
             told = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
             rows = [row for part in mapped("work_precision", _timed, timed, executor, told) for row in part]
-    except MappingInterrupted as stopped:
-        rows = [row for part in stopped.results if part is not None for row in part]
-        raise StudyInterrupted(WorkPrecision(tuple(rows), t_end, reference)) from None
+    except Interrupted as stopped:
+        rows = [row for part in stopped.done if part is not None for row in part]
+        raise Interrupted(WorkPrecision(tuple(rows), t_end, reference), len(rows), None, "runs") from None
     except KeyboardInterrupt:
-        raise StudyInterrupted(WorkPrecision(tuple(row for _, row in runs), t_end, reference)) from None
+        done = WorkPrecision(tuple(row for _, row in runs), t_end, reference)
+        raise Interrupted(done, len(runs), None, "runs") from None
     progress("done", 1, 1)
     return WorkPrecision(tuple(rows), t_end, reference)
 

@@ -157,7 +157,7 @@ def test_ctrl_c_finishes_the_chunk(run, uninterrupted, out, monkeypatch):
             run(out)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert isinstance(caught.value, KeyboardInterrupt)
-    assert_identical(caught.value.trajectory.load(), uninterrupted[: 2 * CHUNK])
+    assert_identical(caught.value.done.load(), uninterrupted[: 2 * CHUNK])
     assert_identical(run(out, resume=True, progress=True).load(), uninterrupted.load())
 
 

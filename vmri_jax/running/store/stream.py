@@ -12,7 +12,7 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.files import check_writable, clear_partial
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
-from vmri_jax.running.progress import Progress, Working, progress_shown
+from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
 from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.store import layout
 from vmri_jax.running.store.identity import changed_conditions, differences, environment, identity
@@ -48,7 +48,7 @@ def stream(
     resume: bool = False,
     overwrite: bool = False,
     throw: bool = True,
-    progress: bool = False,
+    progress: ShowsProgress = False,
     drawing: dict | None = None,
 ) -> StoredTrajectory:
     """`simulate` that writes the trajectory to disk chunk by chunk: a long run survives a kill, and goes on with `resume`.
@@ -67,7 +67,7 @@ def stream(
             complete is returned at once.
         overwrite: replace a store that is in `out`.
         throw: raise `SimulationError` if a step fails; else return the store. What was computed is on disk either way.
-        progress: show a progress bar.
+        progress: True for a bar, or a function that is told (what, done, total).
         drawing: what the system looks like, plain data kept with the run (see `Trajectory.save`).
 
     Returns:
@@ -97,7 +97,7 @@ def stream(
     }
     attributes |= {} if drawing is None else {"drawing": drawing}
     attributes |= {} if run.names is None else {"names": run.names.to_dict()}
-    with interrupts_noted() as interrupted, progress_shown() if progress else Working("stream") as tell:
+    with interrupts_noted() as interrupted, progress_to("stream", progress) as tell:
         if overwrite or not path.exists():
             with _explained(path, 0):
                 layout.create(path, attributes, Record.of(run.start()))
@@ -108,7 +108,7 @@ def stream(
             clear_partial(path)
             for step in _go_on(StoredTrajectory(path), run, tell):
                 if interrupted():
-                    raise Interrupted(StoredTrajectory(path), step, num_steps)
+                    raise Interrupted(StoredTrajectory(path), step, num_steps, "macro steps")
     stored = StoredTrajectory(path)
     stored = stored.of(run.origin) if len(stored) else stored
     if throw:

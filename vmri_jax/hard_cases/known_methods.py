@@ -6,8 +6,8 @@ import jax
 import numpy as np
 from jax.scipy.linalg import block_diag
 
-from vmri_jax.check.measures import difference, run
 from vmri_jax.diagnostics.linear import phase_vector
+from vmri_jax.hard_cases.measures import difference, run
 from vmri_jax.mechanics.invariants import potential_energy
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.schemes.scheme import Scheme

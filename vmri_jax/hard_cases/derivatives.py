@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.check.case import Outcome
-from vmri_jax.check.measures import run
+from vmri_jax.hard_cases.case import Outcome
+from vmri_jax.hard_cases.measures import run
 from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.schemes.scheme import Scheme

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax import diagnostics
-from vmri_jax.check.case import Case, Outcome
-from vmri_jax.check.derivatives import derivatives
-from vmri_jax.check.guards import bad_lane, single_precision
-from vmri_jax.check.known_methods import apart_from, midpoint_integrator, rattle
-from vmri_jax.check.measures import (
+from vmri_jax.diagnostics import step_condition
+from vmri_jax.hard_cases.case import Case, Outcome
+from vmri_jax.hard_cases.derivatives import derivatives
+from vmri_jax.hard_cases.guards import bad_lane, single_precision
+from vmri_jax.hard_cases.known_methods import apart_from, midpoint_integrator, rattle
+from vmri_jax.hard_cases.measures import (
     Energy,
     constraints,
     difference,
@@ -24,8 +25,7 @@ from vmri_jax.check.measures import (
     run,
     status,
 )
-from vmri_jax.check.pictures import draw_energy
-from vmri_jax.diagnostics import step_condition
+from vmri_jax.hard_cases.pictures import draw_energy
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.progress import Working

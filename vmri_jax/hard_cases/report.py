@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Collection, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,11 @@ from rich.table import Table
 from rich.text import Text
 
 from vmri_jax import plots
-from vmri_jax.check.case import Case, Outcome
-from vmri_jax.running.progress import Progress, Working, silent
+from vmri_jax.hard_cases.case import Case, Outcome
+from vmri_jax.hard_cases.cases import cases_for
+from vmri_jax.mechanics.state import HasProblem, Problem
+from vmri_jax.running.interrupts import Interrupted
+from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.study.table import Column, ResultTable, rich_table
 
 VERDICTS = {True: ("pass", "green"), False: ("fail", "red"), None: ("does not apply", "dim")}
@@ -110,16 +112,26 @@ class Report(ResultTable):
         return [folder / name for name in names]
 
 
-class CasesInterrupted(KeyboardInterrupt):
-    """Cases were stopped by Ctrl-C; the `Report` of those that were done before is in `.report`."""
+def check(
+    problem: Problem | HasProblem, numbers: Collection[int] = (), full: bool = False, progress: ShowsProgress = False
+) -> Report:
+    """Put a system to the hard cases: constraints, energy, tolerance, tiny steps, reversal, batches, bad input.
 
-    def __init__(self, report: Report, asked: int):
-        self.report = report
-        super().__init__(f"After {len(report.rows)} of {asked} cases.")
+    Args:
+        problem: a `Problem` or a scene; steps are chosen from its frequencies.
+        numbers, full, progress: as of `run_cases`.
+
+    Returns:
+        The `Report`, a row for each case; ``print(report.markdown())``.
+
+    Raises:
+        ValueError, Interrupted: as of `run_cases`.
+    """
+    return run_cases(cases_for(problem), numbers, full, progress)
 
 
 def run_cases(
-    cases: Sequence[Case], numbers: Collection[int] = (), full: bool = False, progress: Progress = silent
+    cases: Sequence[Case], numbers: Collection[int] = (), full: bool = False, progress: ShowsProgress = False
 ) -> Report:
     """Run cases one after the other; one that raises is a failed row with the reason.
 
@@ -127,27 +139,27 @@ def run_cases(
         cases: e.g. ``cases_for(problem)``.
         numbers: which of them; all by default.
         full: the full form instead of the quick one.
-        progress: called before every case and at the end; without it a line tells the case, where it takes more than two seconds.
+        progress: True for a bar, or a function that is told before every case and at the end; else a line tells the case, where it takes more than two seconds.
 
     Raises:
         ValueError: a number that no case has.
-        CasesInterrupted: Ctrl-C; the cases that were done are in its report.
+        Interrupted: Ctrl-C; carries the report of the cases that were done.
     """
     known = [case.number for case in cases]
     unknown = sorted(set(numbers) - set(known))
     if unknown:
         raise ValueError(f"run_cases: there is no case {', '.join(map(str, unknown))}; they go from 1 to {max(known)}.")
     chosen, rows = [case for case in cases if not numbers or case.number in numbers], []
-    with Working("run_cases") if progress is silent else nullcontext(progress) as tell:
+    with progress_to("check", progress) as tell:
         for k, case in enumerate(chosen):
             tell(f"{case.number} {case.title}", k, len(chosen))
             start = time.perf_counter()
             try:
                 outcome = _outcome(case, full)
             except KeyboardInterrupt:
-                raise CasesInterrupted(Report(tuple(rows), full), len(chosen)) from None
+                raise Interrupted(Report(tuple(rows), full), len(rows), len(chosen), "cases") from None
             rows.append(Row(case, outcome, time.perf_counter() - start))
-    progress("done", len(chosen), len(chosen))
+        tell("done", len(chosen), len(chosen))
     return Report(tuple(rows), full)
 
 

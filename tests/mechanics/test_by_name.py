@@ -1,0 +1,175 @@
+"""Configurations as dictionaries of arrays: the same runs bit by bit as with vectors, and results by name."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vmri_jax as vm
+from vmri_jax.mechanics.by_name import Layout
+
+HOOK, LOAD = 1.0, 20.0
+PARAMS = {"stiffness": 2.0e4, "drag": 0.3, "speed": 0.5}
+RUN = {"scheme": vm.fully_implicit(3), "macro_dt": 0.02, "num_steps": 6}
+
+
+def weight(q_s, q_f, params):
+    return 9.81 * (HOOK * q_f["hook"][1] + LOAD * q_f["load"][1])
+
+
+def sling(q_f, params):
+    return params["stiffness"] / 2 * (jnp.linalg.norm(q_f["load"] - q_f["hook"]) - 1.0) ** 2
+
+
+def rope(q_s, q_f, params):
+    x, y = q_f["hook"]
+    return {"rope": ((x - q_s["trolley"]) ** 2 + y**2 - 25.0) / 2}
+
+
+def drag(t, q_s, q_f, v_s, v_f, params):
+    return {"trolley": -params["drag"] * v_s["trolley"]}, {"load": -params["drag"] * v_f["load"]}
+
+
+def flat_weight(q_s, q_f, params):
+    return 9.81 * (HOOK * q_f[1] + LOAD * q_f[3])
+
+
+def flat_sling(q_f, params):
+    return params["stiffness"] / 2 * (jnp.linalg.norm(q_f[2:] - q_f[:2]) - 1.0) ** 2
+
+
+def flat_rope(q_s, q_f, params):
+    return jnp.array([((q_f[0] - q_s[0]) ** 2 + q_f[1] ** 2 - 25.0) / 2])
+
+
+def flat_drag(t, q_s, q_f, v_s, v_f, params):
+    return -params["drag"] * v_s, jnp.concatenate([jnp.zeros(2), -params["drag"] * v_f[2:]])
+
+
+MASSES = {"slow": {"trolley": 500.0}, "fast": {"hook": HOOK, "load": LOAD}}
+CRANE = vm.Problem(
+    vm.System(vm.ConstantMass(**MASSES), weight, sling, rope, force=drag, params=PARAMS),
+    q_s={"trolley": 0.0},
+    q_f={"hook": [3.0, -4.0], "load": [3.0, -5.0]},
+    v_f={"load": [0.0, 0.1]},
+)
+FLAT = vm.Problem(
+    vm.System(
+        vm.ConstantMass([500.0], [HOOK, HOOK, LOAD, LOAD]),
+        flat_weight,
+        flat_sling,
+        flat_rope,
+        force=flat_drag,
+        params=PARAMS,
+    ),
+    q_s=[0.0],
+    q_f=[3.0, -4.0, 3.0, -5.0],
+    v_f=[0.0, 0.0, 0.0, 0.1],
+)
+
+
+def test_dictionaries_and_vectors_make_the_same_run():
+    by_name, flat = vm.simulate(CRANE, **RUN), vm.simulate(FLAT, **RUN)
+    for name, values in vars(flat.states).items():
+        np.testing.assert_array_equal(getattr(by_name.states, name), values)
+    assert jax.tree.map(np.shape, by_name.q_f) == {"hook": (7, 2), "load": (7, 2)}
+    np.testing.assert_array_equal(by_name.q_f["load"], flat.q_f[:, 2:])
+    np.testing.assert_array_equal(by_name.p_s["trolley"], flat.p_s[:, 0])
+    np.testing.assert_array_equal(by_name.v_f["hook"], flat.v_f[:, :2])
+    np.testing.assert_array_equal(by_name.q_f["load"], by_name.position("load"))
+    assert by_name.names.constraint == {"rope": 1}
+    assert by_name.names.fast_coordinates == ["hook x", "hook y", "load x", "load y"]
+
+
+def test_functions_of_one_layout_are_compiled_once():
+    other = dataclasses.replace(
+        CRANE, q_f={"load": [3.0, -5.1], "hook": [3.0, -4.0]}
+    )  # in the order of the first problem
+    assert jax.tree.structure(other.system) == jax.tree.structure(CRANE.system)
+    np.testing.assert_array_equal(other.q_f, [3.0, -4.0, 3.0, -5.1])
+
+
+def test_a_gradient_by_a_start_by_name():
+    def height(y):
+        problem = dataclasses.replace(CRANE, v_f={"load": jnp.stack([0.0, y])})
+        return vm.simulate(problem, **RUN).q_f["load"][-1, 1]
+
+    slope = jax.grad(height)(0.1)
+    numbers = [float(height(jnp.asarray(0.1 + d))) for d in (1e-4, -1e-4)]
+    np.testing.assert_allclose(slope, (numbers[0] - numbers[1]) / 2e-4, rtol=1e-7)  # measured: 3e-9
+
+
+def test_arrays_of_any_shape():
+    def pairs(q_s, q_f, params):
+        return jnp.sum((q_f["atoms"][1:] - q_f["atoms"][:-1]) ** 2) / 2
+
+    def moving(t, q_s, q_f, params):
+        return {"wall": q_f["wall"] - jnp.sin(t)}
+
+    chain = vm.Problem(
+        vm.System(
+            vm.ConstantMass([], {"atoms": [[1.0], [2.0], [3.0]], "wall": 1.0}), pairs, constraint=vm.Rheonomic(moving)
+        ),
+        q_s=[],
+        q_f={"atoms": np.arange(9.0).reshape(3, 3), "wall": 0.0},
+        v_f={"wall": 1.0},
+    )
+    np.testing.assert_array_equal(chain.system.kinetic.fast, [1, 1, 1, 2, 2, 2, 3, 3, 3, 1])
+    run = vm.simulate(chain, vm.fully_implicit(2), macro_dt=0.01, num_steps=3)
+    assert jax.tree.map(np.shape, run.q_f) == {"atoms": (4, 3, 3), "wall": (4,)}
+    assert run.names.constraint == {"wall": 1}
+    np.testing.assert_allclose(run.q_f["wall"], np.sin(run.t), atol=1e-14)
+
+
+def test_layouts_go_through_plain_data():
+    layout = Layout.of("q_f", {"atoms": np.zeros((2, 3)), "wall": 0.0})
+    data = {"shapes": [[name, list(shape)] for name, shape in layout.shapes]}
+    assert Layout.from_dict(data) == layout
+
+
+def problem(**changes):
+    return vm.Problem(
+        **{"system": CRANE_BY_NAME, "q_s": {"trolley": 0.0}, "q_f": {"hook": [3.0, -4.0], "load": [3.0, -5.0]}}
+        | changes
+    )
+
+
+CRANE_BY_NAME = vm.System(vm.ConstantMass(**MASSES), weight, sling, rope, params=PARAMS)
+
+
+def misspelt(q_f, params):
+    return q_f["laod"][0]
+
+
+def unknown_force(t, q_s, q_f, v_s, v_f, params):
+    return {}, {"laod": v_f["load"]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"q_f": {"hook": [3.0, -4.0]}}, "fast has the keys hook, load; give hook"),
+        ({"v_f": {"laod": [0.0, 0.0]}}, "v_f has the keys laod; give hook, load"),
+        ({"v_f": {"load": [0.0, 0.0, 0.0]}}, r"v_f\['load'\] has shape \(3,\); the body has \(2,\)"),
+        ({"q_f": {1: [0.0]}}, "q_f has the key 1"),
+        ({"q_s": [0.0]}, "masses by name, trolley, but the slow coordinates are a vector"),
+        ({"q_s": [0.0], "v_s": {"trolley": 0.0}}, "v_s is a dictionary and q_s is none"),
+        (
+            {"system": CRANE_BY_NAME.replace(fast_potential=misspelt)},
+            "'laod' is not there; q_s has trolley and q_f has hook, load",
+        ),
+        ({"system": CRANE_BY_NAME.replace(force=unknown_force)}, "F_f has the keys laod; give hook, load"),
+    ],
+)
+def test_bad_input(changes, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        problem(**changes)
+
+
+def test_a_system_by_name_needs_a_problem():
+    with pytest.raises(TypeError, match=r"q_f is a dictionary; give Problem"):
+        vm.initial_state(CRANE_BY_NAME, [0.0], {"hook": [3.0, -4.0]}, [0.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match=r"sizes of these bodies are not known"):
+        vm.initial_state(CRANE_BY_NAME, [0.0], [3.0, -4.0, 3.0, -5.0], [0.0], [0.0] * 4)

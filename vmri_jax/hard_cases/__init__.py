@@ -1,0 +1,7 @@
+"""Hard cases put to any system: constraints, energy, tolerance, tiny steps, reversal, known methods, bad input."""
+
+from vmri_jax.hard_cases.case import Case, Outcome
+from vmri_jax.hard_cases.cases import cases_for
+from vmri_jax.hard_cases.report import Report, Row, check, run_cases
+
+__all__ = ["Case", "Outcome", "Report", "Row", "cases_for", "check", "run_cases"]
