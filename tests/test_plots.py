@@ -38,11 +38,7 @@ def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
         return np.sin(t[:, None] * np.arange(1, n + 1))
 
     return vm.Trajectory(
-        t,
-        q_s=wave(n_s),
-        q_f=wave(n_f),
-        p_s=wave(n_s),
-        p_f=wave(n_f),
+        vm.State(t, q_s=wave(n_s), q_f=wave(n_f), p_s=wave(n_s), p_f=wave(n_f)),
         energy=2.0 + 1e-3 * np.sin(t),
         constraint_residual=np.full((num_nodes, 2), 1e-14 if constrained else 0.0),
         info=RunInfo(
@@ -101,7 +97,7 @@ def test_a_trajectory_has_a_panel_for_everything_it_carries():
 
 def test_a_trajectory_cut_short_by_a_failure_is_drawn_up_to_there():
     whole = run(constrained=True)
-    cut = dataclasses.replace(whole, q_s=jnp.asarray(whole.q_s).at[5:].set(jnp.nan))
+    cut = whole.with_arrays(q_s=jnp.asarray(whole.q_s).at[5:].set(jnp.nan))
     drawn = y_data(plots.plot_trajectory(cut).axes[0].lines[0])
     assert np.isfinite(drawn).sum() == 5
 

@@ -5,7 +5,7 @@ import numpy as np
 
 import vmri_jax as vm
 from tests.support import DATA, PROBLEMS
-from vmri_jax.running.trajectory import RunInfo
+from vmri_jax.running.trajectory import RunInfo, from_named_arrays
 
 PENDULUM = {
     "bodies": [
@@ -24,10 +24,10 @@ def trajectory(t, q_s, q_f, p_s=None, p_f=None, energy=None, **fields) -> vm.Tra
     """A run of these nodes that went well."""
     count = len(t)
     defaults = {"result": 0, "failed_at": -1, "constraint_residual": np.zeros((count, 2))}
-    info = RunInfo(*(np.zeros(count - 1, dtype=int) for _ in range(3)))
+    defaults |= dict.fromkeys(RunInfo._fields, np.zeros(count - 1, dtype=int))
     energy = np.ones(count) if energy is None else energy
-    momenta = (q_s if p_s is None else p_s, q_f if p_f is None else p_f)
-    return vm.Trajectory(t, q_s, q_f, *momenta, energy, info=info, **defaults | fields)
+    momenta = {"p_s": q_s if p_s is None else p_s, "p_f": q_f if p_f is None else p_f}
+    return from_named_arrays({"t": t, "q_s": q_s, "q_f": q_f, **momenta, "energy": energy} | defaults | fields)
 
 
 def swinging(count: int = 41, end: float = 4.0, **fields) -> vm.Trajectory:

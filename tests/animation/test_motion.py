@@ -74,13 +74,13 @@ def test_a_failed_run_is_drawn_up_to_its_failure():
     run = swinging()
     broken = np.where(np.arange(41) < 25, 1.0, np.nan)
     fields = {name: getattr(run, name) * broken[:, None] for name in ("q_s", "q_f", "p_s", "p_f")}
-    failed = dataclasses.replace(run, **fields, energy=run.energy * broken, result=4, failed_at=24)
+    failed = run.with_arrays(**fields, energy=run.energy * broken, result=4, failed_at=24)
     moved = motion(failed, Drawing.from_dict(PENDULUM))
     assert len(moved.t) == 25
     assert np.isfinite(moved.points).all()
     assert np.isfinite(moved.velocities).all()
     assert moved.ending == "The run failed in macro step 24, after t = 2.4 (NON_FINITE); it is drawn up to there."
-    nothing = dataclasses.replace(failed, q_s=np.full_like(run.q_s, np.nan))
+    nothing = failed.with_arrays(q_s=np.full_like(run.q_s, np.nan))
     with pytest.raises(ValueError, match="no node with finite positions"):
         motion(nothing, Drawing.from_dict(PENDULUM))
 
@@ -92,8 +92,8 @@ def test_wrong_systems_and_batches_are_refused():
         motion(run, LINE, heavier)
     larger = vm.System(vm.ConstantMass([1.0, 1.0, 1.0], [1.0]), harmonic, stiff)
     with pytest.raises(ValueError, match="does not go with a run of 2 slow and 1 fast"):
-        motion(dataclasses.replace(run, q_s=np.ones((11, 2)), p_s=np.ones((11, 2))), LINE, larger)
-    batch = dataclasses.replace(run, t=np.ones((5, 11)))
+        motion(run.with_arrays(q_s=np.ones((11, 2)), p_s=np.ones((11, 2))), LINE, larger)
+    batch = run.with_arrays(t=np.ones((5, 11)))
     with pytest.raises(ValueError, match=r"batch of shape \(5,\)"):
         motion(batch, LINE)
 

@@ -1,7 +1,5 @@
 """Which signals a strip shows, and during which time."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -65,7 +63,7 @@ def test_what_the_nodes_do_not_resolve_is_not_shown():
 
 def test_bodies_at_rest_have_no_curves():
     run = crane()
-    still = motion(dataclasses.replace(run, q_s=0 * run.q_s, q_f=0 * run.q_f), Drawing.from_dict(DRAWING))
+    still = motion(run.with_arrays(q_s=0 * run.q_s, q_f=0 * run.q_f), Drawing.from_dict(DRAWING))
     assert slow_signal(still) is None
     assert fast_signal(still) is None
     assert not [panel for panel in plot_strip(still, 2).axes if panel.lines]

@@ -13,7 +13,7 @@ from tests.animation.support import swinging
 from vmri_jax.mechanics.names import Names
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.quantities import Work
-from vmri_jax.running.trajectory import RunInfo, know
+from vmri_jax.running.trajectory import RunInfo, with_origin
 from vmri_jax.steppers.results import Result, Status
 
 NAMES = Names(slow={"bob": 2}, fast={"tip": 2}, constraint={"rod": 1})
@@ -37,7 +37,7 @@ def run():
     residual[7] = 1e-14, 2e-13
     info = RunInfo(np.full(40, 3), np.full(40, 4), np.full(40, 1e-15))
     swing = swinging(constraint_residual=residual, result=np.asarray(0), failed_at=np.asarray(-1))
-    return know(eqx.tree_at(lambda run: run.info, swing, info), Origin(NAMES))
+    return with_origin(dataclasses.replace(swing, info=info), Origin(NAMES))
 
 
 def test_a_run_says_what_it_is_and_what_it_has_kept(run):
@@ -55,7 +55,7 @@ def test_a_run_says_what_it_is_and_what_it_has_kept(run):
 def test_a_run_that_failed_says_where(run):
     cut = {name: np.where(np.arange(41)[:, None] > 5, np.nan, getattr(run, name)) for name in ("q_s", "q_f")}
     energy = np.where(np.arange(41) > 5, np.nan, run.energy)
-    failed = dataclasses.replace(run, **cut, energy=energy, result=np.asarray(3), failed_at=np.asarray(5))
+    failed = run.with_arrays(**cut, energy=energy, result=np.asarray(3), failed_at=np.asarray(5))
     assert "status DIVERGED at macro step 5; all saved nodes after it are NaN" in lines_of(failed)
 
 

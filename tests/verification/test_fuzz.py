@@ -16,7 +16,7 @@ from rich.console import Console
 import vmri_jax as vm
 from benchmarks import fuzz
 from tests.verification import random_systems as rs
-from vmri_jax.running.trajectory import RunInfo
+from vmri_jax.running.trajectory import RunInfo, from_named_arrays
 
 # Many draws of each run one program; the structures are chosen to be different ways through a step.
 STRUCTURES = {
@@ -78,11 +78,11 @@ def verdict(**changes) -> str:
         **nodes,
         "energy": np.ones(4),
         "constraint_residual": np.zeros((4, 2)),
-        "info": RunInfo(*np.zeros((3, 3))),
+        **dict.fromkeys(RunInfo._fields, np.zeros(3)),
         "result": 0,
         "failed_at": -1,
     }
-    return fuzz.judge(vm.Trajectory(**fields | changes), 1e-12, num_steps=6)
+    return fuzz.judge(from_named_arrays(fields | changes), 1e-12, num_steps=6)
 
 
 NAN, LAST = np.array([1.0, 1.0, 1.0, np.nan]), {"result": 2, "failed_at": 5}

@@ -23,7 +23,7 @@ import numpy as np
 
 from vmri_jax.running.run_error import RunError, largest_of
 from vmri_jax.running.simulation import Simulation
-from vmri_jax.running.trajectory import Trajectory, from_named_arrays, know
+from vmri_jax.running.trajectory import Trajectory, from_named_arrays
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -74,12 +74,12 @@ def with_error(
     until = np.asarray(trajectory.t)[certified][-1]
     total, slow, fast = (np.where(certified[:, None], a, np.nan) for a in (total, total - fast, fast))
     of_error = None if of is None else _of_error(of, order, trajectory, halved, certified)
-    q_s, q_f = np.split(total, [trajectory.q_s.shape[-1]], axis=1)
+    q_s, q_f = np.split(total, [trajectory.states.q_s.shape[-1]], axis=1)
     shares_at_nodes = largest_of(slow), largest_of(fast)
     error = RunError(q_s, q_f, *shares_at_nodes, of_error, np.asarray(until), np.asarray(growth))
     if not certified.all():
         warnings.warn(f"simulate: {_uncertified(error, trajectory)}", UncertifiedWarning, stacklevel=3)
-    return know(replace(trajectory, error=error), trajectory.origin)
+    return replace(trajectory, error=error)
 
 
 def ratio(order: int) -> float:
@@ -155,7 +155,8 @@ def resting(run: Simulation) -> Trajectory:
     kept = {"energy": np.zeros(k), "constraint_residual": np.zeros((k, 2)), "residual": np.zeros(k - 1)}
     solver = {"method": none, "iterations": none}
     arrays = nodes | kept | solver
-    return from_named_arrays(arrays | {name: np.asarray(value) for name, value in status.items()}).of(run.origin)
+    arrays |= {name: np.asarray(value) for name, value in status.items()}
+    return replace(from_named_arrays(arrays), origin=run.origin)
 
 
 def companion(run: Simulation, scheme: Scheme | Composition, parts: int) -> Trajectory:
@@ -172,7 +173,7 @@ def companion(run: Simulation, scheme: Scheme | Composition, parts: int) -> Traj
 
 def _positions(trajectory: Trajectory) -> np.ndarray:
     """(k, n_s + n_f)"""
-    return np.concatenate([trajectory.q_s, trajectory.q_f], axis=1)
+    return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
 
 
 def _failure(trajectory: Trajectory, run: Simulation) -> float:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from vmri_jax.accuracy.companions import check_function_of_run, with_error
@@ -17,7 +18,7 @@ from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import ShowsProgress
 from vmri_jax.running.simulation import simulation
 from vmri_jax.running.traced import traced_run
-from vmri_jax.running.trajectory import Trajectory, know
+from vmri_jax.running.trajectory import Trajectory, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
@@ -95,7 +96,7 @@ def simulate(
         steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
         end = _end(steps, t_end, save_every, save_micro, adjoint, num_saves)
         best, settings = with_accuracy(system, scheme, state, newton, accuracy, end, num_saves, of)
-        run, trajectory = best.run, know(best.trajectory, best.run.origin._replace(settings=settings))
+        run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
         if int(trajectory.failed_at) < 0:
             return with_error(run, trajectory, of, shares=error, halved=best.halved)
         if throw:
@@ -114,7 +115,7 @@ def simulate(
                 "simulate: error=True compares runs with numbers; call simulate outside of jax.jit, vmap and grad."
             )
         check_system(run.system, run.state.q_s, run.state.q_f)
-        return know(traced_run(run, adjoint), run.origin)
+        return with_origin(traced_run(run, adjoint), run.origin)
     run.check()
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     check_function_of_run(of, error, run)

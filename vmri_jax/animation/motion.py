@@ -117,8 +117,8 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
             f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
         )
     check_type("motion: drawing", drawing, Drawing, "a Drawing, e.g. Drawing.from_dict(problem.drawing)")
-    system = system or trajectory.origin.system
-    q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.q_s, trajectory.q_f, trajectory.t))
+    system = system or (trajectory.origin.system() if trajectory.origin.knows_system else None)
+    q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.states.q_s, trajectory.states.q_f, trajectory.t))
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
     count = len(t) if finite.all() else int(np.argmin(finite))
     if count == 0:
@@ -154,7 +154,7 @@ def _energies(trajectory: Trajectory, count: int, system: System | None) -> tupl
     energy = np.asarray(trajectory.energy, dtype=float)[:count]
     change = energy - energy[0]
     if system is not None and not system.keeps_energy:
-        known = trajectory if trajectory.origin.system is not None else trajectory.of(system)
+        known = trajectory if trajectory.origin.knows_system else trajectory.of(system)
         work = known[:count].work()
         parts = {"work of forces": work.forces, "work of moving constraints": work.constraints}
         done = {name: values for name, values in parts.items() if np.any(values != 0)}
@@ -173,7 +173,7 @@ def _differences(t, values) -> np.ndarray:
 
 def _velocities(system: System, trajectory: Trajectory, count: int) -> np.ndarray:
     """(count, n_s + n_f) velocities of the momenta."""
-    phase = [jnp.asarray(a)[:count] for a in (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)]
+    phase = [jnp.asarray(a)[:count] for a in tuple(vars(trajectory.states).values())[1:]]
     try:
         start = float(diagnostics.energy(system, *(a[0] for a in phase)))
         v_s, v_f = jax.jit(jax.vmap(partial(diagnostics.velocity, system)))(*phase)
@@ -203,7 +203,7 @@ def _with_micro_nodes(trajectory: Trajectory, t, q, v) -> tuple[np.ndarray, np.n
     steps = len(t) - 1
     if trajectory.t_micro is None or why_not(t, trajectory.t_micro[:steps]):
         return t, q, v
-    n_s = np.shape(trajectory.q_s)[1]
+    n_s = np.shape(trajectory.states.q_s)[1]
     nodes = Nodes(t, q[:, :n_s], q[:, n_s:], v[:, :n_s], v[:, n_s:])
-    every = with_micro_nodes(nodes, trajectory.t_micro[:steps], trajectory.q_f_micro[:steps])
+    every = with_micro_nodes(nodes, trajectory.t_micro[:steps], trajectory.micro.q_f[:steps])
     return every.t, np.concatenate([every.q_s, every.q_f], axis=1), np.concatenate([every.v_s, every.v_f], axis=1)

@@ -70,7 +70,7 @@ def animate(
 def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
     """Of a saved run, with the first drawing there is."""
     (trajectory, description), problem = _load(run), None if system is None else find_problem(system)
-    sizes = [np.shape(a)[-1] for a in (trajectory.q_s, trajectory.q_f)]
+    sizes = [np.shape(a)[-1] for a in (trajectory.states.q_s, trajectory.states.q_f)]
     if problem is not None and sizes != [np.size(problem.q_s), np.size(problem.q_f)]:
         raise ValueError(
             f"--system {system} has {np.size(problem.q_s)} slow and {np.size(problem.q_f)} fast coordinates, the run "

@@ -135,7 +135,9 @@ def started(search: Search, start, num_steps: int, num_controls: int, grid: str)
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
     """Nodes and controls of another optimum at the times of this one."""
     run, m = start.trajectory, start.controls.shape[-1]
-    known = np.concatenate([np.asarray(x) for x in (run.q_s, run.q_f, run.p_s, run.p_f)], axis=1)
+    known = np.concatenate(
+        [np.asarray(x) for x in (run.states.q_s, run.states.q_f, run.states.p_s, run.states.p_f)], axis=1
+    )
     duration, asked = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
     if abs(duration - asked) > 1e-9 * asked:
         raise ValueError(f"minimize: start is an Optimum over {duration:g}; this one is over {asked:g}.")

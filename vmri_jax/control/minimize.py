@@ -159,8 +159,7 @@ def _trajectory(setup: Transcription, z, status: Status) -> Trajectory:
     phases = nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f
     failed = np.flatnonzero(np.asarray(status.result) > Result.CONVERGED_AT_ROUNDOFF)
     return Trajectory(
-        nodes.t,
-        *phases,
+        nodes,
         energy=jax.vmap(lambda *z: invariants.energy(setup.system, *z))(*phases),
         constraint_residual=jax.vmap(lambda s: invariants.constraint_residual(setup.system, s))(nodes),
         info=RunInfo(status.method, status.iterations, status.residual),

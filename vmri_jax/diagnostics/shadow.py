@@ -100,7 +100,7 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     whole_number("shadow_energy: k", k)
     system = _checked(system, scheme, trajectory, k)
     t = np.asarray(trajectory.t)
-    nodes = State(*(jnp.asarray(a) for a in (t, trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)))
+    nodes = State(*(jnp.asarray(a) for a in (t, *list(vars(trajectory.states).values())[1:])))
     macro_dt = (t[-1] - t[0]) / (len(t) - 1)
     actions, missed, result = _actions(system, scheme, nodes, macro_dt)
     if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(missed) < MISSED:
@@ -118,7 +118,7 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
 
 
 def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajectory, k: int) -> System:
-    nodes = (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)
+    _, *nodes = vars(trajectory.states).values()
     start = State(trajectory.t[..., 0], *(a[..., 0, :] for a in nodes))
     system, _ = start_of("shadow_energy", system, start)
     if system.force is not None or system.is_rheonomic:

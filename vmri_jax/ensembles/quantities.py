@@ -193,7 +193,8 @@ def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
         t, q_s, q_f = jnp.zeros(2), jnp.zeros((2, n_s)), jnp.zeros((2, n_f))
         info = RunInfo(jnp.zeros(1, dtype=int), jnp.zeros(1, dtype=int), jnp.zeros(1))
         status = jnp.zeros((), dtype=int)
-        run = Trajectory(t, q_s, q_f, q_s, q_f, t, jnp.zeros((2, 2)), info, status, status).of(problem)
+        nodes = State(t, q_s, q_f, q_s, q_f)
+        run = Trajectory(nodes, t, jnp.zeros((2, 2)), info, status, status).of(problem)
         dimensions.update({name: one.dimensions for name, one in kept(quantities, run).items()})
 
     jax.eval_shape(shapes)

@@ -172,7 +172,7 @@ class Shooting:
             throw=False,
             adjoint="stored",
         )
-        nodes = State(run.t, run.q_s, run.q_f, run.p_s, run.p_f)
+        nodes = run.states
         observed = [jax.vmap(m.observe)(nodes) for m in self.data]
         return observed, _phase(problem, jax.tree.map(lambda a: a[-1], nodes))
 

@@ -65,7 +65,7 @@ class Resolved:
         state, system = self.problem.state(), self.problem.system
         trajectory = run(self.problem, self.scheme, self.macro_dt, 10_000 if full else 1_000, save_every=10)
         jacobian = jax.jit(jax.vmap(jax.jacrev(system.constraints, argnums=(1, 2))))
-        jacobians = jacobian(trajectory.t, trajectory.q_s, trajectory.q_f)
+        jacobians = jacobian(trajectory.t, trajectory.states.q_s, trajectory.states.q_f)
         rows = np.concatenate([np.asarray(a) for a in jacobians], axis=2)
         rows = rows[np.isfinite(rows).all(axis=(1, 2))]
         rows = rows / np.linalg.norm(rows, axis=2, keepdims=True)

@@ -97,7 +97,7 @@ def energy_scale(problem: Problem, trajectory: Trajectory) -> float:
     """Size of the energies of a run: the larger of ``|E_0|`` and the largest kinetic energy, at least 1e-300."""
     still = problem.system.replace(slow_potential=None, fast_potential=None, potentials=None)
     kinetic = jax.vmap(partial(diagnostics.energy, still))
-    phase = (trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f)
+    _, *phase = vars(trajectory.states).values()
     return max(float(np.nanmax(kinetic(*phase))), float(abs(trajectory.energy[0])), 1e-300)
 
 

@@ -100,7 +100,7 @@ def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Th
         theme: colours.
     """
     t = np.asarray(trajectory.t)
-    energies = np.asarray(oscillatory_energies(omega, trajectory.q_f, trajectory.p_f))
+    energies = np.asarray(oscillatory_energies(omega, trajectory.states.q_f, trajectory.states.p_f))
     with new_figure(7.2, 3.4, title, theme) as figure:
         axes = figure.subplots()
         axes.plot(t, energies.sum(axis=1), color=theme.ink, linewidth=1.0, label=r"$I = \sum I_i$")
@@ -120,8 +120,8 @@ def position_panels(run: Run) -> list[tuple[np.ndarray, list[str], str, np.ndarr
     names, error = run.names, getattr(run, "error", None)
     slow, fast = (None, None) if error is None else (error.q_s, error.q_f)
     panels = (
-        (run.q_s, names.positions("s"), names.slow_coordinates, r"slow positions $q_s$", slow),
-        (run.q_f, names.positions("f"), names.fast_coordinates, r"fast positions $q_f$", fast),
+        (run.states.q_s, names.positions("s"), names.slow_coordinates, r"slow positions $q_s$", slow),
+        (run.states.q_f, names.positions("f"), names.fast_coordinates, r"fast positions $q_f$", fast),
     )
     return [
         (

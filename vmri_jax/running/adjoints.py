@@ -24,7 +24,7 @@ from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.engine import Engine
-from vmri_jax.running.trajectory import NODES, Trajectory
+from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton.implicit import only_once
@@ -158,15 +158,14 @@ def reversible(run, engine: Engine, save_every: int, arrays) -> Trajectory:
 
 def _run_and_nodes(run, engine: Engine, save_every: int, arrays):
     trajectory = run(arrays)
-    return trajectory, (arrays, State(*(getattr(trajectory, name) for name in ("t", "q_s", "q_f", "p_s", "p_f"))))
+    return trajectory, (arrays, trajectory.states)
 
 
 def _stepped_back(run, engine: Engine, save_every: int, kept, cotangent: Trajectory):
     """Cotangents of (leaves, start, macro_dt)."""
     (leaves, _, macro_dt), nodes = only_once(kept)
-    at_nodes = tuple(getattr(cotangent, name) for name in NODES)
-    at_micro = (cotangent.q_f_micro, cotangent.t_micro) if engine.save_micro else None
-    by_real, by_state, by_dt = _back(engine, save_every, leaves, macro_dt, nodes, at_nodes, at_micro)
+    at_nodes = (*vars(cotangent.states).values(), cotangent.energy, cotangent.constraint_residual)
+    by_real, by_state, by_dt = _back(engine, save_every, leaves, macro_dt, nodes, at_nodes, cotangent.micro)
     by_leaves = [by_real[i] if i in by_real else _no_cotangent(leaf) for i, leaf in enumerate(leaves)]
     return ((by_leaves, tuple(vars(by_state).values()), by_dt),)
 
@@ -218,7 +217,7 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_no
     by_micro = jnp.zeros((engine.num_saves, len(times), nodes.q_f.shape[1]))
     by_dt = jnp.zeros(())
     if at_micro is not None:
-        by_micro, t_micro = at_micro
+        t_micro, by_micro = at_micro
         at_nodes = (at_nodes[0].at[1:].add(t_micro.sum(1)), *at_nodes[1:])
         by_dt -= jnp.sum(t_micro * (1 - times))
     before, after = (jax.tree.map(lambda a, part=part: a[part], nodes) for part in (slice(-1), slice(1, None)))

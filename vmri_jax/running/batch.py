@@ -16,7 +16,7 @@ from vmri_jax.running.engine import Engine
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import Working
 from vmri_jax.running.simulation import Simulation, simulation
-from vmri_jax.running.trajectory import Trajectory, from_arrays
+from vmri_jax.running.trajectory import Trajectory, from_arrays, with_origin
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
@@ -119,7 +119,7 @@ def simulate_batch(
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
     if warn:
         _warn_of_failures(trajectory)
-    return trajectory.of(run.origin if params is None else run.origin._replace(params=params, lanes=True))
+    return with_origin(trajectory, run.origin.repeated((lanes,), params))
 
 
 def _warn_of_failures(trajectory: Trajectory) -> None:

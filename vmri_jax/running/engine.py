@@ -18,7 +18,7 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.loops import PLAIN, WHOLE, Loops, Recursive, Stored
 from vmri_jax.running.saved import Node, Saved
-from vmri_jax.running.trajectory import RunInfo, Trajectory
+from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
 
@@ -161,9 +161,9 @@ class Engine:
         first, at = _node(system, tolerance, at)
         at, (nodes, info, micros) = loops.scan(save, at, self.num_saves)
         nodes = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, nodes)
-        t_micro = None if micros is None else nodes.t[1:, None] - _before_end(stepper.scheme, macro_dt)
-        status = {"result": at.result, "failed_at": at.failed_at}
-        return Trajectory(*nodes, info=info, **status, t_micro=t_micro, q_f_micro=micros)
+        before_end = _before_end(stepper.scheme, macro_dt)
+        micro = None if micros is None else MicroNodes(nodes.state.t[1:, None] - before_end, micros)
+        return Trajectory(*nodes, info=info, result=at.result, failed_at=at.failed_at, micro=micro)
 
     def _interval(self, stepper: Plan, state: State, t_start, macro_dt, loops: Loops):
         """``at, info, micro = interval(at, count)``: the macro steps between two saved nodes."""
@@ -272,5 +272,6 @@ def _node(system: System, tolerance, at: _At) -> tuple[Node, _At]:
     cause = jnp.where(finite, violated, Result.NON_FINITE)
     result = jnp.where(breaks, cause, at.result)
     failed_at = jnp.where(breaks, jnp.maximum(at.step - 1, 0), at.failed_at)
-    values = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))
-    return Node(jnp.asarray(state.t), *values), at._replace(result=result, failed_at=failed_at)
+    *phase, energy, residual = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))
+    node = Node(State(jnp.asarray(state.t), *phase), energy, residual)
+    return node, at._replace(result=result, failed_at=failed_at)

@@ -35,6 +35,8 @@ DIMENSIONS = {
     "q_f_micro": ("t", "micro", "fast"),
 }
 """Names of the axes of all arrays with a row for each saved node."""
+MICRO = "t_micro", "q_f_micro"
+"""Names of the arrays of micro nodes."""
 FILL = {"f": np.nan, "i": -1}
 """Values where there are none, by kind of number: of what a run did before its start, and of rows that are not there yet."""
 
@@ -45,10 +47,16 @@ def rows_of(run: "Trajectory") -> dict[str, np.ndarray]:
     Args:
         run: one run, or a batch.
     """
-    known = {name: getattr(run, name, None) for name in DIMENSIONS} | run.info._asdict()
-    error = getattr(run, "error", None)
-    if error is not None:
-        known |= {name: getattr(error, name.removeprefix("error_")) for name in DIMENSIONS if name.startswith("error_")}
+    known = (
+        dict(vars(run.states))
+        | run.info._asdict()
+        | ({} if run.micro is None else dict(zip(MICRO, run.micro, strict=True)))
+    )
+    known |= {"energy": run.energy, "constraint_residual": run.constraint_residual}
+    if run.error is not None:
+        known |= {
+            name: getattr(run.error, name.removeprefix("error_")) for name in DIMENSIONS if name.startswith("error_")
+        }
     arrays = {name: np.asarray(value) for name, value in known.items() if value is not None}
     axis = arrays["t"].ndim - 1
     for name, array in arrays.items():
@@ -75,8 +83,8 @@ class Exports(Quantities):
             raise ValueError("columns: this is a batch of runs; take one of them, run.lane(i).")
         rows = rows_of(run)
         parts = [("", rows["q_s"], rows["q_f"]), ("p ", rows["p_s"], rows["p_f"])]
-        if run.origin.system is not None:
-            parts.insert(1, ("v ", np.asarray(run.v_s), np.asarray(run.v_f)))
+        if run.origin.knows_system:
+            parts.insert(1, ("v ", *map(np.asarray, run.velocities)))
         found = {"t": rows["t"]}
         for letter, slow, fast in parts:
             labels = [*names.slow_coordinates, *names.fast_coordinates]

@@ -28,9 +28,9 @@ def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micr
 
 def _jump(trajectory: Trajectory, macro_dt, save_every: int) -> str:
     """The sentence about a force that jumps in the failing step or the one after it; empty where none does."""
-    system, interval = trajectory.origin.system, int(trajectory.failed_at) // save_every
-    if system is None or np.ndim(trajectory.t) != 1:
+    if not trajectory.origin.knows_system or np.ndim(trajectory.t) != 1:
         return ""
+    system, interval = trajectory.origin.system(), int(trajectory.failed_at) // save_every
     last = trajectory[interval]
     steps = int(trajectory.failed_at) - interval * save_every + 2
     return in_words(jump_ahead(system, last, steps * float(macro_dt)), trajectory.names)

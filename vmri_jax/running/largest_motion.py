@@ -106,8 +106,9 @@ def what_moves_most(trajectory, step: int, save_every: int, macro_dt: float, num
         save_every: macro steps from one node to the next.
         macro_dt, num_micro: of the run.
     """
-    if trajectory.origin.system is None:
+    if not trajectory.origin.knows_system:
         return ""
-    system = trajectory.origin.known_system.replace(params=trajectory.origin.params)
-    motion = largest_motion(system, trajectory[step // save_every], trajectory.names, macro_dt, num_micro)
+    motion = largest_motion(
+        trajectory.origin.system(), trajectory[step // save_every], trajectory.names, macro_dt, num_micro
+    )
     return "" if motion is None else motion.sentence(macro_dt)

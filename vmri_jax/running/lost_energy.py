@@ -36,8 +36,10 @@ def lost_energy(run: Trajectory, macro_dt: float) -> str:
         run: one run, without a failure, that knows its system; of constant masses, else nothing is said.
         macro_dt: step H.
     """
-    system = run.origin.system
-    if system is None or not system.keeps_energy or not isinstance(system.kinetic, ConstantMass):
+    if not run.origin.knows_system:
+        return ""
+    system = run.origin.system()
+    if not system.keeps_energy or not isinstance(system.kinetic, ConstantMass):
         return ""
     energy = np.asarray(run.energy)
     change = np.abs(energy - energy[0])
@@ -45,8 +47,8 @@ def lost_energy(run: Trajectory, macro_dt: float) -> str:
     if not change[worst] > ROUNDOFF * np.abs(energy).max():
         return ""
     nodes = np.unique(np.append(np.linspace(0, len(energy) - 1, LOOKED_AT).astype(int), worst))
-    slow = _kinetic(system.kinetic.slow_mass, np.asarray(run.p_s)[nodes])
-    fast = _kinetic(system.kinetic.fast_mass, np.asarray(run.p_f)[nodes])
+    slow = _kinetic(system.kinetic.slow_mass, np.asarray(run.states.p_s)[nodes])
+    fast = _kinetic(system.kinetic.fast_mass, np.asarray(run.states.p_f)[nodes])
     kinetic = (slow + fast).max()
     if not change[worst] > max(LOST * kinetic, _kinetic_of_roundoff(run, macro_dt)):
         return ""
@@ -68,9 +70,9 @@ def _kinetic(mass, p: np.ndarray) -> np.ndarray:
 
 def _kinetic_of_roundoff(run: Trajectory, macro_dt: float) -> float:
     """Kinetic energy of velocities that round-off of the positions makes in the steps of a run."""
-    mass, t = run.origin.known_system.kinetic, np.asarray(run.t)
+    mass, t = run.origin.system().kinetic, np.asarray(run.t)
     steps = float(t[-1] - t[0]) / macro_dt
-    position = max(np.abs(q).max(initial=0.0) for q in (np.asarray(run.q_s), np.asarray(run.q_f)))
+    position = max(np.abs(q).max(initial=0.0) for q in (np.asarray(run.states.q_s), np.asarray(run.states.q_f)))
     total = sum(float(jnp.trace(part.matrix)) for part in (mass.slow_mass, mass.fast_mass))
     return total * steps * (DIGITS * position / macro_dt) ** 2 / 2
 

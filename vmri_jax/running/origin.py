@@ -1,6 +1,9 @@
-"""What a run is of: its system and the names of its parts, and functions of a state at all of its nodes."""
+"""The origin of a run: its system and the names of its parts, and functions of a state at all of its nodes."""
 
-from typing import Any, NamedTuple
+import pickle
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,77 +11,115 @@ import numpy as np
 
 from vmri_jax.mechanics.checks import check_system
 from vmri_jax.mechanics.names import Names
+from vmri_jax.mechanics.rows import Part
 from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.settings import Settings
 
 
-class Origin(NamedTuple):
-    """What a run is of, as far as it is known.
+@partial(jax.tree_util.register_dataclass, data_fields=["bare", "params"], meta_fields=["names", "settings"])
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """The origin of a run, as far as it is known; a pytree, whose arrays have the lanes of a batch of runs as their first axes.
 
-    names: of bodies and constraints, None if nothing has one.
-    system: what moved; None of a run that was read from a file.
-    params: parameters of the run, as of its system.
-    lanes: whether these have a batch axis.
-    settings: scheme and steps, where they were chosen for an accuracy.
+    Attributes:
+        names: of bodies and constraints, None if nothing has one.
+        bare: the system that moved, without its parameters; None of a run that was read from a file.
+        params: parameters of the run, as of its system.
+        settings: scheme and steps, where they were chosen for an accuracy.
     """
 
     names: Names | None = None
-    system: System | None = None
+    bare: System | None = None
     params: Any = None
-    lanes: bool = False
     settings: Settings | None = None
 
     @classmethod
-    def of(cls, what: System | Problem | HasProblem) -> "Origin":
-        """That of a system, a problem or a scene."""
-        names = names_of(what)
-        system = opened(what)
+    def of(cls, moving: System | Problem | HasProblem) -> "Origin":
+        """The origin of runs of a system, a problem or a scene."""
+        names = names_of(moving)
+        system = opened(moving)
         system = system.system if isinstance(system, Problem) else system
         if not isinstance(system, System):
-            raise TypeError(f"of: got {type(what).__name__}; give the vmri_jax.System, Problem or Scene of the run.")
-        return cls(names, system, system.params)
+            raise TypeError(f"of: got {type(moving).__name__}; give the vmri_jax.System, Problem or Scene of the run.")
+        return cls(names, _with_params(system, None), system.params)
 
     @classmethod
     def named(cls, names: dict | None) -> "Origin":
-        """That of a run of which only the names are known, from plain data."""
+        """The origin of a run of which only the names are known, from plain data."""
         return cls(None if names is None else Names.from_dict(names))
 
+    def repeated(self, lanes: tuple[int, ...], params: Any = None) -> "Origin":
+        """The same for a batch of runs: every array is repeated, without copies.
+
+        Args:
+            lanes: shape of the batch.
+            params: parameters that differ between lanes, of one lane each; None where all have the same.
+        """
+        if not lanes:
+            return self
+
+        def of_all(tree):
+            return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (*lanes, *np.shape(leaf))), tree)
+
+        return replace(self, bare=of_all(self.bare), params=of_all(self.params) if params is None else params)
+
     @property
-    def known_system(self) -> System:
-        """The system.
+    def knows_system(self) -> bool:
+        """Whether the system is known."""
+        return self.bare is not None
+
+    def system(self, axes: int = 0) -> System:
+        """The system with the parameters of the run; of a batch of runs that of its first lane.
+
+        Args:
+            axes: number of axes of lanes.
 
         Raises:
             ValueError: it is not known.
         """
-        if self.system is None:
+        if self.bare is None:
             raise ValueError(
-                "this run does not know its system, since it was read from a file or went through a transformation of JAX. "
-                "Give it: run.of(problem), with the Problem, Scene or System that was simulated."
+                "this run does not know its system, since it was read from a file, or pickled with functions that Python cannot "
+                "pickle. Give it: run.of(problem), with the Problem, Scene or System that was simulated."
             )
-        return self.system
+        bare, params = (
+            jax.tree.map(lambda leaf: leaf[(0,) * axes], (self.bare, self.params)) if axes else (self.bare, self.params)
+        )
+        return _with_params(bare, params)
+
+    def shaped(self, part: Part, vectors):
+        """Vectors (..., n) as the user gave the start: vectors, or a dictionary of arrays."""
+        return vectors if self.names is None else self.names.shaped(part, vectors)
 
     def check(self, n_s: int, n_f: int) -> None:
         """Refuse a system of other coordinates than the run.
 
         Raises:
-            ValueError: with what does not fit.
+            ValueError: with the numbers that do not fit.
         """
         try:
-            check_system(self.known_system, np.zeros(n_s), np.zeros(n_f))
+            check_system(self.system(), np.zeros(n_s), np.zeros(n_f))
         except ValueError as error:
             raise ValueError(f"of: the run has {n_s} slow and {n_f} fast coordinates. {error}") from None
 
-    def lane(self, i: int) -> "Origin":
-        """That of one run of a batch."""
-        if not self.lanes:
-            return self
-        return self._replace(params=jax.tree.map(lambda a: a[i], self.params), lanes=False)
+    def __getstate__(self) -> dict:
+        """All of it, or the names alone where Python cannot pickle a function of the system, as of a lambda."""
+        state = dict(vars(self))
+        try:
+            pickle.dumps(self.bare)
+        except (pickle.PicklingError, AttributeError, TypeError):
+            state |= {"bare": None, "params": None}
+        return state
 
 
-def names_of(what: Any) -> Names | None:
+UNKNOWN = Origin()
+"""The origin of a run of which nothing is known."""
+
+
+def names_of(moving: Any) -> Names | None:
     """The names that a problem or a scene has."""
-    return getattr(what, "names", None)
+    return getattr(moving, "names", None)
 
 
 def at_nodes(function, origin: Origin, nodes, *static):
@@ -94,14 +135,29 @@ def at_nodes(function, origin: Origin, nodes, *static):
         ValueError: the system is not known.
     """
     axes = jax.tree.leaves(nodes)[0].ndim
-    return _mapped(function, axes, origin.lanes, static, origin.known_system, origin.params, nodes)
+    origin.system(axes - 1)  # refuses one that is not known
+    arrays, structure = jax.tree.flatten((origin.bare, origin.params))
+    repeated = tuple(_is_repeated(array, axes - 1) for array in arrays)
+    arrays = [array[(0,) * (axes - 1)] if once else array for array, once in zip(arrays, repeated, strict=True)]
+    return _mapped(function, axes, repeated, structure, static, arrays, nodes)
+
+
+def _is_repeated(array, axes: int) -> bool:
+    """Whether an array of NumPy is one array for all lanes, as `Origin.repeated` makes it."""
+    return isinstance(array, np.ndarray) and axes > 0 and not any(array.strides[:axes])
 
 
 @eqx.filter_jit
-def _mapped(function, axes: int, lanes: bool, static: tuple, system: System, params, nodes):
-    def at(params, node):
-        return function(system.replace(params=params), node, *static)
+def _mapped(function, axes: int, repeated: tuple[bool, ...], structure, static: tuple, arrays: list, nodes):
+    def at(arrays, node):
+        return function(_with_params(*jax.tree.unflatten(structure, arrays)), node, *static)
 
     for axis in range(axes):
-        at = jax.vmap(at, (0 if axis == 1 and lanes else None, 0))
-    return at(params, nodes)
+        lanes = [None if axis == 0 or once else 0 for once in repeated]  # the innermost axis is that of the nodes
+        at = jax.vmap(at, (lanes, 0))
+    return at(arrays, nodes)
+
+
+def _with_params(system: System, params) -> System:
+    """The same system with other parameters, without the checks of its constructor."""
+    return eqx.tree_at(lambda system: system.params, system, params, is_leaf=lambda leaf: leaf is None)

@@ -80,27 +80,32 @@ class Quantities(ABC):
     def names(self) -> Names:
         """Names of bodies, coordinates and constraints, plain ones where none are known."""
         run, origin = self.whole(), self.origin
-        n_s, n_f = run.q_s.shape[-1], run.q_f.shape[-1]
-        given = origin.names or Names()
-        if origin.system is None:
-            return given.of_coordinates(n_s, n_f)
-        return given.of(origin.system, n_s, n_f)
+        n_s, n_f = run.states.q_s.shape[-1], run.states.q_f.shape[-1]
+        names = origin.names or Names()
+        if not origin.knows_system:
+            return names.of_coordinates(n_s, n_f)
+        return names.of(origin.system(np.ndim(run.t) - 1), n_s, n_f)
 
     @property
     def keeps_energy(self) -> bool | None:
         """Whether the energy of the system is constant; None if the system is not known."""
-        system = self.origin.system
-        return None if system is None else system.keeps_energy
+        origin = self.origin
+        return origin.bare.keeps_energy if origin.bare is not None else None
 
     @property
     def v_s(self):
         """Slow velocities, shaped like q_s."""
-        return _velocities(self.whole())[0]
+        return self.origin.shaped("s", self.velocities[0])
 
     @property
     def v_f(self):
         """Fast velocities, shaped like q_f."""
-        return _velocities(self.whole())[1]
+        return self.origin.shaped("f", self.velocities[1])
+
+    @property
+    def velocities(self):
+        """Vectors (..., k, n_s) and (..., k, n_f) of all velocities."""
+        return _velocities(self.whole())
 
     def position(self, body: str):
         """Positions (..., k, size) of a body, or of a coordinate that has a name.
@@ -112,7 +117,7 @@ class Quantities(ABC):
             ValueError: no body of this name.
         """
         run = self.whole()
-        return _of_body(run, body, _bodies, run.q_s, run.q_f)
+        return _of_body(run, body, _bodies, run.states.q_s, run.states.q_f)
 
     def momentum(self, body: str):
         """Momenta of a body at the saved nodes, (..., k, size); in joint coordinates of a rigid body ``M v`` of itself alone.
@@ -127,7 +132,7 @@ class Quantities(ABC):
         names = run.names
         if names.kinematics is not None and body in names.rigid:  # p of a root is that of all it carries
             return _part(at_nodes(_body_momenta, run.origin, run.states, names.kinematics), names.place_of(body))
-        return _of_body(run, body, _body_momenta, run.p_s, run.p_f)
+        return _of_body(run, body, _body_momenta, run.states.p_s, run.states.p_f)
 
     def velocity(self, body: str):
         """Velocities (..., k, size) of a body, or of a coordinate that has a name.
@@ -179,7 +184,7 @@ class Quantities(ABC):
             raise ValueError(f"reaction_forces: {unknown('constraint', constraint, names.rows)}{hint}")
         rows = tuple(names.rows[constraint])
         forces, touched = at_nodes(reaction_force, run.origin, _states(run, micro), rows)
-        n_s = run.q_s.shape[-1]
+        n_s = run.states.q_s.shape[-1]
         parts = {"s": (forces[..., :n_s], touched[..., :n_s]), "f": (forces[..., n_s:], touched[..., n_s:])}
         found = {}
         for name, (part, start, size) in names.bodies.items():
@@ -290,13 +295,13 @@ def _states(run: "Trajectory", micro: bool, every: bool = False) -> State:
 
 def _all_nodes(run: "Trajectory") -> Nodes:
     """Times, positions and velocities at all nodes, macro and micro, in order; NaN after a failure."""
-    nodes = Nodes(*(np.asarray(a) for a in (run.t, run.q_s, run.q_f, *_velocities(run))))
+    nodes = Nodes(*(np.asarray(a) for a in (run.t, run.states.q_s, run.states.q_f, *_velocities(run))))
     finite = np.isfinite(np.column_stack(nodes)).all(axis=1)
     count = len(nodes.t) if np.all(finite) else int(np.argmin(finite))
     if count < 2:
         raise ValueError("micro nodes: the run failed in its first step; there are none.")
     kept = Nodes(*(a[:count] for a in nodes))
-    found = with_micro_nodes(kept, run.t_micro[: count - 1], run.q_f_micro[: count - 1])
+    found = with_micro_nodes(kept, run.t_micro[: count - 1], run.micro.q_f[: count - 1])
     missing = (len(nodes.t) - count) * run.t_micro.shape[1]
     return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in found))
 

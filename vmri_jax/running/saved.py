@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
-from vmri_jax.running.trajectory import RunInfo, Trajectory
+from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
 
 NUMBERS = 2**17
 """Numbers in the nodes of a piece of a run, a megabyte. With more of them processes with many systems need more memory, with fewer long
@@ -24,11 +24,7 @@ OTHERS, DONE = 4, len(RunInfo._fields)
 class Node(NamedTuple):
     """Fields of a `Trajectory` at a node."""
 
-    t: Float[Numbers, "*k"]
-    q_s: Float[Numbers, "*k n_s"]
-    q_f: Float[Numbers, "*k n_f"]
-    p_s: Float[Numbers, "*k n_s"]
-    p_f: Float[Numbers, "*k n_f"]
+    state: State
     energy: Float[Numbers, "*k"]
     constraint_residual: Float[Numbers, "*k 2"]
 
@@ -52,7 +48,7 @@ class Saved(NamedTuple):
 
     def write(self, number, node: Node, info: RunInfo, micro) -> "Saved":
         """With node `number`; number 0 is the start, which has no micro nodes before it."""
-        row = jnp.concatenate([jnp.ravel(jnp.asarray(a, float)) for a in (*node, *info)])
+        row = jnp.concatenate([jnp.ravel(jnp.asarray(a, float)) for a in jax.tree.leaves((node, info))])
         rows = jax.lax.dynamic_update_index_in_dim(self.rows, row, number, 0)
         micros = self.micros
         if micros is not None:
@@ -85,10 +81,8 @@ class Saved(NamedTuple):
         t = module.where(module.isnan(t[:, 0]), times, t[:, 0])
         method, iterations, left = did[1:].T
         info = RunInfo(method.astype(int), iterations.astype(int), left)
-        t_micro = None if self.micros is None else t[1:, None] - before_end
-        return Trajectory(
-            t, q_s, q_f, p_s, p_f, energy[:, 0], residual, info, **status, t_micro=t_micro, q_f_micro=self.micros
-        )
+        micro = None if self.micros is None else MicroNodes(t[1:, None] - before_end, self.micros)
+        return Trajectory(State(t, q_s, q_f, p_s, p_f), energy[:, 0], residual, info, **status, micro=micro)
 
 
 def _numbers(state: State) -> int:

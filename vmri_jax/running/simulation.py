@@ -26,7 +26,7 @@ from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import ShowsProgress, Working, progress_to
 from vmri_jax.running.saved import room_of_a_piece
 from vmri_jax.running.summaries import summary_of_prepared
-from vmri_jax.running.trajectory import Trajectory, from_arrays, join, know
+from vmri_jax.running.trajectory import Trajectory, from_arrays, join, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.newton import Newton
@@ -98,15 +98,15 @@ class Simulation:
             SimulationError: a step failed.
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
-        origin = self.origin if params is None else self.origin._replace(params=params)
+        origin = self.origin if params is None else replace(self.origin, params=params)
         with Working(STEPPING):
             arrays = self._program(False)(*arguments)
-        trajectory = know(from_arrays(arrays), origin)
+        trajectory = with_origin(from_arrays(arrays), origin)
         if int(trajectory.failed_at) < 0:
             return trajectory
         if self._fallback_helps(trajectory):
             with Working(FALLING_BACK):
-                trajectory = know(from_arrays(self._program(True)(*arguments)), origin)
+                trajectory = with_origin(from_arrays(self._program(True)(*arguments)), origin)
         if throw and int(trajectory.failed_at) >= 0:
             raise simulation_error(trajectory, arguments[2], arguments[3], self.scheme.num_micro)
         return trajectory
@@ -190,8 +190,8 @@ class Simulation:
 
     @cached_property
     def origin(self) -> Origin:
-        """What its trajectory is of."""
-        return Origin(self.names, self.system, self.system.params)
+        """The origin of its trajectories."""
+        return replace(Origin.of(self.system), names=self.names)
 
     @cached_property
     def start_arrays(self) -> tuple:
@@ -276,7 +276,7 @@ class Simulation:
 
     def _joined(self, pieces: list[Trajectory]) -> Trajectory:
         """One run, as arrays of JAX; `jax.numpy.asarray` would compile a program for every length."""
-        return know(jax.device_put(join(pieces)), self.origin)
+        return with_origin(jax.device_put(join(pieces)), self.origin)
 
 
 def prepare(

@@ -52,7 +52,7 @@ def summary_of_prepared(run: "Simulation") -> str:
 
 def named_coordinates(names: Names | None, run: "Trajectory") -> dict[str, str]:
     """Lines on the slow and the fast coordinates of a run by name, plain names where none are known."""
-    names = (names or Names()).of_coordinates(run.q_s.shape[-1], run.q_f.shape[-1])
+    names = (names or Names()).of_coordinates(run.states.q_s.shape[-1], run.states.q_f.shape[-1])
     return {"slow": coordinates(names.slow_coordinates), "fast": coordinates(names.fast_coordinates)}
 
 

@@ -1,9 +1,9 @@
 """What a run returns: saved nodes, what the solver did, conserved quantities, and where it stopped."""
 
-import dataclasses
 import json
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import NamedTuple, overload
+from typing import Any, NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -14,9 +14,9 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.export import Exports
+from vmri_jax.running.export import MICRO, Exports
 from vmri_jax.running.files import replaced
-from vmri_jax.running.origin import Origin
+from vmri_jax.running.origin import UNKNOWN, Origin
 from vmri_jax.running.run_error import RunError
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.summaries import summary_of
@@ -26,8 +26,6 @@ FORMAT = "vmri_jax trajectory 2"
 NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
 """Fields with one entry per saved node; all others but `STATUS` have one per saved interval."""
 STATUS = ("result", "failed_at")
-MICRO = ("t_micro", "q_f_micro")
-"""Fields with one entry per saved interval that may be None."""
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """The estimated error, which may be None, as arrays."""
 STATUS_ARRAYS = jax.Array, np.ndarray
@@ -59,68 +57,113 @@ class RunInfo(NamedTuple):
         return f"{method.name}, at most {most} iterations per step, residual at most {np.nanmax(self.residual, initial=0.0):.1e}"
 
 
-class Trajectory(Exports, eqx.Module):
+class MicroNodes(NamedTuple):
+    """Micro nodes of the macro step that ends at each saved node, its start excluded.
+
+    t: times.
+    q_f: fast positions.
+    """
+
+    t: Float[Numbers, "k-1 num_micro"]
+    q_f: Float[Numbers, "k-1 num_micro n_f"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory(Exports):
     """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has an axis of lanes before.
 
     ``len(run)`` is k; ``run[i]`` is the `State` at a node, ``run[-1]`` that at the end; ``run[a:b]`` and ``run[a:b:n]`` are the
-    `Trajectory` of these nodes. Velocities, multipliers, reaction forces and work are `Quantities` of it. A run that is returned from a
-    transformation of JAX has kept the arrays alone; then ``run.of(problem)`` says again what the run is of.
+    `Trajectory` of these nodes. Velocities, multipliers, reaction forces and work are `Quantities` of it. It is a pytree of arrays; its
+    origin travels with it through ``jax.tree.map``, ``jax.vmap``, ``jax.jit`` and pickle.
+
+    Positions, velocities and momenta are dictionaries of arrays, ``run.q_f["load"]``, where the start of the problem is; `states` has vectors.
 
     Attributes:
-        q_s, q_f, p_s, p_f: positions and momenta; NaN after a failure.
+        states: all saved nodes as a `State` of arrays (k,), (k, n); NaN after a failure.
         energy: Hamiltonian.
         constraint_residual: largest |g| and largest |G v|, of the rows that were left out as implied, too.
-        info: what the solver did since the node before.
-        t_micro, q_f_micro: the micro nodes of the macro step that ends at each saved node (its start excluded); None unless
-            asked for.
+        info: work of the solver since the node before.
         result: status of the run, the number of a `Result`, as which it prints; the first that was no success.
         failed_at: index of the macro step that failed, -1 if none did.
+        micro: the micro nodes of the macro step that ends at each saved node (its start excluded); None unless asked for.
         error: estimated error of the positions, a `RunError`; None unless asked for.
+        origin: system, parameters and names.
     """
 
-    t: Float[Numbers, "k"]
-    q_s: Float[Numbers, "k n_s"]
-    q_f: Float[Numbers, "k n_f"]
-    p_s: Float[Numbers, "k n_s"]
-    p_f: Float[Numbers, "k n_f"]
+    states: State
     energy: Float[Numbers, "k"]
     constraint_residual: Float[Numbers, "k 2"]
     info: RunInfo
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
-    t_micro: Float[Numbers, "k-1 num_micro"] = None
-    q_f_micro: Float[Numbers, "k-1 num_micro n_f"] = None
-    error: RunError = None  # pyright: ignore[reportAssignmentType] as t_micro, None unless asked for
+    micro: MicroNodes | None = None
+    error: RunError = None  # pyright: ignore[reportAssignmentType] as `micro` None unless asked for
+    origin: Origin = UNKNOWN
 
     def __repr__(self) -> str:
-        fields = [getattr(self, name) for name in (*NODES, *STATUS)]
+        fields = [*vars(self.states).values(), self.energy, self.constraint_residual, self.result, self.failed_at]
         if not all(map(has_values, (*fields, *self.info))) or not np.size(self.energy) or not np.ndim(self.t):
-            return eqx.Module.__repr__(self)
+            return eqx.tree_pformat(self)
         return summary(*summary_of(self))
 
     @property
-    def origin(self) -> Origin:
-        return vars(self).get("_origin", Origin())
+    def t(self):
+        """(k,) times."""
+        return self.states.t
+
+    @property
+    def q_s(self):
+        """(k, n_s) slow positions, or by name."""
+        return self.origin.shaped("s", self.states.q_s)
+
+    @property
+    def q_f(self):
+        """(k, n_f) fast positions, or by name."""
+        return self.origin.shaped("f", self.states.q_f)
+
+    @property
+    def p_s(self):
+        """(k, n_s) slow momenta, or by name."""
+        return self.origin.shaped("s", self.states.p_s)
+
+    @property
+    def p_f(self):
+        """(k, n_f) fast momenta, or by name."""
+        return self.origin.shaped("f", self.states.p_f)
+
+    @property
+    def t_micro(self):
+        """(k - 1, num_micro) times of the micro nodes; None unless asked for."""
+        return None if self.micro is None else self.micro.t
+
+    @property
+    def q_f_micro(self):
+        """(k - 1, num_micro, n_f) fast positions at the micro nodes, or by name; None unless asked for."""
+        return None if self.micro is None else self.origin.shaped("f", self.micro.q_f)
 
     @property
     def settings(self) -> Settings:
         """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run, and of one that was read from a file."""
         return self.origin.settings  # pyright: ignore[reportReturnType]
 
-    def of(self, what: System | Problem | HasProblem | Origin) -> "Trajectory":
-        """The same run, which knows what it is of: its system, and the names of its parts.
+    def of(self, moving: System | Problem | HasProblem) -> "Trajectory":
+        """The same run with its origin: its system, and the names of its parts.
 
         Args:
-            what: the Problem, Scene or System that was simulated.
+            moving: the Problem, Scene or System that was simulated.
 
         Raises:
             TypeError: something else.
             ValueError: it has other numbers of coordinates.
         """
-        origin = what if isinstance(what, Origin) else Origin.of(what)
-        if not isinstance(what, Origin):
-            origin.check(self.q_s.shape[-1], self.q_f.shape[-1])
-        return know(object.__new__(type(self)), origin, vars(self))
+        origin = Origin.of(moving)
+        origin.check(self.states.q_s.shape[-1], self.states.q_f.shape[-1])
+        return with_origin(self, origin.repeated(np.shape(self.t)[:-1]))
+
+    def with_arrays(self, **arrays) -> "Trajectory":
+        """The same run with other arrays, by the names of a file: ``run.with_arrays(q_f=..., energy=...)``."""
+        return with_origin(from_named_arrays(named_arrays(self) | arrays), self.origin)
 
     def whole(self) -> "Trajectory":
         return self
@@ -136,7 +179,7 @@ class Trajectory(Exports, eqx.Module):
         if isinstance(nodes, int | np.integer):
             at = range(len(self))[nodes]  # beyond the ends an IndexError
             lanes = (slice(None),) * (np.ndim(self.t) - 1)
-            return State(*(a[*lanes, at] for a in vars(self.states).values()))
+            return jax.tree.map(lambda a: a[*lanes, at], self.states)
         if not isinstance(nodes, slice):
             raise TypeError(
                 f"Trajectory: the index is {nodes!r}; give the number of a node, or a slice as in run[:100]."
@@ -144,9 +187,9 @@ class Trajectory(Exports, eqx.Module):
         if not is_concrete(self.energy):
             raise TypeError("Trajectory: the run is traced by JAX; take slices of its arrays, run.q_s[a:b].")
         first, last, stride = ends_of("Trajectory", nodes, len(self))
-        part = from_named_arrays(part_of(named_arrays(self), first, last, stride)).of(self.origin)
-        error = None if self.error is None else self.error.part(slice(first, last + 1, stride))
-        return know(part, self.origin, {"error": error})
+        part = from_named_arrays(part_of(named_arrays(self), first, last, stride))
+        error: Any = None if self.error is None else self.error.part(slice(first, last + 1, stride))
+        return with_origin(replace(part, error=error), self.origin)
 
     def lane(self, i: int) -> "Trajectory":
         """One run of a batch.
@@ -159,20 +202,12 @@ class Trajectory(Exports, eqx.Module):
         """
         if np.ndim(self.t) != 2:
             raise ValueError("lane: this is one run, no batch of runs.")
-        return jax.tree.map(lambda a: a[i], self).of(self.origin.lane(i))
-
-    def __getstate__(self) -> dict:
-        return {name: value for name, value in vars(self).items() if name != "_origin"}  # functions may not be pickled
+        return with_origin(jax.tree.map(lambda a: a[i], self), jax.tree.map(lambda a: a[i], self.origin))
 
     @property
     def success(self):
         """Whether no step failed (of every run, in a batch)."""
         return self.result <= Result.CONVERGED_AT_ROUNDOFF
-
-    @property
-    def states(self) -> State:
-        """All saved nodes as a `State` of arrays (k,), (k, n)."""
-        return State(self.t, self.q_s, self.q_f, self.p_s, self.p_f)
 
     @property
     def final_state(self):
@@ -233,23 +268,16 @@ class Trajectory(Exports, eqx.Module):
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
-        return from_named_arrays(arrays).of(Origin.named(None if names is None else json.loads(str(names))))
+        origin = Origin.named(None if names is None else json.loads(str(names)))
+        return with_origin(from_named_arrays(arrays), origin)
 
 
-def know(trajectory: Trajectory, origin: Origin, fields: dict | None = None) -> Trajectory:
-    """A trajectory that nobody else has yet, with what it is of; a method of a module would cost a quarter of a short run.
-
-    Args:
-        trajectory: it is changed.
-        origin: what it is of.
-        fields: its fields, if it has none yet.
-    """
-    attributes = vars(trajectory)
-    attributes.update(fields or {}, _origin=origin)
-    result = attributes["result"]
+def with_origin(trajectory: Trajectory, origin: Origin) -> Trajectory:
+    """A trajectory of the engine as users get it: with its origin, and with a status that prints as a sentence."""
+    result = trajectory.result
     if isinstance(result, STATUS_ARRAYS) and result.ndim == 0 and is_concrete(result):
-        attributes["result"] = Status(result)  # which prints as a sentence
-    return trajectory
+        result = Status(result)
+    return replace(trajectory, result=result, origin=origin)
 
 
 def ends_of(what: str, nodes: slice, count: int) -> tuple[int, int, int]:
@@ -311,17 +339,23 @@ def join(pieces: list[Trajectory]) -> Trajectory:
 
 
 def named_arrays(trajectory: Trajectory) -> dict:
-    """All arrays of a trajectory by name, those of `info` among them; None for what was not asked for."""
-    fields = {field.name: getattr(trajectory, field.name) for field in dataclasses.fields(trajectory)}
-    info, error = fields.pop("info"), fields.pop("error")
-    return fields | info._asdict() | ({} if error is None else dict(zip(ERROR, error, strict=True)))
+    """All arrays of a trajectory by name, positions as vectors; None for those that were not asked for."""
+    arrays = dict(vars(trajectory.states)) | {
+        name: getattr(trajectory, name) for name in ("energy", "constraint_residual")
+    }
+    arrays |= trajectory.info._asdict() | {name: getattr(trajectory, name) for name in STATUS}
+    arrays |= dict(zip(MICRO, trajectory.micro or (None, None), strict=True))
+    return arrays | ({} if trajectory.error is None else dict(zip(ERROR, trajectory.error, strict=True)))
 
 
 def from_named_arrays(arrays: dict) -> Trajectory:
     """The inverse of `named_arrays`; those that may be None may be absent."""
-    info = RunInfo(**{name: arrays.pop(name) for name in RunInfo._fields})
-    errors = [arrays.pop(name, None) for name in ERROR]
-    return Trajectory(**arrays, info=info, **({} if errors[0] is None else {"error": RunError(*errors)}))
+    states = State(*(arrays[name] for name in ("t", "q_s", "q_f", "p_s", "p_f")))
+    info = RunInfo(*(arrays[name] for name in RunInfo._fields))
+    others = {name: arrays[name] for name in ("energy", "constraint_residual", *STATUS)}
+    micro = None if arrays.get(MICRO[0]) is None else MicroNodes(*(arrays[name] for name in MICRO))
+    error: Any = None if arrays.get(ERROR[0]) is None else RunError(*(arrays.get(name) for name in ERROR))
+    return Trajectory(states, info=info, micro=micro, error=error, **others)
 
 
 def from_arrays(arrays: list) -> Trajectory:
@@ -329,11 +363,13 @@ def from_arrays(arrays: list) -> Trajectory:
     return jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
 
 
-_FIELDS = {field.name for field in dataclasses.fields(Trajectory)} - {"info", "error"} | set(RunInfo._fields)
+_FIELDS = {*NODES, *STATUS, *MICRO, *RunInfo._fields}
 _ONE = np.zeros(())
 _STRUCTURES = {
     len(jax.tree.leaves(trajectory)): jax.tree.structure(trajectory)
     for micro in (None, _ONE)
-    for trajectory in [from_named_arrays(dict.fromkeys(_FIELDS, _ONE) | dict.fromkeys(MICRO, micro))]
+    for trajectory in [
+        from_named_arrays(dict.fromkeys(_FIELDS, _ONE) | dict.fromkeys(MICRO, micro))
+    ]  # its origin has no arrays
 }
 """Of trajectories without and with micro nodes, by the number of their arrays."""

@@ -291,8 +291,8 @@ class Scene:
             for part in ("s", "f"):
                 places = {name: place for name, place in twin.places.items() if place.part == part}
                 pieces = [of_body(name) for name in sorted(places, key=lambda name: places[name].start)]
-                arrays[f"{letter}_{part}"] = np.concatenate(pieces, axis=-1) if pieces else run.q_s[..., :0]
-        return replace(run, **arrays, t_micro=None, q_f_micro=None).of(twin)
+                arrays[f"{letter}_{part}"] = np.concatenate(pieces, axis=-1) if pieces else run.states.q_s[..., :0]
+        return run.with_arrays(**arrays, t_micro=None, q_f_micro=None).of(twin)
 
     def without(self, *names: str) -> "Scene":
         """The scene without these effects.

@@ -39,10 +39,10 @@ def swapped_at_start(trajectory) -> str:
     Args:
         trajectory: it knows its system.
     """
-    if not trajectory.q_s.shape[-1] or not trajectory.q_f.shape[-1]:
+    if not trajectory.states.q_s.shape[-1] or not trajectory.states.q_f.shape[-1]:
         return ""  # nothing to swap: small motions of all coordinates would take seconds to compile
     try:
-        found = swapped(small_motions(trajectory.origin.known_system, trajectory[0]), trajectory.names)
+        found = swapped(small_motions(trajectory.origin.system(), trajectory[0]), trajectory.names)
     except (ValueError, TypeError, IndexError):  # nothing to expand: there is a better message about that
         return ""
     return found[0] if found else ""

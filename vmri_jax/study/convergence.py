@@ -368,7 +368,7 @@ def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, refer
     energy = np.asarray(trajectory.energy)
     off = energy - (energy[0] if energies is None else energies)
     drift, band = _drift_and_band(np.asarray(trajectory.t), off)
-    phase = trajectory.q_s, trajectory.q_f, trajectory.p_s, trajectory.p_f
+    _, *phase = vars(trajectory.states).values()
     maps = [np.asarray(jax.vmap(lambda *z, xi=xi: diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
     return ConvergenceRow(
         scheme=label,

@@ -81,6 +81,6 @@ class Program:
 def joined(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """q and p of the saved nodes, slow coordinates first."""
     return (
-        np.concatenate([trajectory.q_s, trajectory.q_f], axis=-1),
-        np.concatenate([trajectory.p_s, trajectory.p_f], axis=-1),
+        np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=-1),
+        np.concatenate([trajectory.states.p_s, trajectory.states.p_f], axis=-1),
     )

@@ -10,12 +10,12 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.export import Exports
+from vmri_jax.running.export import MICRO, Exports
 from vmri_jax.running.largest_motion import what_moves_most
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
 from vmri_jax.running.summaries import named_coordinates
-from vmri_jax.running.trajectory import MICRO, NODES, RunInfo, Trajectory, ends_of, from_named_arrays
+from vmri_jax.running.trajectory import NODES, RunInfo, Trajectory, ends_of, from_named_arrays, with_origin
 from vmri_jax.steppers.results import Result, SimulationError
 
 
@@ -72,11 +72,15 @@ class StoredTrajectory(Exports):
     def origin(self) -> Origin:
         return self._origin
 
-    def of(self, what: System | Problem | HasProblem | Origin) -> "StoredTrajectory":
-        """The same, which knows its system, see `Trajectory.of`."""
-        own = copy(self)
-        own._origin = self[:1].of(what).origin
-        return own
+    def of(self, moving: System | Problem | HasProblem) -> "StoredTrajectory":
+        """The same with its system, see `Trajectory.of`."""
+        return self.with_origin(self[:1].of(moving).origin)
+
+    def with_origin(self, origin: Origin) -> "StoredTrajectory":
+        """The same with another origin."""
+        stored = copy(self)
+        stored._origin = origin
+        return stored
 
     @property
     def success(self) -> bool:
@@ -133,7 +137,7 @@ class StoredTrajectory(Exports):
         arrays |= {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
         if self.failed_at < last * self.save_every:
             arrays |= {"result": np.asarray(int(self.result)), "failed_at": np.asarray(self.failed_at)}
-        return from_named_arrays(arrays).of(self.origin)
+        return with_origin(from_named_arrays(arrays), self.origin)
 
     def chunks(self):
         """The trajectory piece by piece, each of a chunk and starting where the one before ends."""

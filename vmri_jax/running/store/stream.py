@@ -110,7 +110,7 @@ def stream(
                 if interrupted():
                     raise Interrupted(StoredTrajectory(path), step, num_steps, "macro steps")
     stored = StoredTrajectory(path)
-    stored = stored.of(run.origin) if len(stored) else stored
+    stored = stored.with_origin(run.origin) if len(stored) else stored
     if throw:
         stored.raise_failure(scheme.num_micro)
     return stored
