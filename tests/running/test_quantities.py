@@ -1,5 +1,7 @@
 """Velocities, multipliers, reaction forces and work of a run, by name, against formulas and independent integrals."""
 
+import copy
+import dataclasses
 import pickle
 from dataclasses import replace
 
@@ -89,9 +91,9 @@ def test_work_accounts_for_the_energy():
     assert work.uncertainty < 1e-2
 
 
-def test_work_at_nodes_that_are_too_far_apart_is_uncertain(hanging, hanging_run):
+def test_work_at_nodes_that_are_too_far_apart_is_uncertain(hanging_run):
     """The bell vibrates at 283 rad/s: what its damper takes is not seen at every 50th of a second, but at micro nodes."""
-    coarse = replace(hanging_run, t_micro=None, q_f_micro=None).of(hanging).work()
+    coarse = replace(hanging_run, micro=None).work()
     fine = hanging_run.work()
     assert fine.uncertainty < coarse.uncertainty / 20
     assert np.abs(fine.balance).max() < np.abs(coarse.balance).max() / 5
@@ -158,14 +160,54 @@ def test_a_batch_with_its_own_parameters():
         runs.columns()
 
 
-def test_transformations_lose_the_origin_and_say_so(swing):
-    halved = jax.tree.map(lambda a: a, swing)
+def test_transformations_keep_the_origin(swing):
+    v_f = np.asarray(swing.v_f)
+    for other in (jax.tree.map(jnp.asarray, swing), jax.jit(lambda run: run)(swing), copy.deepcopy(swing)):
+        assert np.array_equal(other.v_f, v_f)
+        assert other.names.fast_coordinates == ["bob x", "bob y"]
+    both = jax.tree.map(lambda *a: jnp.stack(a), swing, swing)
+    assert np.array_equal(both.v_f, np.stack([v_f, v_f]))
+    assert np.array_equal(jax.tree.map(lambda a: a[1], both).multipliers()["rod"], swing.multipliers()["rod"])
+
+
+def test_lanes_of_vmap_and_of_a_batch_have_their_parameters():
+    problem = vm.Problem(vm.System(weighed, params={"m": 2.0}), [], [0.0], [], [1.0])
+
+    def run(m):
+        system = problem.system.replace(params={"m": m})
+        return vm.simulate(dataclasses.replace(problem, system=system), vm.fully_implicit(2), macro_dt=0.1, num_steps=2)
+
+    lanes = jax.vmap(run)(jnp.array([1.0, 4.0]))
+    assert np.allclose(lanes.v_f, 1.0)
+    assert np.allclose(lanes.lane(1).p_f, 4.0)
+    states = jax.tree.map(lambda a: np.stack([a, a]), problem.state())
+    batch = vm.simulate_batch(problem, vm.fully_implicit(2), states, macro_dt=0.1, num_steps=2)
+    second = jax.tree.map(lambda a: a[1], batch)
+    assert np.allclose(batch.v_f, 1.0)
+    assert np.allclose(second.v_f, 1.0)
+
+
+def test_pickles_keep_the_origin_where_python_can(swing):
+    problem = vm.Problem(vm.System(weighed, params={"m": 2.0}), [], [0.0], [], [1.0])
+    run = vm.simulate(problem, vm.fully_implicit(2), macro_dt=0.1, num_steps=2)
+    assert np.array_equal(pickle.loads(pickle.dumps(run)).v_f, run.v_f)
+    local = vm.Problem(
+        vm.System(lambda q_s, q_f, v_s, v_f, params: weighed(q_s, q_f, v_s, v_f, params), params={"m": 2.0}),
+        [],
+        [0.0],
+        [],
+        [1.0],
+    )
+    run = pickle.loads(pickle.dumps(vm.simulate(local, vm.fully_implicit(2), macro_dt=0.1, num_steps=2)))
     with pytest.raises(ValueError, match=r"does not know its system.*run.of\(problem\)"):
-        halved.v_f  # noqa: B018
-    assert np.array_equal(halved.of(pendulum()).v_f, swing.v_f)
-    with pytest.raises(ValueError, match=r"of: the run has 0 slow and 2 fast coordinates. ConstantMass: slow is for 3"):
-        halved.of(vm.systems.fermi_pasta_ulam())
-    assert np.array_equal(pickle.loads(pickle.dumps(swing)).q_f, swing.q_f)
+        run.v_f  # noqa: B018
+    assert np.allclose(run.of(local).v_f, 1.0)
+    with pytest.raises(ValueError, match=r"of: the run has 0 slow and 1 fast coordinates. ConstantMass: slow is for 3"):
+        run.of(vm.systems.fermi_pasta_ulam())
+
+
+def weighed(q_s, q_f, v_s, v_f, params):
+    return params["m"] / 2 * v_f @ v_f
 
 
 def test_prepared_runs_know_their_parameters():

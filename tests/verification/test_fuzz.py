@@ -102,8 +102,8 @@ FAILED = LAST | dict.fromkeys(("q_s", "q_f", "p_s", "p_f"), NAN[:, None]) | {"en
         (FAILED | {"energy": np.ones(4)}, "stale numbers: energy"),
         ({"constraint_residual": np.full((4, 2), 2e-6)}, "constraint violated"),
         ({"constraint_residual": np.full((4, 2), np.nan)}, "constraint violated"),
-        ({"q_f_micro": np.full((3, 2, 1), np.nan)}, "not finite: q_f_micro"),
-        ({"info": RunInfo(*np.full((3, 3), np.nan))}, "not finite: residual"),
+        ({"t_micro": np.ones((3, 2)), "q_f_micro": np.full((3, 2, 1), np.nan)}, "not finite: q_f_micro"),
+        ({"residual": np.full(3, np.nan)}, "not finite: residual"),
     ],
 )
 def test_verdicts(changes, found):

@@ -16,7 +16,7 @@ where the time that is spent on each grid goes with the share that it leaves.
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -54,6 +54,9 @@ LONGEST = 20.0
 an error that cannot be certified, as of chaotic motion, take longer."""
 MOST_MICRO = 64
 """Most micro steps that are chosen; more save little where slow forces are not a hundred times as dear as fast ones."""
+LARGEST_SINGLE = 60
+"""Coordinates of the largest system that a single interval of high degree is tried on. Its matrices have all coordinates at all nodes: with 200
+coordinates compiling and factorising them takes minutes, and steps by kicks win."""
 SAME = 1.3
 """Factor within which two numbers of micro steps cost the same: the second is not compiled. A larger one misses savings."""
 LEAST_TIME, LEAST_SHARE = 0.02, 1e-3
@@ -141,17 +144,25 @@ class Search:
         dt = np.asarray(self.length / num_steps)
         return replace(self.runs[key], macro_dt=dt, num_steps=num_steps, save_every=save_every)
 
-    def trial(self, family: Family, num_micro: int, num_steps: int) -> Trial:
-        """A run of about so many macro steps; more where its error is not certified.
+    def first_trials(self, menu: Sequence[tuple[Family, int]]) -> list[Trial]:
+        """A trial of each scheme.
 
-        Steps that are too large for the motion fail or diverge, and need no fallback: it is compiled only where no number of steps is enough.
+        Steps that are too large for the motion fail or diverge, and need no fallback: it is compiled only where no scheme of the menu works
+        without it.
         """
-        trial = self._doubled(family, num_micro, num_steps, falls_back=False)
-        has_failed = int(trial.trajectory.failed_at) >= 0
-        return self._doubled(family, num_micro, num_steps, falls_back=True) if has_failed else trial
+        trials = [self.trial(*scheme, FEWEST_STEPS) for scheme in menu]
+        if any(int(trial.trajectory.failed_at) < 0 for trial in trials):
+            return trials
+        return [self.trial(*scheme, FEWEST_STEPS, falls_back=True) for scheme in menu]
 
-    def _doubled(self, family: Family, num_micro: int, num_steps: int, falls_back: bool) -> Trial:
-        """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; else the last one in the time there is."""
+    def trial(self, family: Family, num_micro: int, num_steps: int, falls_back: bool = False) -> Trial:
+        """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; else the last one in the time there is.
+
+        Args:
+            family, num_micro: the scheme.
+            num_steps: macro steps, at least.
+            falls_back: whether steps that the first method does not solve are made again with exact matrices, see `Simulation`.
+        """
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
             before = time.perf_counter()
@@ -186,7 +197,8 @@ class Search:
         best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
         if max(best, num_micro) <= SAME * min(best, num_micro):
             return trial
-        other = self.trial(trial.family, best, max(1, round(trial.run.num_steps * num_micro / best)))
+        num_steps = max(1, round(trial.run.num_steps * num_micro / best))
+        other = self.trial(trial.family, best, num_steps, trial.run.may_fall_back)
         return min((trial, other), key=lambda one: one.time_for(AIM * accuracy))
 
 
@@ -235,7 +247,7 @@ def with_accuracy(
 
     search = Search(make, length, num_saves)
     menu = _menu(scheme, opened_system, start, accuracy, length)
-    trials = [search.trial(family, num_micro, FEWEST_STEPS) for family, num_micro in menu]
+    trials = search.first_trials(menu)
     extent = max(extent_of(trial.trajectory) for trial in trials)
     if accuracy > extent:
         raise ValueError(
@@ -243,8 +255,8 @@ def with_accuracy(
             "accurate. Give a smaller one, in the unit of the positions."
         )
     best = min(trials, key=lambda trial: trial.time_for(AIM * accuracy))
-    has_both = start.q_s.size and start.q_f.size and stage_scheme(best.run.scheme).degree == 1
-    if has_both and np.isfinite(best.error) and best.error > 0:
+    can_choose = micro_steps_help(opened_system, start) and stage_scheme(best.run.scheme).degree == 1
+    if can_choose and np.isfinite(best.error) and best.error > 0:
         best = search.with_best_num_micro(best, accuracy)
     best = _accurate(search, best, accuracy)
     if not best.error <= accuracy:
@@ -271,7 +283,7 @@ def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
         num_steps = _beside_resonances(search, best, max(best.steps_for(AIM * accuracy), fewest))
         if num_steps > MOST_STEPS:
             break
-        best = search.trial(best.family, best.num_micro, num_steps)
+        best = search.trial(best.family, best.num_micro, num_steps, best.run.may_fall_back)
         if best.error <= accuracy:
             break
         fewest = best.run.num_steps + 1
@@ -307,10 +319,18 @@ def _menu(scheme, system: System, start: State, accuracy: float, length: float) 
     base = of_order_2(fully_explicit if isinstance(system.kinetic, ConstantMass) else fully_implicit)
     name = next((name for most, name in COMPOSED if digits <= most), None)
     unit = _unit(system, stage_scheme(base.make(1)))
-    num_micro = unit * -(-FIRST_MICRO // unit) if unit > 1 or (start.q_s.size and start.q_f.size) else 1
+    num_micro = unit * -(-FIRST_MICRO // unit) if micro_steps_help(system, start) else 1
     kicks = base if name is None else base.composed(name), num_micro
     single = of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1
-    return [kicks, single] if unit == 1 else [kicks]  # a single interval has no k-th micro node
+    has_single = (
+        unit == 1 and start.q_s.size + start.q_f.size <= LARGEST_SINGLE
+    )  # a single interval has no k-th micro node
+    return [kicks, single] if has_single else [kicks]
+
+
+def micro_steps_help(system: System, start: State) -> bool:
+    """Whether a macro step may save something: fast coordinates, and slow ones or potentials that the macro grid evaluates less often."""
+    return bool(start.q_f.size and (start.q_s.size or system.slow_potential is not None or system.potentials))
 
 
 def _unit(system: System, scheme: Scheme) -> int:
