@@ -12,6 +12,7 @@ from vmri_jax.mechanics.checks import check_flags, check_system
 from vmri_jax.mechanics.constraints import check_constraints
 from vmri_jax.mechanics.state import Movable, State
 from vmri_jax.running.adjoints import check_adjoint
+from vmri_jax.running.arguments import Steps
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
@@ -50,7 +51,7 @@ def simulate(
         run = vm.simulate(problem, accuracy=1e-5, t_end=10.0)
 
     With an accuracy the steps, and without a scheme the scheme, are chosen by trial runs, see `vmri_jax.accuracy.steps`; the choice is
-    ``run.settings``, and ``run.error`` tells the error of the run.
+    ``run.settings``, and ``run.error`` tells the error of the run. Resonant steps are passed over in systems of up to 60 coordinates.
 
     Compiled once per system structure and scheme structure: step sizes, parameters, rule weights, initial states, numbers of steps and of
     saved nodes may vary without compiling again. Works under ``jax.vmap`` over state,
@@ -108,7 +109,8 @@ def simulate(
             f"simulate: {missing} without an accuracy; give accuracy=1e-5 with it, or a scheme and save_every."
         )
     check_adjoint(adjoint, scheme)
-    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    steps_asked_for = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    run = simulation(system, scheme, state, newton, steps_asked_for)
     if not run.is_concrete:
         if error:
             raise ValueError(

@@ -30,6 +30,7 @@ from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
+from vmri_jax.running.arguments import Steps
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.settings import Settings
@@ -54,9 +55,9 @@ LONGEST = 20.0
 an error that cannot be certified, as of chaotic motion, take longer."""
 MOST_MICRO = 64
 """Most micro steps that are chosen; more save little where slow forces are not a hundred times as dear as fast ones."""
-LARGEST_SINGLE = 60
-"""Coordinates of the largest system that a single interval of high degree is tried on. Its matrices have all coordinates at all nodes: with 200
-coordinates compiling and factorising them takes minutes, and steps by kicks win."""
+MOST_COORDINATES = 60
+"""Coordinates of the largest system that a single interval of high degree is tried on, and whose steps are looked at for resonances. The
+matrices of both have all coordinates: with 200 of them they take minutes, and steps by kicks win."""
 SAME = 1.3
 """Factor within which two numbers of micro steps cost the same: the second is not compiled. A larger one misses savings."""
 LEAST_TIME, LEAST_SHARE = 0.02, 1e-3
@@ -239,7 +240,7 @@ def with_accuracy(
     _check(accuracy, length, start)
 
     def make(scheme: Scheme | Composition) -> Simulation:
-        run = simulation(system, scheme, state, newton, length, None, 1, None, 1, False)
+        run = simulation(system, scheme, state, newton, Steps(length, num_steps=1))
         run.check()
         check_memory("simulate", run.state, scheme.num_micro, num_saves or SAVED, False)
         check_function_of_run(of, True, run)
@@ -323,7 +324,7 @@ def _menu(scheme, system: System, start: State, accuracy: float, length: float) 
     kicks = base if name is None else base.composed(name), num_micro
     single = of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1
     has_single = (
-        unit == 1 and start.q_s.size + start.q_f.size <= LARGEST_SINGLE
+        unit == 1 and start.q_s.size + start.q_f.size <= MOST_COORDINATES
     )  # a single interval has no k-th micro node
     return [kicks, single] if has_single else [kicks]
 
@@ -352,7 +353,8 @@ def _beside_resonances(search: Search, trial: Trial, num_steps: int) -> int:
     )
     from vmri_jax.stability.multipliers import multipliers
 
-    if trial.num_micro == 1:
+    start = trial.run.state
+    if trial.num_micro == 1 or start.q_s.size + start.q_f.size > MOST_COORDINATES:
         return num_steps
     try:
         motions = small_motions(trial.run.system, trial.run.state)

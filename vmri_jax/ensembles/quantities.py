@@ -168,7 +168,7 @@ def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, K
     found: dict[str, Kept] = {}
 
     def shapes():
-        trajectory = run.engine.trajectory(run.leaves, run.start_arrays, run.macro_dt, run.save_every)
+        trajectory = run.engine.trajectory(run.arrays, run.save_every)
         found.update(kept(quantities, trajectory))
         return {name: one.value for name, one in found.items()}
 

@@ -18,6 +18,7 @@ from vmri_jax.ensembles.quantities import Quantity, of_lanes, quantity
 from vmri_jax.mechanics.names import near
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.mechanics.system import System
+from vmri_jax.running import arguments
 from vmri_jax.running.arguments import steps_until
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.simulation import Simulation, simulation
@@ -157,7 +158,8 @@ class Work:
             )
         state = self.problem.state(self.project)
         every = num_steps // self.num_saves
-        return simulation(self.problem, group.scheme, state, self.newton, macro_dt, None, num_steps, None, every, False)
+        steps = arguments.Steps(macro_dt, num_steps=num_steps, save_every=every)
+        return simulation(self.problem, group.scheme, state, self.newton, steps)
 
     def check_values(self, rows: Rows) -> None:
         """Refuse values of columns that do not fit what they replace.

@@ -163,6 +163,13 @@ class System(eqx.Module):
         """The same system with some fields changed, e.g. ``system.replace(params=new)``."""
         return dataclasses.replace(self, **changes)
 
+    def with_params(self, params) -> "System":
+        """The same system with other parameters, without the checks of the constructor, which take a millisecond."""
+        system = object.__new__(type(self))
+        for name, value in {**vars(self), "params": params}.items():
+            object.__setattr__(system, name, value)
+        return system
+
     def all_potentials(self, q_s, q_f) -> dict:
         """Values of V ("slow"), of W ("fast") and of `potentials` by name; zero without V or W, and those of one name together."""
         zero = jnp.zeros(())

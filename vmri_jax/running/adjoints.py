@@ -23,7 +23,7 @@ from jax.flatten_util import ravel_pytree
 from vmri_jax.mechanics import invariants
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.state import State
-from vmri_jax.running.engine import Engine
+from vmri_jax.running.engine import Arrays, Engine
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -167,7 +167,7 @@ def _stepped_back(run, engine: Engine, save_every: int, kept, cotangent: Traject
     at_nodes = (*vars(cotangent.states).values(), cotangent.energy, cotangent.constraint_residual)
     by_real, by_state, by_dt = _back(engine, save_every, leaves, macro_dt, nodes, at_nodes, cotangent.micro)
     by_leaves = [by_real[i] if i in by_real else _no_cotangent(leaf) for i, leaf in enumerate(leaves)]
-    return ((by_leaves, tuple(vars(by_state).values()), by_dt),)
+    return (Arrays(by_leaves, tuple(vars(by_state).values()), by_dt),)
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -1,5 +1,8 @@
 """Arguments of runs: bad ones are refused, with what came, what was expected and what to do."""
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete, real_array, require_x64, whole_number
@@ -13,7 +16,19 @@ WHOLE = 1e-9
 """Part by which a number of steps may miss a whole number."""
 
 
-def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro=False):
+@dataclass(frozen=True)
+class Steps:
+    """Steps of a run as they are asked for, see `vmri_jax.simulate`: exactly one of macro_dt and micro_dt, one of num_steps and t_end."""
+
+    macro_dt: Any = None
+    micro_dt: Any = None
+    num_steps: int | None = None
+    t_end: float | None = None
+    save_every: int = 1
+    save_micro: bool = False
+
+
+def check_run(system, scheme, state, newton, steps: Steps):
     """Refuse bad arguments of `simulate`; returns macro_dt, num_steps and save_every."""
     require_x64()
     if not isinstance(scheme, Scheme | Composition):
@@ -23,15 +38,15 @@ def check_run(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_en
     check_params(system.params)
     if not isinstance(newton, Newton | None):
         raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(method='dense').")
-    check_flags(save_micro=save_micro)
-    dt = check_step_size(scheme, macro_dt, micro_dt)
+    check_flags(save_micro=steps.save_micro)
+    dt, num_steps, t_end = check_step_size(scheme, steps.macro_dt, steps.micro_dt), steps.num_steps, steps.t_end
     check_number("simulate: the t of state", state.t)
     if (num_steps is None) == (t_end is None):
         got = "neither" if num_steps is None else "both"
         raise ValueError(f"simulate: got {got} of num_steps and t_end; give exactly one of them.")
     if num_steps is None:
         num_steps = steps_until(t_end, state.t, dt)
-    counts = check_counts(num_steps, save_every)
+    counts = check_counts(num_steps, steps.save_every)
     if is_concrete(vars(state)):
         check_vectors(state)
     return dt, *counts

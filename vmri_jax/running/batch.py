@@ -12,7 +12,8 @@ from vmri_jax.mechanics.arrays import is_concrete, real_array, whole_number
 from vmri_jax.mechanics.checks import check_params
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.engine import Engine
+from vmri_jax.running.arguments import Steps
+from vmri_jax.running.engine import Arrays, Engine
 from vmri_jax.running.memory import check_memory
 from vmri_jax.running.progress import Working
 from vmri_jax.running.simulation import Simulation, simulation
@@ -84,9 +85,8 @@ def simulate_batch(
         raise ValueError(
             "simulate_batch: t_end with a step size for each lane; give num_steps, the same for all lanes."
         )
-    run = simulation(
-        problem, scheme, first, newton, _first(macro_dt), _first(micro_dt), num_steps, t_end, save_every, save_micro
-    )
+    steps = Steps(_first(macro_dt), _first(micro_dt), num_steps, t_end, save_every, save_micro)
+    run = simulation(problem, scheme, first, newton, steps)
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
     dt = np.asarray(real_array(f"simulate_batch: {name}", dt))
     if dt.shape not in ((), (lanes,)):
@@ -203,7 +203,8 @@ def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices
         piece = jax.tree.map(lambda a, index=index: a[index], batch)
         macro_dt = run.macro_dt if piece["macro_dt"] is None else piece["macro_dt"]
         num_params = 0 if piece["params"] is None else len(piece["params"])
-        shared = run.leaves[: len(run.leaves) - num_params]
+        leaves = run.arrays.model
+        shared = leaves[: len(leaves) - num_params]
         pieces.append(program(shared, piece["params"] or [], piece["state"], macro_dt, run.save_every))
     return from_arrays([jnp.asarray(np.concatenate(parts)[:lanes]) for parts in zip(*pieces, strict=True)])
 
@@ -213,7 +214,7 @@ def _side_by_side(engine: Engine, own_params: bool, own_steps: bool, devices: in
     """``program(leaves, params, state, macro_dt, save_every)``: the runs of `engine`, a lane each."""
 
     def lane(leaves, params, state, macro_dt, save_every):
-        return jax.tree.leaves(engine.trajectory(leaves + params, state, macro_dt, save_every))
+        return jax.tree.leaves(engine.trajectory(Arrays(leaves + params, state, macro_dt), save_every))
 
     lanes = (False, own_params, True, own_steps, False)
     program = jax.vmap(lane, [0 if own else None for own in lanes])

@@ -19,18 +19,59 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.loops import PLAIN, WHOLE, Loops, Recursive, Stored
 from vmri_jax.running.saved import Node, Saved
 from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
 
 
+class Model(NamedTuple):
+    """All that decides how a run goes on from a state: how equations are solved, the scheme, the system."""
+
+    newton: Newton
+    scheme: Scheme | Composition
+    system: System
+
+
+class Arrays(NamedTuple):
+    """The numbers that a run is computed from, as bare arrays: JAX flattens a system in Python, which would take longer than a short run.
+
+    model: leaves of a `Model`, those of the parameters of the system last.
+    state: of the start, its five arrays.
+    macro_dt: H.
+    """
+
+    model: list
+    state: tuple
+    macro_dt: Any
+
+    def start(self) -> State:
+        """The state at the start."""
+        return State(*self.state)
+
+
+class Place(NamedTuple):
+    """Where a piece of a run begins.
+
+    memory: of the stepper, from the piece before.
+    starts: whether no step is remembered; then the memory of a first step takes the place of `memory`.
+    t_start: time of the start of the whole run.
+    step: macro steps before.
+    """
+
+    memory: Any
+    starts: Any
+    t_start: Any
+    step: Any
+
+
 @dataclass(frozen=True)
 class Engine:
-    """Compiled runs of all systems and schemes of one structure; what they compute with is handed over as bare arrays.
-
-    The programs take `leaves`, the arrays of (newton, scheme, system), the five arrays of a `State`, and numbers.
+    """Compiled runs of all systems and schemes of one structure, as functions of `Arrays` and of numbers of steps.
 
     Attributes:
-        structure: of the pytree (newton, scheme, system).
+        structure: of the pytree `Model`.
         num_saves: saved intervals that there is room for.
         save_micro: whether micro nodes are saved.
     """
@@ -41,7 +82,7 @@ class Engine:
 
     @cached_property
     def whole(self):
-        """``whole(leaves, state, macro_dt, save_every, saves)``: a run from its first step, as the arrays of its `Trajectory`.
+        """``whole(arrays, save_every, saves)``: a run from its first step, as the arrays of its `Trajectory`.
 
         Only the first `saves` of the saved intervals are computed.
         """
@@ -49,53 +90,52 @@ class Engine:
 
     @cached_property
     def stored(self):
-        """``stored(leaves, state, macro_dt, save_every)``: `trajectory` with `save_every` static, to be differentiated in any mode."""
+        """``stored(arrays, save_every)``: `trajectory` with `save_every` static, to be differentiated in any mode."""
 
-        def stored(leaves, state, macro_dt, save_every):
-            return self.trajectory(leaves, state, macro_dt, save_every, loops=Stored())
+        def stored(arrays: Arrays, save_every):
+            return self.trajectory(arrays, save_every, loops=Stored())
 
-        return jax.jit(stored, static_argnums=3)
+        return jax.jit(stored, static_argnums=1)
 
     @cached_property
     def checkpointed(self):
         """The same with derivatives in reverse mode only, that need memory like the logarithm of the number of steps."""
 
-        def checkpointed(leaves, state, macro_dt, save_every):
+        def checkpointed(arrays: Arrays, save_every):
             loops = Stored() if self.num_saves * save_every <= WHOLE else Recursive(save_every)
-            return self.trajectory(leaves, state, macro_dt, save_every, loops=loops, reverse_only=True)
+            return self.trajectory(arrays, save_every, loops=loops, reverse_only=True)
 
-        return jax.jit(checkpointed, static_argnums=3)
+        return jax.jit(checkpointed, static_argnums=1)
 
     @cached_property
     def piece(self):
-        """``piece(saved, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves)``: a run of any length, by pieces.
+        """``piece(saved, arrays, place, save_every, saves)``: a run of any length, by pieces.
 
-        Computes the first `saves` saved intervals into the arrays `saved`, whose memory it takes over, and returns `_Counted`. The
-        `memory` of the stepper comes from the piece before; where `starts` is true, the memory of a first step takes its place.
+        Computes the first `saves` saved intervals into the arrays `saved`, whose memory it takes over, and returns `_Counted`.
         """
 
-        def piece(saved, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves):
-            start = State(*state)
-            stepper = self.stepper(leaves, start)
-            memory = jax.tree.map(partial(jnp.where, starts), stepper.init(start, macro_dt), memory)
-            return self._counted(stepper, _At.before(start, memory, step), saved, t_start, macro_dt, save_every, saves)
+        def piece(saved: Saved, arrays: Arrays, place: Place, save_every, saves):
+            start, macro_dt = arrays.start(), arrays.macro_dt
+            stepper = self.stepper(arrays.model, start)
+            memory = jax.tree.map(partial(jnp.where, place.starts), stepper.init(start, macro_dt), place.memory)
+            times = _Times(place.t_start, macro_dt, save_every)
+            return self._counted(stepper, _At.before(start, memory, place.step), saved, times, saves)
 
         return jax.jit(piece, donate_argnums=0)
 
-    def next_piece(
-        self, leaves, state, memory, starts, t_start, macro_dt, step: int, save_every: int, saves: int
-    ) -> tuple[Trajectory, State, Any]:
+    def next_piece(self, arrays: Arrays, place: Place, save_every: int, saves: int) -> tuple[Trajectory, State, Any]:
         """`piece` with its trajectory in arrays of NumPy, and the state and memory at its end."""
-        scheme = jax.tree.unflatten(self.structure, leaves)[1]
-        free = self._free[tuple(a.shape for a in state)]
+        scheme = self.model(arrays.model).scheme
+        free = self._free[tuple(a.shape for a in arrays.state)]
         try:
             room = free.pop()
         except IndexError:  # the first piece, or all arrays are in use by other threads
-            room = self._nothing(State(*state), scheme.num_micro)
-        done = self.piece(room, leaves, state, memory, starts, t_start, macro_dt, step, save_every, saves)
+            room = self._nothing(arrays.start(), scheme.num_micro)
+        done = self.piece(room, arrays, place, save_every, saves)
         saved = done.saved.first(saves, int(done.number))
         free.append(done.saved)
-        times = np.asarray(t_start) + (step + np.arange(saves + 1) * save_every) * np.asarray(macro_dt)
+        macro_dt = np.asarray(arrays.macro_dt)
+        times = np.asarray(place.t_start) + (place.step + np.arange(saves + 1) * save_every) * macro_dt
         return self._trajectory(scheme, done._replace(saved=saved), times, macro_dt), done.at.state, done.at.memory
 
     @cached_property
@@ -103,12 +143,12 @@ class Engine:
         """Arrays for saved nodes that no piece uses at present, by the shapes of states."""
         return defaultdict(list)
 
-    def blank_memory(self, leaves, state):
+    def blank_memory(self, arrays: Arrays):
         """The memory that `piece` is given where it starts: zeros."""
-        return _blank_memory(self, tuple((a.shape, a.dtype) for a in (*leaves, *state)))
+        return _blank_memory(self, tuple((a.shape, a.dtype) for a in (*arrays.model, *arrays.state)))
 
     def trajectory(
-        self, leaves, state, macro_dt, save_every, saves=None, loops: Loops | None = None, reverse_only: bool = False
+        self, arrays: Arrays, save_every, saves=None, loops: Loops | None = None, reverse_only: bool = False
     ) -> Trajectory:
         """A run from its first step, not compiled; of all saved intervals, or of the first `saves` of them.
 
@@ -116,24 +156,27 @@ class Engine:
             loops: to be differentiated; None for the fastest.
             reverse_only: as of `plan`.
         """
-        start = State(*state)
-        stepper = self.stepper(leaves, start, reverse_only)
+        start, macro_dt = arrays.start(), arrays.macro_dt
+        stepper, times = self.stepper(arrays.model, start, reverse_only), _Times(start.t, macro_dt, save_every)
         at = _At.before(start, stepper.init(start, macro_dt), 0)
         if loops is not None:
-            return self._scanned(stepper, at, macro_dt, save_every, loops)
-        nothing = self._nothing(start, stepper.scheme.num_micro)
-        done = self._counted(stepper, at, nothing, start.t, macro_dt, save_every, saves)
-        times = start.t + jnp.arange(self.num_saves + 1) * save_every * macro_dt
-        return self._trajectory(stepper.scheme, done, times, macro_dt)
+            return self._scanned(stepper, at, times, loops)
+        done = self._counted(stepper, at, self._nothing(start, stepper.scheme.num_micro), times, saves)
+        nodes = start.t + jnp.arange(self.num_saves + 1) * save_every * macro_dt
+        return self._trajectory(stepper.scheme, done, nodes, macro_dt)
 
-    def stepper(self, leaves, state: State, reverse_only: bool = False) -> Plan:
+    def model(self, leaves: list) -> Model:
+        """The `Model` with these leaves."""
+        return jax.tree.unflatten(self.structure, leaves)
+
+    def stepper(self, leaves: list, state: State, reverse_only: bool = False) -> Plan:
         """How its steps are taken."""
-        newton, scheme, system = jax.tree.unflatten(self.structure, leaves)
+        newton, scheme, system = self.model(leaves)
         return plan(system, scheme, state, newton, fallback=False, reverse_only=reverse_only)
 
-    def _counted(self, stepper: Plan, at: "_At", saved: Saved, t_start, macro_dt, save_every, saves) -> "_Counted":
+    def _counted(self, stepper: Plan, at: "_At", saved: Saved, times: "_Times", saves) -> "_Counted":
         """`saves * save_every` macro steps; with `saves` None all that there is room for, whether or not steps fail: lanes go on together."""
-        interval = self._interval(stepper, at.state, t_start, macro_dt, PLAIN)
+        interval = self._interval(stepper, at.state, times, PLAIN)
 
         def goes_on(done: _Counted):
             return done.number <= self.num_saves if saves is None else (done.number <= saves) & (done.at.failed_at < 0)
@@ -141,35 +184,35 @@ class Engine:
         def save(done: _Counted) -> _Counted:
             number, at, saved = done
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
-            moved, info, micro = interval(at, jnp.where(is_later, save_every, 0))
+            moved, info, micro = interval(at, jnp.where(is_later, times.save_every, 0))
             at = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, at)
             node, at = _node(stepper.system, stepper.newton.tolerance, at)
             return _Counted(number + 1, at, saved.write(number, node, info, micro))
 
         return jax.lax.while_loop(goes_on, save, _Counted(jnp.asarray(0), at, saved))
 
-    def _scanned(self, stepper: Plan, at: "_At", macro_dt, save_every: int, loops: Loops) -> Trajectory:
+    def _scanned(self, stepper: Plan, at: "_At", times: "_Times", loops: Loops) -> Trajectory:
         """All of a run from its first step, by loops that can be differentiated."""
         system, tolerance = stepper.system, stepper.newton.tolerance
-        interval = self._interval(stepper, at.state, at.state.t, macro_dt, loops)
+        interval = self._interval(stepper, at.state, times, loops)
 
         def save(at: _At, _):
-            at, info, micro = interval(at, save_every)
+            at, info, micro = interval(at, times.save_every)
             node, at = _node(system, tolerance, at)
             return at, (node, info, micro)
 
         first, at = _node(system, tolerance, at)
         at, (nodes, info, micros) = loops.scan(save, at, self.num_saves)
         nodes = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, nodes)
-        before_end = _before_end(stepper.scheme, macro_dt)
+        before_end = _before_end(stepper.scheme, times.macro_dt)
         micro = None if micros is None else MicroNodes(nodes.state.t[1:, None] - before_end, micros)
         return Trajectory(*nodes, info=info, result=at.result, failed_at=at.failed_at, micro=micro)
 
-    def _interval(self, stepper: Plan, state: State, t_start, macro_dt, loops: Loops):
+    def _interval(self, stepper: Plan, state: State, times: "_Times", loops: Loops):
         """``at, info, micro = interval(at, count)``: the macro steps between two saved nodes."""
         no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
         no_micro = jnp.zeros((stepper.scheme.num_micro, state.q_f.shape[0])) if self.save_micro else None
-        take = _step_of(stepper, t_start, macro_dt, self.save_micro)
+        take = _step_of(stepper, times, self.save_micro)
 
         def interval(at: _At, count):
             at, info, micro = loops.repeat(count, take, (at, no_info, no_micro))
@@ -203,11 +246,19 @@ def _blank_memory(engine: Engine, shapes: tuple):
     """Zeros in the shapes of the memory of a stepper; `shapes` and types of the leaves and of the five arrays of a state."""
 
     def memory(*arrays):
-        start = State(*arrays[-5:])
+        start = State(*arrays[-5:])  # the five arrays of a state
         return engine.stepper(list(arrays[:-5]), start).init(start, 1.0)
 
     blank = jax.eval_shape(memory, *(jax.ShapeDtypeStruct(*shape) for shape in shapes))
     return jax.device_put(jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), blank))
+
+
+class _Times(NamedTuple):
+    """Times of a run: that of its start, the macro step H, and the macro steps from one saved node to the next."""
+
+    t_start: Any
+    macro_dt: Any
+    save_every: Any
 
 
 class _At(NamedTuple):
@@ -233,8 +284,9 @@ class _Counted(NamedTuple):
     saved: Saved
 
 
-def _step_of(stepper: Plan, t_start, macro_dt, save_micro: bool):
+def _step_of(stepper: Plan, times: _Times, save_micro: bool):
     """A macro step as the body of a loop. From a failure on momenta are NaN, and by them all positions after it."""
+    t_start, macro_dt, _ = times
 
     def step(_, carry):
         at, worst, _ = carry

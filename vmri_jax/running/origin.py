@@ -42,7 +42,7 @@ class Origin:
         system = system.system if isinstance(system, Problem) else system
         if not isinstance(system, System):
             raise TypeError(f"of: got {type(moving).__name__}; give the vmri_jax.System, Problem or Scene of the run.")
-        return cls(names, _with_params(system, None), system.params)
+        return cls(names, system.with_params(None), system.params)
 
     @classmethod
     def named(cls, names: dict | None) -> "Origin":
@@ -86,7 +86,7 @@ class Origin:
         bare, params = (
             jax.tree.map(lambda leaf: leaf[(0,) * axes], (self.bare, self.params)) if axes else (self.bare, self.params)
         )
-        return _with_params(bare, params)
+        return bare.with_params(params)
 
     def shaped(self, part: Part, vectors):
         """Vectors (..., n) as the user gave the start: vectors, or a dictionary of arrays."""
@@ -150,14 +150,10 @@ def _is_repeated(array, axes: int) -> bool:
 @eqx.filter_jit
 def _mapped(function, axes: int, repeated: tuple[bool, ...], structure, static: tuple, arrays: list, nodes):
     def at(arrays, node):
-        return function(_with_params(*jax.tree.unflatten(structure, arrays)), node, *static)
+        bare, params = jax.tree.unflatten(structure, arrays)
+        return function(bare.with_params(params), node, *static)
 
     for axis in range(axes):
         lanes = [None if axis == 0 or once else 0 for once in repeated]  # the innermost axis is that of the nodes
         at = jax.vmap(at, (lanes, 0))
     return at(arrays, nodes)
-
-
-def _with_params(system: System, params) -> System:
-    """The same system with other parameters, without the checks of its constructor."""
-    return eqx.tree_at(lambda system: system.params, system, params, is_leaf=lambda leaf: leaf is None)

@@ -17,8 +17,8 @@ from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.arguments import check_run, check_vectors, nothing_fast
-from vmri_jax.running.engine import Engine, engine
+from vmri_jax.running.arguments import Steps, check_run, check_vectors, nothing_fast
+from vmri_jax.running.engine import Arrays, Engine, Model, Place, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
@@ -81,8 +81,6 @@ class Simulation:
     save_every: int
     save_micro: bool
     names: Names | None
-    leaves: list = field(repr=False)
-    structure: Any = field(repr=False)
     may_fall_back: bool = True
 
     def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = True) -> Trajectory:
@@ -100,15 +98,15 @@ class Simulation:
         arguments = self._arguments(state, macro_dt, params, num_steps)
         origin = self.origin if params is None else replace(self.origin, params=params)
         with Working(STEPPING):
-            arrays = self._program(False)(*arguments)
-        trajectory = with_origin(from_arrays(arrays), origin)
+            trajectory = with_origin(from_arrays(self._program(False)(*arguments)), origin)
         if int(trajectory.failed_at) < 0:
             return trajectory
         if self._fallback_helps(trajectory):
             with Working(FALLING_BACK):
                 trajectory = with_origin(from_arrays(self._program(True)(*arguments)), origin)
         if throw and int(trajectory.failed_at) >= 0:
-            raise simulation_error(trajectory, arguments[2], arguments[3], self.scheme.num_micro)
+            arrays, save_every, _ = arguments
+            raise simulation_error(trajectory, arrays.macro_dt, save_every, self.scheme.num_micro)
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
@@ -120,22 +118,22 @@ class Simulation:
 
         It takes the fallback if the run needs it. Arguments as of a call.
         """
-        arguments = self._arguments(state, macro_dt, params, num_steps)
-        arguments = jax.device_put(arguments[:3]) + arguments[3:]
+        arrays, *counts = self._arguments(state, macro_dt, params, num_steps)
+        arguments = jax.device_put(arrays), *counts
         program = self._program(self._fallback_helps(from_arrays(self._program(False)(*arguments))))
         program(*arguments)
         return lambda: program(*arguments)[0].block_until_ready()  # the arrays of one program are ready together
 
-    def _arguments(self, state, macro_dt, params, num_steps) -> tuple:
-        """What the programs of the engine are called with."""
-        leaves, start, save_every = self.leaves, self.start_arrays, self.save_every
+    def _arguments(self, state, macro_dt, params, num_steps) -> tuple[Arrays, int, int]:
+        """The arguments of the programs of the engine."""
+        leaves, start, save_every = self.arrays.model, self.arrays.state, self.save_every
         if state is not None:
             check_vectors(state)
             start = _arrays(state)
-            if [a.shape for a in start] != [a.shape for a in self.start_arrays]:
+            if [a.shape for a in start] != [a.shape for a in self.arrays.state]:
                 raise ValueError(
                     f"the arrays of state have shapes {[a.shape for a in start]}; the run was prepared for "
-                    f"{[a.shape for a in self.start_arrays]}."
+                    f"{[a.shape for a in self.arrays.state]}."
                 )
         if params is not None:
             leaves = self._leaves_with(params)
@@ -144,7 +142,7 @@ class Simulation:
                 raise ValueError(f"num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
             save_every = num_steps // self.num_saves
         macro_dt = self.macro_dt if macro_dt is None else np.asarray(macro_dt, dtype=float)
-        return leaves, start, macro_dt, save_every, self.num_saves
+        return Arrays(leaves, start, macro_dt), save_every, self.num_saves
 
     def _leaves_with(self, params) -> list:
         own, structure = jax.tree.flatten(self.system.params)
@@ -153,7 +151,8 @@ class Simulation:
             check_params(params)
         if structure_given != structure or list(map(np.shape, given)) != list(map(np.shape, own)):
             raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
-        return self.leaves[: len(self.leaves) - len(own)] + [np.asarray(leaf) for leaf in given]
+        leaves = self.arrays.model
+        return leaves[: len(leaves) - len(own)] + [np.asarray(leaf) for leaf in given]
 
     def _program(self, falls_back: bool):
         """The compiled run, see `Engine.whole`."""
@@ -164,9 +163,7 @@ class Simulation:
 
     def with_scheme(self, scheme: Scheme | Composition) -> "Simulation":
         """The same run by another scheme."""
-        newton, scheme, system = of_one_type((self.newton, scheme, self.system))
-        leaves, structure = jax.tree.flatten((newton, scheme, system))
-        return replace(self, system=system, scheme=scheme, newton=newton, leaves=leaves, structure=structure)
+        return replace(self, scheme=of_one_type(scheme))
 
     @property
     def order(self) -> int:
@@ -181,7 +178,7 @@ class Simulation:
     @property
     def is_concrete(self) -> bool:
         """Whether there are only numbers, no tracers of a transformation."""
-        return is_concrete((self.leaves, self.start_arrays, self.macro_dt))
+        return is_concrete(self.arrays)
 
     @cached_property
     def plan(self) -> Plan:
@@ -194,9 +191,10 @@ class Simulation:
         return replace(Origin.of(self.system), names=self.names)
 
     @cached_property
-    def start_arrays(self) -> tuple:
-        """The arrays of the start."""
-        return tuple(vars(self.state).values())
+    def arrays(self) -> Arrays:
+        """The numbers that it is computed from."""
+        model = Model(self.newton, self.scheme, self.system)
+        return Arrays(jax.tree.leaves(model), tuple(vars(self.state).values()), self.macro_dt)
 
     @cached_property
     def engine(self) -> Engine:
@@ -210,24 +208,24 @@ class Simulation:
 
     def engine_for(self, is_exact: bool, num_saves: int) -> Engine:
         """Programs with the first method or with exact matrices, for a number of saved intervals."""
-        structure = self._exact_structure if is_exact else self.structure
-        return engine(structure, num_saves, self.save_micro)
+        return engine(self._structures[is_exact], num_saves, self.save_micro)
 
     @cached_property
-    def _exact_structure(self):
-        newton = replace(self.newton, method="arrowhead")
-        return jax.tree.structure((newton, self.scheme, self.system))
+    def _structures(self) -> tuple:
+        """Structures of the `Model` with the first method, and with exact matrices."""
+        newtons = self.newton, replace(self.newton, method="arrowhead")
+        return tuple(jax.tree.structure(Model(newton, self.scheme, self.system)) for newton in newtons)
 
     def check(self, what: str = "simulate: the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return something else than they should, and constraints that cannot be kept."""
-        shapes = tuple(a.shape for a in self.start_arrays)
-        numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.leaves)
-        _check_once(_Known((self.structure, shapes, numbers), self.system, self.state, what, constraints))
+        shapes = tuple(a.shape for a in self.arrays.state)
+        numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.arrays.model)
+        _check_once(_Known((self._structures[0], shapes, numbers), self.system, self.state, what, constraints))
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
         """Before the first step; or from a state before step number `step`, as if that was the first one."""
-        start = self.start_arrays if state is None else _arrays(state)
-        memory = self._piece_engine(fell_back).blank_memory(self.leaves, start)
+        start = self.arrays.state if state is None else _arrays(state)
+        memory = self._piece_engine(fell_back).blank_memory(self.arrays._replace(state=start))
         return Checkpoint(step, State(*start), memory, fell_back, starts=True)
 
     def _piece_engine(self, is_exact: bool) -> Engine:
@@ -249,9 +247,9 @@ class Simulation:
         return pieces, at
 
     def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
-        numbers = self.start_arrays[0], self.macro_dt, at.step, self.save_every, saves
-        given = self.leaves, tuple(vars(at.state).values()), at.memory, at.starts
-        piece, state, memory = self._piece_engine(at.fell_back).next_piece(*given, *numbers)
+        arrays = self.arrays._replace(state=tuple(vars(at.state).values()))
+        place = Place(at.memory, at.starts, self.arrays.state[0], at.step)
+        piece, state, memory = self._piece_engine(at.fell_back).next_piece(arrays, place, self.save_every, saves)
         return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
@@ -308,39 +306,31 @@ def prepare(
     Raises:
         ValueError, TypeError: bad arguments, as of `simulate`.
     """
-    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    run = simulation(system, scheme, state, newton, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
     if not run.is_concrete:
         raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
     check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
-    leaves, macro_dt, start = jax.device_put((run.leaves, run.macro_dt, run.state))
-    run = replace(run, leaves=leaves, macro_dt=macro_dt, state=start)
+    on_device = ("system", "scheme", "newton", "state", "macro_dt")
+    run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
     with Working("prepare: compiling the run"):
-        jax.block_until_ready(
-            run._program(False)(leaves, run.start_arrays, macro_dt, 0, 0)
-        )  # no steps: it only compiles
+        jax.block_until_ready(run._program(False)(run.arrays, 0, 0))  # no steps: it only compiles
     return run
 
 
-def simulation(
-    system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro
-) -> Simulation:
+def simulation(moving: Movable, scheme, state: State | None, newton: Newton | None, steps: Steps) -> Simulation:
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     warn_if_slow()
-    problem, given = opened(system), system
+    problem = opened(moving)
     system, state = start_of("simulate", problem, state)
-    macro_dt, num_steps, save_every = check_run(
-        system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro
-    )
-    useless = nothing_fast(scheme, state.q_f.size) if given is not problem else ""
+    macro_dt, num_steps, save_every = check_run(system, scheme, state, newton, steps)
+    useless = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if useless:
         warnings.warn(f"simulate: {useless}", stacklevel=3)
     newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
-    leaves, structure = jax.tree.flatten((newton, scheme, system))
-    state = State(*_arrays(state))
-    macro_dt, names = _float(macro_dt), names_of(problem)
+    state, macro_dt = State(*_arrays(state)), _float(macro_dt)
     return Simulation(
-        system, scheme, newton, state, macro_dt, num_steps, save_every, save_micro, names, leaves, structure
+        system, scheme, newton, state, macro_dt, num_steps, save_every, steps.save_micro, names_of(problem)
     )
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def traced_run(run: "Simulation", adjoint: str) -> Trajectory:
     """All steps of a run, some of whose arrays are tracers; `adjoint` as of `simulate`."""
     system, scheme, every = run.system, run.scheme, run.save_every
-    arrays = run.leaves, run.start_arrays, run.macro_dt
+    arrays = run.arrays
     kind = chosen(adjoint, scheme, run.num_steps, system.force is not None)
     if adjoint == "auto" and kind != "stored":
         arrays = telling(kind, run.num_steps, arrays)
@@ -40,13 +40,13 @@ def _differentiated(kind: str, engine: Engine, save_every: int) -> Callable[[tup
         "stored": run,
         "forward": partial(forward, run),
         "reversible": partial(reversible, run, engine, save_every),
-        "checkpoint": lambda arrays: engine.checkpointed(*arrays, save_every),
+        "checkpoint": lambda arrays: engine.checkpointed(arrays, save_every),
     }
     return kinds[kind]
 
 
 def _stored(engine: Engine, save_every: int, arrays) -> Trajectory:
-    return engine.stored(*arrays, save_every)
+    return engine.stored(arrays, save_every)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))

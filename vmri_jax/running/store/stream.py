@@ -10,6 +10,7 @@ from typing import Any
 
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.state import Movable, State
+from vmri_jax.running.arguments import Steps
 from vmri_jax.running.files import check_writable, clear_partial
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
@@ -82,7 +83,8 @@ def stream(
     """
     path = Path(out)
     _check_place(path, resume, overwrite)
-    run = simulation(system, scheme, state, newton, macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    steps = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
+    run = simulation(system, scheme, state, newton, steps)
     num_steps = run.num_steps
     if not run.is_concrete:
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
