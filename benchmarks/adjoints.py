@@ -80,7 +80,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
 
 def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str, Ratio]]:
     """A row for each adjoint and number of steps, and times over that of a run."""
-    problem, scheme, newton = case.problem(), vm.fully_implicit(10), vm.Newton("nested")
+    problem, scheme, solver = case.problem(), vm.fully_implicit(10), vm.solvers.Nested()
     start, params = problem.state(), jax.tree.map(jnp.asarray, problem.system.params)
 
     def gradient(adjoint: str, steps: int):
@@ -93,7 +93,7 @@ def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str
                 macro_dt=case.macro_dt,
                 num_steps=steps,
                 save_every=steps // 10,
-                newton=newton,
+                solver=solver,
                 adjoint=adjoint,
             )
             return jnp.sum(end.q_s[-1] ** 2) + jnp.sum(end.q_f[-1] ** 2)
@@ -103,7 +103,7 @@ def measured(case: Case, repeats: int, tell: Tell) -> tuple[list[dict], dict[str
         return program, time.perf_counter() - began
 
     forward = vm.prepare(
-        problem, scheme, macro_dt=case.macro_dt, num_steps=SHORT, save_every=SHORT // 10, newton=newton
+        problem, scheme, macro_dt=case.macro_dt, num_steps=SHORT, save_every=SHORT // 10, solver=solver
     ).timed()
     calls, rows, expected = {"run": forward}, [], None
     for adjoint in ADJOINTS:

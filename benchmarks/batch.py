@@ -69,7 +69,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
     return growing("batch", name, (_measure(case, size, tell) for case in size.cases), c_loops.missing())
 
 
-def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, devices: int) -> Callable:
+def _program(problem: vm.Problem, case: Case, batch: int, solver: vm.solvers.Newton, devices: int) -> Callable:
     states = starts(problem, batch)
 
     def run(num_steps: int) -> vm.Trajectory:
@@ -80,7 +80,7 @@ def _program(problem: vm.Problem, case: Case, batch: int, newton: vm.Newton, dev
             micro_dt=case.micro_dt,
             num_steps=num_steps,
             save_every=num_steps,
-            newton=newton,
+            solver=solver,
             devices=devices if batch % devices == 0 else 1,
         )
 
@@ -99,14 +99,14 @@ def _measure(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim
 
 def _all_sizes(case: Case, size: Size, tell: Tell) -> tuple[list[dict], list[Claim]]:
     problem = programs.problem(case.system)
-    newtons = {"default": vm.Newton()}
+    newtons = {"default": vm.solvers.Auto()}
     if case.fixed:
-        newtons["fixed"] = vm.Newton(fixed_iterations=_fewest_iterations(problem, case))
+        newtons["fixed"] = vm.solvers.Auto(fixed_iterations=_fewest_iterations(problem, case))
     runs, work, results = {}, {}, {}
-    for option, newton in newtons.items():
+    for option, solver in newtons.items():
         for batch in size.batches:
             tell(f"{case.system}, batch {batch}, {option}")
-            simulate = _program(problem, case, batch, newton, min(size.devices, batch))
+            simulate = _program(problem, case, batch, solver, min(size.devices, batch))
             steps = _steps(simulate, batch, size)
             key = f"{option} {batch}"
             runs[key], work[key] = partial(simulate, steps), batch * steps * NUM_MICRO
@@ -173,7 +173,9 @@ def _fewest_iterations(problem: vm.Problem, case: Case) -> int:
     run = vm.simulate(problem.system, scheme, state, micro_dt=case.micro_dt, num_steps=steps)
     taken = np.asarray(run.info.iterations)
     for iterations in range(max(1, int(taken.mean())), int(taken.max())):
-        simulate = programs.program(problem, scheme, vm.Newton(fixed_iterations=iterations), micro_dt=case.micro_dt)
+        simulate = programs.program(
+            problem, scheme, vm.solvers.Auto(fixed_iterations=iterations), micro_dt=case.micro_dt
+        )
         if not programs.failed(simulate(steps)):
             return iterations
     return max(1, int(taken.max()))

@@ -50,7 +50,7 @@ class System:
         """Arguments of `simulate`; without a second method, which every lane would compute."""
         method = "nested" if self.problem.system.has_constant_mass else "arrowhead"
         steps = {"macro_dt": T_END / self.num_steps, "num_steps": self.num_steps, "save_every": self.num_steps}
-        return {**steps, "newton": vm.Newton(method)}
+        return {**steps, "solver": vm.solvers.named(method)()}
 
     def end(self, state: vm.State):
         """Positions (n,) at the end."""
@@ -161,7 +161,7 @@ def _measure(system: System, size: Size, tell: Tell) -> tuple[list[dict], list[C
     row("gradient", accelerator, GRADIENT_LANES, partial(gradients, states))
     with jax.default_device(cpu):
         lanes = min(size.lanes)
-        many, step = _repeated(few, lanes), {k: v for k, v in system.run.items() if k != "newton"}
+        many, step = _repeated(few, lanes), {k: v for k, v in system.run.items() if k != "solver"}
         batch = partial(vm.simulate_batch, system.problem.system, system.scheme, many, **step)
         row("simulate_batch", cpu, lanes, lambda: batch().q_f, error=error)
     for lanes, run, peer_error in _diffrax(system, few, size.lanes, reference, error, accelerator):

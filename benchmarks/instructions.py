@@ -13,7 +13,6 @@ import vmri_jax as vm
 from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.programs import problem
 from benchmarks.report import Claim, Report, growing
-from vmri_jax.steppers.newton.options import Choice
 
 COLUMNS = ("program", "instructions", "to compile, s")
 STEPS = 100
@@ -45,13 +44,18 @@ class Program:
     problem: Callable[[], vm.Problem]
     scheme: vm.Scheme
     most: int
-    method: Choice = "auto"
+    method: str = "auto"
     is_gradient: bool = False
 
     def compiled(self) -> jax.stages.Compiled:
         """The program."""
         problem, macro_dt = self.problem(), MICRO_DT * self.scheme.num_micro
-        options = {"macro_dt": macro_dt, "num_steps": STEPS, "save_every": STEPS, "newton": vm.Newton(self.method)}
+        options = {
+            "macro_dt": macro_dt,
+            "num_steps": STEPS,
+            "save_every": STEPS,
+            "solver": vm.solvers.named(self.method)(),
+        }
         if not self.is_gradient:
             return vm.prepare(problem, self.scheme, **options).compiled()
 

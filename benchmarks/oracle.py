@@ -50,12 +50,12 @@ def compare(of: rs.Structure, draw: rs.Draw) -> Comparison:
     """A few macro steps by the stepper of a structure, and by the textbook."""
     problem, scheme = rs.problem(of, draw), rs.scheme(of, draw)
     state = problem.state()
-    newton = vm.Newton(of.method)  # pyright: ignore
-    how = {"macro_dt": draw.macro_dt, "num_steps": STEPS, "save_every": EVERY, "newton": newton, "throw": False}
+    solver = vm.solvers.named(of.method)()  # pyright: ignore
+    how = {"macro_dt": draw.macro_dt, "num_steps": STEPS, "save_every": EVERY, "solver": solver, "throw": False}
     run = vm.simulate(problem.system, scheme, state, **how)
     expected = simulate_textbook(problem.system, scheme, state, draw.macro_dt)
     method = vm.Method(int(np.max(run.info.method))).name
-    kind = kind_of_step(vm.plan(problem.system, scheme, state, newton))
+    kind = kind_of_step(vm.plan(problem.system, scheme, state, solver))
     differences = [_relative(run, expected, names) for names in (("q_s", "q_f"), ("p_s", "p_f"))]
     return Comparison(method, kind, vm.Result(int(run.result)).name, *differences)
 

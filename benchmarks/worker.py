@@ -106,9 +106,9 @@ def simulator(case: Case):
     """``simulate(num_steps)`` by `vm.simulate`."""
     problem, scheme = case.problem(), case.made_scheme()
     state = problem.state()
-    newton = vm.Newton(case.method)  # pyright: ignore[reportArgumentType]
+    solver = vm.solvers.named(case.method)()  # pyright: ignore[reportArgumentType]
     return lambda n: vm.simulate(
-        problem.system, scheme, state, **last_node(case.macro_dt, n), newton=newton, throw=False
+        problem.system, scheme, state, **last_node(case.macro_dt, n), solver=solver, throw=False
     )
 
 

@@ -87,17 +87,15 @@ def forget_programs():
 
 @pytest.fixture(scope="session", autouse=True)
 def default_method(request):
-    """`Newton()` with the method of the command line: the tests hold for every method."""
-    from vmri_jax import Newton
+    """`solvers.Auto()` is the solver with the method of the command line: the tests hold for every method."""
+    from vmri_jax.steppers import solvers
 
     method = request.config.getoption("--method")
     if method is None:
         yield
         return
     with pytest.MonkeyPatch.context() as patch:
-        defaults = Newton.__init__.__defaults__ or ()
-        patch.setattr(Newton.__init__, "__defaults__", (method, *defaults[1:]))
-        assert Newton().method == method
+        patch.setattr(solvers, "Auto", solvers.named(method))
         yield
 
 

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax import Newton, State, initial_state, macro_step, simulate, systems
+from vmri_jax import State, initial_state, macro_step, simulate, systems
 from vmri_jax.schemes.composition import stage_scheme
+from vmri_jax.steppers import solvers
 
 DATA = Path(__file__).parent / "data"
 PROBLEMS = {
@@ -22,7 +23,7 @@ NUM_SAVES = 50
 
 
 compiled_step = jax.jit(macro_step)
-"""``(system, scheme, state, macro_dt, newton) -> (state, info)``, compiled once per structure."""
+"""``(system, scheme, state, macro_dt, solver) -> (state, info)``, compiled once per structure."""
 
 
 @jax.jit
@@ -37,12 +38,12 @@ def step_matrix(system, scheme, macro_dt):
     return jax.jacfwd(step)(jnp.zeros(4))
 
 
-def without_fallback(system, scheme) -> Newton:
+def without_fallback(system, scheme) -> solvers.Newton:
     """The default iteration; where it is the nested march, without the exact solve behind it, which takes long to compile."""
     scheme = stage_scheme(scheme)
     potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
     local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)
-    return Newton("nested") if system.has_constant_mass and local else Newton()
+    return solvers.Nested() if system.has_constant_mass and local else solvers.Auto()
 
 
 STENCIL = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}

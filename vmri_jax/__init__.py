@@ -78,7 +78,7 @@ from vmri_jax.schemes.scheme import (
     mollified_impulse,
     takahashi_imada,
 )
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
 from vmri_jax.steppers.stepper import StepInfo
@@ -149,7 +149,6 @@ __all__ = [
     "LostEnergyWarning",
     "Method",
     "Names",
-    "Newton",
     "NotConfiguredWarning",
     "Plan",
     "Problem",
@@ -199,6 +198,7 @@ __all__ = [
     "scene",
     "simulate",
     "simulate_batch",
+    "solvers",
     "stability",
     "stream",
     "study",

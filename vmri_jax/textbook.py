@@ -165,7 +165,7 @@ def constraints(system: System, scheme: Scheme, slow, fast, t, macro_dt):
     return jax.vmap(system.g)(t + macro_dt * theta, q_s, fast), jax.vmap(system.g_slow)(t + macro_dt * slow_theta, slow)
 
 
-def newton(residual: Callable, guess, max_iterations: int = 50):
+def solver(residual: Callable, guess, max_iterations: int = 50):
     """The root of ``residual(x)`` with shapes as x, by Newton's method; NaN where it does not converge.
 
     Goes on until a change is below 1e-9 of x, and then once more, to round-off. Differentiable by the implicit function theorem.
@@ -210,7 +210,7 @@ def project(system: System, state: State, v_s, v_f):
         rates = system.constraint_rates(t, q_s, q_f, v_s, v_f)
         return p_s + force_s - state.p_s, p_f + force_f - state.p_f, rates
 
-    v_s, v_f, mu = newton(residual, (v_s, v_f, jnp.zeros_like(values)))
+    v_s, v_f, mu = solver(residual, (v_s, v_f, jnp.zeros_like(values)))
     force_s, force_f = pull(mu)
     return State(t, q_s, q_f, state.p_s - force_s, state.p_f - force_f), (v_s, v_f)
 
@@ -260,7 +260,7 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
     )
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
     straight = state.q_s + macro_dt * slow_theta * v_s, state.q_f + macro_dt * theta * v_f
-    x = newton(residual, Unknowns(*straight, jnp.zeros((n * r, n_g)), jnp.zeros((r, n_gs))))
+    x = solver(residual, Unknowns(*straight, jnp.zeros((n * r, n_g)), jnp.zeros((r, n_gs))))
     d_slow, d_fast = slots(x)
     end = State(t + macro_dt, x.slow[-1], x.fast[-1], d_slow[-1] / micro_dt, d_fast[-1] / micro_dt)
     return project(system, end, v_s, v_f)[0]

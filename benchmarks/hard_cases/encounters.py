@@ -49,13 +49,13 @@ def norm_at_zero(full: bool) -> Outcome:
     finite gradients; coincident points fail plainly
     """
     problem = vm.systems.triple_spherical_pendulum(lengths=(10.0, 2.0, 0.01))
-    steps, scheme, newton = 500 if full else 50, vm.fully_explicit(2), vm.Newton(method="nested")
+    steps, scheme, solver = 500 if full else 50, vm.fully_explicit(2), vm.solvers.Nested()
 
     @jax.jit
     @partial(jax.jacfwd, has_aux=True)
     def reached(stiffness, state):
         system = problem.system.replace(params=problem.system.params | {"stiffness": stiffness})
-        run = vm.simulate(system, scheme, state, macro_dt=1e-3, num_steps=steps, save_every=steps, newton=newton)
+        run = vm.simulate(system, scheme, state, macro_dt=1e-3, num_steps=steps, save_every=steps, solver=solver)
         return run.q_f[-1], run
 
     values, said = {}, []

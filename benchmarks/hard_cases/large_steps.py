@@ -12,9 +12,9 @@ from vmri_jax.hard_cases import Outcome
 from vmri_jax.hard_cases.measures import constraints, difference, energy, iterations, nodes, run, status
 from vmri_jax.study.timing import interleaved
 
-EXACT = vm.Newton(method="arrowhead")
+EXACT = vm.solvers.Arrowhead()
 """The march with exact matrices, which a pass may take over from those before it: it has to converge."""
-DENSE = vm.Newton(method="dense")
+DENSE = vm.solvers.Dense()
 """Newton's iteration as textbooks have it, with the matrix of every iterate: its iterations are counted."""
 
 
@@ -45,8 +45,8 @@ def large_macro_step(full: bool) -> Outcome:
     at most 8 Newton iterations; H = 2 fails plainly or stays bounded
     """
     problem, scheme, steps = vm.systems.fermi_pasta_ulam(), vm.fully_implicit(100), 100 if full else 20
-    one, two = (run(problem, scheme, h, steps, newton=EXACT) for h in (1.0, 2.0))
-    newton = iterations(run(problem, scheme, 1.0, 20, newton=DENSE))
+    one, two = (run(problem, scheme, h, steps, solver=EXACT) for h in (1.0, 2.0))
+    newton = iterations(run(problem, scheme, 1.0, 20, solver=DENSE))
     passes = int(np.max(np.asarray(one.info.iterations)[:20]))
     begins_well = one.success or int(one.failed_at) >= 20
     later = "" if one.success else f", {status(one)}"
@@ -61,9 +61,11 @@ def large_macro_step(full: bool) -> Outcome:
 PENDULUM = vm.fully_implicit(5)
 
 
-def _pendulum_run(problem: vm.Problem, macro_dt: float, num_steps: int, newton=EXACT) -> vm.Trajectory:
+def _pendulum_run(
+    problem: vm.Problem, macro_dt: float, num_steps: int, solver: vm.solvers.Newton = EXACT
+) -> vm.Trajectory:
     """With 20 saved nodes."""
-    return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, newton=newton)
+    return run(problem, PENDULUM, macro_dt, num_steps, save_every=num_steps // 20, solver=solver)
 
 
 @hard_case(7, "large constrained step")
@@ -139,16 +141,16 @@ def many_micro_steps(full: bool) -> Outcome:
     """
     problem, macro_dt, micro = vm.systems.fermi_pasta_ulam(), 0.1, (200, 1000, 5000)
 
-    def end(num_micro, steps, newton=None):  # one saved node: one program for each num_micro
+    def end(num_micro, steps, solver=None):  # one saved node: one program for each num_micro
         scheme = vm.fully_implicit(num_micro)
-        return nodes(run(problem, scheme, macro_dt, steps, save_every=steps, newton=newton))[-1]
+        return nodes(run(problem, scheme, macro_dt, steps, save_every=steps, solver=solver))[-1]
 
     steps = {n: (20 if full else 5) * micro[-1] // n for n in micro}  # as many micro steps for each
     runs = {f"{n}": partial(end, n, steps[n]) for n in micro}
     seconds = interleaved(runs, 40 if full else 20, min_seconds=0.0, clock=time.process_time)
     best = {n: min(seconds[f"{n}"]) / steps[n] for n in micro}
     slope = np.polyfit(np.log(micro), np.log(list(best.values())), 1)[0]
-    apart = difference(end(micro[0], 3), end(micro[0], 3, vm.Newton(method="dense")))
+    apart = difference(end(micro[0], 3), end(micro[0], 3, vm.solvers.Dense()))
     return Outcome(
         f"time over num_micro {micro[0]} to {micro[-1]}: slope {slope:.2f}; from the dense solve at 200: {apart:.0e}",
         abs(slope - 1) <= 0.15 and apart < 1e-11,

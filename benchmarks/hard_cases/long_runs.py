@@ -104,9 +104,9 @@ def loose_tolerance(full: bool) -> Outcome:
     """
     steps, problem = 1_000_000 if full else 100_000, vm.systems.fermi_pasta_ulam()
     changes, details = {}, {}
-    newtons = {name: vm.Newton("nested", tolerance=float(name)) for name in ("1e-4", "1e-8", "1e-12")}
-    for name, newton in (newtons | {"the default": vm.Newton()}).items():
-        trajectory = long_run(problem, vm.fully_implicit(10), CHAIN_DT, steps, newton=newton)
+    newtons = {name: vm.solvers.Nested(tolerance=float(name)) for name in ("1e-4", "1e-8", "1e-12")}
+    for name, solver in (newtons | {"the default": vm.solvers.Auto()}).items():
+        trajectory = long_run(problem, vm.fully_implicit(10), CHAIN_DT, steps, solver=solver)
         changes[name] = energy(trajectory, steps)
         details |= {f"{key} {name}": value for key, value in _energy_picture(trajectory).items()}
     loose, middle, _, default = changes.values()

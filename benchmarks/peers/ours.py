@@ -22,7 +22,7 @@ LOOSE = (1e-2, 1e-4, 1e-6)
 """Newton tolerances for moderate errors, where there are constraints; equations are also solved to round-off."""
 LOOSE_HIGH = tuple(tolerances(1e-3, 1e-10))
 """The same for high degrees, whose steps are long: tolerances are relative to the motion."""
-MARCH = vm.Newton("nested")
+MARCH = vm.solvers.Nested()
 """As `vm.simulate` starts a run. What it does not solve fails here, and is not solved again in another way."""
 
 
@@ -61,8 +61,8 @@ def ladders(case: Case) -> list[Ladder]:
     def ladder(name: str, scheme, tolerance: float) -> Ladder:
         @cache
         def prepared():
-            newton = dataclasses.replace(MARCH, tolerance=tolerance)
-            return programs.program(case.problem, scheme, newton, macro_dt=case.t_end)
+            solver = dataclasses.replace(MARCH, tolerance=tolerance)
+            return programs.program(case.problem, scheme, solver, macro_dt=case.t_end)
 
         def build(num_steps: int):
             simulate, macro_dt = prepared(), case.t_end / num_steps
@@ -98,13 +98,13 @@ def batch_ladders(case: Case, states: vm.State, q, v, schemes=None) -> list[Ladd
     del q, v  # known from the states
 
     def ladder(name: str, scheme, tolerance: float) -> Ladder:
-        newton = dataclasses.replace(MARCH, tolerance=tolerance)
+        solver = dataclasses.replace(MARCH, tolerance=tolerance)
 
         def build(num_steps: int):
             steps = {"macro_dt": case.t_end / num_steps, "num_steps": num_steps, "save_every": num_steps}
 
             def run():
-                return last_positions(vm.simulate_batch(case.problem.system, scheme, states, **steps, newton=newton))
+                return last_positions(vm.simulate_batch(case.problem.system, scheme, states, **steps, solver=solver))
 
             return run
 

@@ -13,7 +13,7 @@ from vmri_jax.control import minimize
 NONE = np.zeros(0)
 POINT = vm.Problem(vm.System(vm.ConstantMass([1.0], NONE)), [0.0], NONE)
 """On a straight line, moved by a force."""
-MARCH = vm.Newton("nested")
+MARCH = vm.solvers.Nested()
 """Without the exact solve behind it, which takes long to compile."""
 STIFFNESS = np.array([4.0, 9.0])
 TIPS = np.array([0.1, 0.05])
@@ -100,7 +100,7 @@ def test_a_hub_with_flexible_modes():
         scheme=vm.fully_implicit(1),
         macro_dt=1 / steps,
         num_steps=steps,
-        newton=MARCH,
+        solver=MARCH,
     )
     assert abs(optimum.cost - cost) / cost < 1.2e-2  # measured 1.16e-2
     expected = [(expm(A.T * (1 - t - 0.5 / steps)) @ at_end)[3] for t in optimum.t]
@@ -127,7 +127,7 @@ def test_a_cart_with_a_pendulum_from_rest_to_rest():
         macro_dt=0.1,
         num_steps=12,
         grid="micro",
-        newton=MARCH,
+        solver=MARCH,
     )
     assert optimum.converged
     assert optimum.controls.shape == (12, 2, 1)

@@ -41,7 +41,7 @@ CASES = {  # problem, scheme, macro_dt, steps
 }
 
 
-def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, newton=None, **options):
+def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, solver=None, **options):
     """A function of everything a run depends on and tells, ``cost(params, p_s, p_f, macro_dt)``, and where to take it."""
     state, system = problem.state(), problem.system
 
@@ -54,7 +54,7 @@ def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, newton=Non
             macro_dt=macro_dt,
             num_steps=steps,
             save_every=save_every,
-            newton=newton,
+            solver=solver,
             **options,
         )
         inside = jnp.sum(jnp.sin(run.q_f_micro)) + jnp.sum(run.t_micro) if options.get("save_micro") else 0.0
@@ -66,7 +66,7 @@ def cost_of(problem: vm.Problem, scheme, macro_dt, steps, save_every, newton=Non
 
 def simple_cost(adjoint, steps="solved"):
     """Of a small system without constraints, a function of the momenta at the start alone."""
-    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, 6, vm.Newton("nested"), adjoint=adjoint)
+    cost, at = cost_of(CHAIN, SIMPLE[steps], 0.05, 6, 6, vm.solvers.Nested(), adjoint=adjoint)
     return (lambda p_f: cost(at[0], at[1], p_f, at[3])), at[2]
 
 
@@ -80,8 +80,8 @@ def simple_gradient(adjoint, steps="solved"):
 def gradient(case: str, save_every: int, adjoint: str, save_micro: bool = False):
     """All derivatives of a case in a row."""
     make, scheme, macro_dt, steps = CASES[case]
-    newton = vm.Newton("nested") if case != "composed" else None
-    cost, at = cost_of(make(), scheme, macro_dt, steps, save_every, newton, adjoint=adjoint, save_micro=save_micro)
+    solver = vm.solvers.Nested() if case != "composed" else None
+    cost, at = cost_of(make(), scheme, macro_dt, steps, save_every, solver, adjoint=adjoint, save_micro=save_micro)
     derivatives = jax.jit(jax.grad(cost, argnums=(0, 1, 2, 3)))(*at)
     return np.concatenate([np.ravel(a) for a in jax.tree.leaves(derivatives)])
 

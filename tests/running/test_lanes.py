@@ -15,7 +15,6 @@ from tests.support import largest_difference
 from tests.user_systems import two_oscillators
 from vmri_jax import (
     Method,
-    Newton,
     Result,
     State,
     explicit_slow,
@@ -27,13 +26,13 @@ from vmri_jax import (
 )
 
 STEPS, OMEGAS = jnp.array([0.01, 0.02, 0.03]), jnp.array([30.0, 50.0, 60.0])
-SCHEME_OF_THREE, MARCH = fully_implicit(2), Newton("nested")
+SCHEME_OF_THREE, MARCH = fully_implicit(2), vm.solvers.Nested()
 
 
 def batch_of_three(chain, states: State):
     """Each lane with a step size and a stiffness of its own."""
     return simulate_batch(
-        chain.system, SCHEME_OF_THREE, states, macro_dt=STEPS, num_steps=10, params={"omega": OMEGAS}, newton=MARCH
+        chain.system, SCHEME_OF_THREE, states, macro_dt=STEPS, num_steps=10, params={"omega": OMEGAS}, solver=MARCH
     )
 
 
@@ -51,7 +50,7 @@ def test_step_sizes_and_params_per_lane(chain, three):
     for lane in range(3):
         system = chain.system.replace(params={"omega": OMEGAS[lane]})
         state = lane_of(spread(chain, 3), lane)
-        alone = simulate(system, SCHEME_OF_THREE, state, macro_dt=STEPS[lane], num_steps=10, newton=MARCH)
+        alone = simulate(system, SCHEME_OF_THREE, state, macro_dt=STEPS[lane], num_steps=10, solver=MARCH)
         assert largest_difference(three.p_f[lane], alone.p_f) < 1e-12
 
 
@@ -69,10 +68,10 @@ LANES, BAD = 16, 7
 
 
 @pytest.mark.parametrize(
-    ("name", "scheme", "macro_dt", "newton"),
-    [("chain", fully_implicit(2), 0.05, Newton()), ("cart", explicit_slow(2), 0.02, Newton("nested"))],
+    ("name", "scheme", "macro_dt", "solver"),
+    [("chain", fully_implicit(2), 0.05, vm.solvers.Auto()), ("cart", explicit_slow(2), 0.02, vm.solvers.Nested())],
 )
-def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, newton):
+def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, solver):
     """Over starts, step sizes and parameters. One start has velocities beyond what a double can square."""
     problem, rng = SYSTEMS[name](), np.random.default_rng(5)
     v_s = np.array(problem.v_s + 0.3 * rng.normal(size=(LANES, problem.v_s.size)))
@@ -84,7 +83,7 @@ def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, newton):
     def go(v_s, v_f, macro_dt, params):
         system = problem.system.replace(params=params)
         state = initial_state(system, problem.q_s, problem.q_f, v_s, v_f, project=True)
-        return simulate(system, scheme, state, macro_dt=macro_dt, newton=newton, throw=False, **RUN)
+        return simulate(system, scheme, state, macro_dt=macro_dt, solver=solver, throw=False, **RUN)
 
     batch = jax.jit(jax.vmap(go))(v_s, v_f, steps, params)
     assert batch.q_f.shape == (LANES, 5, problem.q_f.size)
@@ -106,7 +105,7 @@ def test_vmap_of_simulate_equals_the_loop(name, scheme, macro_dt, newton):
 def test_lanes_that_the_march_does_not_solve_are_solved_exactly():
     """At H = 2 the curvature of V outweighs the mass of the slow variables."""
     problem = two_oscillators(kappa=25.0)
-    step = {"macro_dt": 40.0, "num_steps": 3, "newton": Newton(max_iterations=20)}
+    step = {"macro_dt": 40.0, "num_steps": 3, "solver": vm.solvers.Auto(max_iterations=20)}
     run = simulate_batch(problem.system, fully_implicit(20), spread(problem, 3), **step)
     assert np.all(np.asarray(run.result) <= Result.CONVERGED_AT_ROUNDOFF)
     assert np.any(np.asarray(run.info.method) == Method.ARROWHEAD)
@@ -168,9 +167,9 @@ vm.configure(devices=2)
 import jax, jax.numpy as jnp
 problem = vm.systems.fermi_pasta_ulam(1)
 states = jax.tree.map(lambda a: a + 1e-3 * jnp.arange(5.0).reshape(5, *[1] * a.ndim), problem.state())
-march = vm.Newton("nested")
+march = vm.solvers.Nested()
 one, two, chunks = (
-    vm.simulate_batch(problem.system, vm.fully_implicit(2), states, macro_dt=0.02, num_steps=5, newton=march, **how)
+    vm.simulate_batch(problem.system, vm.fully_implicit(2), states, macro_dt=0.02, num_steps=5, solver=march, **how)
     for how in ({}, {"devices": 2}, {"devices": 2, "chunk": 1})
 )
 assert jax.device_count() == 2
@@ -191,7 +190,7 @@ def test_a_lane_off_the_constraints_has_failed():
     problem = SYSTEMS[name]()
     states = spread(problem, 5)
     states = eqx.tree_at(lambda s: s.q_f, states, states.q_f.at[1].multiply(1.01))
-    run = simulate_batch(problem.system, scheme, states, macro_dt=macro_dt, newton=MARCH, warn=False, **RUN)
+    run = simulate_batch(problem.system, scheme, states, macro_dt=macro_dt, solver=MARCH, warn=False, **RUN)
     assert np.flatnonzero(run.result).tolist() == [1]
     assert run.result[1] == Result.CONSTRAINT_VIOLATED
     assert run.failed_at.tolist() == [-1, 0, -1, -1, -1]

@@ -10,7 +10,6 @@ import pytest
 from tests.support import largest_difference
 from vmri_jax import (
     Method,
-    Newton,
     Result,
     SimulationError,
     State,
@@ -21,6 +20,7 @@ from vmri_jax import (
     simulate,
 )
 from vmri_jax.running import progress
+from vmri_jax.steppers import solvers
 
 CALLS = Counter()
 STEPS = {"macro_dt": 0.03, "num_steps": 8, "save_every": 2}
@@ -60,8 +60,8 @@ def test_numbers_change_without_compiling_again(fpu):
 
 def test_the_fallback_takes_over_and_says_so(tsp, capsys, monkeypatch):
     monkeypatch.setattr(progress, "SECONDS", 0.0)
-    newton = Newton(max_iterations=40)
-    run = prepare(tsp, fully_implicit(10), macro_dt=0.2, num_steps=20, save_every=5, newton=newton)
+    solver = solvers.Auto(max_iterations=40)
+    run = prepare(tsp, fully_implicit(10), macro_dt=0.2, num_steps=20, save_every=5, solver=solver)
     trajectory = run()
     assert trajectory.success
     assert (

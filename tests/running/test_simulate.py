@@ -11,7 +11,6 @@ import vmri_jax as vm
 from tests.support import largest_difference
 from vmri_jax import (
     ConstantMass,
-    Newton,
     Problem,
     Result,
     SimulationError,
@@ -177,7 +176,7 @@ def test_too_few_iterations_fail_the_run(fpu):
     with pytest.raises(
         SimulationError, match=r"step 0 .*STAGNATED.* after 1 Newton iterations.*max_iterations"
     ) as caught:
-        run(fpu, fully_implicit(3), newton=Newton(max_iterations=1))
+        run(fpu, fully_implicit(3), solver=vm.solvers.Auto(max_iterations=1))
     assert caught.value.iterations == 1
     assert caught.value.residual > 1e-12
 

@@ -80,11 +80,11 @@ def test_equals_its_stages_one_by_one(name, base):
     problem, dt = PROBLEMS[name](), 0.01
     scheme = compose(base, "suzuki4")
     run = vm.simulate(problem.system, scheme, problem.state(), macro_dt=dt, num_steps=3, save_micro=True)
-    state, micro, newton = problem.state(), [], without_fallback(problem.system, base)
+    state, micro, solver = problem.state(), [], without_fallback(problem.system, base)
     for _ in range(3):
         micro.append([])
         for c in np.asarray(scheme.coefficients):
-            state, info = compiled_step(problem.system, base, state, c * dt, newton)
+            state, info = compiled_step(problem.system, base, state, c * dt, solver)
             micro[-1].append(info.q_f_micro)
     end = run.final_state
     for ours, theirs in ((end.q_s, state.q_s), (end.q_f, state.q_f), (end.p_s, state.p_s), (end.p_f, state.p_f)):
@@ -110,8 +110,8 @@ def test_keeps_constraints_and_symmetry():
 def test_keeps_the_area(name):
     """With constraints it follows from the symplectic step, and from the stages one by one."""
     problem, scheme = PROBLEMS[name](), compose(fully_explicit(2), "kahan-li6")
-    newton = without_fallback(problem.system, scheme)
-    assert vm.diagnostics.symplectic_defect(problem, scheme, macro_dt=0.01, newton=newton) < 1e-11
+    solver = without_fallback(problem.system, scheme)
+    assert vm.diagnostics.symplectic_defect(problem, scheme, macro_dt=0.01, solver=solver) < 1e-11
 
 
 def test_derivative_by_the_step():

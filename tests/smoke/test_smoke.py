@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from vmri_jax import ConstantMass, Newton
+from vmri_jax import ConstantMass
 from vmri_jax.scene import Anchor, Body, Gravity, RigidLink, Scene, Spring
 
 STEPS = {
     "explicit": ("fermi_pasta_ulam", vm.fully_explicit(4), None),
     "rattle": ("triple_spherical_pendulum", vm.fully_explicit(1), None),
     "split": ("simple_atomic_model", vm.explicit_slow(3), None),
-    "nested march": ("triple_spherical_pendulum", vm.fully_implicit(3), Newton("nested")),
+    "nested march": ("triple_spherical_pendulum", vm.fully_implicit(3), vm.solvers.Nested()),
     "collocation": ("fermi_pasta_ulam", vm.galerkin(1, 3), None),
-    "coupled, dense": ("fermi_pasta_ulam", vm.fully_implicit(2), Newton("dense")),
-    "coupled, arrowhead": ("fermi_pasta_ulam", vm.fully_implicit(2), Newton("arrowhead")),
+    "coupled, dense": ("fermi_pasta_ulam", vm.fully_implicit(2), vm.solvers.Dense()),
+    "coupled, arrowhead": ("fermi_pasta_ulam", vm.fully_implicit(2), vm.solvers.Arrowhead()),
     "composition": ("fermi_pasta_ulam", vm.compose(vm.fully_explicit(2), "suzuki4"), None),
 }
 
@@ -32,9 +32,9 @@ def start(name: str):
 
 @pytest.mark.parametrize("name", STEPS)
 def test_every_kind_of_step(name):
-    system, scheme, newton = STEPS[name]
+    system, scheme, solver = STEPS[name]
     problem, state = start(system)
-    run = vm.simulate(problem.system, scheme, state, macro_dt=0.002, num_steps=10, newton=newton)
+    run = vm.simulate(problem.system, scheme, state, macro_dt=0.002, num_steps=10, solver=solver)
     assert run.result <= vm.Result.CONVERGED_AT_ROUNDOFF
     assert float(jnp.abs(run.energy / run.energy[0] - 1).max()) < 1e-3
     assert float(run.constraint_residual.max()) < 1e-9

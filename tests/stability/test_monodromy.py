@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from tests.stability.systems import double_pendulum
-from vmri_jax import Newton, fully_explicit, initial_state
+from vmri_jax import fully_explicit, initial_state
 from vmri_jax.stability import linear_model, monodromy, multipliers, small_motions, stability_map
+from vmri_jax.steppers import solvers
 
-MARCH = Newton(method="nested")
+MARCH = solvers.Nested()
 
 
 def test_powers_of_a_linear_step():
@@ -37,7 +38,7 @@ def swinging():
 def test_on_a_constraint_manifold(swinging):
     """The derivative maps tangent vectors to tangent vectors, keeps the symplectic form, and predicts a neighbour."""
     system, state = swinging
-    found = monodromy(system, fully_explicit(3), state, macro_dt=0.03, num_steps=30, newton=MARCH)
+    found = monodromy(system, fully_explicit(3), state, macro_dt=0.03, num_steps=30, solver=MARCH)
     assert found.matrix.shape == (4, 4)
     assert found.symplectic_defect < 1e-12  # 2e-14
     assert 0.1 < found.closure < 2
@@ -48,7 +49,7 @@ def test_on_a_constraint_manifold(swinging):
         start = [np.asarray(a) for a in (state.q_s, state.q_f, state.p_s, state.p_f)]
         q_s, q_f, p_s, p_f = (a + d for a, d in zip(start, np.split(shift, 4), strict=True))
         moved = initial_state(system, q_s, q_f, p_s / 5, p_f, project=True)
-        end = monodromy(system, fully_explicit(3), moved, macro_dt=0.03, num_steps=30, newton=MARCH).end
+        end = monodromy(system, fully_explicit(3), moved, macro_dt=0.03, num_steps=30, solver=MARCH).end
         ends.append(np.concatenate([end.q_s, end.q_f, end.p_s, end.p_f]))
     predicted = found.end_basis.T @ (found.matrix @ direction)
     assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(predicted, abs=1e-5 * np.abs(predicted).max())
@@ -57,7 +58,7 @@ def test_on_a_constraint_manifold(swinging):
 def test_failing_steps_and_bad_input(swinging):
     system, state = swinging
     with pytest.raises(RuntimeError, match=r"macro step \d+ failed: "):
-        monodromy(system, fully_explicit(3), state, macro_dt=30.0, num_steps=30, newton=MARCH)
+        monodromy(system, fully_explicit(3), state, macro_dt=30.0, num_steps=30, solver=MARCH)
     with pytest.raises(ValueError, match="num_steps is 0"):
         monodromy(system, fully_explicit(3), state, macro_dt=0.03, num_steps=0)
     with pytest.raises(ValueError, match="macro_dt is -1"):

@@ -92,7 +92,9 @@ def test_with_constraints_every_method_makes_the_same_step():
     system = problem.system.replace(fast_potential=stretch)
 
     def run(scheme, method):
-        return vm.simulate(system, scheme, problem.state(), macro_dt=0.02, num_steps=20, newton=vm.Newton(method))
+        return vm.simulate(
+            system, scheme, problem.state(), macro_dt=0.02, num_steps=20, solver=vm.solvers.named(method)()
+        )
 
     march, arrowhead = (run(vm.takahashi_imada(3), method) for method in ("nested", "arrowhead"))
     assert largest_difference(march.p_f, arrowhead.p_f) < 1e-9

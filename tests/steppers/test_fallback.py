@@ -12,7 +12,6 @@ from tests.support import largest_difference
 from tests.user_systems import cart, double_pendulum, two_oscillators
 from vmri_jax import (
     Method,
-    Newton,
     Result,
     Scheme,
     explicit_slow,
@@ -24,6 +23,7 @@ from vmri_jax import (
     quadrature,
     simulate,
 )
+from vmri_jax.steppers import solvers
 
 
 def drag(t, q_s, q_f, v_s, v_f, params):
@@ -42,7 +42,7 @@ def test_a_plan_says_how_a_step_is_solved(fpu):
     assert str(plan(fpu, inside)).startswith(whole)
     assert str(plan(double_pendulum(), fully_implicit(3))).startswith(whole)
     with pytest.raises(ValueError, match="method 'nested' needs a ConstantMass, and potentials"):
-        plan(fpu, inside, newton=Newton("nested"))
+        plan(fpu, inside, solver=solvers.Nested())
 
 
 def test_explicit_steps_have_no_iterations(fpu):
@@ -53,14 +53,14 @@ def test_explicit_steps_have_no_iterations(fpu):
 
 def test_auto_falls_back_where_the_march_does_not_converge():
     """At H = 2 the curvature of V outweighs the mass of the slow variables."""
-    problem, newton = two_oscillators(kappa=25.0), Newton(max_iterations=6)
+    problem, solver = two_oscillators(kappa=25.0), solvers.Auto(max_iterations=6)
 
-    def go(state, newton):
-        step = {"macro_dt": 40.0, "num_steps": 3, "newton": newton, "throw": False}
+    def go(state, solver):
+        step = {"macro_dt": 40.0, "num_steps": 3, "solver": solver, "throw": False}
         return simulate(problem.system, fully_implicit(20), state, **step)
 
     state = problem.state()
-    march, run, exact = (go(state, n) for n in (Newton("nested", max_iterations=6), newton, Newton("arrowhead")))
+    march, run, exact = (go(state, n) for n in (solvers.Nested(max_iterations=6), solver, solvers.Arrowhead()))
     assert int(march.result) == Result.STAGNATED
     assert int(march.failed_at) == 0
     assert run.success
@@ -68,7 +68,7 @@ def test_auto_falls_back_where_the_march_does_not_converge():
     for name in ("q_s", "q_f", "p_s", "p_f"):
         found, expected = getattr(run, name)[1], getattr(exact, name)[1]
         assert largest_difference(found, expected) / np.abs(expected).max() < 1e-12
-    inside = jax.jit(lambda state: go(state, newton))(state)
+    inside = jax.jit(lambda state: go(state, solver))(state)
     assert int(inside.info.method.max()) == Method.ARROWHEAD
     assert largest_difference(inside.q_f, run.q_f) < 1e-11
 
@@ -98,7 +98,7 @@ def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp):
     """At this step the nested march solves seven steps, and not the eighth."""
     step = {"macro_dt": 0.2, "num_steps": 20, "throw": False}
     march, run, exact = (
-        simulate(tsp, fully_implicit(10), newton=Newton(method, max_iterations=40), **step)
+        simulate(tsp, fully_implicit(10), solver=solvers.named(method)(max_iterations=40), **step)
         for method in ("nested", "auto", "arrowhead")
     )
     assert int(march.failed_at) == 7
@@ -112,8 +112,8 @@ def test_fixed_iterations(method):
     problem = cart()
 
     def run(count):
-        newton = Newton(method, fixed_iterations=count)
-        step = {"macro_dt": 0.01, "num_steps": 20, "newton": newton, "throw": False}
+        solver = solvers.named(method)(fixed_iterations=count)
+        step = {"macro_dt": 0.01, "num_steps": 20, "solver": solver, "throw": False}
         return simulate(problem.system, fully_explicit(5), problem.state(), **step)
 
     free, enough = run(None), run(6)
@@ -128,7 +128,7 @@ def test_no_library_call_in_a_compiled_run(tsp):
     """The loop over macro steps of a small constrained system has no call out of it."""
     run = jax.jit(
         lambda state: simulate(
-            tsp.system, fully_explicit(5), state, macro_dt=0.001, num_steps=5, newton=Newton("nested")
+            tsp.system, fully_explicit(5), state, macro_dt=0.001, num_steps=5, solver=solvers.Nested()
         )
     )
     text = str(run.lower(tsp.state()).compile().as_text())

@@ -12,7 +12,6 @@ from tests.user_systems import FULL_MASS, two_oscillators
 from vmri_jax import (
     ConstantMass,
     Method,
-    Newton,
     Problem,
     System,
     explicit_slow,
@@ -23,6 +22,7 @@ from vmri_jax import (
     simulate,
     systems,
 )
+from vmri_jax.steppers import solvers
 
 
 def ends_differ(a, b) -> float:
@@ -51,14 +51,14 @@ def positions(run):
 def test_few_passes_and_errors_within_the_tolerance(name, scheme, macro_dt, passes, request):
     problem = swinging() if name == "pendulum" else request.getfixturevalue(name)
 
-    def run(newton):
-        return simulate(problem.system, scheme, problem.state(), macro_dt=macro_dt, num_steps=20, newton=newton)
+    def run(solver):
+        return simulate(problem.system, scheme, problem.state(), macro_dt=macro_dt, num_steps=20, solver=solver)
 
-    exact = run(Newton("nested"))
+    exact = run(solvers.Nested())
     assert exact.info.iterations.mean() < passes, exact.info.iterations.mean()
     motion = np.abs(np.diff(positions(exact), axis=0)).max()
     for tolerance in (1e-3, 1e-9):
-        error = np.abs(positions(run(Newton("nested", tolerance))) - positions(exact)).max()
+        error = np.abs(positions(run(solvers.Nested(tolerance))) - positions(exact)).max()
         assert error < tolerance * motion  # measured at most 0.14 of it
 
 
@@ -120,7 +120,9 @@ def test_full_masses_forces_and_coupled_fast_potential():
     system = System(FULL_MASS, fast_potential=skew, constraint=link, force=drag)
     state = initial_state(system, [0.0, 0.0], [1.0, 1.0, 0.3], [0.1, 0.2], [0.0, 0.3, -0.2])
     for scheme in (fully_implicit(4), galerkin(2, 2)):
-        ends = [compiled_step(system, scheme, state, 0.1, Newton(method))[0] for method in ("nested", "arrowhead")]
+        ends = [
+            compiled_step(system, scheme, state, 0.1, solvers.named(method)())[0] for method in ("nested", "arrowhead")
+        ]
         assert ends_differ(*ends) < 1e-12  # measured 1e-15
 
 
@@ -128,7 +130,7 @@ def test_macro_steps_in_which_slow_forces_turn_over():
     """At H = 1 what V answers is as large as the masses: by the masses alone the march does not converge."""
     problem = systems.fermi_pasta_ulam(10)
     run = simulate(
-        problem.system, fully_implicit(100), problem.state(), macro_dt=1.0, num_steps=20, newton=Newton("nested")
+        problem.system, fully_implicit(100), problem.state(), macro_dt=1.0, num_steps=20, solver=solvers.Nested()
     )
     assert run.info.iterations.max() < 16  # measured 10
 
@@ -138,7 +140,7 @@ def test_forces_on_slow_variables_cost_few_passes(degree):
     """Potential and damping: by the masses alone it would be 77 and 31."""
     problem = two_oscillators()
     system = problem.system.replace(force=strong_drag)
-    run = simulate(system, galerkin(20, degree), problem.state(), macro_dt=0.2, num_steps=20, newton=Newton("nested"))
+    run = simulate(system, galerkin(20, degree), problem.state(), macro_dt=0.2, num_steps=20, solver=solvers.Nested())
     assert run.info.iterations.mean() < 7.5  # measured 6.3 and 6.4
 
 

@@ -11,7 +11,6 @@ from tests.support import NAMES, area_change, largest_difference, node, relative
 from tests.user_systems import two_oscillators
 from vmri_jax import (
     ConstantMass,
-    Newton,
     Scheme,
     State,
     System,
@@ -26,6 +25,7 @@ from vmri_jax import (
 )
 from vmri_jax.diagnostics import momentum_map, observed_order
 from vmri_jax.schemes.quadrature import midpoint, mollified, trapezoidal
+from vmri_jax.steppers import solvers
 
 
 @pytest.mark.parametrize("fast", [midpoint, trapezoidal], ids=["midpoint", "kicks"])
@@ -117,7 +117,7 @@ def dumbbell_start(x=(0.0,) * 6) -> State:
 
 def dumbbell_run(scheme=None, method: Any = "auto", start=None):
     scheme, start = scheme or mollified_impulse(3), start or dumbbell_start()
-    return simulate(DUMBBELL, scheme, start, macro_dt=0.02, num_steps=50, newton=Newton(method))
+    return simulate(DUMBBELL, scheme, start, macro_dt=0.02, num_steps=50, solver=solvers.named(method)())
 
 
 def test_structure_with_constraints():

@@ -4,15 +4,16 @@ import jax.numpy as jnp
 import pytest
 
 from tests.support import compiled_step, largest_difference
-from vmri_jax import ConstantMass, Newton, Result, State, System, fully_implicit, initial_state, kernels, simulate
+from vmri_jax import ConstantMass, Result, State, System, fully_implicit, initial_state, kernels, simulate
+from vmri_jax.steppers import solvers
 from vmri_jax.steppers.marched import PLAIN_PASSES
 
-EXACT = Newton(method="arrowhead")
+EXACT = solvers.Arrowhead()
 
 
-def step(problem, scheme, macro_dt, newton=EXACT, state=None):
+def step(problem, scheme, macro_dt, solver=EXACT, state=None):
     state = problem.state() if state is None else state
-    state, info = compiled_step(problem.system, scheme, state, macro_dt, newton)
+    state, info = compiled_step(problem.system, scheme, state, macro_dt, solver)
     return state, info, Result(int(info.result))
 
 
@@ -25,7 +26,7 @@ def test_a_plain_step_converges(fpu):
 
 
 def test_too_few_iterations_stagnate(fpu):
-    _, info, result = step(fpu, fully_implicit(20), 0.05, Newton("arrowhead", max_iterations=1))
+    _, info, result = step(fpu, fully_implicit(20), 0.05, solvers.Arrowhead(max_iterations=1))
     assert result is Result.STAGNATED
     assert not result.success
     assert int(info.iterations) == 1
@@ -41,7 +42,7 @@ def test_nan_is_reported(fpu):
 
 
 def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
-    _, info, result = step(fpu, fully_implicit(20), 0.05, Newton("arrowhead", tolerance=1e-30))
+    _, info, result = step(fpu, fully_implicit(20), 0.05, solvers.Arrowhead(tolerance=1e-30))
     assert result is Result.CONVERGED_AT_ROUNDOFF or result is Result.CONVERGED
     assert int(info.iterations) < 10
     assert float(info.residual) < 1e-13
@@ -51,20 +52,20 @@ def test_a_tolerance_below_roundoff_ends_at_the_floor(fpu):
 def test_iterations_of_the_pendulum(tsp, macro_dt, most):
     state = tsp.state()
     for _ in range(2):
-        run = simulate(tsp.system, fully_implicit(10), state, macro_dt=macro_dt, num_steps=60, newton=EXACT)
+        run = simulate(tsp.system, fully_implicit(10), state, macro_dt=macro_dt, num_steps=60, solver=EXACT)
         assert int(run.info.iterations.max()) <= most
         state = run.final_state
 
 
 def test_iterations_of_a_large_macro_step(fpu):
-    run = simulate(fpu.system, fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=20, newton=EXACT)
+    run = simulate(fpu.system, fully_implicit(100), fpu.state(), macro_dt=1.0, num_steps=20, solver=EXACT)
     assert int(run.info.iterations.max()) <= 14  # measured 12
 
 
 def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(fpu):
     scheme = fully_implicit(20)
     exact, info, _ = step(fpu, scheme, 0.5)
-    loose, loose_info, result = step(fpu, scheme, 0.5, Newton("arrowhead", tolerance=1e-4))
+    loose, loose_info, result = step(fpu, scheme, 0.5, solvers.Arrowhead(tolerance=1e-4))
     assert result is Result.CONVERGED
     assert int(loose_info.iterations) < int(info.iterations)
     assert 1e-15 < largest_difference(loose.q_s, exact.q_s) < 1e-4
@@ -73,10 +74,6 @@ def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(f
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            {"method": "sparse"},
-            "method is 'sparse'; it must be one of auto, nested, arrowhead, null_space, dense",
-        ),
         ({"tolerance": 0.0}, "tolerance is 0.0; it must be positive"),
         ({"max_iterations": 0}, "max_iterations is 0; it must be positive"),
         ({"fixed_iterations": 0}, "fixed_iterations is 0; it must be positive"),
@@ -84,7 +81,7 @@ def test_a_looser_tolerance_needs_fewer_iterations_and_is_as_accurate_as_asked(f
 )
 def test_bad_options_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
-        Newton(**arguments)
+        solvers.Auto(**arguments)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +94,14 @@ def test_bad_options_are_refused(arguments, message):
 )
 def test_options_that_are_no_numbers_are_refused(arguments, message):
     with pytest.raises(TypeError, match=message):
-        Newton(**arguments)
+        solvers.Auto(**arguments)
+
+
+def test_a_solver_that_is_not_there():
+    with pytest.raises(
+        ValueError, match="method is 'sparse'; it must be one of auto, nested, arrowhead, null_space, dense"
+    ):
+        solvers.named("sparse")
 
 
 def test_every_status_has_a_message():
@@ -107,14 +111,14 @@ def test_every_status_has_a_message():
 
 def test_huge_steps_end_at_the_solution_that_is_meant(tsp):
     """Plain Newton from straight motion ends at another solution in one of these steps, of 70 times the energy."""
-    run = simulate(tsp.system, fully_implicit(10), tsp.state(), macro_dt=0.2, num_steps=60, newton=EXACT)
+    run = simulate(tsp.system, fully_implicit(10), tsp.state(), macro_dt=0.2, num_steps=60, solver=EXACT)
     assert float(jnp.abs(run.energy - run.energy[0]).max()) < 200.0  # measured 145, of 12 000 that are exchanged
     assert float(run.constraint_residual.max()) < 1e-11
 
 
 def test_continuation_finds_the_solution_that_plain_newton_misses(tsp):
     """The whole step, from what the steps before lead to and from straight motion, has no solution that passes find."""
-    run = simulate(tsp.system, fully_implicit(10), tsp.state(), macro_dt=0.4, num_steps=40, newton=EXACT)
+    run = simulate(tsp.system, fully_implicit(10), tsp.state(), macro_dt=0.4, num_steps=40, solver=EXACT)
     if kernels.CONTRACTION > 0:  # with exact matrices in every pass nothing is missed
         assert int(run.info.iterations.max()) > PLAIN_PASSES
     assert float(jnp.abs(run.energy - run.energy[0]).max()) < 800.0  # measured 613, of 12 000 that are exchanged
@@ -157,6 +161,6 @@ def test_slow_variable_that_only_sees_round_off():
     """A symmetric pair leaves its centre at rest but for round-off: no size of its own to converge relative to."""
     system = System(ConstantMass([1.0], [1.0, 1.0]), pair, stiff_pair)
     state = initial_state(system, [0.0], [0.3, -0.3], [0.0], [0.0, 0.0])
-    run = simulate(system, fully_implicit(4), state, macro_dt=0.1, num_steps=200, newton=EXACT)
+    run = simulate(system, fully_implicit(4), state, macro_dt=0.1, num_steps=200, solver=EXACT)
     assert int(run.info.iterations.max()) <= 4
     assert float(jnp.abs(run.q_s).max()) < 1e-15  # measured 1e-17

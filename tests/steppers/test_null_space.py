@@ -15,7 +15,7 @@ from vmri_jax.diagnostics import null_space_condition, symplectic_defect
 from vmri_jax.steppers.march import inverse_with_multipliers
 from vmri_jax.steppers.newton.null_space import inverse_without_multipliers, motions
 
-NULL_SPACE = vm.Newton(method="null_space")
+NULL_SPACE = vm.solvers.NullSpace()
 REFERENCE = "triple_spherical_pendulum", pytest.param("simple_atomic_model", marks=pytest.mark.full)
 
 
@@ -55,8 +55,8 @@ def test_trajectories_are_those_of_the_method_with_multipliers(make, step, steps
     problem = make()
     arguments = {"macro_dt": step, "num_steps": steps, "save_every": 20}
     runs = [
-        vm.simulate(problem, vm.fully_implicit(num_micro=5), newton=newton, **arguments)
-        for newton in (NULL_SPACE, vm.Newton(method="arrowhead"))
+        vm.simulate(problem, vm.fully_implicit(num_micro=5), solver=solver, **arguments)
+        for solver in (NULL_SPACE, vm.solvers.Arrowhead())
     ]
     assert runs[0].info.method[0] == vm.Method.NULL_SPACE
     assert float(runs[0].constraint_residual.max()) < 1e-12
@@ -72,8 +72,8 @@ def test_trajectories_are_those_of_the_method_with_multipliers(make, step, steps
 def test_trajectories_of_rigid_bodies(name, num_micro):
     scene = replace(gallery_scene(name), coordinates="directors")
     runs = [
-        vm.simulate(scene, vm.fully_implicit(num_micro), macro_dt=0.005, num_steps=100, newton=newton)
-        for newton in (NULL_SPACE, None)
+        vm.simulate(scene, vm.fully_implicit(num_micro), macro_dt=0.005, num_steps=100, solver=solver)
+        for solver in (NULL_SPACE, None)
     ]
     np.testing.assert_allclose(runs[0].q_s, runs[1].q_s, atol=1e-11)
     np.testing.assert_allclose(runs[0].q_f, runs[1].q_f, atol=1e-11)
@@ -81,7 +81,7 @@ def test_trajectories_of_rigid_bodies(name, num_micro):
 
 def test_steps_are_symplectic():
     problem = systems.triple_spherical_pendulum()
-    defect = symplectic_defect(problem, vm.fully_implicit(num_micro=3), macro_dt=0.02, newton=NULL_SPACE)
+    defect = symplectic_defect(problem, vm.fully_implicit(num_micro=3), macro_dt=0.02, solver=NULL_SPACE)
     assert float(defect) < 1e-11
 
 
@@ -97,5 +97,5 @@ def test_the_condition_does_not_depend_on_the_step(name):
 
 @pytest.mark.parametrize(("name", "few", "many"), [("triple_spherical_pendulum", 5, 7), ("simple_atomic_model", 9, 15)])
 def test_a_plan_says_how_many_unknowns_are_left(name, few, many):
-    planned = vm.plan(getattr(systems, name)(), vm.fully_implicit(num_micro=5), newton=NULL_SPACE)
+    planned = vm.plan(getattr(systems, name)(), vm.fully_implicit(num_micro=5), solver=NULL_SPACE)
     assert f"unknowns of each micro interval: {few}, with multipliers {many}" in str(planned)

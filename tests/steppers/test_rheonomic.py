@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 
 from vmri_jax import (
     ConstantMass,
-    Newton,
     Rheonomic,
     System,
     compose,
@@ -24,6 +23,7 @@ from vmri_jax import (
     stream,
 )
 from vmri_jax.diagnostics import observed_order, symplectic_defect
+from vmri_jax.steppers import solvers
 
 LENGTH, G = 0.5, 9.81
 PARAMS = {"amplitude": 0.3, "frequency": 4.0}
@@ -121,8 +121,8 @@ def test_order(name, scheme, steps):
     ],
 )
 def test_all_methods_find_the_same(name, scheme, method):
-    expected = run(SYSTEMS[name], scheme, 10, newton=Newton("arrowhead"))
-    found = run(SYSTEMS[name], scheme, 10, newton=Newton(method))
+    expected = run(SYSTEMS[name], scheme, 10, solver=solvers.Arrowhead())
+    found = run(SYSTEMS[name], scheme, 10, solver=solvers.named(method)())
     assert np.abs(found.q_f - expected.q_f).max() < 1e-12
     assert np.abs(found.p_s - expected.p_s).max() < 1e-11
 
@@ -177,7 +177,7 @@ def test_derivatives_by_parameters():
     def end(amplitude):
         system = SYSTEMS["pivot that is moved"].replace(params={"amplitude": amplitude, "frequency": 4.0})
         state = initial_state(system, jnp.zeros(1), jnp.stack([amplitude, -LENGTH]), jnp.zeros(1), jnp.zeros(2))
-        step = {"macro_dt": 0.05, "num_steps": 10, "newton": Newton("nested")}
+        step = {"macro_dt": 0.05, "num_steps": 10, "solver": solvers.Nested()}
         return simulate(system, fully_explicit(2), state, **step).q_f[-1, 0]
 
     at, h = jnp.asarray(0.3), 1e-5

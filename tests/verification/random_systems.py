@@ -8,14 +8,12 @@ import dataclasses
 from collections.abc import Callable
 from functools import cache
 from random import Random
-from typing import get_args
 
 import jax.numpy as jnp
 import numpy as np
 
 import vmri_jax as vm
 from vmri_jax import quadrature
-from vmri_jax.steppers.newton.options import Choice
 
 
 def _distance(x):
@@ -167,7 +165,11 @@ def structure(random: Random, tame: bool = False) -> Structure:
     scheme = random.choice([name for name in SCHEMES if not (tame and name == "mollified impulse")])
     degree = random.choice([1, 2, 3, 4] if tame else [1, 2, 3]) if scheme in HIGH_DEGREE else 1
     functions = list(KINETIC)[: (0 if scheme == "takahashi imada" else 2) if tame else None]
-    methods = ["auto", "arrowhead", "null_space", "dense"] if tame else ["auto"] * 4 + list(get_args(Choice))[1:]
+    methods = (
+        ["auto", "arrowhead", "null_space", "dense"]
+        if tame
+        else ["auto"] * 4 + ["nested", "arrowhead", "null_space", "dense"]
+    )
     composable = not tame or (degree == 1 and scheme != "mixed")
     return Structure(
         dimension=random.choice([1, 2, 2, 3]),

@@ -91,8 +91,8 @@ compiled_defect = jax.jit(symplectic_defect)
 
 
 def defect(problem, scheme, macro_dt):
-    newton = without_fallback(problem.system, scheme)
-    return compiled_defect(problem.system, scheme, problem.state(), macro_dt=macro_dt, newton=newton)
+    solver = without_fallback(problem.system, scheme)
+    return compiled_defect(problem.system, scheme, problem.state(), macro_dt=macro_dt, solver=solver)
 
 
 def test_step_is_symplectic_for_rules_that_are_not_symmetric():

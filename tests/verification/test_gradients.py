@@ -10,7 +10,8 @@ import pytest
 
 from tests.support import PROBLEMS, without_fallback
 from tests.user_systems import cart
-from vmri_jax import Newton, State, fully_explicit, fully_implicit, galerkin, initial_state, simulate, systems
+from vmri_jax import State, fully_explicit, fully_implicit, galerkin, initial_state, simulate, systems
+from vmri_jax.steppers import solvers
 
 CHAIN = systems.fermi_pasta_ulam(1)
 CASES = {  # problem, scheme, macro_dt, name and entry of the parameter
@@ -33,15 +34,15 @@ def central_difference(function, x, step):
     return float((4 * d[1] - d[0]) / 3)
 
 
-def final_position(case: str, newton: Newton | None = None):
+def final_position(case: str, solver: Newton | None = None):
     """The sum of cosines of the fast positions after 10 steps as a function of ``(stiffness, v, q_f, macro_dt)``.
 
     The start has the velocities v, projected onto the constraints, and the fast positions q_f; by the march alone where no
-    `newton` is given. Also the stiffness, v, q_f and step of the case.
+    `solver` is given. Also the stiffness, v, q_f and step of the case.
     """
     problem, scheme, macro_dt, parameter, entry = CASES[case]
     params, n_s = problem.system.params, problem.q_s.size
-    newton = newton or without_fallback(problem.system, scheme)
+    solver = solver or without_fallback(problem.system, scheme)
 
     def replaced(stiffness):
         if parameter is None:
@@ -52,7 +53,7 @@ def final_position(case: str, newton: Newton | None = None):
         system = problem.system.replace(params=replaced(stiffness))
         state = initial_state(problem.system, problem.q_s, problem.q_f, v[:n_s], v[n_s:])
         state = State(state.t, state.q_s, q_f, state.p_s, state.p_f)
-        run = simulate(system, scheme, state, macro_dt=macro_dt, num_steps=10, save_every=5, newton=newton)
+        run = simulate(system, scheme, state, macro_dt=macro_dt, num_steps=10, save_every=5, solver=solver)
         return jnp.sum(jnp.cos(run.q_f[-1] * jnp.arange(1, run.q_f.shape[1] + 1)))
 
     stiffness = params if parameter is None else params[parameter]
@@ -63,7 +64,7 @@ def final_position(case: str, newton: Newton | None = None):
 @cache
 def gradient_program(case: str):
     """Value and gradient by all arguments in one compiled program, and the arguments of the case."""
-    function, at = final_position(case, Newton() if case == FALLS_BACK else None)
+    function, at = final_position(case, solvers.Auto() if case == FALLS_BACK else None)
     return jax.jit(jax.value_and_grad(function, argnums=(0, 1, 2, 3))), at
 
 
@@ -108,7 +109,7 @@ def test_both_methods_agree():
     """The derivative through all unknowns at once is that through the march."""
     case = "cart, fully implicit"
     program, at = gradient_program(case)
-    function, _ = final_position(case, Newton("arrowhead"))
+    function, _ = final_position(case, solvers.Arrowhead())
     by_stiffness = jax.jit(jax.grad(function))(*at)
     assert float(by_stiffness) == pytest.approx(float(program(*at)[1][0]), rel=1e-9)
 

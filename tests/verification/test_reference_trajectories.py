@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support import DATA, PROBLEMS, relative_difference
-from vmri_jax import Newton, explicit_slow, fully_explicit, fully_implicit, initial_state, simulate
+from vmri_jax import explicit_slow, fully_explicit, fully_implicit, initial_state, simulate
+from vmri_jax.steppers import solvers
 
 CASES = {case["name"]: case for case in json.loads((DATA / "reference" / "manifest.json").read_text())}
 
@@ -49,7 +50,7 @@ def test_trajectory_equals_the_reference(name, method):
         macro_dt=case["macro_step"],
         num_steps=case["steps"],
         save_micro=True,
-        newton=Newton(method=method),
+        solver=solvers.named(method)(),
     )
     differences = {k: relative_difference(getattr(run, k), expected[k]) for k in ("q_s", "q_f", "p_s", "p_f")}
     # stored micro nodes of a step include its start, ours do not

@@ -22,7 +22,7 @@ from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.solvers import Newton
 
 
 def simulate(
@@ -36,7 +36,7 @@ def simulate(
     t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     throw: bool = True,
     progress: ShowsProgress = False,
     adjoint: str = "auto",
@@ -67,7 +67,7 @@ def simulate(
         num_steps, t_end: macro steps, a multiple of `save_every`, or the time that they end at; exactly one of them.
         save_every: macro steps from one saved node to the next.
         save_micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
-        newton: how implicit equations are solved.
+        solver: how implicit equations are solved.
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN from the failure on.
         progress: True for a bar, or a function that is told (what, done, total). Without it, and in trial runs for an accuracy, a run that takes more than two seconds says so by a line
@@ -96,7 +96,7 @@ def simulate(
     if accuracy is not None:
         steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
         end = _end(steps, t_end, save_every, save_micro, adjoint, num_saves)
-        best, settings = with_accuracy(system, scheme, state, newton, accuracy, end, num_saves, of)
+        best, settings = with_accuracy(system, scheme, state, solver, accuracy, end, num_saves, of)
         run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
         if int(trajectory.failed_at) < 0:
             return with_error(run, trajectory, of, shares=error, halved=best.halved)
@@ -110,7 +110,7 @@ def simulate(
         )
     check_adjoint(adjoint, scheme)
     steps_asked_for = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
-    run = simulation(system, scheme, state, newton, steps_asked_for)
+    run = simulation(system, scheme, state, solver, steps_asked_for)
     if not run.is_concrete:
         if error:
             raise ValueError(

@@ -39,7 +39,7 @@ from vmri_jax.running.timing import seconds_per_call
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.solvers import Newton
 
 AIM = 0.5
 """Part of the accuracy that steps are chosen for. Trials predict errors of finer runs to about a factor of 2; with a larger part more runs
@@ -207,7 +207,7 @@ def with_accuracy(
     system: Movable,
     scheme: Scheme | Composition | None,
     state: State | None,
-    newton: Newton | None,
+    solver: Newton | None,
     accuracy: float,
     t_end: float,
     num_saves: int | None,
@@ -218,7 +218,7 @@ def with_accuracy(
     Warns with `AccuracyNotReached` if no trial is as accurate.
 
     Args:
-        system, scheme, state, newton, t_end: as of `vmri_jax.simulate`; None for a scheme from the menu.
+        system, scheme, state, solver, t_end: as of `vmri_jax.simulate`; None for a scheme from the menu.
         accuracy: in the unit of the positions.
         num_saves: saved intervals, equally spaced; None for at most `SAVED`.
         of: function of a run, refused before the trials if it returns no numbers.
@@ -240,7 +240,7 @@ def with_accuracy(
     _check(accuracy, length, start)
 
     def make(scheme: Scheme | Composition) -> Simulation:
-        run = simulation(system, scheme, state, newton, Steps(length, num_steps=1))
+        run = simulation(system, scheme, state, solver, Steps(length, num_steps=1))
         run.check()
         check_memory("simulate", run.state, scheme.num_micro, num_saves or SAVED, False)
         check_function_of_run(of, True, run)

@@ -24,7 +24,7 @@ from vmri_jax.running.settings import Settings
 from vmri_jax.running.store import StoredTrajectory, stream
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import stage_scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Method, SimulationError
 
 DEFAULT_SCHEME = "fully-implicit"
@@ -109,7 +109,7 @@ def simulate(
             "num_steps": steps,
             "save_every": save_every,
             "save_micro": save_micro,
-            "newton": Newton(method=method.replace("-", "_")),  # pyright: ignore[reportArgumentType]
+            "solver": solvers.named(method.replace("-", "_"))(),  # pyright: ignore[reportArgumentType]
             "progress": True,
         }
         if streamed:

@@ -12,7 +12,7 @@ from vmri_jax.control.transcription import Transcription
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.running.simulation import prepare
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import plan
 
 
@@ -35,7 +35,7 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
 
 
 def transcribed(
-    problem, actuate, num_controls, cost, scheme, macro_dt, num_steps, final_cost, goal, limits, bounds, grid, newton
+    problem, actuate, num_controls, cost, scheme, macro_dt, num_steps, final_cost, goal, limits, bounds, grid, solver
 ) -> Transcription:
     """The problem as it is transcribed; arguments as of `vmri_jax.control.minimize`."""
     whole_number("minimize: num_steps", num_steps)
@@ -47,9 +47,9 @@ def transcribed(
         raise TypeError(
             f"minimize: system.params is {type(params).__name__}; the controls need it to be a dict, or None."
         )
-    prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, newton=newton)  # the checks of a run
-    if newton is None and plan(system, scheme, state).has_fallback:
-        newton = Newton("nested")
+    prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # the checks of a run
+    if solver is None and plan(system, scheme, state).has_fallback:
+        solver = solvers.Nested()
     u = np.zeros(num_controls)
     forces = jax.eval_shape(lambda: actuate(state.q_s, state.q_f, u, params))
     expected = (state.q_s.shape, state.q_f.shape)
@@ -69,7 +69,7 @@ def transcribed(
         system.replace(params=params),
         state,
         scheme,
-        newton or Newton(),
+        solver or solvers.Auto(),
         np.asarray(float(macro_dt)),
         actuate,
         cost,

@@ -22,8 +22,8 @@ from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solvers import Newton
 from vmri_jax.steppers.stepper import Status
 
 
@@ -44,7 +44,7 @@ def minimize(
     grid: Literal["macro", "micro"] = "macro",
     tolerance: float = 1e-8,
     max_iterations: int = 50,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     progress: ShowsProgress = False,
 ) -> Optimum:
     """Minimise ``sum_k H (C(z_k, u_k) + C(z_{k+1}, u_k)) / 2 + final_cost(z_N)`` subject to the steps of the scheme and ``goal = 0``.
@@ -65,7 +65,7 @@ def minimize(
         problem: what moves and where it starts, a scene with `vmri_jax.scene.Controlled` effects or a problem; its
             ``system.params`` is a dict or None.
         cost: per time, ``cost(state, u) -> ()``; with a positive second derivative by u.
-        scheme, macro_dt, num_steps, newton: as of `simulate`. Forces act on the grid that the scheme holds them on.
+        scheme, macro_dt, num_steps, solver: as of `simulate`. Forces act on the grid that the scheme holds them on.
         actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for those of a scene.
         num_controls: m, length of u; of a scene it is known.
         final_cost: of the last state, ``final_cost(state) -> ()``.
@@ -106,7 +106,7 @@ def minimize(
         limits,
         bounds,
         grid,
-        newton,
+        solver,
     )
     search = Search(setup)
     point = started(search, start, num_steps, len(labels), grid)

@@ -27,8 +27,8 @@ from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solvers import Newton
 
 CONTROL = "vmri_jax.control"
 """Name among the parameters of a system of the controls of a step, with its start and the length of the parts that they are held for."""
@@ -55,7 +55,7 @@ class Transcription(eqx.Module):
     system: System
     start: State
     scheme: Scheme | Composition
-    newton: Newton
+    solver: Newton
     macro_dt: Float[Numbers, ""]
     actuate: Callable = eqx.field(static=True)
     cost: Callable = eqx.field(static=True)
@@ -103,7 +103,7 @@ class Transcription(eqx.Module):
         state = self.state(z, k)
         held = u, state.t, self.macro_dt / self.parts
         system = self.controlled.replace(params={**self.system.params, CONTROL: held})
-        end, info = macro_step(system, self.scheme, state, self.macro_dt, self.newton)
+        end, info = macro_step(system, self.scheme, state, self.macro_dt, self.solver)
         return phase_vector(end), info.status
 
     def steps(self, z, u, follow):

@@ -11,7 +11,8 @@ from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.equations import StepEquations
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton, dense
+from vmri_jax.steppers.newton import dense
+from vmri_jax.steppers.solvers import Newton
 
 
 def phase_vector(state: State):
@@ -91,14 +92,14 @@ def symplectic_defect(
     state: State | None = None,
     *,
     macro_dt,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
 ):
     """Largest entry of ``M^T J M - J`` for the derivative M of one macro step, on the constraint manifold.
 
     With constraints, the form is compared on tangent vectors of the constraint manifold only, in an orthonormal basis.
 
     Args:
-        system, scheme, macro_dt, newton: as in `simulate`.
+        system, scheme, macro_dt, solver: as in `simulate`.
         state: fulfils the constraints; None for the start of the problem.
     """
     system, state = start_of("symplectic_defect", system, state)
@@ -106,7 +107,7 @@ def symplectic_defect(
 
     def step(z):
         start = State(state.t, *jnp.split(z, splits))
-        return phase_vector(macro_step(system, scheme, start, macro_dt, newton)[0])
+        return phase_vector(macro_step(system, scheme, start, macro_dt, solver)[0])
 
     M = jax.jit(jax.jacfwd(step))(z)
     J = symplectic_form(z.size // 2)

@@ -24,7 +24,7 @@ from vmri_jax.running.progress import Progress, ShowsProgress, progress_to
 from vmri_jax.running.store.layout import locked
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.solvers import Newton
 
 GIVE_UP = 10
 """So many chunks that cannot be computed, and none that can: then others are not tried."""
@@ -109,7 +109,7 @@ def ensemble(
     num_micro: int | None = None,
     save: str | Sequence[str] = "end",
     num_saves: int = 1,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     project: bool | None = None,
     chunk: int | None = None,
     executor: Any = None,
@@ -145,7 +145,7 @@ def ensemble(
         save: what is kept of each run, names from `vmri_jax.ensembles.QUANTITIES` or own functions of a trajectory, given like
             systems in a file.
         num_saves: nodes of a run, equally spaced after the start, that `save` sees: all k-th macro steps for num_steps / k.
-        newton, project: as in `simulate` and `initial_state`.
+        solver, project: as in `simulate` and `initial_state`.
         chunk: runs of a chunk; None for about a second's work. The store keeps it.
         executor: where chunks are computed: None for this process; a `dask.distributed.Client`, of a cluster of any kind; or a
             `concurrent.futures.Executor` that spawns processes.
@@ -184,7 +184,7 @@ def ensemble(
         columns=tuple(design.described()),
         steps=Steps(t_end, num_steps, macro_dt, micro_dt),
         num_micro=num_micro,
-        newton=newton,
+        solver=solver,
         project=project,
         save=(save,) if isinstance(save, str) else tuple(save),
         num_saves=whole_number("ensemble: num_saves", num_saves),

@@ -25,7 +25,7 @@ from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.trajectory import STATUS, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.solvers import Newton
 
 AnyScheme = str | Scheme | Composition | Callable[[int], Scheme | Composition]
 """A scheme, by name or itself, or what makes one for a number of micro steps."""
@@ -60,7 +60,7 @@ class Work:
     system: name of a system, or a problem that can be pickled.
     schemes: by label.
     columns: names of the columns of the design.
-    steps, num_micro, newton, project: as of `ensemble`.
+    steps, num_micro, solver, project: as of `ensemble`.
     save: names of what is kept; num_saves: saved nodes after the start.
     sources: digests of the user's files that are named here.
     """
@@ -70,7 +70,7 @@ class Work:
     columns: tuple[str, ...]
     steps: Steps
     num_micro: int | None = None
-    newton: Newton | None = None
+    solver: Newton | None = None
     project: bool | None = None
     save: tuple[str, ...] = ("end",)
     num_saves: int = 1
@@ -159,7 +159,7 @@ class Work:
         state = self.problem.state(self.project)
         every = num_steps // self.num_saves
         steps = arguments.Steps(macro_dt, num_steps=num_steps, save_every=every)
-        return simulation(self.problem, group.scheme, state, self.newton, steps)
+        return simulation(self.problem, group.scheme, state, self.solver, steps)
 
     def check_values(self, rows: Rows) -> None:
         """Refuse values of columns that do not fit what they replace.
@@ -202,7 +202,7 @@ class Work:
             num_steps=group.num_steps,
             save_every=group.num_steps // self.num_saves,
             params=lanes.params,
-            newton=self.newton,
+            solver=self.solver,
             chunk=width,
             warn=False,
         )

@@ -20,7 +20,8 @@ from vmri_jax.running.progress import Progress, Working
 from vmri_jax.running.simulation import prepare
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solvers import Newton
 
 START = ("q_s", "q_f", "v_s", "v_f")
 """Names of unknowns that are the start of a problem."""
@@ -46,7 +47,7 @@ def fit(
     starts: int = 1,
     spread: float = 0.3,
     max_steps: int = 100,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     seed: int = 0,
 ) -> Fit:
     """Find the parameters for which the motion comes closest to what was measured.
@@ -63,7 +64,7 @@ def fit(
             the start. Or a function ``{name: value} -> Problem``, for everything else.
         data: one or several sets of measurements.
         parameters: an `Unknown` for each name, or a number to start from.
-        scheme, macro_dt, newton: as of `simulate`. The times of measurement must be macro nodes. Runs are made without a fallback
+        scheme, macro_dt, solver: as of `simulate`. The times of measurement must be macro nodes. Runs are made without a fallback
             where the scheme allows it.
         segments: parts of multiple shooting; more than one for long or chaotic motion.
         starts: searches side by side, the first from the start itself, the others from around it.
@@ -90,11 +91,11 @@ def fit(
         raise ValueError("fit: all times of measurement are that of the start; measure later ones, too.")
     with Working("fit") as tell:
         tell("a run with the parameters to start from", 0, PHASES)
-        run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), newton=newton)
+        run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), solver=solver)
         run()
-        if newton is None and run.plan.has_fallback:
-            newton = Newton("nested")
-        shooting = Shooting(model, unknowns, data, steps, scheme, newton or Newton(), float(macro_dt), segments)
+        if solver is None and run.plan.has_fallback:
+            solver = solvers.Nested()
+        shooting = Shooting(model, unknowns, data, steps, scheme, solver or solvers.Auto(), float(macro_dt), segments)
         search = _Search(shooting, max_steps)
         u = np.zeros((starts, unknowns.size))
         u[1:] = spread * np.random.default_rng(seed).standard_normal((starts - 1, unknowns.size))

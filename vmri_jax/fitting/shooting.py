@@ -21,7 +21,7 @@ from vmri_jax.mechanics.invariants import velocity
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.solvers import Newton
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Shooting:
     data: Sequence[Measured]
     steps: Sequence[np.ndarray]
     scheme: Scheme | Composition
-    newton: Newton
+    solver: Newton
     macro_dt: float
     segments: int
 
@@ -93,7 +93,7 @@ class Shooting:
             macro_dt=self.macro_dt,
             num_steps=self.length * self.segments,
             save_every=self.length,
-            newton=self.newton,
+            solver=self.solver,
         )
         nodes = State(*(np.asarray(getattr(run, name))[1:-1] for name in ("t", "q_s", "q_f", "p_s", "p_f")))
         return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
@@ -168,7 +168,7 @@ class Shooting:
             macro_dt=self.macro_dt,
             num_steps=self.length,
             save_every=self.every,
-            newton=self.newton,
+            solver=self.solver,
             throw=False,
             adjoint="stored",
         )

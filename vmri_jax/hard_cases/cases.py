@@ -33,7 +33,7 @@ from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.stability import advise
 from vmri_jax.stability.linear import small_motions
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
 
 NUM_MICRO = 5
 PHASE = 0.2
@@ -116,8 +116,8 @@ class Resolved:
     def tolerance(self, full: bool) -> Outcome:
         steps, ends = 1_000 if full else 100, {}
         for tolerance in (1e-4, 1e-8, 1e-12):
-            newton = Newton(tolerance=tolerance)
-            trajectory = run(self.problem, self.scheme, self.macro_dt, steps, save_every=steps, newton=newton)
+            solver = solvers.Auto(tolerance=tolerance)
+            trajectory = run(self.problem, self.scheme, self.macro_dt, steps, save_every=steps, solver=solver)
             ends[tolerance] = nodes(trajectory)[-1]
         size = np.abs(ends[1e-12]).max()
         loose, middle = (difference(ends[t], ends[1e-12]) / size for t in (1e-4, 1e-8))
@@ -214,7 +214,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
         return derivatives(problem, own.scheme, own.macro_dt)
 
     def lane(full: bool) -> Outcome:
-        return bad_lane(problem, own.scheme, own.macro_dt, 20, Newton(), lanes=64 if full else 16)
+        return bad_lane(problem, own.scheme, own.macro_dt, 20, solvers.Auto(), lanes=64 if full else 16)
 
     step = f"fully_implicit, num_micro {NUM_MICRO}, H = {own.macro_dt:.3g}"
     one = f"num_micro 1, omega = {own.omega:.3g}"

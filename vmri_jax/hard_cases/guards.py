@@ -10,8 +10,8 @@ from vmri_jax.hard_cases.measures import difference, run
 from vmri_jax.mechanics.state import Problem, State, initial_state
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.schemes.scheme import fully_implicit
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solvers import Newton
 
 ABSURD = 1e160
 """A momentum whose kinetic energy overflows."""
@@ -43,14 +43,14 @@ def _refusal(call) -> str:
 
 
 def bad_lane(
-    problem: Problem, scheme, macro_dt, num_steps: int, newton: Newton, lanes: int = 256, compared: int = 4
+    problem: Problem, scheme, macro_dt, num_steps: int, solver: Newton, lanes: int = 256, compared: int = 4
 ) -> Outcome:
     """A batch whose lanes start along one run, one of them with absurd momenta, against single runs of some lanes."""
     bad = lanes // 3
-    along = run(problem, scheme, macro_dt, lanes - 1, newton=newton)  # consistent states, at rest or driven
+    along = run(problem, scheme, macro_dt, lanes - 1, solver=solver)  # consistent states, at rest or driven
     p_s, p_f = (jnp.asarray(p).at[bad].set(ABSURD) for p in (along.p_s, along.p_f))
     states = State(along.t, along.q_s, along.q_f, p_s, p_f)
-    options = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps, "newton": newton}
+    options = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps, "solver": solver}
     batch = simulate_batch(problem.system, scheme, states, **options, warn=False)
     failed = np.flatnonzero(np.asarray(batch.failed_at) >= 0)
     apart = 0.0

@@ -70,7 +70,7 @@ class Names:
             name: Place(part, start, size) for part, sizes in parts for name, start, size in _one_after_another(sizes)
         }
 
-    def shaped(self, part: Part, vectors):
+    def shaped(self, part: Part, vectors) -> Any:
         """Vectors (..., n) as the user gave the start: a dictionary of arrays (..., *shape) by name, or the vectors themselves.
 
         Args:

@@ -10,7 +10,7 @@ from vmri_jax.mechanics.checks import check_arrays, check_flags, check_number, c
 from vmri_jax.mechanics.state import State
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.solvers import Newton
 
 WHOLE = 1e-9
 """Part by which a number of steps may miss a whole number."""
@@ -28,7 +28,7 @@ class Steps:
     save_micro: bool = False
 
 
-def check_run(system, scheme, state, newton, steps: Steps):
+def check_run(system, scheme, state, solver, steps: Steps):
     """Refuse bad arguments of `simulate`; returns macro_dt, num_steps and save_every."""
     require_x64()
     if not isinstance(scheme, Scheme | Composition):
@@ -36,8 +36,8 @@ def check_run(system, scheme, state, newton, steps: Steps):
             f"simulate: scheme is {type(scheme).__name__}; give a Scheme, e.g. fully_implicit(num_micro=10)."
         )
     check_params(system.params)
-    if not isinstance(newton, Newton | None):
-        raise TypeError(f"simulate: newton is {newton!r}; give a Newton, e.g. Newton(method='dense').")
+    if not isinstance(solver, Newton | None):
+        raise TypeError(f"simulate: solver is {solver!r}; give one of vmri_jax.solvers, e.g. vm.solvers.Dense().")
     check_flags(save_micro=steps.save_micro)
     dt, num_steps, t_end = check_step_size(scheme, steps.macro_dt, steps.micro_dt), steps.num_steps, steps.t_end
     check_number("simulate: the t of state", state.t)

@@ -20,8 +20,8 @@ from vmri_jax.running.simulation import Simulation, simulation
 from vmri_jax.running.trajectory import Trajectory, from_arrays, with_origin
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solvers import Newton
 
 WORKING_SET = 4096
 """Fast and slow variables at all nodes of a macro step that the lanes of a chunk may have together, 32 kB."""
@@ -45,7 +45,7 @@ def simulate_batch(
     save_every: int = 1,
     save_micro: bool = False,
     params=None,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     chunk: int | None = None,
     devices: int = 1,
     warn: bool = True,
@@ -62,7 +62,7 @@ def simulate_batch(
         states: a `State` whose arrays have a leading batch axis, e.g. ``jax.vmap(make)(q_s, ...)`` or
             ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``.
         macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
-        num_steps, t_end, save_every, save_micro, newton: as in `simulate`; t_end with one step size for all.
+        num_steps, t_end, save_every, save_micro, solver: as in `simulate`; t_end with one step size for all.
         params: a pytree like ``system.params`` with a leading batch axis, if parameters differ between lanes.
         chunk: lanes that are computed side by side; chosen from the size of the problem if None.
         devices: CPU devices over which chunks are spread, see `vmri_jax.configure`.
@@ -86,7 +86,7 @@ def simulate_batch(
             "simulate_batch: t_end with a step size for each lane; give num_steps, the same for all lanes."
         )
     steps = Steps(_first(macro_dt), _first(micro_dt), num_steps, t_end, save_every, save_micro)
-    run = simulation(problem, scheme, first, newton, steps)
+    run = simulation(problem, scheme, first, solver, steps)
     name, dt = ("macro_dt", macro_dt) if micro_dt is None else ("micro_dt", micro_dt)
     dt = np.asarray(real_array(f"simulate_batch: {name}", dt))
     if dt.shape not in ((), (lanes,)):

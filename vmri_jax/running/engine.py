@@ -21,15 +21,15 @@ from vmri_jax.running.saved import Node, Saved
 from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solvers import Newton
 
 
 class Model(NamedTuple):
     """All that decides how a run goes on from a state: how equations are solved, the scheme, the system."""
 
-    newton: Newton
+    solver: Newton
     scheme: Scheme | Composition
     system: System
 
@@ -171,8 +171,8 @@ class Engine:
 
     def stepper(self, leaves: list, state: State, reverse_only: bool = False) -> Plan:
         """How its steps are taken."""
-        newton, scheme, system = self.model(leaves)
-        return plan(system, scheme, state, newton, fallback=False, reverse_only=reverse_only)
+        solver, scheme, system = self.model(leaves)
+        return plan(system, scheme, state, solver, fallback=False, reverse_only=reverse_only)
 
     def _counted(self, stepper: Plan, at: "_At", saved: Saved, times: "_Times", saves) -> "_Counted":
         """`saves * save_every` macro steps; with `saves` None all that there is room for, whether or not steps fail: lanes go on together."""
@@ -186,14 +186,14 @@ class Engine:
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
             moved, info, micro = interval(at, jnp.where(is_later, times.save_every, 0))
             at = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, at)
-            node, at = _node(stepper.system, stepper.newton.tolerance, at)
+            node, at = _node(stepper.system, stepper.solver.tolerance, at)
             return _Counted(number + 1, at, saved.write(number, node, info, micro))
 
         return jax.lax.while_loop(goes_on, save, _Counted(jnp.asarray(0), at, saved))
 
     def _scanned(self, stepper: Plan, at: "_At", times: "_Times", loops: Loops) -> Trajectory:
         """All of a run from its first step, by loops that can be differentiated."""
-        system, tolerance = stepper.system, stepper.newton.tolerance
+        system, tolerance = stepper.system, stepper.solver.tolerance
         interval = self._interval(stepper, at.state, times, loops)
 
         def save(at: _At, _):

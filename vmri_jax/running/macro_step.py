@@ -7,13 +7,14 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import plan
+from vmri_jax.steppers.solvers import Newton
 from vmri_jax.steppers.stepper import StepInfo
 
 
 def macro_step(
-    system: System, scheme: Scheme | Composition, state: State, macro_dt, newton: Newton | None = None
+    system: System, scheme: Scheme | Composition, state: State, macro_dt, solver: Newton | None = None
 ) -> tuple[State, StepInfo]:
     """One macro step, ``(state, info) = macro_step(system, scheme, state, macro_dt)``; a pure function.
 
@@ -25,7 +26,7 @@ def macro_step(
         system, scheme: what moves, and how.
         state: a consistent state, from `initial_state` or a former step.
         macro_dt: length H of the macro step, positive.
-        newton: how implicit equations are solved.
+        solver: how implicit equations are solved.
 
     Returns:
         The state at the end of the step, and what the step did.
@@ -37,11 +38,11 @@ def macro_step(
         "macro_step: system", system, System, "a vmri_jax.System; of a scene its .system(), of a problem its .system"
     )
     check_type("macro_step: state", state, State, "a State, e.g. problem.state()")
-    return _macro_step(system, scheme, state, macro_dt, newton or Newton())
+    return _macro_step(system, scheme, state, macro_dt, solver or solvers.Auto())
 
 
 @jax.jit
-def _macro_step(system, scheme, state, macro_dt, newton):
-    planned = plan(system, scheme, state, newton)
+def _macro_step(system, scheme, state, macro_dt, solver):
+    planned = plan(system, scheme, state, solver)
     state, info, memory = planned.step(state, planned.init(state, macro_dt), macro_dt)
     return planned.project(state, memory)[0] if planned.defers_projection else state, info

@@ -88,7 +88,7 @@ class Origin:
         )
         return bare.with_params(params)
 
-    def shaped(self, part: Part, vectors):
+    def shaped(self, part: Part, vectors) -> Any:
         """Vectors (..., n) as the user gave the start: vectors, or a dictionary of arrays."""
         return vectors if self.names is None else self.names.shaped(part, vectors)
 

@@ -93,17 +93,17 @@ class Quantities(ABC):
         return origin.bare.keeps_energy if origin.bare is not None else None
 
     @property
-    def v_s(self):
+    def v_s(self) -> Any:
         """Slow velocities, shaped like q_s."""
         return self.origin.shaped("s", self.velocities[0])
 
     @property
-    def v_f(self):
+    def v_f(self) -> Any:
         """Fast velocities, shaped like q_f."""
         return self.origin.shaped("f", self.velocities[1])
 
     @property
-    def velocities(self):
+    def velocities(self) -> Any:
         """Vectors (..., k, n_s) and (..., k, n_f) of all velocities."""
         return _velocities(self.whole())
 

@@ -29,9 +29,10 @@ from vmri_jax.running.summaries import summary_of_prepared
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.results import Method, Result
+from vmri_jax.steppers.solvers import Newton
 
 SHOWN = 50
 """A run with a progress bar is computed in about so many parts."""
@@ -66,7 +67,7 @@ class Simulation:
     made again with exact matrices, by a program that is compiled then.
 
     Attributes:
-        system, scheme, newton, state, num_steps, save_every, save_micro: as of `simulate`.
+        system, scheme, solver, state, num_steps, save_every, save_micro: as of `simulate`.
         macro_dt: an array of shape ().
         names: of bodies and constraints, None if there are none.
         may_fall_back: whether a run that the first method does not solve is made again with exact matrices, else it fails.
@@ -74,7 +75,7 @@ class Simulation:
 
     system: System
     scheme: Scheme | Composition
-    newton: Newton
+    solver: Newton
     state: State
     macro_dt: Any
     num_steps: int
@@ -183,7 +184,7 @@ class Simulation:
     @cached_property
     def plan(self) -> Plan:
         """How its steps are taken; ``print`` shows it in words."""
-        return plan(self.system, self.scheme, self.state, self.newton)
+        return plan(self.system, self.scheme, self.state, self.solver)
 
     @cached_property
     def origin(self) -> Origin:
@@ -193,7 +194,7 @@ class Simulation:
     @cached_property
     def arrays(self) -> Arrays:
         """The numbers that it is computed from."""
-        model = Model(self.newton, self.scheme, self.system)
+        model = Model(self.solver, self.scheme, self.system)
         return Arrays(jax.tree.leaves(model), tuple(vars(self.state).values()), self.macro_dt)
 
     @cached_property
@@ -213,8 +214,8 @@ class Simulation:
     @cached_property
     def _structures(self) -> tuple:
         """Structures of the `Model` with the first method, and with exact matrices."""
-        newtons = self.newton, replace(self.newton, method="arrowhead")
-        return tuple(jax.tree.structure(Model(newton, self.scheme, self.system)) for newton in newtons)
+        solvers = self.solver, self.solver.exact()
+        return tuple(jax.tree.structure(Model(solver, self.scheme, self.system)) for solver in solvers)
 
     def check(self, what: str = "simulate: the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return something else than they should, and constraints that cannot be kept."""
@@ -288,7 +289,7 @@ def prepare(
     t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
 ) -> "Simulation":
     """Check and compile what `simulate` would run, to be run again and again.
 
@@ -306,31 +307,31 @@ def prepare(
     Raises:
         ValueError, TypeError: bad arguments, as of `simulate`.
     """
-    run = simulation(system, scheme, state, newton, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
+    run = simulation(system, scheme, state, solver, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
     if not run.is_concrete:
         raise ValueError("prepare: arguments are tracers; call it outside of jax.jit, vmap and grad, or take simulate.")
     run.check()
     check_memory("prepare", run.state, scheme.num_micro, run.num_saves, save_micro)
-    on_device = ("system", "scheme", "newton", "state", "macro_dt")
+    on_device = ("system", "scheme", "solver", "state", "macro_dt")
     run = replace(run, **jax.device_put({name: getattr(run, name) for name in on_device}))
     with Working("prepare: compiling the run"):
         jax.block_until_ready(run._program(False)(run.arrays, 0, 0))  # no steps: it only compiles
     return run
 
 
-def simulation(moving: Movable, scheme, state: State | None, newton: Newton | None, steps: Steps) -> Simulation:
+def simulation(moving: Movable, scheme, state: State | None, solver: Newton | None, steps: Steps) -> Simulation:
     """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
     warn_if_slow()
     problem = opened(moving)
     system, state = start_of("simulate", problem, state)
-    macro_dt, num_steps, save_every = check_run(system, scheme, state, newton, steps)
+    macro_dt, num_steps, save_every = check_run(system, scheme, state, solver, steps)
     useless = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if useless:
         warnings.warn(f"simulate: {useless}", stacklevel=3)
-    newton, scheme, system = of_one_type((newton or Newton(), scheme, system))
+    solver, scheme, system = of_one_type((solver or solvers.Auto(), scheme, system))
     state, macro_dt = State(*_arrays(state)), _float(macro_dt)
     return Simulation(
-        system, scheme, newton, state, macro_dt, num_steps, save_every, steps.save_micro, names_of(problem)
+        system, scheme, solver, state, macro_dt, num_steps, save_every, steps.save_micro, names_of(problem)
     )
 
 

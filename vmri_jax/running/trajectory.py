@@ -108,37 +108,37 @@ class Trajectory(Exports):
         return summary(*summary_of(self))
 
     @property
-    def t(self):
+    def t(self) -> Any:
         """(k,) times."""
         return self.states.t
 
     @property
-    def q_s(self):
+    def q_s(self) -> Any:
         """(k, n_s) slow positions, or by name."""
         return self.origin.shaped("s", self.states.q_s)
 
     @property
-    def q_f(self):
+    def q_f(self) -> Any:
         """(k, n_f) fast positions, or by name."""
         return self.origin.shaped("f", self.states.q_f)
 
     @property
-    def p_s(self):
+    def p_s(self) -> Any:
         """(k, n_s) slow momenta, or by name."""
         return self.origin.shaped("s", self.states.p_s)
 
     @property
-    def p_f(self):
+    def p_f(self) -> Any:
         """(k, n_f) fast momenta, or by name."""
         return self.origin.shaped("f", self.states.p_f)
 
     @property
-    def t_micro(self):
+    def t_micro(self) -> Any:
         """(k - 1, num_micro) times of the micro nodes; None unless asked for."""
         return None if self.micro is None else self.micro.t
 
     @property
-    def q_f_micro(self):
+    def q_f_micro(self) -> Any:
         """(k - 1, num_micro, n_f) fast positions at the micro nodes, or by name; None unless asked for."""
         return None if self.micro is None else self.origin.shaped("f", self.micro.q_f)
 

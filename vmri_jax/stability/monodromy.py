@@ -14,8 +14,9 @@ from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import QUICK
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solvers import Newton
 
 
 @dataclass(frozen=True)
@@ -60,14 +61,14 @@ def monodromy(
     *,
     macro_dt,
     num_steps: int,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
 ) -> Monodromy:
     """Product of the step's derivatives along a trajectory, ``M = DPhi(z_(N-1)) ... DPhi(z_0)``.
 
     With constraints, every factor is taken between the tangent spaces of the constraint manifold at its two ends.
 
     Args:
-        system, scheme, macro_dt, newton: as in `macro_step`.
+        system, scheme, macro_dt, solver: as in `macro_step`.
         state: start, consistent; None for that of the problem or scene.
         num_steps: macro steps; one period of a periodic orbit gives its Floquet multipliers.
 
@@ -81,7 +82,7 @@ def monodromy(
     if is_concrete(macro_dt) and not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
         raise ValueError(f"monodromy: macro_dt is {macro_dt}; it must be a positive number.")
     start = State(*(jnp.asarray(a, dtype=float) for a in (state.t, state.q_s, state.q_f, state.p_s, state.p_f)))
-    product = _product(system, scheme, start, macro_dt, newton or Newton(), num_steps)
+    product = _product(system, scheme, start, macro_dt, solver or solvers.Auto(), num_steps)
     last, M, at_start, at_end, results = (np.asarray(a) for a in product)
     failed = np.flatnonzero(results > Result.CONVERGED_AT_ROUNDOFF)
     if failed.size:
@@ -101,12 +102,12 @@ def monodromy(
 
 
 @partial(jax.jit, static_argnames="num_steps", compiler_options=QUICK)
-def _product(system, scheme, state, macro_dt, newton, num_steps: int):
+def _product(system, scheme, state, macro_dt, solver, num_steps: int):
     """End (2 n,), product of the derivatives, tangent bases at the start and at the end, status of every step."""
     splits = phase_splits(state)
 
     def step(z, t):
-        end, info = macro_step(system, scheme, State(t, *jnp.split(z, splits)), macro_dt, newton)
+        end, info = macro_step(system, scheme, State(t, *jnp.split(z, splits)), macro_dt, solver)
         z = phase_vector(end)
         return z, (z, info.result)
 

@@ -20,7 +20,7 @@ from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.stability.linear import QUICK, SmallMotions
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
 
 LANES = 64
 """Step sizes that one compiled call does side by side, where the system is small."""
@@ -94,10 +94,10 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
 @partial(jax.jit, compiler_options=QUICK)
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
     """(k, 2 d, 2 d) derivatives of the macro step at rest for k lengths of it."""
-    newton = Newton(method="arrowhead", fixed_iterations=CONSTRAINED_ITERATIONS if system.is_constrained else 1)
+    solver = solvers.Arrowhead(fixed_iterations=CONSTRAINED_ITERATIONS if system.is_constrained else 1)
 
     def step(coordinates, macro_dt):
         state = State(rest.t, *jnp.split(embed @ coordinates, phase_splits(rest)))
-        return read @ phase_vector(macro_step(system, scheme, state, macro_dt, newton)[0])
+        return read @ phase_vector(macro_step(system, scheme, state, macro_dt, solver)[0])
 
     return jax.vmap(lambda dt: jax.jacfwd(step)(jnp.zeros(embed.shape[1]), dt))(macro_dt)

@@ -31,9 +31,9 @@ from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.schemes.path import control_nodes, lagrange_basis
 from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import constant_mass
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import RUNNING, Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
+from vmri_jax.steppers.solvers import Newton
 from vmri_jax.steppers.time_modes import TimeModes, product, taken, times_i
 
 

@@ -13,9 +13,10 @@ from vmri_jax.mechanics.arrays import Number
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.accept import Accepted
 from vmri_jax.steppers.continuation import solve_in_parts, with_dependent_constraints
-from vmri_jax.steppers.newton import Newton, dense
+from vmri_jax.steppers.newton import dense
 from vmri_jax.steppers.results import RUNNING, Method, Result
 from vmri_jax.steppers.solved import Solution, Solver, ended, status_of
+from vmri_jax.steppers.solvers import Newton
 
 MARGIN = 100.0
 """Factor on the contraction that quadratic convergence promises for the next update. With more, most steps take one more iteration; with

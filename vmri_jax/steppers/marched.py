@@ -21,10 +21,11 @@ from vmri_jax.steppers.march import (
     further_pass,
     inverse_with_multipliers,
 )
-from vmri_jax.steppers.newton import Newton, null_space
+from vmri_jax.steppers.newton import null_space
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import RUNNING, Method, Result
 from vmri_jax.steppers.solved import Solution, Solver, ended, largest_constraint, status_of
+from vmri_jax.steppers.solvers import Newton
 
 PLAIN_PASSES = 30
 """Most passes of an attempt at the whole step, before parts of it are tried. Newton's method needs at most 15 from a good guess, and half of

@@ -29,11 +29,11 @@ from vmri_jax.schemes.path import control_nodes
 from vmri_jax.steppers.accept import Accepted, expected
 from vmri_jax.steppers.interval import Interval, Matrix, constant_mass
 from vmri_jax.steppers.micro_intervals import FastUnknowns, MicroSweep, SweepTotals
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.predictors import PolynomialPredictor
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.slow_equations import ConstraintInertia, SlowEquations
 from vmri_jax.steppers.solved import Solution, Solver, largest_constraint, status_of
+from vmri_jax.steppers.solvers import Newton
 
 EXTRA_PASSES = 1
 """A step that needs more passes than this above the fewest with its matrix K renews K. With more, steps with an old K take more passes; with

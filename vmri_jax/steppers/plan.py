@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS, Sparsity
+from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
@@ -30,6 +31,7 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.discrete_lagrangian import PlacedPotential, Term, lagrangian, placed_potentials
 from vmri_jax.schemes.quadrature import macro
 from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers import solvers
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed
 from vmri_jax.steppers.coupled import Coupled
@@ -40,9 +42,9 @@ from vmri_jax.steppers.kicked import Kicked, Repeated, average_over_fast_motion
 from vmri_jax.steppers.linear import Linear
 from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.nested import Nested
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.rattle import Rattle
 from vmri_jax.steppers.solved import Fallback, Solved, Solver
+from vmri_jax.steppers.solvers import Newton
 from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 from vmri_jax.steppers.subsystems import fast_part, frozen_slow, slow_part
 
@@ -63,7 +65,7 @@ class Plan:
     ``print`` shows it in words, ``print(plan.describe())`` with the rules of the scheme.
 
     Attributes:
-        system, scheme, newton: as they were given.
+        system, scheme, solver: as they were given.
         stepper: the tree of steppers.
         defers_projection: momenta are on the hidden constraints only after `project`, which is needed where they are looked at;
             else every step ends with it.
@@ -71,7 +73,7 @@ class Plan:
 
     system: System
     scheme: Scheme | Composition
-    newton: Newton
+    solver: Newton
     stepper: Stepper
     defers_projection: bool
 
@@ -114,7 +116,7 @@ def plan(
     system: Movable,
     scheme: Scheme | Composition,
     state: State | None = None,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     *,
     fallback: bool = True,
     reverse_only: bool = False,
@@ -124,7 +126,7 @@ def plan(
     Args:
         system, scheme: what moves, a `Problem` or a scene, or a `System` with a state, and how.
         state: any state of the system; only the shapes of its arrays matter.
-        newton: how implicit equations are solved.
+        solver: how implicit equations are solved.
         fallback: whether a step that the first choice does not solve is solved by the march with exact matrices, in the same program.
         reverse_only: whether steps are differentiated in reverse mode only, once, in half the time.
 
@@ -132,11 +134,16 @@ def plan(
         ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
     """
     system, state = start_of("plan", system, state)
-    newton = newton or Newton()
-    choice = _Choice(newton, fallback and newton.method == "auto" and newton.fixed_iterations is None, reverse_only)
-    kicked = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
-    defers = _defers_projection(kicked)
-    stepper: Stepper = replace(kicked, projects=not defers and system.is_constrained)
+    newton = solver or solvers.Auto()
+    falls_back = fallback and isinstance(newton, solvers.Auto) and newton.fixed_iterations is None
+    choice, defers = _Choice(newton, falls_back, reverse_only), False
+    if isinstance(newton, solvers.Custom):
+        stepper: Stepper = newton.stepper(system, stage_scheme(scheme))
+        check_type("plan: the stepper of solvers.Custom", stepper, Stepper, "a vmri_jax.steppers.stepper.Stepper")
+    else:
+        kicked = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
+        defers = _defers_projection(kicked)
+        stepper = replace(kicked, projects=not defers and system.is_constrained)
     if isinstance(scheme, Composition):
         stepper = Composed(scheme.coefficients, stepper)
     return Plan(system, scheme, newton, stepper, defers)

@@ -17,9 +17,9 @@ from vmri_jax.kernels import Full, Sparsity, max_abs
 from vmri_jax.schemes.equations import StepEquations, Unknowns, multiplier_scales
 from vmri_jax.steppers.accept import Accepted
 from vmri_jax.steppers.interval import constant_mass, weighted_sum
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method
 from vmri_jax.steppers.solved import Solution, Solver, status_of
+from vmri_jax.steppers.solvers import Newton
 
 LEAST_SCALE = 0.1
 """If the forward and the backward step of a composition cancel to less than this part of h^2, their common multiplier is round-off: it is

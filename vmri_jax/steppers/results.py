@@ -37,7 +37,7 @@ _MESSAGES = {
     Result.STAGNATED: (
         "Newton's iteration used up its iterations while still improving slowly, and so did shorter parts of the step. Likely "
         "causes: the step is too large for the motion or for the fast forces, or the constraints are nearly dependent. Try a smaller "
-        "macro_dt or a larger num_micro, or raise Newton(max_iterations=...)."
+        "macro_dt or a larger num_micro, or raise solvers.Auto(max_iterations=...)."
     ),
     Result.DIVERGED: (
         "Newton's iteration moved away from a solution, and following the solution of shorter steps ended before the whole "

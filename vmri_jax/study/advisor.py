@@ -21,8 +21,8 @@ from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import SimulationError
+from vmri_jax.steppers.solvers import Newton
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import ResultTable
@@ -90,7 +90,7 @@ class Search:
         t_end: simulated time.
         menu: families to choose from.
         reference: what runs are compared with; its number of nodes is that of the runs.
-        newton: how implicit equations are solved.
+        solver: how implicit equations are solved.
         fallback: as of `Program`.
     """
 
@@ -100,11 +100,11 @@ class Search:
         t_end: float,
         menu: Sequence[Family],
         reference: ReferenceSolution,
-        newton: Newton | None = None,
+        solver: Newton | None = None,
         fallback: bool = True,
     ):
         self.problem, self.t_end, self.menu, self.reference = problem, t_end, menu, reference
-        self.newton, self.fallback = newton, fallback
+        self.solver, self.fallback = solver, fallback
         self.frequency = float(diagnostics.frequencies(problem)[0])
         self.programs: dict[tuple[str, int], Program] = {}
         self.settings: dict[tuple[str, int, int], Setting] = {}
@@ -114,7 +114,7 @@ class Search:
         key = (family.name, num_micro)
         program = self.programs.pop(key, None)
         if program is None:
-            given = self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.newton
+            given = self.problem, family.make(num_micro), self.t_end, self.reference.num_saves, self.solver
             program = Program(*given, self.fallback)
         self.programs[key] = program  # the last one now
         if len(self.programs) > PROGRAMS:
@@ -345,7 +345,7 @@ def tune(
     menu: Sequence[Family] | None = None,
     num_saves: int = 1,
     reference: ReferenceSolution | None = None,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     verify: bool = True,
     exhaustive: bool = False,
     progress: Progress = silent,
@@ -359,7 +359,7 @@ def tune(
         menu: families to choose from, by default `families()`.
         num_saves: nodes compared, equally spaced; 1 compares at t_end.
         reference: compare with this; by default `reference_solution`.
-        newton: how implicit equations are solved.
+        solver: how implicit equations are solved.
         verify: run the setting from another start, and compare with its own reference.
         exhaustive: search without shortcuts.
         progress: told about every attempt.
@@ -384,7 +384,7 @@ def tune(
             f"{MARGIN * reference.error_q:.1e}, or a better reference."
         )
     for fallback in (False, True):  # runs that need it are seldom the cheapest, and it takes long to compile
-        search = Search(problem, t_end, families() if menu is None else menu, reference, newton, fallback)
+        search = Search(problem, t_end, families() if menu is None else menu, reference, solver, fallback)
         with search.kept():
             found = search.cheapest(error, progress, exhaustive)
         if found:
@@ -401,7 +401,7 @@ def tune(
         progress("another start", 1, 1)
         try:
             with search.kept():
-                chosen, checked = _not_by_luck(found, _from_another_start(problem, t_end, reference, newton))
+                chosen, checked = _not_by_luck(found, _from_another_start(problem, t_end, reference, solver))
         except SimulationError as failure:
             warnings.warn(
                 f"tune: the setting is not checked from another start, for the reference solution fails there: {failure}",
@@ -440,7 +440,7 @@ def another_start(problem: Problem, speed: float) -> Problem:
 
 
 def _from_another_start(
-    problem: Problem, t_end: float, seen: ReferenceSolution, newton
+    problem: Problem, t_end: float, seen: ReferenceSolution, solver
 ) -> Callable[[Setting], Verification]:
     """Runs a setting from another start, which the search has not seen."""
     num_saves = seen.num_saves
@@ -448,7 +448,7 @@ def _from_another_start(
     reference = reference_solution(other, t_end, num_saves=num_saves)
 
     def verified(setting: Setting) -> Verification:
-        program = Program(other, setting.scheme, t_end, num_saves, newton)
+        program = Program(other, setting.scheme, t_end, num_saves, solver)
         seconds = program.seconds(setting.num_steps, 5)
         row, known = work_row(setting.row.scheme, program, setting.num_steps, reference).timed(seconds), setting.row
         grown = row.error_q / known.error_q if known.error_q else 1.0  # no error at all: nothing moves

@@ -25,8 +25,8 @@ from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
+from vmri_jax.steppers.solvers import Newton
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable
@@ -208,7 +208,7 @@ def convergence_study(
     params: Mapping[str, Any] | None = None,
     momentum_maps: Sequence[Callable] = (),
     reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     executor: Any = None,
     progress: Progress = silent,
 ) -> ConvergenceStudy:
@@ -227,7 +227,7 @@ def convergence_study(
             those of `problem`.
         momentum_maps: infinitesimal generators of symmetries, see `vmri_jax.diagnostics.momentum_map`.
         reference: compare with this (by label of the parameters if there are several); by default `reference_solution`.
-        newton: how implicit equations are solved.
+        solver: how implicit equations are solved.
         executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
         progress: told about every run before it starts.
 
@@ -254,7 +254,7 @@ def convergence_study(
         runs = mapped(
             "convergence_study",
             _runs,
-            [(problems, schemes[label], num_steps, t_end, num_saves, newton) for label, num_steps in labels],
+            [(problems, schemes[label], num_steps, t_end, num_saves, solver) for label, num_steps in labels],
             executor,
             lambda done, i: progress(f"{labels[i][0]}, H = {t_end / labels[i][1]:g}", done, total),
         )
@@ -296,11 +296,11 @@ def _cases(problem: Problem, params: Mapping[str, Any] | None) -> dict[str, Prob
 
 
 def _runs(
-    problems: Sequence[Problem], scheme, num_steps: int, t_end: float, num_saves: int, newton
+    problems: Sequence[Problem], scheme, num_steps: int, t_end: float, num_saves: int, solver
 ) -> list[Trajectory]:
     """A trajectory of each problem."""
     if len(problems) == 1:
-        return [Program(problems[0], scheme, t_end, num_saves, newton)(num_steps)]
+        return [Program(problems[0], scheme, t_end, num_saves, solver)(num_steps)]
     states = jax.tree.map(lambda *a: jnp.stack(a), *(problem.state() for problem in problems))
     params = jax.tree.map(lambda *a: jnp.stack([jnp.asarray(x) for x in a]), *(p.system.params for p in problems))
     batch = simulate_batch(
@@ -311,7 +311,7 @@ def _runs(
         num_steps=num_steps,
         save_every=num_steps // num_saves,
         params=params,
-        newton=newton,
+        solver=solver,
         warn=False,
     )
     return [jax.tree.map(lambda a, i=i: a[i], batch) for i in range(len(problems))]

@@ -12,7 +12,6 @@ from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.study.program import Program
 from vmri_jax.study.table import Column, ResultTable
@@ -23,7 +22,7 @@ from vmri_jax.study.timing import interleaved
 class CostRow:
     """One program: its size and its times.
 
-    method: what ``Newton(method=...)`` was told.
+    method: what ``vm.solvers.named(method)(=...)`` was told.
     solved_by: name of the `Method` that took the steps, as ``run.info.method`` says it: "auto" chooses one.
     num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
@@ -46,7 +45,7 @@ class CostRow:
 
 @dataclass(frozen=True)
 class CostStudy(ResultTable):
-    """Rows of one or several cost studies; each is a run of ``simulate(..., newton=Newton(method=row.method))``."""
+    """Rows of one or several cost studies; each is a run of ``simulate(..., solver=vm.solvers.named(row.method)())``."""
 
     columns = (
         Column("what", lambda row: row.label),
@@ -98,7 +97,7 @@ def cost_study(
     """Time ``scheme(n)`` for every n in `num_micro` with every method of Newton's iteration, over the same simulated time.
 
     "auto" is what `simulate` takes by itself, and "dense" what the reference paper took; every method is that of
-    ``simulate(..., newton=vm.Newton(method="dense"))`` and of ``vmri simulate --method dense``.
+    ``simulate(..., solver=vm.solvers.Dense())`` and of ``vmri simulate --method dense``.
 
     Where `t_end` is not a whole number of macro steps their number is rounded, and times are given per simulated unit
     and per micro step. A timed call is one compiled program, started once; take `t_end` long enough (thousands of micro
@@ -139,11 +138,11 @@ def cost_study(
 
     try:
         for method in methods:
-            newton = Newton(method=method)  # pyright: ignore[reportArgumentType]
+            solver = vm.solvers.named(method)()  # pyright: ignore[reportArgumentType]
             for n in num_micro:
                 progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
                 num_steps = max(1, round(t_end / (n * micro_dt)))
-                program = Program(problem, scheme(n), num_steps * n * micro_dt, newton=newton)
+                program = Program(problem, scheme(n), num_steps * n * micro_dt, solver=solver)
                 runs.append((method, program, num_steps, program(num_steps)))
         progress(f"{label} measuring times".strip(), total - 1, total)
         calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}

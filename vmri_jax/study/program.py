@@ -13,7 +13,8 @@ from vmri_jax.running.timing import MIN_SECONDS, interleaved
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers import solvers
+from vmri_jax.steppers.solvers import Newton
 
 
 class Program:
@@ -27,7 +28,7 @@ class Program:
         scheme: a scheme or a composition.
         t_end: simulated time.
         num_saves: saved nodes, equally spaced; numbers of steps must be multiples of it.
-        newton: how implicit equations are solved.
+        solver: how implicit equations are solved.
         fallback: whether "auto" may take its second method where the first one fails, which takes long to compile.
 
     Attributes:
@@ -40,19 +41,19 @@ class Program:
         scheme: Scheme | Composition,
         t_end: float,
         num_saves: int = 1,
-        newton: Newton | None = None,
+        solver: Newton | None = None,
         fallback: bool = True,
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
-        self.newton, self.state, self.fallback = newton or Newton(), problem.state(), fallback
-        check_run(problem.system, scheme, self.state, self.newton, self.t_end / num_saves, None, num_saves, None, 1)
+        self.solver, self.state, self.fallback = solver or solvers.Auto(), problem.state(), fallback
+        check_run(problem.system, scheme, self.state, self.solver, self.t_end / num_saves, None, num_saves, None, 1)
         self.compile_seconds = float("nan")
 
     @cached_property
     def _run(self) -> Simulation:
         start = time.perf_counter()
         steps = {"macro_dt": self.t_end / self.num_saves, "num_steps": self.num_saves}
-        run = prepare(self.problem.system, self.scheme, self.state, **steps, newton=self.newton)
+        run = prepare(self.problem.system, self.scheme, self.state, **steps, solver=self.solver)
         self.compile_seconds = time.perf_counter() - start
         return replace(run, may_fall_back=self.fallback)
 

@@ -13,8 +13,8 @@ from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
 from vmri_jax.steppers.results import Method, Result
+from vmri_jax.steppers.solvers import Newton
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
 from vmri_jax.study.table import Column, ResultTable
@@ -167,7 +167,7 @@ def work_precision(
     num_steps: Sequence[int] | None = None,
     num_saves: int = 1,
     reference: ReferenceSolution | None = None,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     repeats: int = 5,
     executor: Any = None,
     progress: Progress = silent,
@@ -185,7 +185,7 @@ def work_precision(
             vibration begins to be seen until the error falls no more or is below 1e-10, or a run takes two seconds.
         num_saves: nodes compared, equally spaced.
         reference: compare with this; by default `reference_solution`.
-        newton: how implicit equations are solved.
+        solver: how implicit equations are solved.
         repeats: timed samples of every run.
         executor: where runs are computed and timed, a task for each scheme, as of `vmri_jax.ensemble`. Times are then those
             of the workers, and only runs of one scheme take turns: for times give each worker a core of its own. None for
@@ -206,7 +206,7 @@ def work_precision(
     frequency = float(diagnostics.frequencies(problem)[0])
     total = len(schemes) + 1
     ladders = [
-        _Ladder(problem, label, scheme, t_end, num_saves, newton, num_steps, reference, frequency)
+        _Ladder(problem, label, scheme, t_end, num_saves, solver, num_steps, reference, frequency)
         for label, scheme in schemes.items()
     ]
     runs: list[tuple[Program, WorkRow]] = []
@@ -239,7 +239,7 @@ class _Ladder(NamedTuple):
     scheme: Scheme | Composition
     t_end: float
     num_saves: int
-    newton: Newton | None
+    solver: Newton | None
     num_steps: Sequence[int] | None
     reference: ReferenceSolution
     frequency: float
@@ -247,7 +247,7 @@ class _Ladder(NamedTuple):
 
 def _climbed(ladder: _Ladder, told: Callable[[int], None] = lambda _: None) -> Iterator[tuple[Program, WorkRow]]:
     """All runs of a ladder, one after the other, with the time of one call each."""
-    program = Program(ladder.problem, ladder.scheme, ladder.t_end, ladder.num_saves, ladder.newton)
+    program = Program(ladder.problem, ladder.scheme, ladder.t_end, ladder.num_saves, ladder.solver)
     per_save = ladder.frequency * ladder.t_end / ladder.scheme.num_micro / ladder.scheme.degree / ladder.num_saves
     left, seen = list(ladder.num_steps or [ladder.num_saves * max(1, int(per_save))]), []
     while left:

@@ -22,8 +22,8 @@ IN_FULL = 8
 
 def identity(simulation: Simulation, start: State) -> dict[str, str]:
     """All that decides a run, by name. Functions are known by their name and by the operations they trace to."""
-    found = {}
-    for name in ("system", "scheme", "newton", "macro_dt", "save_every", "save_micro"):
+    found = {"solver": type(simulation.solver).__name__}
+    for name in ("system", "scheme", "solver", "macro_dt", "save_every", "save_micro"):
         found |= describe(name, getattr(simulation, name))
     found |= describe("state", start)
     return found | {f"operations of {name}": text for name, text in _operations(simulation.system, start).items()}

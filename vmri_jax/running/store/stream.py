@@ -22,7 +22,7 @@ from vmri_jax.running.store.stored import StoredTrajectory
 from vmri_jax.running.trajectory import join
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.steppers.newton import Newton
+from vmri_jax.steppers.solvers import Newton
 
 PARTS = 100
 """A run is written in so many chunks, if they are neither too short nor too large:"""
@@ -44,7 +44,7 @@ def stream(
     t_end: float | None = None,
     save_every: int = 1,
     save_micro: bool = False,
-    newton: Newton | None = None,
+    solver: Newton | None = None,
     chunk: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
@@ -59,7 +59,7 @@ def stream(
     to the uninterrupted one to the last bit. The memory needed is that of one chunk.
 
     Args:
-        system, scheme, state, macro_dt, micro_dt, t_end, save_every, save_micro, newton: as in `simulate`.
+        system, scheme, state, macro_dt, micro_dt, t_end, save_every, save_micro, solver: as in `simulate`.
         out: folder of the store, a zarr group; conventionally named .zarr.
         num_steps: macro steps. A resumed run may be given more of them than before: then it is made longer.
         chunk: saved intervals that are computed and written together, kept by the store; None for a hundredth of the run,
@@ -84,7 +84,7 @@ def stream(
     path = Path(out)
     _check_place(path, resume, overwrite)
     steps = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
-    run = simulation(system, scheme, state, newton, steps)
+    run = simulation(system, scheme, state, solver, steps)
     num_steps = run.num_steps
     if not run.is_concrete:
         raise ValueError("stream: arguments are tracers; it writes files, call it outside of jax.jit, vmap and grad.")
