@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -115,6 +116,26 @@ class Trial:
         return self.steps_for(error) * self.seconds if np.isfinite(self.error) else np.inf
 
 
+class Prices(NamedTuple):
+    """Measured prices and errors of a scheme of order p, by which numbers of micro steps N are compared.
+
+    macro_seconds, micro_seconds: a and b in the time ``a + b N`` of a macro step.
+    slow, fast: the shares S and F of the error ``S + F / N^p`` of the trial's macro step.
+    order: p.
+    """
+
+    macro_seconds: float
+    micro_seconds: float
+    slow: float
+    fast: float
+    order: int
+
+    def relative_time(self, num_micro: int) -> float:
+        """Time of a run with a certain error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not depend on N."""
+        error = self.slow + self.fast / num_micro**self.order
+        return (self.macro_seconds + num_micro * self.micro_seconds) * error ** (1 / self.order)
+
+
 class Search:
     """Trial runs from one start over one length of time.
 
@@ -127,6 +148,7 @@ class Search:
     def __init__(self, make: Callable[[Scheme | Composition], Simulation], length: float, num_saves: int | None):
         self.make, self.length, self.num_saves = make, length, num_saves
         self.runs: dict[tuple[str, int], Simulation] = {}
+        self.prices: Prices | None = None
 
     def saving(self, num_steps: int) -> tuple[int, int]:
         """At least so many macro steps, a multiple of the saved intervals, and the macro steps from one saved node to the next."""
@@ -192,8 +214,9 @@ class Search:
         least = LEAST_TIME * trial.seconds
         micro_seconds = max(of_two - trial.seconds, least) / num_micro
         macro_seconds = max(trial.seconds - num_micro * micro_seconds, least)
-        fast_over_slow = num_micro**p * fast / max(slow, LEAST_SHARE * fast)
-        best = (macro_seconds / micro_seconds * fast_over_slow) ** (1 / (p + 1))
+        slow = max(slow, LEAST_SHARE * fast)
+        self.prices = Prices(macro_seconds, micro_seconds, slow, num_micro**p * fast, p)
+        best = (macro_seconds / micro_seconds * self.prices.fast / slow) ** (1 / (p + 1))
         unit = _unit(trial.run.system, stage_scheme(trial.run.scheme))
         best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
         if max(best, num_micro) <= SAME * min(best, num_micro):
@@ -272,7 +295,9 @@ def with_accuracy(
         )
     numbers = float(best.run.macro_dt), best.run.num_steps, best.run.save_every
     python = best.family.python.format(best.num_micro)
-    return best, Settings(best.run.scheme, python, best.family.options, *numbers)
+    known = search.prices is not None and best.num_micro > 1
+    gain = search.prices.relative_time(1) / search.prices.relative_time(best.num_micro) if known else 1.0
+    return best, Settings(best.run.scheme, python, best.family.options, *numbers, gain)
 
 
 def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:

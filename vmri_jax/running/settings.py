@@ -17,6 +17,7 @@ class Settings:
         options: the same on the command line; empty for a scheme of one's own.
         macro_dt: H.
         num_steps, save_every: macro steps, and those from one saved node to the next.
+        gain: time of single steps over that of these micro steps for the same error, by the prices and shares of the trial runs.
     """
 
     scheme: Scheme | Composition
@@ -25,6 +26,7 @@ class Settings:
     macro_dt: float
     num_steps: int
     save_every: int
+    gain: float = 1.0
 
     @property
     def arguments(self) -> dict[str, Any]:
