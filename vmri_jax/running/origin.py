@@ -40,9 +40,14 @@ class Origin(NamedTuple):
         return cls(names, system, system.params)
 
     @classmethod
-    def named(cls, names: dict | None) -> "Origin":
-        """That of a run of which only the names are known, from plain data."""
-        return cls(None if names is None else Names.from_dict(names))
+    def from_file(cls, names: dict | None, settings: dict | None = None) -> "Origin":
+        """That of a run of which names and settings are known at most, from plain data."""
+        known_names = None if names is None else Names.from_dict(names)
+        return cls(known_names, settings=None if settings is None else Settings.from_dict(settings))
+
+    def without_system(self) -> "Origin":
+        """Names and settings alone: functions of a system may not be pickled."""
+        return Origin(self.names, settings=self.settings)
 
     @property
     def known_system(self) -> System:

@@ -104,7 +104,7 @@ class Trajectory(Exports, eqx.Module):
 
     @property
     def settings(self) -> Settings:
-        """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run, and of one that was read from a file."""
+        """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run."""
         return self.origin.settings  # pyright: ignore[reportReturnType]
 
     def of(self, what: System | Problem | HasProblem | Origin) -> "Trajectory":
@@ -120,6 +120,7 @@ class Trajectory(Exports, eqx.Module):
         origin = what if isinstance(what, Origin) else Origin.of(what)
         if not isinstance(what, Origin):
             origin.check(self.q_s.shape[-1], self.q_f.shape[-1])
+            origin = origin._replace(settings=self.settings)
         return know(object.__new__(type(self)), origin, vars(self))
 
     def whole(self) -> "Trajectory":
@@ -162,7 +163,7 @@ class Trajectory(Exports, eqx.Module):
         return jax.tree.map(lambda a: a[i], self).of(self.origin.lane(i))
 
     def __getstate__(self) -> dict:
-        return {name: value for name, value in vars(self).items() if name != "_origin"}  # functions may not be pickled
+        return {**vars(self), "_origin": self.origin.without_system()}
 
     @property
     def success(self):
@@ -182,7 +183,7 @@ class Trajectory(Exports, eqx.Module):
     def save(self, path, drawing: dict | None = None) -> None:
         """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
 
-        Names of coordinates are the arrays ``slow_names`` and ``fast_names``.
+        Names of coordinates are the arrays ``slow_names`` and ``fast_names``; ``settings`` of a run with an accuracy are JSON.
 
         Args:
             path: of the file.
@@ -198,6 +199,8 @@ class Trajectory(Exports, eqx.Module):
             names = self.names
             arrays |= {"slow_names": np.array(names.slow_coordinates), "fast_names": np.array(names.fast_coordinates)}
             arrays["names"] = np.array(json.dumps(names.to_dict()))
+        if self.settings is not None:
+            arrays["settings"] = np.array(json.dumps(self.settings.to_dict()))
         with replaced(path) as file:
             np.savez_compressed(file, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
@@ -225,7 +228,10 @@ class Trajectory(Exports, eqx.Module):
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
-        names = arrays.pop("names", None)
+        names, settings = (
+            None if text is None else json.loads(str(text))
+            for text in (arrays.pop("names", None), arrays.pop("settings", None))
+        )
         for name in ("drawing", "slow_names", "fast_names"):
             arrays.pop(name, None)
         missing = _FIELDS - set(arrays) - set(MICRO)
@@ -233,7 +239,13 @@ class Trajectory(Exports, eqx.Module):
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
-        return from_named_arrays(arrays).of(Origin.named(None if names is None else json.loads(str(names))))
+        try:
+            origin = Origin.from_file(names, settings)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{path} is a damaged trajectory: its names or settings cannot be read ({error!r})."
+            ) from error
+        return from_named_arrays(arrays).of(origin)
 
 
 def know(trajectory: Trajectory, origin: Origin, fields: dict | None = None) -> Trajectory:
