@@ -71,7 +71,6 @@ for _name, _module in {
     "chains": chains,
     "compile": compilation,
     "control": control,
-    "dear": dear,
     "errors": errors,
     "imports": imports,
     "orders": orders,
@@ -79,6 +78,20 @@ for _name, _module in {
     "savings": savings,
 }.items():
     _plain_command(_name, _module)
+
+
+@app.command("dear", help=dear.__doc__)
+def dear_command(
+    shared: Annotated[bool, typer.Option(help="Count processor time: other processes use the core too.")] = False,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Systems that begin so, e.g. network; may be repeated.")
+    ] = None,
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+) -> None:
+    prepare(core)
+    _measure("dear", dear, full, out, only=only or (), shared=shared)
 
 
 @app.command("batch", help=batch.__doc__)

@@ -1,4 +1,4 @@
-"""Hand-written C loops, the speed floor of the three systems, compiled when first used."""
+"""Hand-written C loops, the speed floor of the three systems and of molecules with all pairs, compiled when first used."""
 
 import ctypes
 import dataclasses
@@ -27,6 +27,7 @@ FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC")
 _ARRAY, _REAL, _LONG = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS"), ctypes.c_double, ctypes.c_long
 SIGNATURES = {
     "fpu": (_ARRAY, _ARRAY, _LONG, _REAL, _LONG, _REAL, _LONG),
+    "molecules": (_ARRAY, _ARRAY, _LONG, _REAL, _REAL, _LONG, _REAL, _LONG),
     "tsp": (_ARRAY, _ARRAY, _ARRAY, _ARRAY, _REAL, _REAL, _REAL, _LONG, _REAL),
     "sam": (_ARRAY, _ARRAY, _ARRAY, _ARRAY, _REAL, _REAL, _REAL, _LONG, _REAL),
 }
@@ -80,6 +81,21 @@ def fpu(problem: Problem, num_micro: int, micro_dt: float, num_macro_steps: int)
     _check("fpu", problem.system.slow_potential if unit else None, soft_springs, num_micro, num_macro_steps)
     omega = float(problem.system.params["omega"])
     return _loop("fpu", problem, len(problem.q_s), omega, num_micro, micro_dt, num_macro_steps)
+
+
+def molecules(
+    problem: Problem, length: float, stiffness: float, num_micro: int, micro_dt: float, num_macro_steps: int
+) -> CLoop:
+    """`fully_explicit(num_micro)` on diatomic molecules with Lennard-Jones forces between all pairs: the impulse method.
+
+    Args:
+        problem: fast coordinates alone, atom by atom, unit masses, as of `benchmarks.dear.systems.molecules`; its potentials are not looked at.
+        length, stiffness: of the bonds.
+        num_micro, micro_dt, num_macro_steps: the steps.
+    """
+    if min(num_micro, num_macro_steps) < 1:
+        raise ValueError(f"molecules: numbers of steps are {(num_micro, num_macro_steps)}; they must be at least 1.")
+    return _loop("molecules", problem, len(problem.q_f) // 6, stiffness, length, num_micro, micro_dt, num_macro_steps)
 
 
 def tsp(problem: Problem, micro_dt: float, num_steps: int, tolerance: float = 1e-12) -> CLoop:

@@ -26,7 +26,9 @@ from vmri_jax.study import (
     families,
 )
 from vmri_jax.study.advisor import Setting
-from vmri_jax.study.cost_report import Answer, _draw_num_micro, _draw_shares, _fastest_that_keep
+from vmri_jax.study.cost_figures import draw_num_micro, draw_shares
+from vmri_jax.study.cost_report import Answer, _draw_stairs, _fastest_that_keep
+from vmri_jax.study.staircase import Stair
 
 
 def run(num_nodes=21, n_s=2, n_f=3, constrained=False):
@@ -303,8 +305,19 @@ def test_the_panels_of_a_cost_page_are_drawn_whatever_they_hold(count):
     found = tuple(Setting(family, n, 4, work_row(1e-3)) for n in range(1, count + 1))
     answers = (Answer(1e-2, found[0] if found else None, found), Answer(1e-4, None, ()))
     report = CostReport(Path("cost.html"), "", 1.0, answers, WorkPrecision((), 1.0, EXACT), {})
-    assert is_drawn(_draw_num_micro(report, plots.LIGHT))
-    assert is_drawn(_draw_shares(report, plots.LIGHT))
+    assert is_drawn(draw_num_micro(answers, plots.LIGHT))
+    assert is_drawn(draw_shares(report.shares, plots.LIGHT))
+    assert is_drawn(_draw_stairs(report, {}, "", plots.DARK))
+
+
+@pytest.mark.parametrize("share", [np.nan, 0.3])
+@pytest.mark.parametrize("error", [0.0, 1e-3])
+def test_staircases_are_drawn(error, share):
+    stairs = [Stair(work_row(error, seconds), error / seconds, share) for seconds in (1e-3, 2e-3)]
+    bound = plots.Bound("bound", "single", 0.5)
+    marked = [plots.Marked("answers", 1e-3, error), plots.Marked("accuracy", 2e-3, error, star=True)]
+    kinds = {"single": stairs, "micro": stairs[:1]}
+    assert is_drawn(plots.plot_staircases(kinds, {"peer": stairs}, marked, bound, 1e-3, "title", plots.DARK))
 
 
 def test_no_answer_of_a_cost_page_is_slower_than_that_for_a_smaller_error():

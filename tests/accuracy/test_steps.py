@@ -1,5 +1,6 @@
 """Runs of an accuracy: their true errors, the choice as arguments, resonant steps, and requests that nothing can meet."""
 
+import pickle
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -43,6 +44,22 @@ def test_a_scheme_of_ones_own_keeps_its_rules():
     assert run.settings.scheme == vm.fully_explicit(2).with_num_micro(run.settings.scheme.num_micro)
     assert "scheme.with_num_micro(" in repr(run)
     assert np.isfinite(run.error.slow).all()
+
+
+@pytest.mark.parametrize("way", ["npz", "pickle"])
+def test_settings_are_kept_by_files_and_pickles(way, tmp_path):
+    problem = SYSTEMS["no_constraint"]
+    run = vm.simulate(problem, accuracy=1e-3, t_end=LENGTH)
+    if way == "npz":
+        run.save(tmp_path / "run.npz")
+        read = vm.Trajectory.load(tmp_path / "run.npz")
+    else:
+        read = pickle.loads(pickle.dumps(run))
+    assert str(read.settings) == str(run.settings)
+    assert read.of(problem).settings is read.settings
+    assert read[2:].settings is read.settings
+    again = vm.simulate(problem, **read.settings.arguments)
+    np.testing.assert_array_equal(again.q_f, run.q_f)
 
 
 def test_rates_of_potentials_divide_the_micro_steps():

@@ -474,7 +474,7 @@ def test_a_page_that_cannot_be_drawn_leaves_its_table(tmp_path, monkeypatch):
     def broken(*_):
         return int("no figure")
 
-    monkeypatch.setattr("vmri_jax.plots.plot_work_precision", broken)
+    monkeypatch.setattr("vmri_jax.plots.plot_staircases", broken)
     monkeypatch.setattr("vmri_jax.study.cost_report", failing)
     result = CliRunner().invoke(cli.app, ["cost", "fpu", "--out", "page"])
     assert result.exit_code == 1

@@ -94,6 +94,16 @@ def test_truncated_file(trajectory, tmp_path, part):
         Trajectory.load(path)
 
 
+def test_damaged_settings(trajectory, tmp_path):
+    path = tmp_path / "run.npz"
+    trajectory.save(path)
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    np.savez(path, **arrays, settings=np.array("{}"))
+    with pytest.raises(ValueError, match=r"run.npz is a damaged trajectory: its names or settings"):
+        Trajectory.load(path)
+
+
 def test_trajectory_with_a_field_missing(trajectory, tmp_path):
     path = tmp_path / "run.npz"
     trajectory.save(path)

@@ -8,6 +8,7 @@ from vmri_jax.plots.controls import plot_control
 from vmri_jax.plots.ensembles import plot_ensemble
 from vmri_jax.plots.fits import plot_fit
 from vmri_jax.plots.runs import plot_oscillatory_energies, plot_trajectory
+from vmri_jax.plots.staircases import Bound, Marked, plot_staircases
 from vmri_jax.plots.studies import plot_convergence, plot_cost, plot_work_precision
 from vmri_jax.plots.theme import (
     DARK,
@@ -29,6 +30,8 @@ __all__ = [
     "DARK",
     "LIGHT",
     "MARKERS",
+    "Bound",
+    "Marked",
     "NotebookFigure",
     "Theme",
     "curve_look",
@@ -42,6 +45,7 @@ __all__ = [
     "plot_ensemble",
     "plot_fit",
     "plot_oscillatory_energies",
+    "plot_staircases",
     "plot_trajectory",
     "plot_work_precision",
     "positive",

@@ -45,9 +45,10 @@ class Origin:
         return cls(names, system.with_params(None), system.params)
 
     @classmethod
-    def named(cls, names: dict | None) -> "Origin":
-        """The origin of a run of which only the names are known, from plain data."""
-        return cls(None if names is None else Names.from_dict(names))
+    def from_file(cls, names: dict | None, settings: dict | None = None) -> "Origin":
+        """The origin of a run of which names and settings are known at most, from plain data."""
+        known_names = None if names is None else Names.from_dict(names)
+        return cls(known_names, settings=None if settings is None else Settings.from_dict(settings))
 
     def repeated(self, lanes: tuple[int, ...], params: Any = None) -> "Origin":
         """The same for a batch of runs: every array is repeated, without copies.

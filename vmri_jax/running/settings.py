@@ -1,9 +1,10 @@
 """Scheme and steps of a run that were chosen for an accuracy."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.plain_data import from_plain, to_plain
 from vmri_jax.schemes.scheme import Scheme
 
 
@@ -20,7 +21,7 @@ class Settings:
         gain: time of single steps over that of these micro steps for the same error, by the prices and shares of the trial runs.
     """
 
-    scheme: Scheme | Composition
+    scheme: Scheme | Composition = field(compare=False)  # `python` and the numbers say all of it
     python: str
     options: str
     macro_dt: float
@@ -33,6 +34,19 @@ class Settings:
         """Arguments of `vmri_jax.simulate` by name."""
         steps = {"macro_dt": self.macro_dt, "num_steps": self.num_steps, "save_every": self.save_every}
         return {"scheme": self.scheme, **steps}
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data, which JSON keeps."""
+        return {**vars(self), "scheme": to_plain(self.scheme)}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Settings":
+        """The inverse of `to_dict`, also of what JSON makes of it.
+
+        Args:
+            data: from `to_dict`.
+        """
+        return cls(**{**data, "scheme": from_plain(data["scheme"])})
 
     def __str__(self) -> str:
         return f"{self.python}, macro_dt={self.macro_dt!r}, num_steps={self.num_steps}, save_every={self.save_every}"

@@ -57,18 +57,19 @@ def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], 
     return (clock() - start) / calls
 
 
-def seconds_each(function: Callable, q, count: int = 2000) -> float:
+def seconds_each(function: Callable, q, count: int = 2000, clock: Callable[[], float] = time.perf_counter) -> float:
     """Seconds per evaluation in a compiled loop in which every evaluation waits for the one before.
 
     Args:
         function: ``function(q)``, shaped like q.
         q: where it is evaluated.
         count: evaluations in the loop.
+        clock: as of `interleaved`.
     """
 
     @jax.jit
     def loop(q, nothing):
         return jax.lax.fori_loop(0, count, lambda _, q: q + nothing * function(q), q)
 
-    seconds = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005)[""]
+    seconds = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005, clock=clock)[""]
     return float(np.median(seconds)) / count

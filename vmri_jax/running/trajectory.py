@@ -144,7 +144,7 @@ class Trajectory(Exports):
 
     @property
     def settings(self) -> Settings:
-        """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run, and of one that was read from a file."""
+        """Scheme and steps of a run with an accuracy, for which they were chosen; None of any other run."""
         return self.origin.settings  # pyright: ignore[reportReturnType]
 
     def of(self, moving: System | Problem | HasProblem) -> "Trajectory":
@@ -157,7 +157,7 @@ class Trajectory(Exports):
             TypeError: something else.
             ValueError: it has other numbers of coordinates.
         """
-        origin = Origin.of(moving)
+        origin = replace(Origin.of(moving), settings=self.settings)
         origin.check(self.states.q_s.shape[-1], self.states.q_f.shape[-1])
         return with_origin(self, origin.repeated(np.shape(self.t)[:-1]))
 
@@ -217,7 +217,7 @@ class Trajectory(Exports):
     def save(self, path, drawing: dict | None = None) -> None:
         """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
 
-        Names of coordinates are the arrays ``slow_names`` and ``fast_names``.
+        Names of coordinates are the arrays ``slow_names`` and ``fast_names``; ``settings`` of a run with an accuracy are JSON.
 
         Args:
             path: of the file.
@@ -233,6 +233,8 @@ class Trajectory(Exports):
             names = self.names
             arrays |= {"slow_names": np.array(names.slow_coordinates), "fast_names": np.array(names.fast_coordinates)}
             arrays["names"] = np.array(json.dumps(names.to_dict()))
+        if self.settings is not None:
+            arrays["settings"] = np.array(json.dumps(self.settings.to_dict()))
         with replaced(path) as file:
             np.savez_compressed(file, **arrays, format=np.array(FORMAT))  # pyright: ignore[reportArgumentType]
 
@@ -260,7 +262,10 @@ class Trajectory(Exports):
             ) from error
         if str(arrays.pop("format", "")) != FORMAT:
             raise ValueError(f"{path} is a .npz file but not a trajectory saved by Trajectory.save.")
-        names = arrays.pop("names", None)
+        names, settings = (
+            None if text is None else json.loads(str(text))
+            for text in (arrays.pop("names", None), arrays.pop("settings", None))
+        )
         for name in ("drawing", "slow_names", "fast_names"):
             arrays.pop(name, None)
         missing = _FIELDS - set(arrays) - set(MICRO)
@@ -268,7 +273,12 @@ class Trajectory(Exports):
             raise ValueError(
                 f"{path} is a damaged trajectory: it lacks {sorted(missing)}, or has arrays of another kind."
             )
-        origin = Origin.named(None if names is None else json.loads(str(names)))
+        try:
+            origin = Origin.from_file(names, settings)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{path} is a damaged trajectory: its names or settings cannot be read ({error!r})."
+            ) from error
         return with_origin(from_named_arrays(arrays), origin)
 
 

@@ -204,6 +204,17 @@ class Scheme(eqx.Module):
             f"Give it one, e.g. scheme.with_potentials({name}=vm.micro(vm.quadrature.trapezoidal, every=2))."
         )
 
+    def evaluations_of(self, name: str | int) -> int:
+        """Gradients of a potential in `System.potentials` per macro step, at a node that two macro steps share once.
+
+        Args:
+            name: of the potential.
+
+        Raises:
+            ValueError: as of `rule_of`.
+        """
+        return _evaluations(self.rule_of(name), self.num_micro)
+
     def describe(self) -> Description:
         """Rules, order, symmetry, evaluations and solves per macro step; prints as a table.
 

@@ -1,31 +1,33 @@
 """One page on what accuracy costs for a system: which scheme to take for which error, and where the time goes."""
 
 import math
-import time
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
 from vmri_jax import diagnostics, plots
 from vmri_jax.accuracy.families import Family, families
+from vmri_jax.accuracy.steps import with_accuracy
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import Progress, part, silent
-from vmri_jax.running.timing import seconds_each
-from vmri_jax.study.advisor import MARGIN, Search, Setting, round_off
+from vmri_jax.steppers.results import SimulationError
+from vmri_jax.study.advisor import MARGIN, Search, Setting, round_off, stopwatch
+from vmri_jax.study.cost_figures import draw_num_micro, draw_shares
 from vmri_jax.study.html import embedded, write_page
+from vmri_jax.study.peers import can_run_dopri8, dopri8_stairs
+from vmri_jax.study.prices import FAST, SLOW, prices, shares
+from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.staircase import MICRO, SINGLE, Stair, confirm, confirmed, staircases, with_shares
 from vmri_jax.study.table import Column, ResultTable
-from vmri_jax.study.work import WorkPrecision, WorkRow, duration
+from vmri_jax.study.work import WorkPrecision, WorkRow, duration, work_row
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
 PERIODS = 30
@@ -33,10 +35,10 @@ PERIODS = 30
 RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 """Errors asked for by default, relative to how far the system moves."""
 BUDGET = 75.0
-"""Seconds of search after which no more schemes are compiled. The first error may take half of them, for all are new to it, the
+"""Seconds of search after which no more schemes are compiled, see `stopwatch`. The first error may take half of them, for all are new to it, the
 next one half of what is then left."""
-SHOWN = 8
-"""Schemes in the figure."""
+REPEATS = 5
+"""Samples of the time of the run that `accuracy=` chooses."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,20 @@ class Answer:
     error: float
     setting: Setting | None
     all: tuple[Setting, ...] = ()
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What a page has besides the search.
+
+    accuracy: the run that ``simulate(..., accuracy=...)`` takes for the error in the middle; None where it takes none.
+    asked: that error.
+    peers: staircases of other programs.
+    """
+
+    accuracy: WorkRow | None = None
+    asked: float = math.nan
+    peers: dict[str, list[Stair]] = field(default_factory=dict)
 
 
 class PageFailed(RuntimeError):
@@ -71,6 +87,8 @@ class CostReport(ResultTable):
     runs: every run of the search.
     shares: parts of the time of the middle answer by what it is spent on.
     not_tried: schemes that the search had no time to compile.
+    stairs: what each kind of schemes reaches, see `vmri_jax.study.staircase`.
+    extras: what is measured when the search is over.
     """
 
     columns = (
@@ -87,6 +105,8 @@ class CostReport(ResultTable):
     runs: WorkPrecision
     shares: dict[str, float]
     not_tried: tuple[str, ...] = ()
+    stairs: dict[str, list[Stair]] = field(default_factory=dict)
+    extras: "Extras" = field(default_factory=lambda: Extras())
 
     @property
     def rows(self) -> tuple[Answer, ...]:
@@ -171,19 +191,54 @@ def cost_report(
             f"cost_report: errors are {list(errors)}; give positive numbers, in the unit of the positions."
         )
     search = Search(problem, t_end, families() if menu is None else menu, reference)
-    answers, deadline = [], time.monotonic() + BUDGET
+    answers, elapsed = [], stopwatch()
     with search.kept():  # while the page is drawn, too
         for i, error in enumerate(sorted(errors, reverse=True)):
-            left = deadline - time.monotonic()
+            left = BUDGET - elapsed()
             settings = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
             answers.append(Answer(error, settings[0] if settings else None, tuple(settings)))
             with suppress(PageFailed):  # the page is drawn again, and its failure told, when all is known
                 _write(search, answers, problem, name, out)
+        progress("runs with smaller steps", 1, 1)
+        confirm(search)
         progress("measuring times", 1, 1)
-        search.time_again(_shown(answers))
-        report = _write(search, answers, problem, name, out)
+        chosen = [a.setting.row.scheme for a in _confirmed(search, answers) if a.setting is not None]
+        stairs = staircases(search.rows().rows)
+        search.time_again({*chosen, *(stair.row.scheme for of_kind in stairs.values() for stair in of_kind)})
+        answers = _confirmed(search, answers)
+        progress("shares of errors", 1, 1)
+        stairs = with_shares(search, staircases(search.rows().rows))
+        report = _write(search, answers, problem, name, out, stairs, _extras(search, answers, progress))
     progress("done", 1, 1)
     return report
+
+
+def _extras(search: Search, answers: Sequence[Answer], progress: Progress) -> Extras:
+    """The choice of `accuracy=`, and other programs."""
+    asked = answers[len(answers) // 2].error
+    progress(f"accuracy {asked:.0e}", 1, 1)
+    chosen = _of_accuracy(search, asked)
+    if not can_run_dopri8(search.problem):
+        return Extras(chosen, asked)
+    progress("diffrax", 1, 1)
+    least = min(answer.error for answer in answers)
+    return Extras(
+        chosen, asked, {"diffrax Dopri8": dopri8_stairs(search.problem, search.t_end, search.reference, least)}
+    )
+
+
+def _of_accuracy(search: Search, error: float) -> WorkRow | None:
+    """The run that ``simulate(problem, accuracy=error)`` takes; None where it refuses the error, or finds no run."""
+    problem, t_end, saves = search.problem, search.t_end, search.reference.num_saves
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of runs that miss the accuracy: the page shows their error
+        try:
+            best, settings = with_accuracy(problem, None, None, None, error, problem.t + t_end, saves)
+        except (ValueError, SimulationError):
+            return None
+    program = Program(problem, best.run.scheme, t_end, saves)
+    row = work_row(settings.python, program, settings.num_steps, search.reference)
+    return row.timed(program.seconds(settings.num_steps, REPEATS)) if np.isfinite(row.error_q) else None
 
 
 def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float) -> list[float]:
@@ -205,19 +260,43 @@ def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float
     return errors
 
 
-def _write(search: Search, answers: Sequence[Answer], problem: Problem, name: str, out: Path) -> CostReport:
+def _write(
+    search: Search,
+    answers: Sequence[Answer],
+    problem: Problem,
+    name: str,
+    out: Path,
+    stairs: dict[str, list[Stair]] | None = None,
+    extras: Extras | None = None,
+) -> CostReport:
     """The page of what is known so far."""
     answers = _fastest_that_keep(answers)
-    runs, shares = search.rows(), _shares(problem, answers[len(answers) // 2].setting)
+    runs, middle = search.rows(), answers[len(answers) // 2].setting
+    price = prices(problem) if middle is not None else {}
+    spent = shares(price, middle.row) if middle is not None else {}
     not_tried = tuple(search.not_tried())
-    report = CostReport(out / "cost.html", name, search.t_end, tuple(answers), runs, shares, not_tried)
-    labels = _shown(answers)
+    stairs = staircases(runs.rows) if stairs is None else stairs
+    report = CostReport(
+        out / "cost.html", name, search.t_end, tuple(answers), runs, spent, not_tried, stairs, extras or Extras()
+    )
     runs.to_csv(out / "cost.csv")
     try:
-        _draw(report, problem, labels)
+        _draw(report, problem, price)
     except Exception as error:
         raise PageFailed(report) from error
     return report
+
+
+def _confirmed(search: Search, answers: Sequence[Answer]) -> list[Answer]:
+    """The answers by runs whose error is confirmed by smaller steps; those that no such run keeps stay as they are."""
+    known = {(s.row.scheme, s.num_steps): s for s in search.settings.values()}
+    stairs = confirmed([s.row for s in search.settings.values()])
+    made = []
+    for answer in answers:
+        keep = [stair for stair in stairs if stair.error <= answer.error]
+        best = min(keep, key=lambda stair: stair.seconds, default=None)
+        made.append(answer if best is None else replace(answer, setting=known[best.row.scheme, best.row.num_steps]))
+    return made
 
 
 def _fastest_that_keep(answers: Sequence[Answer]) -> list[Answer]:
@@ -233,12 +312,12 @@ def _fastest_that_keep(answers: Sequence[Answer]) -> list[Answer]:
     return made[::-1]
 
 
-def _draw(report: CostReport, problem: Problem, labels: Sequence[str]) -> None:
-    """The figure and the page of a report."""
-    runs, name, out = report.runs, report.name, report.path.parent
-    shown = replace(runs, rows=tuple(row for label in labels for row in runs.rows if row.scheme == label))
-    title = f"{name}: what accuracy costs over a time of {report.t_end:g}"
-    plots.save(plots.plot_work_precision(shown, title), out / "cost.png")
+def _draw(report: CostReport, problem: Problem, price: dict[str, float]) -> None:
+    """The figures and the page of a report."""
+    staircase_figure = partial(_draw_stairs, report, price)
+    title = f"{report.name}: what accuracy costs over a time of {report.t_end:g}"
+    for end, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
+        plots.save(staircase_figure(title, theme), report.path.parent / f"cost{end}.png", theme)
     n_g, n_gs = problem.system.num_constraints(problem.q_s, problem.q_f)
     reached = [answer for answer in report.answers if answer.setting is not None]
     write_page(
@@ -250,21 +329,34 @@ def _draw(report: CostReport, problem: Problem, labels: Sequence[str]) -> None:
         growth=_growth(reached),
         multirate=_multirate(report),
         duration=duration,
-        work_precision=embedded(partial(plots.plot_work_precision, shown, "", "seconds")),
-        by_num_micro=embedded(partial(_draw_num_micro, report)),
-        shares_figure=embedded(partial(_draw_shares, report)),
+        work_precision=embedded(partial(staircase_figure, "")),
+        by_num_micro=embedded(partial(draw_num_micro, report.answers)),
+        shares_figure=embedded(partial(draw_shares, report.shares)),
     )
 
 
-def _shown(answers: Sequence[Answer]) -> list[str]:
-    """Labels, with the best num_micro, of the families that are best for some error, or nearly so."""
-    best: dict[str, tuple[float, str]] = {}
-    for answer in answers:
-        fastest = answer.setting.row.seconds if answer.setting else math.inf
-        for setting in answer.all:
-            found = setting.row.seconds / fastest, setting.row.scheme
-            best[setting.family.name] = min(found, best.get(setting.family.name, (math.inf, "")))
-    return [label for _, label in sorted(best.values())[:SHOWN]]
+def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme: plots.Theme) -> plots.NotebookFigure:
+    """What each kind of schemes reaches, with the answers, the choice of `accuracy=`, other programs, and the bound."""
+    rows = [answer.setting.row for answer in report.answers if answer.setting is not None]
+    errors = {(s.row.scheme, s.row.num_steps): s.error for of_kind in report.stairs.values() for s in of_kind}
+    marked = []
+    for row in rows:
+        marked.append(plots.Marked("answers", row.seconds, errors.get((row.scheme, row.num_steps), row.error_q)))
+    chosen = report.extras.accuracy
+    if chosen is not None:
+        marked.append(plots.Marked(f"accuracy={report.extras.asked:.0e}", chosen.seconds, chosen.error_q, star=True))
+    known_to = report.runs.reference.error_q
+    bound = bound_of(report.stairs, price)
+    return plots.plot_staircases(report.stairs, report.extras.peers, marked, bound, known_to, title, theme)
+
+
+def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.Bound | None:
+    """The least time of micro steps, for their largest number on the staircase; None where the slow force is not dearer than the fast one, or has further
+    potentials beside it."""
+    if price.keys() != {SLOW, FAST} or price[SLOW] <= price[FAST] or not (stairs.get(MICRO) and stairs.get(SINGLE)):
+        return None
+    n, v, w = max(stair.row.num_micro for stair in stairs[MICRO]), price[SLOW], price[FAST]
+    return plots.Bound(f"bound: V + {n} W for {n} single steps", SINGLE, (v + n * w) / (n * (v + w)))
 
 
 def _growth(reached: Sequence[Answer]) -> float:
@@ -287,73 +379,3 @@ def _multirate(report: CostReport) -> list[tuple[float, str, int, float]]:
         if single:
             gains.append((answer.error, family, answer.setting.num_micro, single[0] / answer.setting.row.seconds))
     return gains
-
-
-def _shares(problem: Problem, setting: Setting | None) -> dict[str, float]:
-    """Parts of the time of a run: gradients of V and of W, constraints with their Jacobian, all the rest, further potentials included."""
-    if setting is None:
-        return {}
-    system, row, n_s = problem.system, setting.row, problem.q_s.size
-
-    def slow(q):
-        return system.slow_potential(q[:n_s], q[n_s:], system.params)  # pyright: ignore[reportOptionalCall]
-
-    def fast(q):
-        return system.fast_potential(q[n_s:], system.params)  # pyright: ignore[reportOptionalCall]
-
-    def constraints(q):
-        return system.constraints(problem.t, q[:n_s], q[n_s:])
-
-    terms = {}
-    if system.slow_potential is not None:
-        terms["gradient of V"] = jax.grad(slow), row.slow_evaluations
-    if system.fast_potential is not None:
-        terms["gradient of W"] = jax.grad(fast), row.fast_evaluations
-    if any(system.num_constraints(problem.q_s, problem.q_f)):
-        evaluations = row.fast_evaluations or row.slow_evaluations
-        terms["constraints"] = lambda q: jax.jacrev(constraints)(q).sum(0) + constraints(q).sum(), evaluations
-    q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
-    shares = {name: seconds_each(f, q) * count / row.seconds for name, (f, count) in terms.items()}
-    total = sum(shares.values())
-    shares = {name: share / max(total, 1.0) for name, share in shares.items()}
-    return shares | {"everything else": max(0.0, 1.0 - total)}
-
-
-def _draw_num_micro(report: CostReport, theme: plots.Theme) -> Figure:
-    """Time against num_micro of the families that were varied, at each error, one panel per error."""
-    answers = [answer for answer in report.answers if answer.all]
-    names = list(dict.fromkeys(s.family.name for answer in answers for s in answer.all[: 2 * SHOWN]))
-    looks = {name: plots.curve_look(i, theme) for i, name in enumerate(names)}
-    with plots.new_figure(7.2, 3.2, "", theme) as figure:
-        panels = figure.subplots(1, max(1, len(answers)), sharey=True, squeeze=False)[0]
-        for axes, answer in zip(panels, answers, strict=False):
-            for name in names:
-                settings = sorted((s for s in answer.all if s.family.name == name), key=lambda s: s.num_micro)
-                if len(settings) >= 3:
-                    x, y = [s.num_micro for s in settings], plots.positive([s.row.seconds for s in settings])
-                    axes.loglog(x, y, label=name, markersize=3.5, linewidth=1.2, **looks[name])
-            axes.set(title=f"error {answer.error:.0e}", xlabel="num_micro")
-            plots.log_ticks(axes.xaxis, [s.num_micro for shown in answers for s in shown.all])
-            axes.xaxis.set_major_formatter("{x:g}")
-            plots.log_ticks(axes.yaxis, [s.row.seconds for shown in answers for s in shown.all])
-        panels[0].set_ylabel("computing time")
-        panels[0].yaxis.set_major_formatter(EngFormatter("s"))
-        plots.legend_below(figure)
-    return figure
-
-
-def _draw_shares(report: CostReport, theme: plots.Theme) -> Figure:
-    """One bar, cut by what the time is spent on."""
-    with plots.new_figure(7.2, 1.1, "", theme) as figure:
-        axes = figure.subplots()
-        left = 0.0
-        for color, (name, share) in zip(theme.curves, report.shares.items(), strict=False):
-            last = name == "everything else"
-            axes.barh([0], [share], left=left, color=theme.faint if last else color)
-            if share > 0.06:
-                ink = theme.ink if last else theme.paper
-                axes.text(left + share / 2, 0, f"{name}\n{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
-            left += share
-        axes.set(xlim=(0, 1))
-        axes.set_axis_off()
-    return figure

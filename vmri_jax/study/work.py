@@ -1,7 +1,7 @@
 """Work and precision: what an error costs in time and in evaluations, run by run, and the best of all runs."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,9 +9,10 @@ import numpy as np
 from vmri_jax import diagnostics, plots
 from vmri_jax.ensembles.executors import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
+from vmri_jax.mechanics.system import label
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import Progress, silent
-from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.solvers import Newton
@@ -35,6 +36,8 @@ class WorkRow:
     compile_seconds: of the program, which all runs of the scheme share.
     slow_evaluations, fast_evaluations, solves: gradients of V and of W and systems of equations in the whole run, one
         pass of a solve evaluating once; counted from the scheme and the passes that the run reports.
+    stages, degree: of the scheme.
+    evaluations: gradients of the further potentials of the system by name.
     """
 
     scheme: str
@@ -54,6 +57,9 @@ class WorkRow:
     iterations: int
     method: str
     result: str
+    stages: int = 1
+    degree: int = 1
+    evaluations: Mapping[str | int, int] = field(default_factory=dict)
 
     def timed(self, seconds: Sequence[float]) -> "WorkRow":
         """The same with the median and the quartiles of these samples."""
@@ -81,6 +87,7 @@ class WorkPrecision(ResultTable):
         Column("time", lambda row: duration(row.seconds), right=True),
         Column("grad V", lambda row: f"{row.slow_evaluations:,}", right=True),
         Column("grad W", lambda row: f"{row.fast_evaluations:,}", right=True),
+        Column("further gradients", lambda row: ", ".join(f"{label(k)} {n:,}" for k, n in row.evaluations.items())),
         Column("solves", lambda row: f"{row.solves:,}", right=True),
     )
     rows: tuple[WorkRow, ...]
@@ -117,6 +124,10 @@ class WorkPrecision(ResultTable):
         """The Pareto front."""
         return self.pareto()
 
+    def records(self) -> list[dict[str, Any]]:
+        """The rows as dictionaries, with an entry for the gradients of each further potential."""
+        return [_record(row) for row in self.rows]
+
     def content(self) -> dict[str, Any]:
         """Rows, error of the reference, machine and versions."""
         known = {"error_q": self.reference.error_q, "error_p": self.reference.error_p}
@@ -127,7 +138,13 @@ class WorkPrecision(ResultTable):
         return plots.plot_work_precision(self, title, work)
 
 
-def work_row(label: str, program: Program, num_steps: int, reference: ReferenceSolution) -> WorkRow:
+def _record(row: WorkRow) -> dict[str, Any]:
+    """A row as plain values."""
+    plain = asdict(row)
+    return plain | {f"evaluations of {label(name)}": count for name, count in plain.pop("evaluations").items()}
+
+
+def work_row(name: str, program: Program, num_steps: int, reference: ReferenceSolution) -> WorkRow:
     """Run the program and say what it gave and cost; not timed."""
     trajectory, scheme = program(num_steps), program.scheme
     error_q, error_p = reference.errors(trajectory)
@@ -138,8 +155,9 @@ def work_row(label: str, program: Program, num_steps: int, reference: ReferenceS
         constrained = max(program.problem.system.num_constraints(program.problem.q_s, program.problem.q_f)) > 0
         solves = num_steps * (cost.constrained_solves if constrained else cost.solves)
     evaluations = num_steps * float(passes.mean())
+    stage, further = stage_scheme(scheme), dict(program.problem.system.potentials)
     return WorkRow(
-        scheme=label,
+        scheme=name,
         num_micro=scheme.num_micro,
         order=scheme.order,
         num_steps=num_steps,
@@ -156,6 +174,9 @@ def work_row(label: str, program: Program, num_steps: int, reference: ReferenceS
         iterations=int(np.max(trajectory.info.iterations)),
         method=method.name,
         result=Result(int(trajectory.result)).name,
+        stages=cost.stages,
+        degree=cost.degree,
+        evaluations={name: round(evaluations * cost.stages * stage.evaluations_of(name)) for name in further},
     )
 
 

@@ -51,7 +51,7 @@ class StoredTrajectory(Exports):
         self.chunk: int = self.attributes["chunk"]
         self.record: Record = read_record(self.path)
         self.step, self.result, self.failed_at = self.record.step, Result(self.record.result), self.record.failed_at
-        self._origin = Origin.named(self.attributes.get("names"))
+        self._origin = Origin.from_file(self.attributes.get("names"))
 
     @classmethod
     def open(cls, path) -> "StoredTrajectory":

@@ -1,0 +1,289 @@
+"""Time to an error: single and micro steps of kicks, compositions, three rates, one interval of high degree, and other programs."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vmri_jax as vm
+from benchmarks.dear.figures import draw_errors, draw_gains
+from benchmarks.dear.peers import FIXED_STEPS, PEERS, chosen
+from benchmarks.dear.spacecraft import spacecraft
+from benchmarks.dear.systems import MIDDLE, molecules, teacher
+from benchmarks.measure import Ratio, Tell, silent
+from benchmarks.report import Claim, Report
+from benchmarks.savings import ratio_at
+from vmri_jax import plots
+from vmri_jax.running.timing import seconds_each
+from vmri_jax.study.program import Program, joined
+from vmri_jax.study.timing import interleaved
+
+COLUMNS = ("system", "scheme", "H", "error", "ms", "gain", "bound")
+TARGET = 1e-5
+"""Error of the positions at the end at which times are compared."""
+RATIO = 2.0
+"""From one number of macro steps to the next."""
+SLOWEST, SLOWEST_PEER = 60.0, 10.0
+"""Seconds of a run of ours and of another program after which a ladder ends."""
+FINE_STEPS = 400
+"""Macro steps of order 8, of 170 micro steps each, that errors are measured against."""
+LINE = "kicks, N = 1"
+"""The scheme whose time the gain of every other one is measured by."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A system whose slow force has a price, and the schemes that are tried on it.
+
+    title: of its curves.
+    problem: the system with its start; ``problem(three_rates=True)`` has the potential `MIDDLE`.
+    num_micro: numbers of micro steps of kicks, the smallest first.
+    composed: compositions of kicks, with one micro step and with the largest number of them but one.
+    every: micro steps from one kick of `MIDDLE` to the next, with the largest number of micro steps; 0 for no three rates.
+    degree: of one interval without micro steps; 0 for none, as where Newton's matrix is large.
+    t_end: simulated time.
+    errors: largest and smallest error of a ladder of steps.
+    first: macro steps of the first run.
+    repeats: samples of each time.
+    peers: whether other programs run it, too.
+    """
+
+    title: str
+    problem: Callable[..., vm.Problem]
+    num_micro: tuple[int, ...] = (1, 5, 20)
+    composed: tuple[str, ...] = ("suzuki4",)
+    every: int = 0
+    degree: int = 0
+    t_end: float = 1.0
+    errors: tuple[float, float] = (1e-2, 1e-7)
+    first: int = 8
+    repeats: int = 3
+    peers: bool = True
+
+
+@dataclass(frozen=True)
+class Size:
+    """Cases, and whether times are those of the processor."""
+
+    cases: list[Case]
+    shared: bool = False
+
+
+def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size:
+    """ "quick": 8 molecules, and the spacecraft in a field of degree 20; "full": 8 to 256 molecules, the teacher, and the spacecraft.
+
+    Args:
+        name: "quick" or "full".
+        only: beginnings of titles; none for all.
+        shared: count processor time.
+    """
+    return Size([case for case in _cases(name) if not only or case.title.startswith(tuple(only))], shared)
+
+
+def _cases(name: str) -> list[Case]:
+    near = (1e-4, 5e-6)
+    if name == "quick":
+        flight = partial(spacecraft, degree=20)
+        return [
+            Case("8 molecules", partial(molecules, 8), (1, 10), every=5),
+            Case("spacecraft", flight, (1, 40), (), every=10, t_end=10.0, errors=near),
+        ]
+    both = ("suzuki4", "kahan-li6")
+    return [
+        Case("64 molecules", partial(molecules, 64), (1, 20, 40), both, 10, errors=(1e-2, 3e-6), repeats=2),
+        Case("network", teacher, (1, 5, 10, 20), both, 5, 6, errors=(1e-2, 1e-6)),
+        Case("spacecraft", spacecraft, (1, 20, 40, 100), both, 10, 6, 10.0, errors=(1e-2, 2e-6), repeats=2),
+        Case("16 molecules", partial(molecules, 16), (1, 5, 20, 40), both, 10, 6, errors=(1e-2, 1e-6)),
+        *(
+            Case(f"{n} molecules", partial(molecules, n), (1, 20, 40), (), errors=near, peers=False)
+            for n in (8, 32, 128)
+        ),
+        Case("256 molecules", partial(molecules, 256), (1, 20, 40), (), 10, errors=near, first=16, repeats=1),
+    ]
+
+
+Curve = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Numbers of macro steps, errors and milliseconds."""
+
+
+Rungs = Iterator[tuple[int, Callable[[], np.ndarray], Callable[[], object]]]
+"""Numbers of macro steps, functions that give the positions at the end, and runs for the clock."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """How much faster kicks with micro steps reach the target than single steps.
+
+    price: time of a gradient of V over that of W.
+    num_micro: micro steps of the fastest kicks.
+    gain, bound: of times to the target, and what prices allow.
+    """
+
+    title: str
+    price: float
+    num_micro: int
+    gain: float
+    bound: float
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """A report after each system."""
+    clock = time.process_time if size.shared else time.perf_counter
+    rows, claims, notes, curves, gains = [], [], [], {}, []
+    for case in size.cases:
+        problem = case.problem()
+        slow, fast = _prices(problem, clock)
+        peers, missing = chosen(problem) if case.peers else ([], [])
+        of_case = measured(case, problem, peers, tell, clock)
+        rows += [
+            _row(case, of_case, scheme, i, slow / fast) for scheme in of_case for i in range(len(of_case[scheme][0]))
+        ]
+        to_target = {scheme: time_to(TARGET, *curve) for scheme, curve in of_case.items()}
+        claims += _claims(case, to_target, peers)
+        gains += _gain(case, to_target, slow / fast)
+        if case.composed:
+            curves[case.title] = of_case
+        notes.append(
+            f"{case.title}: a gradient of V takes {1e6 * slow:.3g} µs, {slow / fast:.3g} times as long as one of W."
+        )
+        notes += [note for note in missing if note not in notes]
+        figures = {}
+        for suffix, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
+            figures[f"dear{suffix}"] = partial(draw_errors, dict(curves), list(gains), TARGET, theme)
+            figures[f"dear_gain{suffix}"] = partial(draw_gains, list(gains), theme)
+        about = {"clock": "processor time" if size.shared else "wall time", "gains": [vars(gain) for gain in gains]}
+        yield Report("dear", name, list(rows), list(claims), list(notes), figures, about)
+
+
+def _row(case: Case, curves: dict[str, Curve], scheme: str, i: int, price: float) -> dict:
+    """A run, with its gain over single steps of kicks."""
+    steps, errors, ms = (part[i] for part in curves[scheme])
+    has_steps = scheme.split(",")[0] not in PEERS or scheme.split(",")[0] in FIXED_STEPS
+    gain = ratio_at(curves[LINE][1:], errors, ms) if LINE in curves else None
+    row = {"system": case.title, "scheme": scheme, "H": case.t_end / steps if has_steps else None, "error": errors}
+    kicks = scheme.startswith("kicks, N = ")
+    return row | {"ms": ms, "gain": gain, "bound": bound(int(scheme.split()[-1]), price) if kicks else None}
+
+
+def bound(num_micro: int, price: float) -> float:
+    """``N (v + w) / (v + N w)`` for a price v / w."""
+    return num_micro * (price + 1) / (price + num_micro)
+
+
+def _claims(case: Case, to_target: dict[str, float], peers: list[str]) -> list[Claim]:
+    """Single steps over micro steps of each family, and every other program over the best of ours."""
+    claims = []
+    for family in ("kicks", *case.composed):
+        ours = {scheme: ms for scheme, ms in to_target.items() if scheme.startswith(f"{family}, N = ")}
+        fastest = min(ours, key=ours.__getitem__)
+        claims.append(_claim(f"{case.title}: {family}, N = 1 over {fastest}", ours[f"{family}, N = 1"], ours[fastest]))
+    others = {scheme: ms for scheme, ms in to_target.items() if scheme.split(",")[0] in peers}
+    best = min(to_target.keys() - others.keys(), key=to_target.__getitem__)
+    extra = [scheme for scheme in to_target if scheme.startswith(("three rates", "one interval"))]
+    kicks = min((s for s in to_target if s.startswith("kicks")), key=to_target.__getitem__)
+    claims += [_claim(f"{case.title}: {kicks} over {scheme}", to_target[kicks], to_target[scheme]) for scheme in extra]
+    return claims + [
+        _claim(f"{case.title}: {scheme} over {best}", ms, to_target[best]) for scheme, ms in others.items()
+    ]
+
+
+def _claim(name: str, ms: float, best: float) -> Claim:
+    """Times to the target, one over the other."""
+    ratio = ms / best if np.isfinite(best) else np.nan
+    return Claim(f"{name} at {TARGET:g}", Ratio(ratio, ratio, ratio))
+
+
+def _gain(case: Case, to_target: dict[str, float], price: float) -> list[Gain]:
+    """Of kicks, where single steps and micro steps reach the target."""
+    ms = {n: to_target[f"kicks, N = {n}"] for n in case.num_micro}
+    best = min(ms, key=ms.__getitem__)
+    if not np.isfinite(ms[1] + ms[best]):
+        return []
+    return [Gain(case.title, price, best, ms[1] / ms[best], bound(best, price))]
+
+
+def measured(
+    case: Case, problem: vm.Problem, peers: Iterable[str], tell: Tell, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, Curve]:
+    """Numbers of macro steps, errors of the positions at the end and milliseconds, by scheme."""
+    tell(f"{case.title}, fine steps")
+    exact, _ = joined(Program(problem, vm.compose(vm.fully_explicit(10), "kahan-li8"), case.t_end)(FINE_STEPS))
+    runs: dict[str, Callable[[], object]] = {}
+    errors: dict[str, dict[int, float]] = {}
+
+    def climb(scheme: str, rungs: Rungs, slowest: float = SLOWEST) -> None:
+        """Runs of more and more steps, within the errors that are looked at."""
+        errors[scheme] = {}
+        for n, positions, timed in rungs:
+            tell(f"{case.title}, {scheme}, {n}")
+            start = time.perf_counter()
+            error = float(np.abs(positions() - exact[-1]).max())
+            seconds = time.perf_counter() - start
+            if error <= case.errors[0]:
+                errors[scheme][n] = error
+                runs[f"{scheme}: {n}"] = timed
+            if error < case.errors[1] or seconds > slowest:
+                return
+
+    for scheme, (of_scheme, integrator) in schemes(case, problem).items():
+        climb(scheme, _rungs(Program(of_scheme, integrator, case.t_end), case.first))
+    fastest = max(case.num_micro)
+    for peer in peers:
+        name = f"{peer}, N = {fastest}" if peer in FIXED_STEPS else peer
+        rungs = PEERS[peer](problem, case.t_end, fastest)
+        climb(name, ((n, positions, positions) for n, positions in rungs), SLOWEST_PEER)
+    tell(f"{case.title}, measuring times")
+    seconds = interleaved(runs, case.repeats, clock=clock)
+    return {
+        scheme: (
+            np.array(list(ladder)),
+            np.array(list(ladder.values())),
+            np.array([1e3 * np.median(seconds[f"{scheme}: {n}"]) for n in ladder]),
+        )
+        for scheme, ladder in errors.items()
+    }
+
+
+def schemes(case: Case, problem: vm.Problem) -> dict[str, tuple[vm.Problem, Any]]:
+    """Problem and scheme by name."""
+    kicks = {f"kicks, N = {n}": vm.fully_explicit(n) for n in case.num_micro}
+    few = sorted(case.num_micro)[-2 if len(case.num_micro) > 2 else -1]
+    for name in case.composed:
+        kicks |= {f"{name}, N = {n}": vm.compose(vm.fully_explicit(n), name) for n in sorted({1, few})}
+    found: dict[str, tuple[vm.Problem, Any]] = {name: (problem, scheme) for name, scheme in kicks.items()}
+    if case.degree:
+        found[f"one interval, degree {case.degree}"] = problem, vm.galerkin(1, case.degree, "lobatto")
+    if case.every:
+        n = max(case.num_micro)
+        placed = {MIDDLE: vm.micro(vm.quadrature.trapezoidal, every=case.every)}
+        scheme = vm.fully_explicit(n).with_potentials(**placed)
+        found[f"three rates, N = {n} and {n // case.every}"] = case.problem(three_rates=True), scheme
+    return found
+
+
+def _rungs(program: Program, first: int) -> Rungs:
+    """Numbers of macro steps, the positions at the end, and a run for the clock."""
+    n = first
+    while True:
+        yield n, lambda n=n: joined(program(n))[0][-1], program.timed(n)
+        n = round(n * RATIO)
+
+
+def _prices(problem: vm.Problem, clock: Callable[[], float]) -> tuple[float, float]:
+    """Seconds of a gradient of V and of W."""
+    q = jnp.asarray(problem.q_f)
+    slow, fast = (
+        jax.grad(lambda q, name=name: problem.system.all_potentials(jnp.zeros(0), q)[name]) for name in ("slow", "fast")
+    )
+    return seconds_each(slow, q, 100, clock), seconds_each(fast, q, 1000, clock)
+
+
+def time_to(error: float, steps: np.ndarray, errors: np.ndarray, ms: np.ndarray) -> float:
+    """Milliseconds at an error, between those measured; infinite outside of them."""
+    between = ratio_at((errors, ms), error, 1.0)
+    return np.inf if between is None else between

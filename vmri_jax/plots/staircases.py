@@ -1,0 +1,133 @@
+"""What each kind of schemes reaches, as staircases of error against time."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.ticker import EngFormatter
+
+from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, legend_below, log_ticks, new_figure, positive
+
+MARKERS = ("s", "o", "D", "P")
+"""Of the kinds of schemes, in their order."""
+
+
+class Step(Protocol):
+    """A run of a staircase."""
+
+    @property
+    def seconds(self) -> float: ...
+    @property
+    def error(self) -> float: ...
+    @property
+    def fast_share(self) -> float: ...
+
+
+class Marked(NamedTuple):
+    """A run that is marked.
+
+    label: in the legend.
+    star: whether as a star; else as a ring.
+    """
+
+    label: str
+    seconds: float
+    error: float
+    star: bool = False
+
+
+class Bound(NamedTuple):
+    """The least time that micro steps can take: that of single steps, of which N become a macro step.
+
+    label: in the legend.
+    kind: of the staircase whose times are multiplied.
+    factor: ``(v + N w) / (N (v + w))`` of the prices v and w of the slow and of the fast force.
+    """
+
+    label: str
+    kind: str
+    factor: float
+
+
+def plot_staircases(
+    kinds: Mapping[str, Sequence[Step]],
+    peers: Mapping[str, Sequence[Step]] | None = None,
+    marked: Sequence[Marked] = (),
+    bound: Bound | None = None,
+    known_to: float = 0.0,
+    title: str = "",
+    theme: Theme = LIGHT,
+) -> NotebookFigure:
+    """The error that each kind of schemes reaches in a time, a staircase each; corners in the colour of the larger share of the error, slow or fast.
+
+    Args:
+        kinds: staircases by kind, the fastest run first, at most four; a kind without runs keeps its look for other figures.
+        peers: staircases of other programs.
+        marked: runs to mark.
+        bound: of the times of micro steps.
+        known_to: error of the reference solution.
+        title: over the figure.
+        theme: colours.
+    """
+    blue, orange, green, purple, gold, pale = theme.curves
+    colors = purple, green, gold, theme.ink
+    with new_figure(7.2, 4.4, title, theme) as figure:
+        axes = figure.subplots()
+        axes.set(xscale="log", yscale="log", xlabel="computing time of the run", ylabel="largest error of a position")
+        for color, marker, (kind, stairs) in zip(colors, MARKERS, kinds.items(), strict=False):
+            if not stairs:
+                continue
+            _steps(axes, stairs, color=color, linewidth=1.6, zorder=2)
+            for stair in stairs:
+                face = _mixed(blue, orange, stair.fast_share) if np.isfinite(stair.fast_share) else theme.paper
+                axes.plot(
+                    stair.seconds, *positive([stair.error]), marker, color=color, markerfacecolor=face, markersize=6.5
+                )
+            axes.plot([], [], marker=marker, color=color, linewidth=1.6, markerfacecolor=theme.paper, label=kind)
+        for name, stairs in (peers or {}).items():
+            _steps(axes, stairs, color=pale, linestyle="--", linewidth=1.3, label=name, zorder=1.5)
+        if bound is not None and bound.kind in kinds:
+            stairs = kinds[bound.kind]
+            x, y = [bound.factor * stair.seconds for stair in stairs], positive([stair.error for stair in stairs])
+            axes.step(x, y, where="post", color=theme.rod, linestyle=":", linewidth=1.3, label=bound.label, zorder=1.5)
+        for run in marked:
+            look = {"marker": "*", "markersize": 15} if run.star else {"marker": "o", "markersize": 13}
+            face = gold if run.star else "none"
+            axes.plot(
+                run.seconds,
+                *positive([run.error]),
+                linestyle="",
+                label=run.label,
+                color=theme.ink,
+                markerfacecolor=face,
+                **look,
+            )
+        if any(np.isfinite(stair.fast_share) for stairs in kinds.values() for stair in stairs):
+            for name, color in (("error of the macro steps", blue), ("error of the micro steps", orange)):
+                axes.plot([], [], "o", color=theme.rod, markerfacecolor=color, markersize=7, label=name)
+        _limits(axes, kinds, known_to, theme)
+        legend_below(figure)
+    return figure
+
+
+def _steps(axes: Axes, stairs: Sequence[Step], **look) -> None:
+    """The staircase itself."""
+    axes.step([s.seconds for s in stairs], positive([s.error for s in stairs]), where="post", **look)
+
+
+def _mixed(slow: str, fast: str, share: float) -> str:
+    """Colour between that of slow and that of fast."""
+    red, green, blue = ((1 - share) * a + share * b for a, b in zip(to_rgb(slow), to_rgb(fast), strict=True))
+    return to_hex((red, green, blue))
+
+
+def _limits(axes: Axes, kinds: Mapping[str, Sequence[Step]], known_to: float, theme: Theme) -> None:
+    """Ticks, and a line at the error of the reference if it is among the errors."""
+    if known_to > axes.get_ylim()[0]:
+        axes.axhline(known_to, color=theme.ink, linewidth=0.8, linestyle=":")
+        above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}
+        axes.text(0.995, known_to, "error of the reference ", **above)
+    log_ticks(axes.xaxis, [stair.seconds for stairs in kinds.values() for stair in stairs])
+    axes.xaxis.set_major_formatter(EngFormatter("s"))

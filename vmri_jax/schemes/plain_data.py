@@ -1,0 +1,64 @@
+"""Schemes and compositions as plain data: dictionaries, lists, texts and numbers, as JSON has them."""
+
+from typing import Any
+
+import numpy as np
+
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.quadrature import PlacedRule, Rule
+from vmri_jax.schemes.scheme import Scheme
+
+RULES = ("kinetic", "slow", "fast", "constraint", "slow_constraint", "force")
+"""Placed rules of every scheme."""
+
+
+def to_plain(scheme: Scheme | Composition) -> dict[str, Any]:
+    """A scheme as plain data; numbers of float64 stay the same through JSON.
+
+    Args:
+        scheme: with concrete weights and coefficients.
+    """
+    if isinstance(scheme, Composition):
+        return {"scheme": to_plain(scheme.scheme), "coefficients": np.asarray(scheme.coefficients).tolist()}
+    rules = {name: _plain_rule(getattr(scheme, name)) for name in RULES}
+    # pairs, since a potential may have a whole number as its name, which keys of JSON cannot be
+    potentials = [[name, _plain_rule(placed)] for name, placed in scheme.potentials.items()]
+    return {"num_micro": scheme.num_micro, "degree": scheme.degree, **rules, "potentials": potentials}
+
+
+def from_plain(data: dict[str, Any]) -> Scheme | Composition:
+    """The inverse of `to_plain`.
+
+    Args:
+        data: from `to_plain`, also by way of JSON.
+
+    Raises:
+        KeyError, TypeError, ValueError: data that are no scheme.
+    """
+    if "coefficients" in data:
+        scheme = from_plain(data["scheme"])
+        if isinstance(scheme, Composition):
+            raise ValueError("from_plain: the stages of a composition must be those of a scheme.")
+        return Composition(scheme, np.asarray(data["coefficients"]))
+    rules = {name: _placed_rule(data[name]) for name in RULES}
+    potentials = {name: _placed_rule(placed) for name, placed in data["potentials"]}
+    return Scheme(data["num_micro"], data["degree"], **rules, potentials=potentials)
+
+
+def _plain_rule(placed: PlacedRule) -> dict[str, Any]:
+    """A rule with its grid."""
+    return {
+        "nodes": list(placed.rule.nodes),
+        "weights": np.asarray(placed.rule.weights).tolist(),
+        "grid": placed.grid,
+        "mollified": placed.mollified,
+        "gradient_corrected": placed.gradient_corrected,
+        "every": placed.every,
+    }
+
+
+def _placed_rule(data: dict[str, Any]) -> PlacedRule:
+    """The inverse of `_plain_rule`."""
+    rule = Rule(data["nodes"], np.asarray(data["weights"]))
+    kind = {name: data[name] for name in ("grid", "mollified", "gradient_corrected", "every")}
+    return PlacedRule(rule, **kind)

@@ -1,0 +1,122 @@
+"""Another program on the same problem: adaptive Runge-Kutta steps of diffrax, where it is installed and the problem is an equation ``q'' = f(q)``."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from importlib.util import find_spec
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vmri_jax.mechanics.invariants import potential_energy
+from vmri_jax.mechanics.masses import ConstantMass
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.running.timing import interleaved
+from vmri_jax.study.reference_solution import ReferenceSolution
+from vmri_jax.study.staircase import Stair, confirmed, front
+from vmri_jax.study.work import SLOWEST, WorkRow
+
+LARGEST_POWER = 43
+"""Tolerances go down to ``2^-43``, about 1e-13: round-off of float64 makes a smaller one as dear as it is useless."""
+STRIDE = 3
+"""From one power of two of the tolerances to the next."""
+MAX_STEPS = 200_000
+"""Steps after which diffrax gives up; more only lengthen runs that are too slow to be compared."""
+
+
+def can_run_dopri8(problem: Problem) -> bool:
+    """Whether diffrax is installed, and masses are constant, with neither constraints nor forces besides potentials."""
+    system = problem.system
+    plain = isinstance(system.kinetic, ConstantMass) and system.force is None
+    return plain and not any(system.num_constraints(problem.q_s, problem.q_f)) and find_spec("diffrax") is not None
+
+
+def dopri8_runs(problem: Problem, t_end: float, stride: int = STRIDE) -> Iterator[tuple[int, Callable[[], np.ndarray]]]:
+    """Runs of Dopri8 with smaller and smaller tolerances ``2^-power``: the power, and a function that gives q at the end, slow coordinates first.
+
+    Args:
+        problem: one that `can_run_dopri8`.
+        t_end: simulated time.
+        stride: from one power to the next.
+    """
+    import diffrax  # pyright: ignore[reportMissingImports]
+
+    system, n_s = problem.system, problem.q_s.size
+    mass: Any = system.kinetic
+    start = tuple(
+        jnp.concatenate([jnp.asarray(a), jnp.asarray(b)])
+        for a, b in ((problem.q_s, problem.q_f), (problem.v_s, problem.v_f))
+    )
+    gradient = jax.grad(lambda q: potential_energy(system, q[:n_s], q[n_s:]))
+
+    def acceleration(q):
+        force = -gradient(q)
+        return jnp.concatenate(mass.velocity(force[:n_s], force[n_s:]))
+
+    term: Any = diffrax.ODETerm(lambda t, y, args: (y[1], acceleration(y[0])))
+
+    @jax.jit
+    def solve(tolerance):
+        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        solution = diffrax.diffeqsolve(
+            term,
+            diffrax.Dopri8(),
+            0.0,
+            t_end,
+            None,
+            start,
+            stepsize_controller=controller,
+            max_steps=MAX_STEPS,
+            throw=False,
+        )
+        return solution.ys[0][-1]  # pyright: ignore[reportOptionalSubscript]
+
+    for power in range(7, LARGEST_POWER, stride):
+        yield power, lambda tolerance=2.0**-power: np.asarray(solve(tolerance))
+
+
+def dopri8_stairs(problem: Problem, t_end: float, reference: ReferenceSolution, least: float) -> list[Stair]:
+    """What Dopri8 reaches at the end, down to an error.
+
+    Args:
+        problem: one that `can_run_dopri8`.
+        t_end: simulated time.
+        reference: with the positions at the end.
+        least: error below which no smaller tolerance is tried.
+    """
+    runs, errors = {}, {}
+    for power, run in dopri8_runs(problem, t_end):
+        errors[power] = float(np.abs(run() - reference.q[-1]).max())
+        runs[str(power)] = run
+        if errors[power] < least / 10 or interleaved({"": run}, 1, 0.0)[""][0] > SLOWEST:
+            break
+    seconds = interleaved(runs, 3)
+    rows = [
+        # steps of order 8 for a tolerance 2^-power, which diffrax chooses, are about 2^(power / 8); each rung of the ladder counts as a doubling here
+        replace(NOTHING, num_steps=2 ** (power // STRIDE), error_q=error).timed(seconds[str(power)])
+        for power, error in errors.items()
+    ]
+    return front(confirmed(rows))
+
+
+NOTHING = WorkRow(
+    scheme="diffrax Dopri8",
+    num_micro=1,
+    order=8,
+    num_steps=0,
+    macro_dt=np.nan,
+    error_q=np.nan,
+    error_p=np.nan,
+    seconds=np.nan,
+    low=np.nan,
+    high=np.nan,
+    compile_seconds=np.nan,
+    slow_evaluations=0,
+    fast_evaluations=0,
+    solves=0,
+    iterations=0,
+    method="",
+    result="",
+)
+"""A row without what runs of another program do not tell."""

@@ -1,0 +1,61 @@
+"""Prices of the functions of a system, and the parts of a run that they take."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.system import label
+from vmri_jax.running.timing import seconds_each
+from vmri_jax.study.work import WorkRow
+
+SLOW, FAST, CONSTRAINTS = "gradient of V", "gradient of W", "constraints"
+REST = "everything else"
+"""Names of parts of a run; further potentials have names of their own."""
+
+
+def functions(problem: Problem) -> dict[str, Callable]:
+    """Gradients of the potentials and the constraints with their Jacobian, each a function of all positions, by name; those that a system has."""
+    system, n_s = problem.system, problem.q_s.size
+    terms: dict[str, Callable] = {}
+    if system.slow_potential is not None:
+        terms[SLOW] = jax.grad(lambda q: system.slow_potential(q[:n_s], q[n_s:], system.params))  # pyright: ignore[reportOptionalCall]
+    if system.fast_potential is not None:
+        terms[FAST] = jax.grad(lambda q: system.fast_potential(q[n_s:], system.params))  # pyright: ignore[reportOptionalCall]
+    for name, function in system.potentials:
+        terms[gradient_of(name)] = jax.grad(lambda q, function=function: function(q[:n_s], q[n_s:], system.params))
+    if any(system.num_constraints(problem.q_s, problem.q_f)):
+
+        def constraints(q):
+            return system.constraints(problem.t, q[:n_s], q[n_s:])
+
+        terms[CONSTRAINTS] = lambda q: jax.jacrev(constraints)(q).sum(0) + constraints(q).sum()
+    return terms
+
+
+def gradient_of(name: str | int) -> str:
+    """The name of a further potential's gradient."""
+    return f"gradient of {label(name)}"
+
+
+def prices(problem: Problem) -> dict[str, float]:
+    """Seconds of each of `functions`, each on its own in a compiled loop."""
+    q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
+    return {name: seconds_each(function, q) for name, function in functions(problem).items()}
+
+
+def shares(price: dict[str, float], row: WorkRow) -> dict[str, float]:
+    """Parts of the time of a run, by what it is spent on; they sum to 1.
+
+    Args:
+        price: seconds of each function, from `prices`.
+        row: the run.
+    """
+    counts = {SLOW: row.slow_evaluations, FAST: row.fast_evaluations}
+    counts |= {gradient_of(name): count for name, count in row.evaluations.items()}
+    counts[CONSTRAINTS] = row.fast_evaluations or row.slow_evaluations
+    parts = {name: seconds * counts.get(name, 0) / row.seconds for name, seconds in price.items()}
+    total = sum(parts.values())
+    parts = {name: part / max(total, 1.0) for name, part in parts.items()}
+    return parts | {REST: max(0.0, 1.0 - total)}
