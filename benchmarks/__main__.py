@@ -72,7 +72,6 @@ for _name, _module in {
     "compile": compilation,
     "control": control,
     "errors": errors,
-    "imports": imports,
     "orders": orders,
     "programs": instructions,
     "savings": savings,
@@ -141,6 +140,19 @@ def mechanisms_command(
 ) -> None:
     prepare(core, cache=False)
     _measure("mechanisms", mechanisms, full, out, markdown=True, only=only or (), way=way or ())
+
+
+@app.command("imports", help=imports.__doc__)
+def imports_command(
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Files whose names begin so, e.g. humanoid; may be repeated.")
+    ] = None,
+) -> None:
+    prepare(core)
+    _measure("imports", imports, full, out, only=only or ())
 
 
 @app.command("against", help=against.__doc__)

@@ -63,7 +63,8 @@ def sizes(name: str) -> Size:
     if name == "quick":
         return Size((10, 20, 40), (10, 20), 3, (10,), (3,))
     numbers = (1, 3, 10, 30, 100)
-    return Size(numbers, (1, 10, 30), 5, numbers, numbers)
+    beside_few = (7, 8)  # chains on both sides of the number of rows from which `vm.simulate` takes the band
+    return Size(tuple(sorted((*numbers, *beside_few))), (1, *beside_few, 10, 30), 5, numbers, numbers)
 
 
 def chain(bodies: int, coordinates: Coordinates = "directors") -> Scene:

@@ -30,10 +30,12 @@ def test_files_of_installed_packages_move_as_in_mujoco(tmp_path, monkeypatch):
     monkeypatch.setattr(imports, "find_spec", known.get)
     size = imports.sizes("quick")
     assert [Path(file).stem for _, file in size.files] == ["cartpole", "swimmer"]
+    assert [Path(file).stem for _, file in imports.sizes("full", ["giant"]).files] == ["giant"]
     *_, report = imports.run(size, "quick")
     first, second = report.rows
     assert (first["file"], first["bodies"], first["coordinates"]) == ("gymnasium/cartpole.xml", 2, 2)
     assert first["error"] < 1e-8
+    assert first["acceleration"] < 1e-12
     assert "fluid (density = 1000)" in second["not read"]
     assert "1 of 2 files are read" in report.notes[0]
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.scene.test_joint_coordinates import accelerations, by_directors, state_of
+from tests.scene.body_motions import accelerations, state_of
+from tests.scene.test_joint_coordinates import by_directors
 from vmri_jax.scene import (
     Box,
     Frame,

@@ -17,8 +17,8 @@ from vmri_jax import (
     initial_state,
     macro_step,
 )
+from vmri_jax.mechanics.arrays import QUICK
 from vmri_jax.stability import linear_model, multipliers, small_motions
-from vmri_jax.stability.linear import QUICK
 from vmri_jax.steppers import solvers
 
 

@@ -1,5 +1,7 @@
 """Numbers as users give them: real, and float64."""
 
+from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import Any, TypeAlias
 
 import jax
@@ -15,6 +17,9 @@ Number: TypeAlias = Float[Numbers, ""] | float
 ADVICE = "give float64: lists of numbers, NumPy arrays by .astype(float), JAX arrays made after vm.configure()"
 """What to do about numbers of less than 64 bits."""
 
+QUICK = {"xla_backend_optimization_level": 0}
+"""Options of the compiler for programs that run for milliseconds: compiled in half the time, at the same speed on small matrices."""
+
 
 def is_concrete(tree) -> bool:
     """Whether a pytree holds values, rather than tracers of jit, vmap or grad."""
@@ -24,6 +29,24 @@ def is_concrete(tree) -> bool:
 def library(*values):
     """NumPy, or `jax.numpy` where a value is traced: single calls of JAX take some 20 ms each the first time."""
     return np if is_concrete(values) else jnp
+
+
+def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = ()) -> Callable:
+    """A function that runs a few times, compiled with the options `QUICK`; within a function that JAX stages it is a part of its program.
+
+    Args:
+        function: of arrays, and of the arguments that `static_argnames` names.
+        static_argnames: as of `jax.jit`.
+    """
+    quick = jax.jit(function, static_argnames=static_argnames, compiler_options=QUICK)
+    part = jax.jit(function, static_argnames=static_argnames)  # JAX takes options for whole programs alone
+
+    @wraps(function)
+    def call(*arguments):
+        is_whole = is_concrete((arguments, jnp.zeros(())))  # while JAX stages a program, all new arrays are tracers
+        return (quick if is_whole else part)(*arguments)
+
+    return call
 
 
 def of_one_type(tree):

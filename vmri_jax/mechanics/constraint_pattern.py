@@ -13,9 +13,9 @@ from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.system import System
 
 FEW = 80
-"""Rows of constraints up to which the full matrix is taken and no zeros are looked for. Of hinged chains by directors the band takes the
-same time as the full matrix at 77 rows, and a third of it at 88. With a larger number short chains take longer for a step, with a
-smaller one the first run of small systems takes some seconds longer."""
+"""Rows of constraints up to which the full matrix is taken and no zeros are looked for. Of hinged chains by directors the band takes
+0.9 of the time of the full matrix at 77 rows, and 0.3 of it at 88 (`python -m benchmarks chains --full`). With a larger number short chains take
+longer for a step, with a smaller one the first run of small systems takes some seconds longer."""
 CHANGE = 1e-6
 """Part of the largest value of a constraint from which a change counts."""
 

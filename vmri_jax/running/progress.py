@@ -9,9 +9,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import wraps
+from typing import ParamSpec, TypeVar, cast
 
 Progress = Callable[[str, int, int], None]
 """Called as ``progress(what, done, total)`` before every piece of work and once at the end."""
+P, R = ParamSpec("P"), TypeVar("R")
 ShowsProgress = bool | Progress
 """The argument ``progress`` of all functions that take long: True for a bar, False for a line now and then, or a function that is told."""
 
@@ -126,6 +129,18 @@ def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Pr
     if not callable(progress):
         raise TypeError(f"{name}: progress is {progress!r}; give True, False, or a function of (what, done, total).")
     return nullcontext(progress)
+
+
+def shows_progress(function: Callable[P, R]) -> Callable[P, R]:
+    """`function`, which calls its argument `progress`, for users that give True or False for it, see `ShowsProgress`."""
+
+    @wraps(function)
+    def shown(*args: P.args, **kwargs: P.kwargs) -> R:
+        with progress_to(function.__name__, cast(ShowsProgress, kwargs.pop("progress", False))) as tell:
+            kwargs["progress"] = tell
+            return function(*args, **kwargs)
+
+    return shown
 
 
 def silent(what: str, done: int, total: int) -> None:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
+from vmri_jax.mechanics.arrays import quickly_compiled
 from vmri_jax.scene.body import LARGEST_POINT, Bodies, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.terms import EffectTerm
@@ -134,12 +135,21 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
     return found
 
 
-@partial(jax.jit, static_argnames=("term", "kinetic"))
+@partial(quickly_compiled, static_argnames=("term", "kinetic"))
 def _derivatives(term: EffectTerm, kinetic: bool, q, v, params):
     """What `Linearised` holds after the columns, before the motions of bodies are chosen."""
+    if not kinetic:  # L = -V(q) has no derivatives by velocities, which would be traced and compiled for nothing
+
+        def gradient(q):
+            values = jax.grad(term.value)(q, None, params)
+            return values, values
+
+        stiffness, values = jax.jacfwd(gradient, has_aux=True)(q)
+        none = jnp.zeros_like(stiffness)
+        return -values, stiffness, none, none
 
     def lagrangian(q, v):
-        return term.kinetic(q, None, v, None, params) if kinetic else -term.value(q, None, params)
+        return term.kinetic(q, None, v, None, params)
 
     def force(q, v):
         momentum = jax.grad(lagrangian, 1)

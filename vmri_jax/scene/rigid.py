@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, library
 from vmri_jax.scene.body import AnyBody, Pace, Point, joined
 from vmri_jax.scene.declare import effect_class, names
 from vmri_jax.scene.effect import Effect
@@ -174,8 +174,7 @@ class RigidBody(AnyBody):
     @property
     def rates(self):
         """(n,) velocity of the centre of mass, ``d_i' = spin x d_i``."""
-        turned = jnp.cross(self.spin, self.directors)
-        turned = np.asarray(turned) if is_concrete(turned) else turned
+        turned = library(self.spin, self.directors).cross(self.spin, self.directors)
         return joined([self.velocity, *(turned[i] for i in self.wide)])
 
     @property

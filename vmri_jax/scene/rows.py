@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
@@ -161,7 +161,7 @@ def _evaluated(element: _Element, q: np.ndarray, t: float) -> tuple[np.ndarray, 
     return np.asarray(values), np.asarray(jacobian)
 
 
-@partial(jax.jit, static_argnames="term")
+@partial(quickly_compiled, static_argnames="term")
 def _value_and_jacobian(term: EffectTerm, q, params, t):
     def values(q):
         value = jnp.reshape(term.value(q, None, params, t), (-1,))

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import eye_array
 
-from vmri_jax.mechanics.arrays import is_concrete, library
+from vmri_jax.mechanics.arrays import is_concrete, library, quickly_compiled
 from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Place
 from vmri_jax.scene.body import GROUND, Bodies
@@ -147,7 +147,7 @@ class Sorting:
         return joint_numbers(self.bodies, self.links) if self.links else {}
 
 
-@partial(jax.jit, static_argnames="kinematics")
+@partial(quickly_compiled, static_argnames="kinematics")
 def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
     """Q and dQ/dq."""
 

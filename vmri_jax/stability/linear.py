@@ -13,12 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.diagnostics.linear import frequencies_of, phase_splits
+from vmri_jax.mechanics.arrays import QUICK
 from vmri_jax.mechanics.invariants import potential_energy, velocity
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.mechanics.system import ConstantMass, System
 
-QUICK = {"xla_backend_optimization_level": 0}
-"""Programs that run for milliseconds: compiled in half the time, at the same speed on matrices this small."""
 GROWING = 1e-6
 """Growth rates below this part of the fastest rate are round-off of motions that do not grow."""
 

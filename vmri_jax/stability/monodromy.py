@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.diagnostics.linear import phase_splits, phase_vector, symplectic_form, tangents
-from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.arrays import QUICK, is_concrete
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.linear import QUICK
 from vmri_jax.steppers import solvers
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton

@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.diagnostics.linear import phase_splits, phase_vector
+from vmri_jax.mechanics.arrays import QUICK
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.macro_step import macro_step
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
-from vmri_jax.stability.linear import QUICK, SmallMotions
+from vmri_jax.stability.linear import SmallMotions
 from vmri_jax.steppers import solvers
 
 LANES = 64

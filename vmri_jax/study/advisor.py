@@ -20,7 +20,7 @@ from vmri_jax.accuracy.families import Family, families
 from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.state import HasProblem, Problem, State, problem_of
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.progress import Progress, silent
+from vmri_jax.running.progress import Progress, shows_progress, silent
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.steppers.solvers import Newton
 from vmri_jax.study.program import Program
@@ -344,6 +344,7 @@ def check_target(error: float, t_end: float, problem: Problem) -> None:
         )
 
 
+@shows_progress
 def tune(
     problem: Problem | HasProblem,
     error: float,
@@ -355,7 +356,7 @@ def tune(
     solver: Newton | None = None,
     verify: bool = True,
     exhaustive: bool = False,
-    progress: Progress = silent,
+    progress: Any = False,
 ) -> Recommendation:
     """Find the scheme, num_micro and macro step that reach an error in the least time on this machine.
 
@@ -369,7 +370,7 @@ def tune(
         solver: how implicit equations are solved.
         verify: run the setting from another start, and compare with its own reference.
         exhaustive: search without shortcuts.
-        progress: told about every attempt.
+        progress: True for a bar, or a function (what, done, total) that is told about every attempt.
 
     Raises:
         ValueError: an error below round-off or below what the reference can tell.

@@ -21,7 +21,7 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.batch import simulate_batch
 from vmri_jax.running.export import extra
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.progress import Progress, silent
+from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -198,6 +198,7 @@ class ConvergenceStudy(ResultTable):
         return xarray.Dataset({name: (tuple(axes), array) for name, array in data.items()}, coords=axes)
 
 
+@shows_progress
 def convergence_study(
     problem: Problem | HasProblem,
     schemes: Mapping[str, Scheme | Composition],
@@ -210,7 +211,7 @@ def convergence_study(
     reference: ReferenceSolution | Mapping[str, ReferenceSolution] | None = None,
     solver: Newton | None = None,
     executor: Any = None,
-    progress: Progress = silent,
+    progress: Any = False,
 ) -> ConvergenceStudy:
     """Run every scheme with every macro step to `t_end` and compare with a reference.
 
@@ -229,7 +230,7 @@ def convergence_study(
         reference: compare with this (by label of the parameters if there are several); by default `reference_solution`.
         solver: how implicit equations are solved.
         executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
-        progress: told about every run before it starts.
+        progress: True for a bar, or a function (what, done, total) that is told about every run before it starts.
 
     Raises:
         ValueError: no scheme, a step that does not divide `t_end` as above, a reference of another shape.

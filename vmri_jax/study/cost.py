@@ -3,13 +3,14 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.progress import Progress, silent
+from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
@@ -80,6 +81,7 @@ class CostStudy(ResultTable):
         return CostStudy(self.rows + other.rows)
 
 
+@shows_progress
 def cost_study(
     problem: Problem | HasProblem,
     scheme: Callable[[int], Scheme],
@@ -91,7 +93,7 @@ def cost_study(
     repeats: int = 5,
     min_seconds: float = 0.1,
     label: str = "",
-    progress: Progress = silent,
+    progress: Any = False,
     clock: Callable[[], float] = time.perf_counter,
 ) -> CostStudy:
     """Time ``scheme(n)`` for every n in `num_micro` with every method of Newton's iteration, over the same simulated time.
@@ -116,7 +118,7 @@ def cost_study(
         repeats: timed runs of each program.
         min_seconds: runs shorter than this are called several times and averaged.
         label: name of this scheme or system in the rows.
-        progress: told about every program before it is compiled, and before times are measured.
+        progress: True for a bar, or a function (what, done, total) that is told about every program before it is compiled, and before times are measured.
         clock: `time.process_time` where other processes share the core.
 
     Raises:

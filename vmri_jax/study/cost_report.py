@@ -16,7 +16,7 @@ from vmri_jax.accuracy.families import Family, families
 from vmri_jax.accuracy.steps import with_accuracy
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
-from vmri_jax.running.progress import Progress, part, silent
+from vmri_jax.running.progress import Progress, part, shows_progress
 from vmri_jax.steppers.results import SimulationError
 from vmri_jax.study.advisor import MARGIN, Search, Setting, round_off, stopwatch
 from vmri_jax.study.cost_figures import draw_num_micro, draw_shares
@@ -150,6 +150,7 @@ def default_t_end(problem: Problem) -> float:
     return float(f"{t_end:.0e}")
 
 
+@shows_progress
 def cost_report(
     problem: Problem | HasProblem,
     name: str,
@@ -158,7 +159,7 @@ def cost_report(
     t_end: float | None = None,
     errors: Sequence[float] | None = None,
     menu: Sequence[Family] | None = None,
-    progress: Progress = silent,
+    progress: Any = False,
 ) -> CostReport:
     """Search for the cheapest settings for a few errors and write ``cost.html``, ``cost.png`` and ``cost.csv``.
 
@@ -171,7 +172,7 @@ def cost_report(
         t_end: simulated time, by default `default_t_end`.
         errors: largest ``|q - q_ref|`` at t_end; by default a ladder relative to how far the system moves.
         menu: families to choose from.
-        progress: told what is running.
+        progress: True for a bar, or a function (what, done, total) that is told what is running.
 
     Raises:
         ValueError: errors that are not positive; none are asked for, and the system does not move.

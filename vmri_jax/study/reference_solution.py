@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.failures import simulation_error
-from vmri_jax.running.progress import Progress, silent
+from vmri_jax.running.progress import shows_progress
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.scheme import galerkin
 from vmri_jax.study.program import Program, joined
@@ -61,6 +62,7 @@ class ReferenceSolution:
             raise ValueError(f"{path} is not a file written by ReferenceSolution.save ({error}).") from error
 
 
+@shows_progress
 def reference_solution(
     problem: Problem | HasProblem,
     t_end: float,
@@ -68,7 +70,7 @@ def reference_solution(
     num_saves: int = 10,
     num_steps: int | None = None,
     degree: int = 4,
-    progress: Progress = silent,
+    progress: Any = False,
 ) -> ReferenceSolution:
     """Fine single-rate solution of order ``2 degree``, checked against itself at half the step.
 
@@ -79,7 +81,7 @@ def reference_solution(
         num_steps: steps of the coarser of the two runs, a multiple of `num_saves`; by default steps are halved until
             two runs agree to round-off or no longer come closer.
         degree: polynomial degree of the path, with Gauss quadrature on every term.
-        progress: told about every run.
+        progress: True for a bar, or a function (what, done, total) that is told about every run.
 
     Returns:
         The finer of the two runs that agree best; its errors are the largest differences between them.

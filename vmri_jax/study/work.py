@@ -11,7 +11,7 @@ from vmri_jax.ensembles.executors import mapped
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.mechanics.system import label
 from vmri_jax.running.interrupts import Interrupted
-from vmri_jax.running.progress import Progress, silent
+from vmri_jax.running.progress import shows_progress
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
@@ -180,6 +180,7 @@ def work_row(name: str, program: Program, num_steps: int, reference: ReferenceSo
     )
 
 
+@shows_progress
 def work_precision(
     problem: Problem | HasProblem,
     schemes: Mapping[str, Scheme | Composition],
@@ -191,7 +192,7 @@ def work_precision(
     solver: Newton | None = None,
     repeats: int = 5,
     executor: Any = None,
-    progress: Progress = silent,
+    progress: Any = False,
 ) -> WorkPrecision:
     """Error against wall time and evaluations for every scheme over a ladder of macro steps.
 
@@ -211,7 +212,7 @@ def work_precision(
         executor: where runs are computed and timed, a task for each scheme, as of `vmri_jax.ensemble`. Times are then those
             of the workers, and only runs of one scheme take turns: for times give each worker a core of its own. None for
             this process.
-        progress: told about every run.
+        progress: True for a bar, or a function (what, done, total) that is told about every run.
 
     Raises:
         ValueError: no scheme, or numbers of steps that are no multiples of num_saves.
