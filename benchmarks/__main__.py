@@ -31,6 +31,7 @@ from benchmarks import (
     peers,
     savings,
     tricks,
+    tuned,
 )
 from benchmarks.gail2014.command import gail2014
 from benchmarks.hard_cases.command import hard
@@ -91,6 +92,18 @@ def dear_command(
 ) -> None:
     prepare(core)
     _measure("dear", dear, full, out, only=only or (), shared=shared)
+
+
+@app.command("tuned", help=tuned.__doc__)
+def tuned_command(
+    shared: Annotated[bool, typer.Option(help="Count processor time: other processes use the core too.")] = False,
+    only: Annotated[list[str] | None, typer.Option(help="Systems, e.g. 'FPU l=3'; may be repeated.")] = None,
+    full: Full = False,
+    core: Core = None,
+    out: Out = OUT,
+) -> None:
+    prepare(core)
+    _measure("tuned", tuned, full, out, only=only or (), shared=shared)
 
 
 @app.command("batch", help=batch.__doc__)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from importlib import import_module
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -16,14 +15,12 @@ from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.study import (
     Program,
     ReferenceSolution,
-    cost_report,
     families,
     reference_solution,
     tune,
     work_precision,
 )
 from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search, another_start
-from vmri_jax.study.cost_report import default_t_end
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
 
@@ -203,33 +200,6 @@ def test_ladders_end_by_themselves(reference):
     errors = [row.error_q for row in study.curve("high order")]
     assert errors[0] > 1e3 * errors[-1]
     assert len(errors) < 12
-
-
-def test_cost_report(tmp_path):
-    report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-5, 1e-3), menu=SHORT_MENU)
-    text = report.path.read_text()
-    assert [answer.error for answer in report.answers] == [1e-3, 1e-5]
-    assert "What accuracy costs" in text
-    assert not report.not_tried
-    printed = " ".join(str(report).split())  # whatever the width of the terminal
-    assert "Runs to t = 1, with errors of the positions there. The reference solution is good to" in printed
-    setting = report.answers[1].setting
-    assert setting is not None
-    assert setting.command("spring") in text.replace("&#34;", '"')
-    assert sum(report.shares.values()) == pytest.approx(1)
-    assert {"cost.html", "cost.png", "cost.csv"} <= {path.name for path in tmp_path.iterdir()}
-    assert default_t_end(PROBLEM) == pytest.approx(30 * 2 * np.pi / 20, rel=0.1)
-    with pytest.raises(ValueError, match="positive"):
-        cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(-1.0,))
-
-
-def test_a_cost_report_names_the_schemes_that_it_had_no_time_for(tmp_path, monkeypatch):
-    """Once a scheme has kept the error, a search without time compiles no other one."""
-    monkeypatch.setattr(import_module("vmri_jax.study.cost_report"), "BUDGET", -1.0)
-    report = cost_report(PROBLEM, "spring", tmp_path, t_end=1.0, errors=(1e-3,), menu=SHORT_MENU)
-    assert 0 < len(report.not_tried) < len(SHORT_MENU)
-    for text in (str(report), report.path.read_text()):
-        assert f"not tried: {', '.join(report.not_tried)}. For one error vmri tune tries all" in " ".join(text.split())
 
 
 def test_another_start_fits_constraints_that_move():

@@ -1,0 +1,158 @@
+"""What a run of an accuracy costs over the best setting that the search over all schemes finds for the same error."""
+
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+import vmri_jax as vm
+from benchmarks import errors
+from benchmarks.dear.systems import molecules
+from benchmarks.measure import Tell, ratio, silent
+from benchmarks.report import Claim, Report
+from vmri_jax.accuracy.companions import UncertifiedWarning
+from vmri_jax.accuracy.steps import AccuracyNotReached
+from vmri_jax.mechanics.state import problem_of
+from vmri_jax.study import Program, families, recommend, reference_solution
+from vmri_jax.study.advisor import NothingReached
+from vmri_jax.study.timing import interleaved
+
+COLUMNS = (
+    "system",
+    "error",
+    "by accuracy",
+    "its error",
+    "ms",
+    "by search",
+    "error there",
+    "ms there",
+    "ratio",
+    "seconds",
+    "of search",
+)
+NODES = errors.NODES
+"""Saved intervals, at whose ends errors are compared."""
+ERRORS = (1e-3, 1e-6)
+REPEATS = 5
+AT_MOST = 2.0
+"""The median of the ratios that is held to."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A system, an error, and the menu of the search.
+
+    menu: families; None for all.
+    """
+
+    system: str
+    problem: Callable[[], Any]
+    t_end: float
+    error: float
+    menu: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Size:
+    """Cases, and whether times are those of the processor."""
+
+    cases: list[Case]
+    shared: bool = False
+
+
+def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size:
+    """ "quick": two systems and four families of schemes; "full": eight systems and all families.
+
+    Args:
+        name: "quick" or "full".
+        only: systems; none for all.
+        shared: count processor time.
+    """
+
+    def of(system: str) -> Callable[[], Any]:
+        return errors.Case(system, 1.0).problem
+
+    systems = {
+        "FPU l=3": (of("FPU l=3"), 2.0),
+        "2 molecules": (partial(molecules, 2), 0.3),
+        "FPU l=10": (of("FPU l=10"), 1.0),
+        "TSP": (of("TSP"), 1.0),
+        "SAM": (of("SAM"), 1.0),
+        "molecule": (of("molecule"), 1.0),
+        "upright_pendulum": (of("upright_pendulum"), 1.0),
+        "three_scales": (of("three_scales"), 1.0),
+    }
+    few = ("fully explicit", "fully explicit, suzuki4", "fully explicit, kahan-li6", "galerkin 4")
+    menu = few if name == "quick" else None
+    chosen = list(systems)[:2] if name == "quick" else list(systems)
+    cases = [
+        Case(system, systems[system][0], systems[system][1], error, menu)
+        for system in chosen
+        if not only or system in only
+        for error in ERRORS
+    ]
+    return Size(cases, shared)
+
+
+def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+    """A report after each case."""
+    clock = time.process_time if size.shared else time.perf_counter
+    rows, notes = [], []
+    for case in size.cases:
+        tell(f"{case.system}, {case.error:g}")
+        try:
+            rows.append(_row(case, clock))
+        except (NothingReached, ValueError) as refused:
+            notes.append(f"{case.system}, {case.error:g}: {refused}")
+        ratios = [row["ratio"] for row in rows]
+        claims = []
+        if ratios:
+            claims.append(
+                Claim(
+                    "time of an accuracy over the search, median of all",
+                    ratio(ratios, [1.0] * len(ratios)),
+                    at_most=AT_MOST,
+                )
+            )
+        about = {"clock": "processor time" if size.shared else "wall time"}
+        yield Report("tuned", name, list(rows), claims, list(notes), about=about)
+
+
+def _row(case: Case, clock: Callable[[], float]) -> dict:
+    """Both runs, timed in turn."""
+    problem = problem_of("tuned", case.problem())
+    begun = clock()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UncertifiedWarning)
+        warnings.simplefilter("ignore", AccuracyNotReached)
+        settings = vm.simulate(problem, accuracy=case.error, t_end=case.t_end, num_saves=NODES).settings
+    seconds = clock() - begun
+    reference = reference_solution(problem, case.t_end, num_saves=NODES)
+    menu = None if case.menu is None else [f for f in families() if f.name in case.menu]
+    begun = clock()
+    best = recommend(
+        problem, case.error, case.t_end, menu=menu, num_saves=NODES, reference=reference, verify=False
+    ).setting
+    of_search = clock() - begun
+    ours = Program(problem, settings.scheme, case.t_end, NODES)
+    theirs = Program(problem, best.scheme, case.t_end, NODES)
+    true = reference.errors(ours(settings.num_steps))[0]
+    runs = {"ours": ours.timed(settings.num_steps), "theirs": theirs.timed(best.num_steps)}
+    samples = interleaved(runs, REPEATS, clock=clock)
+    return {
+        "system": case.system,
+        "error": case.error,
+        "by accuracy": f"{settings.python}, {settings.num_steps} steps",
+        "its error": true,
+        "ms": 1e3 * float(np.median(samples["ours"])),
+        "by search": f"{best.row.scheme}, {best.num_steps} steps",
+        "error there": best.row.error_q,
+        "ms there": 1e3 * float(np.median(samples["theirs"])),
+        "ratio": ratio(samples["ours"], samples["theirs"]).value,
+        "seconds": seconds,
+        "of search": of_search,
+    }
