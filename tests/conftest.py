@@ -34,7 +34,7 @@ def pytest_addoption(parser):
     parser.addoption(
         "--unoptimised",
         action="store_true",
-        help="programs are compiled without LLVM's optimisations, in about 0.6 of the time",
+        help="programs are compiled without LLVM's optimisations, in about a third of the time",
     )
     parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
     parser.addoption(
@@ -56,10 +56,12 @@ def pytest_configure(config):
 
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_folder())  # all other processes of tests
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(SECONDS_WORTH_KEEPING)
-    configure(cache=cache_folder())
+    from tests.compiling import trace_quickly, unoptimised
+
     if config.getoption("--unoptimised"):
-        jax.config.update("jax_disable_most_optimizations", True)
-        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # workers round as this process does
+        unoptimised()
+    configure(cache=cache_folder())
+    trace_quickly()
     config.pluginmanager.register(Durations(config.getoption("--budget")), "durations")
     # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random velocities.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
