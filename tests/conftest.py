@@ -5,11 +5,11 @@ import signal
 import sys
 from pathlib import Path
 
-import jax
 import psutil
 import pytest
 from hypothesis import settings
 
+from tests.compiling import forget_programs, trace_quickly, unoptimised
 from tests.durations import Durations
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=50)
@@ -56,8 +56,6 @@ def pytest_configure(config):
 
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_folder())  # all other processes of tests
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(SECONDS_WORTH_KEEPING)
-    from tests.compiling import trace_quickly, unoptimised
-
     if config.getoption("--unoptimised"):
         unoptimised()
     configure(cache=cache_folder())
@@ -78,13 +76,13 @@ def pytest_collection_modifyitems(config, items):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def forget_programs():
+def few_programs():
     """Compiled programs go when they hold too many memory maps or too much memory; until then other modules share them."""
     yield
     maps = Path("/proc/self/maps")
     many_maps = maps.exists() and len(maps.read_text().splitlines()) > MANY_MAPS
     if many_maps or psutil.Process().memory_info().rss > MUCH_MEMORY:
-        jax.clear_caches()
+        forget_programs()
 
 
 @pytest.fixture(scope="session", autouse=True)
