@@ -5,11 +5,11 @@ import signal
 import sys
 from pathlib import Path
 
-import jax
 import psutil
 import pytest
 from hypothesis import settings
 
+from tests.compiling import forget_programs, trace_quickly, unoptimised
 from tests.durations import Durations
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None, max_examples=50)
@@ -34,7 +34,7 @@ def pytest_addoption(parser):
     parser.addoption(
         "--unoptimised",
         action="store_true",
-        help="programs are compiled without LLVM's optimisations, in about 0.6 of the time",
+        help="programs are compiled without LLVM's optimisations, in about a third of the time",
     )
     parser.addoption("--method", help="method of Newton's iteration wherever a test does not choose one; default auto")
     parser.addoption(
@@ -56,10 +56,10 @@ def pytest_configure(config):
 
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_folder())  # all other processes of tests
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(SECONDS_WORTH_KEEPING)
-    configure(cache=cache_folder())
     if config.getoption("--unoptimised"):
-        jax.config.update("jax_disable_most_optimizations", True)
-        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # workers round as this process does
+        unoptimised()
+    configure(cache=cache_folder())
+    trace_quickly()
     config.pluginmanager.register(Durations(config.getoption("--budget")), "durations")
     # Tests make functions of one piece of code again for each case, runs that lose their energy, and starts with random velocities.
     config.addinivalue_line("filterwarnings", "ignore::vmri_jax.CompiledAgainWarning")
@@ -76,13 +76,13 @@ def pytest_collection_modifyitems(config, items):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def forget_programs():
+def few_programs():
     """Compiled programs go when they hold too many memory maps or too much memory; until then other modules share them."""
     yield
     maps = Path("/proc/self/maps")
     many_maps = maps.exists() and len(maps.read_text().splitlines()) > MANY_MAPS
     if many_maps or psutil.Process().memory_info().rss > MUCH_MEMORY:
-        jax.clear_caches()
+        forget_programs()
 
 
 @pytest.fixture(scope="session", autouse=True)
