@@ -17,7 +17,7 @@ from benchmarks.report import Claim, Report
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.steps import AccuracyNotReached
 from vmri_jax.mechanics.state import problem_of
-from vmri_jax.study import Program, families, recommend, reference_solution
+from vmri_jax.study import Program, families, reference_solution, tune
 from vmri_jax.study.advisor import NothingReached
 from vmri_jax.study.timing import interleaved
 
@@ -134,9 +134,7 @@ def _row(case: Case, clock: Callable[[], float]) -> dict:
     reference = reference_solution(problem, case.t_end, num_saves=NODES)
     menu = None if case.menu is None else [f for f in families() if f.name in case.menu]
     begun = clock()
-    best = recommend(
-        problem, case.error, case.t_end, menu=menu, num_saves=NODES, reference=reference, verify=False
-    ).setting
+    best = tune(problem, case.error, case.t_end, menu=menu, num_saves=NODES, reference=reference, verify=False).setting
     of_search = clock() - begun
     ours = Program(problem, settings.scheme, case.t_end, NODES)
     theirs = Program(problem, best.scheme, case.t_end, NODES)

@@ -20,7 +20,7 @@ PAGES = ("README.md", "CONTRIBUTING.md", "benchmarks/README.md", "docs/**/*.md")
 GALLERY = "notebooks/scenes/README.md"
 SEARCHES = ("vmri tune", "vmri cost")
 """Commands of two minutes: they have a file of tests for themselves, so that two workers share the commands."""
-FILES = {"crane.py": "README.md", "my_scene.py": "docs/how_to/scenes.md"}
+FILES = {"crane.py": "docs/nutshell.md", "my_scene.py": "docs/how_to/scenes.md"}
 """Files that commands name, each the first program of a page."""
 CODES = {"vmri advise fpu": 1}
 """Exit codes other than 0: a step that is advised against."""
