@@ -80,4 +80,4 @@ def test_bad_input(fpu):
     with pytest.raises(
         TypeError, match=r"the stepper of solvers.Custom is NoneType; give a vmri_jax.steppers.stepper.Stepper"
     ):
-        vm.simulate(fpu, vm.fully_explicit(1), solver=vm.solvers.Custom(nothing), **STEPS)
+        vm.simulate(fpu, vm.fully_explicit(1), solver=vm.solvers.Custom(nothing), **STEPS)  # pyright: ignore[reportArgumentType]

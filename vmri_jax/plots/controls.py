@@ -1,17 +1,14 @@
 """Figures of optimal control: the controls, the motion that they make, and how they were found."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from vmri_jax.plots.runs import coordinates, limit_times, position_panels
 from vmri_jax.plots.theme import LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
 
-if TYPE_CHECKING:
-    from vmri_jax.control.optimum import Optimum
 
-
-def plot_control(optimum: "Optimum", *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Controls with their bounds, slow and fast positions against time, and what the iterations left.
 
     Args:

@@ -1,20 +1,17 @@
 """Figures of fits: what is left of the measurements, and how the parameters are correlated."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, new_figure
 
-if TYPE_CHECKING:
-    from vmri_jax.fitting.result import Fit
-
 INSIDE = 1.96
 """Standard deviations that hold 95 %."""
 
 
-def plot_fit(fit: "Fit", *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+def plot_fit(fit: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Misses over time, how they are distributed, and the correlations of the parameters.
 
     Args:

@@ -5,16 +5,13 @@ import importlib
 import io
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vmri_jax.running.files import replaced
 from vmri_jax.running.quantities import Quantities
+from vmri_jax.running.saved_run import SavedRun
 from vmri_jax.steppers.results import Result
-
-if TYPE_CHECKING:
-    from vmri_jax.running.trajectory import Trajectory
 
 DIMENSIONS = {
     "t": ("t",),
@@ -41,7 +38,7 @@ FILL = {"f": np.nan, "i": -1}
 """Values where there are none, by kind of number: of what a run did before its start, and of rows that are not there yet."""
 
 
-def rows_of(run: "Trajectory") -> dict[str, np.ndarray]:
+def rows_of(run: SavedRun) -> dict[str, np.ndarray]:
     """The arrays of a run with a row for each saved node; what its steps did before a node is in the row of that node.
 
     Args:
@@ -165,7 +162,7 @@ class Exports(Quantities):
         return xarray.Dataset(data, coords=coordinates, attrs=attributes(run))
 
 
-def attributes(run: "Trajectory") -> dict:
+def attributes(run: SavedRun) -> dict:
     """The status of a run, and the names of its parts as JSON."""
     if np.ndim(run.t) > 1:
         found = {"result": np.asarray(run.result), "failed_at": np.asarray(run.failed_at)}

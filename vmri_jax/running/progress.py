@@ -14,7 +14,8 @@ from typing import ParamSpec, TypeVar, cast
 
 Progress = Callable[[str, int, int], None]
 """Called as ``progress(what, done, total)`` before every piece of work and once at the end."""
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 ShowsProgress = bool | Progress
 """The argument ``progress`` of all functions that take long: True for a bar, False for a line now and then, or a function that is told."""
 

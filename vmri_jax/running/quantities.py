@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,9 +20,7 @@ from vmri_jax.mechanics.summary import has_values, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.origin import Origin, at_nodes
-
-if TYPE_CHECKING:
-    from vmri_jax.running.trajectory import Trajectory
+from vmri_jax.running.saved_run import SavedRun
 
 RANDOM = 0.5
 """Values at nodes with a von Neumann ratio above this count as random: the nodes do not resolve what they are of."""
@@ -68,7 +66,7 @@ class Quantities(ABC):
     """
 
     @abstractmethod
-    def whole(self) -> "Trajectory":
+    def whole(self) -> SavedRun:
         """All saved nodes."""
 
     @property
@@ -233,7 +231,7 @@ class Quantities(ABC):
         return plot_trajectory(self.whole(), title)
 
 
-def _known(what: str, run: "Trajectory") -> "Trajectory":
+def _known(what: str, run: SavedRun) -> SavedRun:
     """The run, unless its numbers are tracers of a transformation."""
     if not is_concrete(run.energy):
         raise ValueError(
@@ -243,7 +241,7 @@ def _known(what: str, run: "Trajectory") -> "Trajectory":
     return run
 
 
-def _of_body(run: "Trajectory", body: str, carried: Callable, slow=None, fast=None):
+def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
     """Values (..., k, size) of a body.
 
     Args:
@@ -276,11 +274,11 @@ def _body_momenta(system: System, state: State, kinematics: Kinematics):
     return kinematics.momenta(state.q_s, state.q_f, v_s, v_f, system.params)
 
 
-def _velocities(run: "Trajectory"):
+def _velocities(run: SavedRun):
     return at_nodes(_velocity, run.origin, run.states)
 
 
-def _states(run: "Trajectory", micro: bool, every: bool = False) -> State:
+def _states(run: SavedRun, micro: bool, every: bool = False) -> State:
     """The states at the saved nodes, or at the micro nodes; at `every` node with the start."""
     if not micro:
         return run.states
@@ -293,7 +291,7 @@ def _states(run: "Trajectory", micro: bool, every: bool = False) -> State:
     return states if every else jax.tree.map(lambda a: a[1:], states)
 
 
-def _all_nodes(run: "Trajectory") -> Nodes:
+def _all_nodes(run: SavedRun) -> Nodes:
     """Times, positions and velocities at all nodes, macro and micro, in order; NaN after a failure."""
     nodes = Nodes(*(np.asarray(a) for a in (run.t, run.states.q_s, run.states.q_f, *_velocities(run))))
     finite = np.isfinite(np.column_stack(nodes)).all(axis=1)
@@ -306,7 +304,7 @@ def _all_nodes(run: "Trajectory") -> Nodes:
     return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in found))
 
 
-def _shaped(run: "Trajectory", values: np.ndarray, micro: bool) -> np.ndarray:
+def _shaped(run: SavedRun, values: np.ndarray, micro: bool) -> np.ndarray:
     return values.reshape(*np.shape(run.t_micro), -1) if micro else values
 
 

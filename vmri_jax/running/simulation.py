@@ -16,6 +16,7 @@ from vmri_jax.mechanics.checks import check_closures, check_params, check_system
 from vmri_jax.mechanics.constraints import check_constraints, check_mass
 from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Movable, State, opened, start_of
+from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps, check_run, check_vectors, nothing_fast
 from vmri_jax.running.engine import Arrays, Engine, Model, Place, engine
@@ -25,7 +26,6 @@ from vmri_jax.running.memory import check_memory
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import ShowsProgress, Working, progress_to
 from vmri_jax.running.saved import room_of_a_piece
-from vmri_jax.running.summaries import summary_of_prepared
 from vmri_jax.running.trajectory import Trajectory, from_arrays, join, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
@@ -160,7 +160,12 @@ class Simulation:
         return self.engine_for(falls_back, self.num_saves).whole
 
     def __repr__(self) -> str:
-        return summary_of_prepared(self)
+        micro = f", of {self.scheme.num_micro} micro steps each" if self.scheme.num_micro > 1 else ""
+        lines = {
+            "macro steps": f"{self.num_steps} of {numbers(self.macro_dt)}{micro}",
+            "saved nodes": f"{self.num_saves + 1}, one every {self.save_every} macro steps",
+        }
+        return summary("Simulation, prepared: run() makes a Trajectory", lines | self.system.terms())
 
     def with_scheme(self, scheme: Scheme | Composition) -> "Simulation":
         """The same run by another scheme."""

@@ -1,20 +1,16 @@
 """What a run is, in a few lines: how many nodes of which times, its coordinates by name, and what it has kept."""
 
 from collections import Counter
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vmri_jax.mechanics.names import Names
-from vmri_jax.mechanics.summary import coordinates, listed, numbers, summary
+from vmri_jax.mechanics.summary import coordinates, listed
+from vmri_jax.running.saved_run import SavedRun
 from vmri_jax.steppers.results import Result
 
-if TYPE_CHECKING:
-    from vmri_jax.running.simulation import Simulation
-    from vmri_jax.running.trajectory import Trajectory
 
-
-def summary_of(run: "Trajectory") -> tuple[str, dict[str, str]]:
+def summary_of(run: SavedRun) -> tuple[str, dict[str, str]]:
     """Title and lines of the summary of a run, or of a batch of runs.
 
     Args:
@@ -36,21 +32,7 @@ def summary_of(run: "Trajectory") -> tuple[str, dict[str, str]]:
     }
 
 
-def summary_of_prepared(run: "Simulation") -> str:
-    """What a prepared run will do.
-
-    Args:
-        run: of `vmri_jax.prepare`.
-    """
-    micro = f", of {run.scheme.num_micro} micro steps each" if run.scheme.num_micro > 1 else ""
-    lines = {
-        "macro steps": f"{run.num_steps} of {numbers(run.macro_dt)}{micro}",
-        "saved nodes": f"{run.num_saves + 1}, one every {run.save_every} macro steps",
-    }
-    return summary("Simulation, prepared: run() makes a Trajectory", lines | run.system.terms())
-
-
-def named_coordinates(names: Names | None, run: "Trajectory") -> dict[str, str]:
+def named_coordinates(names: Names | None, run: SavedRun) -> dict[str, str]:
     """Lines on the slow and the fast coordinates of a run by name, plain names where none are known."""
     names = (names or Names()).of_coordinates(run.states.q_s.shape[-1], run.states.q_f.shape[-1])
     return {"slow": coordinates(names.slow_coordinates), "fast": coordinates(names.fast_coordinates)}

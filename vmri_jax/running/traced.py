@@ -2,19 +2,16 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 import jax
 
 from vmri_jax.running.adjoints import by_the_other, chosen, forward, one_or_other, reversible, telling
 from vmri_jax.running.engine import Engine
+from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import Trajectory
 
-if TYPE_CHECKING:
-    from vmri_jax.running.simulation import Simulation
 
-
-def traced_run(run: "Simulation", adjoint: str) -> Trajectory:
+def traced_run(run: Simulation, adjoint: str) -> Trajectory:
     """All steps of a run, some of whose arrays are tracers; `adjoint` as of `simulate`."""
     system, scheme, every = run.system, run.scheme, run.save_every
     arrays = run.arrays
