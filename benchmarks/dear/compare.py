@@ -30,8 +30,6 @@ RATIO = 2.0
 """From one number of macro steps to the next."""
 SLOWEST, SLOWEST_PEER = 60.0, 10.0
 """Seconds of a run of ours and of another program after which a ladder ends."""
-FINE_STEPS = 400
-"""Macro steps of order 8, of 170 micro steps each, that errors are measured against."""
 LONG = 5.0
 """Seconds of a run above which the run that tells its error is the sample of its time; a smaller value lets compilation count."""
 LINE = "kicks, N = 1"
@@ -50,7 +48,8 @@ class Case:
     degree: of one interval without micro steps; 0 for none, as where Newton's matrix is large.
     t_end: simulated time.
     errors: largest and smallest error of a ladder of steps.
-    first: macro steps of the first run.
+    first: macro steps of the first run, of compositions a sixteenth of it.
+    fine: macro steps of order 8, of 170 micro steps each, that errors are measured against.
     repeats: samples of each time.
     peers: whether other programs run it, too.
     """
@@ -64,6 +63,7 @@ class Case:
     t_end: float = 1.0
     errors: tuple[float, float] = (1e-2, 1e-7)
     first: int = 8
+    fine: int = 400
     repeats: int = 3
     peers: bool = True
 
@@ -96,14 +96,14 @@ def _cases(name: str) -> list[Case]:
             Case("spacecraft", flight, (1, 40), (), every=10, t_end=10.0, errors=near),
         ]
     both = ("suzuki4", "kahan-li6")
+    large: Any = {"num_micro": (1, 20, 40), "composed": (), "t_end": 0.25, "first": 16, "fine": 100, "peers": False}
     return [
         Case("64 molecules", partial(molecules, 64), (1, 20, 40), both, 10, errors=(1e-2, 3e-6), repeats=2),
         Case("network", teacher, (1, 5, 10, 20), both, 5, 6, errors=(1e-2, 1e-6)),
         Case("spacecraft", spacecraft, (1, 40, 100), both, 10, 6, 10.0, errors=(1e-2, 2e-6), first=64, repeats=2),
         Case("8 molecules", partial(molecules, 8), (1, 20, 40), (), errors=near, peers=False),
-        Case("256 molecules", partial(molecules, 256), (1, 40), (), 10, errors=near, first=64, repeats=1, peers=False),
         Case("16 molecules", partial(molecules, 16), (1, 5, 20, 40), both, 10, 6, errors=(1e-2, 1e-6)),
-        *(Case(f"{n} molecules", partial(molecules, n), (1, 20, 40), (), errors=near, peers=False) for n in (32, 128)),
+        *(Case(f"{n} molecules", partial(molecules, n), errors=near, **large) for n in (32, 128, 256)),
     ]
 
 
@@ -212,7 +212,7 @@ def measured(
 ) -> dict[str, Curve]:
     """Numbers of macro steps, errors of the positions at the end and milliseconds, by scheme."""
     tell(f"{case.title}, fine steps")
-    exact, _ = joined(Program(problem, vm.compose(vm.fully_explicit(10), "kahan-li8"), case.t_end)(FINE_STEPS))
+    exact, _ = joined(Program(problem, vm.compose(vm.fully_explicit(10), "kahan-li8"), case.t_end)(case.fine))
     runs: dict[str, Callable[[], object]] = {}
     errors: dict[str, dict[int, float]] = {}
     samples: dict[str, list[float]] = {}
@@ -235,7 +235,8 @@ def measured(
                 return
 
     for scheme, (of_scheme, integrator) in schemes(case, problem).items():
-        climb(scheme, _rungs(Program(of_scheme, integrator, case.t_end), case.first))
+        first = max(1, case.first // 16) if isinstance(integrator, vm.Composition) else case.first
+        climb(scheme, _rungs(Program(of_scheme, integrator, case.t_end), first))
     fastest = max(case.num_micro)
     for peer in peers:
         name = f"{peer}, N = {fastest}" if peer in FIXED_STEPS else peer
