@@ -8,7 +8,9 @@ NEWER ?= python3.13
 
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 # Workers take one core each: threads of BLAS for small matrices only get in their way.
-TOOLS := tests/benchmarks tests/pages tests/tools tests/ensembles/test_workers.py
+AS_USERS := tests/benchmarks tests/pages
+# Timed, or printed on a page: compiled as users compile.
+TOOLS := tests/tools tests/ensembles/test_workers.py
 
 .PHONY: reproduce test test-tools smoke notebooks docs bench lint lock clean
 
@@ -16,10 +18,11 @@ reproduce: .venv/installed  ## the quick reference study: figures, tables and ou
 	$(BIN)/python -m benchmarks gail2014 --quick --out out
 
 test: .venv/installed  ## the library; the same instructions, compiled without LLVM's optimisations: most of the time is compiling
-	$(PYTEST) --unoptimised $(addprefix --ignore=,tests/smoke $(TOOLS)) $(OPTIONS)
+	$(PYTEST) --unoptimised $(addprefix --ignore=,tests/smoke $(TOOLS) $(AS_USERS)) $(OPTIONS)
 
 test-tools: .venv/installed  ## benchmarks, notebooks, programs and commands of the pages, every tool on every small system, ensembles on workers
-	$(PYTEST) $(TOOLS) $(OPTIONS)
+	$(PYTEST) $(AS_USERS) $(OPTIONS)
+	$(PYTEST) --unoptimised $(TOOLS) $(OPTIONS)
 
 smoke:  ## a few minutes: every kind of step, with another environment, make smoke ENVIRONMENT=/path/to/venv
 	$(ENVIRONMENT)/bin/python -m pytest -n 2 tests/smoke

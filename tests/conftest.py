@@ -20,7 +20,7 @@ MANY_MAPS = 20_000
 MUCH_MEMORY = 1.2e9
 """Bytes of a process from which on compiled programs are forgotten after a file of tests. A larger value saves the compiling of the
 few programs that files share, and two workers need more than a small machine has."""
-LONGEST = ("textbook", "verification", "steppers")
+LONGEST = ("textbook", "verification", "steppers", "pages")
 """Folders whose files take longest come first, so that workers end together."""
 
 
