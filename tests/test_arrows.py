@@ -35,7 +35,9 @@ def sorted_modules(package: Path) -> list[str]:
         graphlib.CycleError: there is none; the error has the circle.
     """
     known = modules(package)
-    return list(TopologicalSorter({name: set(imports(path, known)) - {name} for name, path in known.items()}).static_order())
+    return list(
+        TopologicalSorter({name: set(imports(path, known)) - {name} for name, path in known.items()}).static_order()
+    )
 
 
 def test_the_imports_of_the_package_have_no_circle():

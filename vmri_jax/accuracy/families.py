@@ -15,7 +15,7 @@ class Family:
     """Schemes that differ only in num_micro.
 
     name: in tables and figures.
-    make: the scheme with so many micro steps (per stage, in a composition).
+    make: the scheme with a number of micro steps (per stage, in a composition).
     options: the same on the command line.
     python: the same in a program, with ``{}`` for num_micro.
     first: the num_micro that a search tries first.

@@ -12,7 +12,7 @@ from vmri_jax.running.files import check_place
 KINDS = ("body", "link", "spring", "solid")
 """What the number `kind` of a cell says."""
 CELLS = {3: "triangle", 4: "quad"}
-"""Polygons of so many corners; others are cut into triangles."""
+"""Numbers of corners that VTK has kinds of cells for; other polygons are cut into triangles."""
 
 
 def write_vtk(motion: Motion, path: str | Path) -> None:

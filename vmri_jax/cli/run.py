@@ -32,7 +32,7 @@ DEFAULT_SCHEME = "fully-implicit"
 SAVED_NODES = 1000
 """About as many nodes are saved by default."""
 DRAWN = 10_000
-"""At most so many nodes of a run on disk are drawn."""
+"""Most nodes of a run on disk that a figure has; more are not seen, and take longer to read."""
 
 app = typer.Typer()
 

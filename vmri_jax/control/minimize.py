@@ -76,7 +76,7 @@ def minimize(
             a coarser grid; zero if None.
         grid: controls for every macro interval, or for every micro interval.
         tolerance: of updates, gaps, the goal and limits, relative to the motion and to the controls.
-        max_iterations: at most so many linear-quadratic problems.
+        max_iterations: most linear-quadratic problems that are solved.
         progress: show cost and misses of each iteration as a bar; without it a line tells them now and then, where it takes more
             than two seconds.
 

@@ -92,7 +92,7 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
     Args:
         system, scheme: of the run; without forces and constraints that depend on time, since those keep no energy.
         trajectory: with every macro node saved, at least 2 k + 21 of them.
-        k: central differences take so many nodes on either side, and are of order 2 k.
+        k: nodes that central differences take on either side; they are of order 2 k.
 
     Raises:
         ValueError: forces, rheonomic constraints, a mollified scheme; nodes left out; too few of them; a run that failed.

@@ -18,11 +18,11 @@ from vmri_jax.running.store.identity import changed_conditions, describe, differ
 from vmri_jax.steppers.results import Result
 
 SECONDS = 1.0
-"""A chunk takes about so long, longer where there would be more than"""
+"""Seconds that a chunk of runs takes, about. With a larger value an interrupted ensemble loses more, with a smaller one workers wait for files."""
 MOST_CHUNKS = 20_000
-"""of them: a scheduler hands out some hundreds in a second, and each has its files. It"""
+"""Most chunks of an ensemble. Schedulers hand out some hundreds of tasks a second, and every chunk has its files: more chunks cost more than they compute."""
 MOST_BYTES = 2**26
-"""fits into so much memory,"""
+"""Most bytes of the results of a chunk; with larger ones a worker needs more memory."""
 PARTS = 64
 """and is at most such a part of all runs, so that workers share them evenly."""
 NANOSECONDS = {"explicit": 1.0, "implicit": 25.0, "constrained": 25.0}

@@ -39,8 +39,8 @@ NUM_MICRO = 5
 PHASE = 0.2
 """omega h of the fastest vibration: resolved, and omega H = 1 well below the first resonance."""
 LONGER, SLOWER = 8, 0.75
-"""A run shorter than the slowest motion has a trend without a drift: it is made so many times longer. A drift goes on at its rate there,
-what turns back or settles slows down to less than this part of it."""
+"""Factor by which a run is made longer if its energy has a trend, and the part of the rate of that trend above which it is a drift: a trend of the
+slowest motion turns back or settles in the longer run, a drift goes on."""
 ROUND_OFF_BAND = 1e-9
 """Bands of the energy below this are round-off."""
 SHADOW = 2_000

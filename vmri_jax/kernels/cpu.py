@@ -12,7 +12,7 @@ UNROLLED = 8
 TOGETHER = 3
 """Steps of that loop that are written out."""
 REGISTER = 4
-"""Numbers in a vector register: rows of so many fill them."""
+"""Numbers in a vector register; rows of matrices are padded to a multiple of it."""
 ELEMENTWISE = 16
 """Largest system that is eliminated by elementwise operations."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 Numbers: TypeAlias = Any
-"""Arrays in annotations: ``Float[Numbers, "n_s"]`` are so many floats, in an array of JAX or of NumPy."""
+"""Arrays in annotations: ``Float[Numbers, "n_s"]`` is an array of n_s floats, of JAX or of NumPy."""
 Number: TypeAlias = Float[Numbers, ""] | float
 """A number in annotations, of Python or as an array."""
 

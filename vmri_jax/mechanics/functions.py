@@ -9,8 +9,9 @@ from functools import lru_cache
 
 import jax
 
-AGAIN = 5
-"""So many functions of one piece of code, each compiled anew, are worth a warning."""
+COPIES_UNTIL_WARNING = 5
+"""Functions made of one piece of code, each compiled anew, until the user is warned; a larger value lets more time go by, a smaller one warns about
+a few cases that are meant."""
 
 
 NO_TIME = (
@@ -62,9 +63,9 @@ def _count(function: Callable) -> None:
     if code is None:
         return
     _made[code] += 1
-    if _made[code] == AGAIN:
+    if _made[code] == COPIES_UNTIL_WARNING:
         warnings.warn(
-            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been made {AGAIN} times, and "
+            f"the function {function.__name__} (line {code.co_firstlineno} of {code.co_filename}) has been made {COPIES_UNTIL_WARNING} times, and "
             "everything that contains it was compiled as often, since functions are compared by identity. Define it once, outside of "
             "the loop, and hand over what varies as params.",
             CompiledAgainWarning,

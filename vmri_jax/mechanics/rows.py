@@ -89,7 +89,7 @@ class Rows:
 
         Args:
             places: a single one gives a vector (size,), more give (n, size).
-            size: so many coordinates of each; None for all.
+            size: number of coordinates that are taken of each; None for all.
         """
         stride, runs = places[0].size, []
         for part, start, _ in places:

@@ -22,11 +22,12 @@ from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers,
 from vmri_jax.mechanics.system import System
 
 NOTICED, REFUSED = 1e-6, 1e-2
-"""Parts of the velocities against the constraints that are said, and that are refused."""
+"""Part of the velocities (in the norm of the kinetic energy) that violates the constraints: above the first a warning, above the second an error.
+Smaller values refuse starts that are rounded, larger ones pass over mistakes."""
 Layouts = tuple[by_name.Layout | None, by_name.Layout | None]
 """Of q_s and of q_f, None where these are vectors."""
-MOST = 0.85
-"""A part that is said where projecting it away is asked for."""
+LARGEST_PROJECTED = 0.85
+"""Part of the velocities that may be projected away without a word where that is asked for: more is hardly meant."""
 
 
 class State(eqx.Module):
@@ -114,7 +115,7 @@ def tell_of_velocities(what: str, taken: float, project: bool, constraints: str 
         f"{what}: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit {constraints}"
     )
     scenes = "of a scene, with_rates({joint: rate}) finds all that belong to the rate of a joint"
-    if project and taken > MOST:
+    if project and taken > LARGEST_PROJECTED:
         warnings.warn(f"{message}, and project=True has taken them away; {scenes}.", stacklevel=3)
     if project:
         return

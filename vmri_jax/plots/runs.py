@@ -13,7 +13,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.plots.theme import DARK, LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
 
 MOST_NAMED = 12
-"""Of more curves than this in one panel so many are named."""
+"""Most curves of a panel that the legend names; of more curves this number is named, evenly chosen."""
 BAND = 0.25
 """Opacity of bands of errors; more opaque ones hide the curves of other coordinates."""
 ROUNDOFF = 1e-13
@@ -161,7 +161,7 @@ def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error
 
 
 def _thin(t) -> float:
-    """Line width for so many nodes: oscillations must not run into a solid band."""
+    """Line width for a number of nodes: oscillations must not run into a solid band."""
     return 1.2 if len(t) <= 300 else 0.7
 
 

@@ -64,7 +64,7 @@ def chosen(adjoint: str, scheme: Scheme | Composition, num_steps: int, has_force
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def telling(kind: str, num_steps: int, arrays):
-    """The arrays; who differentiates by them is told what has been chosen."""
+    """Return the arrays, and warn once which adjoint was chosen if somebody differentiates by them."""
     return arrays
 
 

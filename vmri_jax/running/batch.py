@@ -25,7 +25,7 @@ from vmri_jax.steppers.solvers import Newton
 
 WORKING_SET = 4096
 """Fast and slow variables at all nodes of a macro step that the lanes of a chunk may have together, 32 kB."""
-FEWEST, MOST = 64, 1024
+FEWEST_LANES, MOST_LANES = 64, 1024
 """Lanes of a chunk. With fewer of them a lane takes longer, even where 64 do not fit into the cache."""
 
 
@@ -189,11 +189,11 @@ def lanes_at_once(run: Simulation) -> int:
     """The chunk that is chosen, a power of two: lanes that fit into the working set, but not too few."""
     nodes = run.scheme.num_micro * stage_scheme(run.scheme).degree
     size = nodes * (run.state.q_s.size + run.state.q_f.size)
-    return 2 ** int(np.log2(np.clip(WORKING_SET / size, FEWEST, MOST)))
+    return 2 ** int(np.log2(np.clip(WORKING_SET / size, FEWEST_LANES, MOST_LANES)))
 
 
 def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices: int) -> Trajectory:
-    """All lanes, so many at a time; the last ones are filled up with copies, so that one program does all."""
+    """All lanes, `width` at a time; the last chunk is filled up with copies of its last lane, so that one program computes all chunks."""
     lanes = len(batch["state"][0])
     width = min(width, -(-lanes // devices) * devices)
     program = _side_by_side(engine, batch["params"] is not None, batch["macro_dt"] is not None, devices)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from vmri_jax.steppers.solved import ROOT
 
 WHOLE = 1000
-"""Runs of so many steps are kept as a whole."""
+"""Most macro steps whose states are all kept for a derivative: a longer run would take more memory than computing states again takes time."""
 WIDTH = 100
 """Parts that are kept at a time, at every level of `Recursive`."""
 
@@ -23,7 +23,7 @@ class Loops:
         return jax.lax.fori_loop(0, count, step, carry)
 
     def scan(self, body: Callable, carry, count: int):
-        """``carry, y = body(carry, None)`` so many times, and the stacked y."""
+        """``carry, y = body(carry, None)``, `length` times, and the stacked y."""
         return jax.lax.scan(body, carry, length=count)
 
 

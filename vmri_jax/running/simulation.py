@@ -34,8 +34,8 @@ from vmri_jax.steppers.plan import Plan, plan, with_rules_for
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.solvers import Newton
 
-SHOWN = 50
-"""A run with a progress bar is computed in about so many parts."""
+PARTS_OF_A_BAR = 50
+"""Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
 STEPPING = "the run: it is compiled if it is the first of its kind, then stepped"
 FALLING_BACK = (
     "a step that the first method does not solve: the run is made again with exact matrices, compiled if they are new"
@@ -268,7 +268,7 @@ class Simulation:
         if progress is False:
             with Working(STEPPING):
                 return self._joined(self.advance(self.start(), self.num_saves)[0])
-        size, at, pieces = -(-self.num_saves // SHOWN), self.start(), []
+        size, at, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
         with interrupts_noted() as interrupted, progress_to("simulate", progress) as tell:
             for done in range(0, self.num_saves, size):
                 tell("simulating", done, self.num_saves)

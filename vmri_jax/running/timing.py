@@ -50,7 +50,7 @@ def interleaved(
 
 
 def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Mean seconds of so many calls; what they return is waited for."""
+    """Mean seconds of `calls` calls, results awaited."""
     start = clock()
     for _ in range(calls):
         jax.block_until_ready(run())

@@ -26,7 +26,7 @@ from vmri_jax.scene.terms import EffectTerm
 SEPARATION = 3.0
 """Smallest ratio of two neighbouring rates that separates slow from fast; without, one rate is enough for all."""
 SPAN = 1e3
-"""Rates slower than the fastest one by more than this count as slower by this: they are slow in any case."""
+"""Largest ratio of time scales that counts: slower effects are slow in any case, and would hide the gap between slow and fast ones."""
 
 
 class Rates(NamedTuple):

@@ -29,11 +29,11 @@ POINTS = (48, 384)
 RESOLUTION = 1e-5
 """Ends of windows are found to this part of the scan."""
 NEAR = 0.05
-"""Windows at most this part of the step away are near: frequencies move along a trajectory,"""
+"""Distance of a window of unstable steps, as a part of the step, up to which it counts as near: frequencies move along a trajectory."""
 WIDTHS = 3.0
-"""but no further than so many times their width, which grows with the coupling as their distance does."""
+"""Distance of a window, in its widths, up to which it counts as near: width and motion of a window both grow with the coupling."""
 BEYOND = 0.01
-"""Causes are looked for in steps longer by so much: V and W together reach a limit before each alone."""
+"""Part by which the step is longer in which causes are looked for: V and W together reach a limit before each alone."""
 SCANS = 5
 """Scans downwards, each over smaller steps, until there is a safe one."""
 

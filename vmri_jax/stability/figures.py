@@ -10,7 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm
 from vmri_jax.plots import LIGHT, NotebookFigure, Theme, new_figure, panel_grid
 from vmri_jax.stability.map import StabilityMap
 
-SHOWN = (1e-6, 1.0)
+GROWTHS_SHOWN = (1e-6, 1.0)
 """Growth per step from the faintest to the full colour."""
 COLUMNS = 3
 
@@ -29,7 +29,7 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
     columns = min(COLUMNS, len(maps))
     height = float(np.clip(0.9 + 0.17 * max(len(m.rows) for m in maps.values()), 1.6, 3.2))
     shades = LinearSegmentedColormap.from_list("growth", [theme.curves[4], theme.curves[1], theme.ink])
-    colors = ScalarMappable(LogNorm(*SHOWN, clip=True), shades)
+    colors = ScalarMappable(LogNorm(*GROWTHS_SHOWN, clip=True), shades)
     size = max(5.2, 0.9 + 2.9 * columns), 0.9 + height * math.ceil(len(maps) / columns)
     with new_figure(*size, title, theme) as figure:
         panels = panel_grid(figure, len(maps), columns)

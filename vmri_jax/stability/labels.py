@@ -6,7 +6,7 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.stability.linear import SmallMotions, small_motions
 
 FASTER = 2.0
-"""Slow variables that vibrate so many times faster than the fast ones are wrongly labelled."""
+"""Ratio of the fastest frequency of slow variables to that of fast ones above which the two are probably swapped."""
 
 
 def swapped(motions: SmallMotions, names: Names | None = None) -> tuple[str, float] | None:

@@ -14,7 +14,7 @@ from vmri_jax.running.origin import names_of
 from vmri_jax.stability.linear import small_motions
 from vmri_jax.study.table import Column, ResultTable
 
-SHOWN = 12
+ROWS_SHOWN = 12
 """Vibrations in the table, the fastest first."""
 NAMED = 3
 """Coordinates that are named for each vibration."""
@@ -61,12 +61,12 @@ class Vibrations(ResultTable):
 
     def shown(self) -> tuple[Vibration, ...]:
         """The fastest ones."""
-        return self.rows[:SHOWN]
+        return self.rows[:ROWS_SHOWN]
 
     @property
     def caption(self) -> str:
         """How many are left out, and whether the state is unstable."""
-        left = len(self.rows) - SHOWN
+        left = len(self.rows) - ROWS_SHOWN
         more = f"{left} slower ones are in .rows and .to_csv(path). " if left > 0 else ""
         grows = (
             f"Motion about this state grows by itself, like exp({self.growth_rate:.3g} t)." if self.growth_rate else ""

@@ -78,7 +78,7 @@ class Accepted(NamedTuple):
         return cls(newton.tolerance / SAFETY, *roundoff)
 
     def sizes(self, motions, iterations) -> tuple[Any, Any]:
-        """The changes (slow, fast) that are accepted with such motions after so many iterations."""
+        """The changes (slow, fast) that are accepted with these motions after this number of iterations."""
         numbers = jnp.finfo(float)
         rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny  # variables at rest have no size of their own
         late = (iterations >= PATIENCE) * 1

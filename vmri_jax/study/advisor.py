@@ -30,19 +30,19 @@ from vmri_jax.study.work import WorkPrecision, WorkRow, duration, timed_in_turn,
 
 NUM_MICRO = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 PATIENCE = 5.0
-"""A setting that takes so many times the best one is given up."""
+"""Time of a setting over that of the best one above which it is given up; a larger ratio searches longer."""
 KEPT = 4
 """Families that go to stage 2, settings that go to stage 3."""
 CLOSE = 1.1
 """The number of steps is found within this factor."""
 MARGIN = 10.0
-"""A target must lie so many times above the error of the reference."""
+"""Least ratio of the error asked for to that of the reference: below it, errors of runs are those of the reference."""
 SHOWN = 5
 """Settings that a recommendation and `vmri tune` print."""
 SHAKE = 0.01
 """Velocities of the other start differ by about this part: the motion is another one, with the same time scales."""
 LUCK = 2.0
-"""A setting whose error from another start is so many times larger was lucky; the next one is tried."""
+"""Ratio of the error from another start to that from the first one above which a setting was good by luck, and the next one is tried."""
 LONGEST = 5.0
 """Seconds of a run after which a setting is given up, whatever the others take."""
 MAX_STEPS = 2**22

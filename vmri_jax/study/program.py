@@ -18,7 +18,7 @@ from vmri_jax.steppers.solvers import Newton
 
 
 class Program:
-    """``program(num_steps)`` simulates `problem` over `t_end` in so many macro steps.
+    """``program(num_steps)`` simulates `problem` over `t_end` in num_steps macro steps.
 
     It is a `vmri_jax.prepare` whose step size follows from the number of steps, compiled when first called, once for all
     problems of the same structure. A run that fails is seen in the trajectory; nothing is raised.

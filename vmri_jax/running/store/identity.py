@@ -17,7 +17,7 @@ from vmri_jax.mechanics.system import KineticFunction, System
 from vmri_jax.running.simulation import Simulation
 
 IN_FULL = 8
-"""Arrays of so many numbers are compared in sight, larger ones by a digest."""
+"""Numbers of the largest array that is written out in a message about two runs that differ; larger ones are compared by a digest."""
 
 
 def identity(simulation: Simulation, start: State) -> dict[str, str]:

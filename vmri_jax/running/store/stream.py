@@ -25,11 +25,11 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
 
 PARTS = 100
-"""A run is written in so many chunks, if they are neither too short nor too large:"""
+"""Chunks of a run on disk; more of them lose less after a kill, and take more files."""
 LEAST_MICRO_STEPS = 1_000_000
-"""what takes a second or less is not worth a chunk,"""
+"""Fewest micro steps of a chunk, about a second: shorter chunks would spend their time on files."""
 MOST_BYTES = 2**26
-"""and a chunk has to fit well into memory."""
+"""Most bytes of a chunk, which is held in memory as a whole."""
 
 
 def stream(
