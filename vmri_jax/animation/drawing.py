@@ -24,7 +24,7 @@ KEYS = (
 BLOCK_KEYS = ("name", "coordinates", "labels")
 BODY_KEYS = ("name", "coordinates", "offset", "radius", "color", "shown")
 SOLID_KEYS = ("name", "coordinates", "corners", "faces", "color")
-SHOWN = ("ball", "name", "")
+FORMS_OF_CENTRES = ("ball", "name", "")
 KINDS = ("link", "spring")
 PACES = ("slow", "fast")
 
@@ -332,7 +332,7 @@ def _body(data: Any, where: str) -> Body:
     forms = tuple(_form(entry, where) for entry in coordinates)
     offset = numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
     shown = data.get("shown", "ball")
-    if shown not in SHOWN:
+    if shown not in FORMS_OF_CENTRES:
         raise ValueError(f"{where}: shown is {shown!r}; it must be 'ball', 'name' or ''.")
     return Body(str(data["name"]), forms, offset, radius, color, shown)
 
