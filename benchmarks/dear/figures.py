@@ -123,7 +123,9 @@ def _gain_panel(axes: Axes, gains: Sequence[Any], theme: plots.Theme) -> None:
             gain.price, gain.gain, "o" if are_molecules else "s", color=blue if are_molecules else orange, markersize=6
         )
         name = gain.title.removesuffix(" molecules")
-        axes.annotate(name, (gain.price, gain.gain), (6, -9), textcoords="offset points", fontsize=8.5)
+        on_the_left = gain.title == "network"  # which is as dear as the spacecraft
+        beside = {"xytext": (-7, -2) if on_the_left else (7, -2), "ha": "right" if on_the_left else "left"}
+        axes.annotate(name, (gain.price, gain.gain), textcoords="offset points", fontsize=8.5, **beside)
     axes.set(title=GAIN_TITLE, xlabel="price of V over the price of W", ylabel="single steps over micro steps")
     log_ticks(axes.yaxis, [1.0, *(gain.gain for gain in gains)])
     axes.yaxis.set_major_formatter("{x:g}")

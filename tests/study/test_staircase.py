@@ -78,6 +78,15 @@ def test_confirmed_runs_and_shares_of_a_search():
     assert 0 <= stairs[MICRO][0].fast_share < 0.5 < stairs[SINGLE][0].fast_share <= 1
 
 
+def test_single_steps_are_tried_beside_micro_steps():
+    problem = no_constraint()
+    kicks = of_order_2(vm.fully_explicit)
+    search = Search(problem, 1.0, [kicks], reference_solution(problem, 1.0, num_saves=1))
+    search.at(kicks, 5, 40)
+    confirm(search)
+    assert {(s.num_micro, s.num_steps) for s in search.settings.values()} == {(5, 40), (5, 60), (1, 200), (1, 300)}
+
+
 def test_bound_is_that_of_the_prices():
     stairs = {SINGLE: [Stair(ROW, 1e-3)], MICRO: [Stair(replace(ROW, num_micro=10), 1e-3)]}
     bound = bound_of(stairs, {SLOW: 9.0, FAST: 1.0})

@@ -34,6 +34,8 @@ KINDS = (SINGLE, MICRO, COMPOSED, INTERVALS)
 CONFIRMING = 1.3
 """Steps of the run that confirms another one, over those of the other: errors that are small by chance are so over a few percent of the steps. A larger
 factor needs more runs."""
+COMPARED = 2
+"""Runs of micro steps that single steps are tried beside; each takes up to the number of micro steps times as long."""
 MORE_STEPS = 1.5
 """Steps of runs that are made to confirm others, over those of the others."""
 
@@ -106,6 +108,7 @@ def confirm(search: "Search") -> None:
     Args:
         search: its runs; the new ones are added to them.
     """
+    _try_single_steps(search)
     best: list[Stair] = []
     settings = search.settings.values()
     for kind in KINDS:
@@ -121,6 +124,16 @@ def confirm(search: "Search") -> None:
         if most < CONFIRMING * num_steps:
             unit = search.reference.num_saves
             search.at(*known[scheme], unit * int(np.ceil(MORE_STEPS * num_steps / unit)))
+
+
+def _try_single_steps(search: "Search") -> None:
+    """Where no single steps were tried, as many as there are micro steps in the fastest runs of order 2: micro steps are held against them."""
+    settings = list(search.settings.values())
+    if any(kind_of(setting.row) == SINGLE for setting in settings):
+        return
+    of_micro = [s for s in settings if kind_of(s.row) == MICRO and np.isfinite(s.row.error_q)]
+    for setting in sorted(of_micro, key=lambda s: s.row.seconds)[:COMPARED]:
+        search.at(setting.family, 1, setting.num_steps * setting.num_micro)
 
 
 def with_shares(search: "Search", stairs: dict[str, list[Stair]]) -> dict[str, list[Stair]]:
