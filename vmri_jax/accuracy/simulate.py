@@ -96,7 +96,7 @@ def simulate(
     if accuracy is not None:
         steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
         end = _end(steps, t_end, save_every, save_micro, adjoint, num_saves)
-        best, settings = with_accuracy(system, scheme, state, solver, accuracy, end, num_saves, of)
+        best, settings = with_accuracy(system, scheme, state, solver, accuracy, t_end=end, num_saves=num_saves, of=of)
         run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
         if int(trajectory.failed_at) < 0:
             return with_error(run, trajectory, of, shares=error, halved=best.halved)

@@ -232,6 +232,7 @@ def with_accuracy(
     state: State | None,
     solver: Newton | None,
     accuracy: float,
+    *,
     t_end: float,
     num_saves: int | None,
     of: Callable | None = None,

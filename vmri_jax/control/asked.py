@@ -1,6 +1,7 @@
 """What is asked of an optimisation: checks of its arguments, and where it starts."""
 
 from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,11 @@ from vmri_jax.control.transcription import Transcription
 from vmri_jax.mechanics.arrays import real_array, whole_number
 from vmri_jax.mechanics.state import start_of
 from vmri_jax.running.simulation import prepare
+from vmri_jax.schemes.composition import Composition
+from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers import solvers
 from vmri_jax.steppers.plan import plan
+from vmri_jax.steppers.solvers import Newton
 
 
 def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, ...]]:
@@ -34,13 +38,33 @@ def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, .
     return actuate, tuple(f"u {i}" for i in range(num_controls)) if num_controls > 1 else ("u",)
 
 
-def transcribed(
-    problem, actuate, num_controls, cost, scheme, macro_dt, num_steps, final_cost, goal, limits, bounds, grid, solver
-) -> Transcription:
-    """The problem as it is transcribed; arguments as of `vmri_jax.control.minimize`."""
+class Aims(NamedTuple):
+    """What an optimal control is to reach, as of `vmri_jax.control.minimize`."""
+
+    cost: Callable
+    final_cost: Callable | None
+    goal: Callable | None
+    limits: Callable | None
+    bounds: Any
+
+
+class Grid(NamedTuple):
+    """The steps between which controls are held, as of `vmri_jax.control.minimize`."""
+
+    scheme: Scheme | Composition
+    macro_dt: float
+    num_steps: int
+    kind: Literal["macro", "micro"]
+    solver: Newton | None
+
+
+def transcribed(problem, actuate: Callable, num_controls: int, aims: Aims, grid: Grid) -> Transcription:
+    """The problem as it is transcribed, with controls that `actuate` makes forces of."""
+    cost, final_cost, goal, limits, bounds = aims
+    scheme, macro_dt, num_steps, kind, solver = grid
     whole_number("minimize: num_steps", num_steps)
-    if grid not in ("macro", "micro"):
-        raise ValueError(f"minimize: grid is {grid!r}; it must be 'macro' or 'micro'.")
+    if kind not in ("macro", "micro"):
+        raise ValueError(f"minimize: grid is {kind!r}; it must be 'macro' or 'micro'.")
     system, state = start_of("minimize", problem, None)
     params = {} if system.params is None else system.params
     if not isinstance(params, Mapping):
@@ -77,7 +101,7 @@ def transcribed(
         goal or unaimed,
         limits,
         _bounds(bounds, num_controls),
-        scheme.num_micro if grid == "micro" else 1,
+        scheme.num_micro if kind == "micro" else 1,
     )
 
 

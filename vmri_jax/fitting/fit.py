@@ -252,13 +252,13 @@ class _Search:
             self.shooting,
             u,
             misses,
-            by_parameters,
-            by_starts,
-            int(iterations),
-            bool(good),
-            float(gap),
-            squares,
-            partial(_again, self, u, z),
+            by_parameters=by_parameters,
+            by_starts=by_starts,
+            iterations=int(iterations),
+            converged=bool(good),
+            gap=float(gap),
+            squares=squares,
+            again=partial(_again, self, u, z),
         )
 
 

@@ -57,7 +57,7 @@ class Fit:
 
     @classmethod
     def of(
-        cls, shooting: Shooting, u, misses, by_parameters, by_starts, iterations, converged, gap, squares, again
+        cls, shooting: Shooting, u, misses, *, by_parameters, by_starts, iterations, converged, gap, squares, again
     ) -> "Fit":
         """From the end of a search."""
         unknowns = shooting.unknowns

@@ -234,7 +234,7 @@ def _of_accuracy(search: Search, error: float) -> WorkRow | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of runs that miss the accuracy: the page shows their error
         try:
-            best, settings = with_accuracy(problem, None, None, None, error, problem.t + t_end, saves)
+            best, settings = with_accuracy(problem, None, None, None, error, t_end=problem.t + t_end, num_saves=saves)
         except (ValueError, SimulationError):
             return None
     program = Program(problem, best.run.scheme, t_end, saves)
