@@ -34,7 +34,7 @@ def central_difference(function, x, step):
     return float((4 * d[1] - d[0]) / 3)
 
 
-def final_position(case: str, solver: Newton | None = None):
+def final_position(case: str, solver: solvers.Newton | None = None):
     """The sum of cosines of the fast positions after 10 steps as a function of ``(stiffness, v, q_f, macro_dt)``.
 
     The start has the velocities v, projected onto the constraints, and the fast positions q_f; by the march alone where no

@@ -296,8 +296,9 @@ def with_accuracy(
         )
     numbers = float(best.run.macro_dt), best.run.num_steps, best.run.save_every
     python = best.family.python.format(best.num_micro)
-    known = search.prices is not None and best.num_micro > 1
-    gain = search.prices.relative_time(1) / search.prices.relative_time(best.num_micro) if known else 1.0
+    gain, prices = 1.0, search.prices
+    if prices is not None and best.num_micro > 1:
+        gain = prices.relative_time(1) / prices.relative_time(best.num_micro)
     return best, Settings(best.run.scheme, python, best.family.options, *numbers, gain)
 
 

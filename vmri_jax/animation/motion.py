@@ -201,9 +201,10 @@ def _ending(trajectory: Trajectory, count: int) -> str:
 def _with_micro_nodes(trajectory: Trajectory, t, q, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes with the micro nodes between them, if the run kept those of all its macro steps and they are in order."""
     steps = len(t) - 1
-    if trajectory.t_micro is None or why_not(t, trajectory.t_micro[:steps]):
+    micro = trajectory.micro
+    if micro is None or why_not(t, micro.t[:steps]):
         return t, q, v
     n_s = np.shape(trajectory.states.q_s)[1]
     nodes = Nodes(t, q[:, :n_s], q[:, n_s:], v[:, :n_s], v[:, n_s:])
-    every = with_micro_nodes(nodes, trajectory.t_micro[:steps], trajectory.micro.q_f[:steps])
+    every = with_micro_nodes(nodes, micro.t[:steps], micro.q_f[:steps])
     return every.t, np.concatenate([every.q_s, every.q_f], axis=1), np.concatenate([every.v_s, every.v_f], axis=1)

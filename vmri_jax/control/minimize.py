@@ -19,7 +19,7 @@ from vmri_jax.mechanics.checks import check_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.origin import Origin, names_of
 from vmri_jax.running.progress import ShowsProgress, progress_to
-from vmri_jax.running.trajectory import RunInfo, Trajectory
+from vmri_jax.running.trajectory import RunInfo, Trajectory, with_origin
 from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
@@ -118,7 +118,8 @@ def minimize(
     converged = all(last[name] <= tolerance for name in ("update", "gap", "miss", "over"))
     u = point.u
     driven = setup.driven(u)
-    trajectory = _trajectory(setup, *search.rolled(u)).of(Origin(names_of(opened_problem), driven, driven.params))
+    origin = replace(Origin.of(driven), names=names_of(opened_problem))
+    trajectory = with_origin(_trajectory(setup, *search.rolled(u)), origin)
     controls, held = np.asarray(u), setup.times(num_steps)
     if grid == "macro":
         controls, held = controls[:, 0], held[:, 0]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from vmri_jax.catalogue import imported
 from vmri_jax.mechanics.names import near
-from vmri_jax.mechanics.state import Problem
+from vmri_jax.mechanics.state import Problem, State
 from vmri_jax.running.export import DIMENSIONS
 from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import RunInfo, Trajectory

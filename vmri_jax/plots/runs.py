@@ -23,14 +23,16 @@ ROUNDOFF = 1e-13
 class Run(Protocol):
     """Saved nodes of a run, (k,) and (k, n), and what is known of it, see `vmri_jax.Trajectory`."""
 
-    t: Any
-    q_s: Any
-    q_f: Any
-    p_f: Any
-    energy: Any
-    constraint_residual: Any
-    error: Any
-
+    @property
+    def states(self) -> Any: ...
+    @property
+    def t(self) -> Any: ...
+    @property
+    def energy(self) -> Any: ...
+    @property
+    def constraint_residual(self) -> Any: ...
+    @property
+    def error(self) -> Any: ...
     @property
     def names(self) -> Names: ...
     @property

@@ -81,7 +81,8 @@ class Exports(Quantities):
         rows = rows_of(run)
         parts = [("", rows["q_s"], rows["q_f"]), ("p ", rows["p_s"], rows["p_f"])]
         if run.origin.knows_system:
-            parts.insert(1, ("v ", *map(np.asarray, run.velocities)))
+            v_s, v_f = map(np.asarray, run.velocities)
+            parts.insert(1, ("v ", v_s, v_f))
         found = {"t": rows["t"]}
         for letter, slow, fast in parts:
             labels = [*names.slow_coordinates, *names.fast_coordinates]

@@ -228,7 +228,8 @@ class Quantities(ABC):
         """
         from vmri_jax.plots import plot_trajectory  # matplotlib takes half a second
 
-        return plot_trajectory(self.whole(), title)
+        run: Any = self.whole()
+        return plot_trajectory(run, title)
 
 
 def _known(what: str, run: SavedRun) -> SavedRun:

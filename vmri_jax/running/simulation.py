@@ -333,11 +333,9 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Newton | No
     useless = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if useless:
         warnings.warn(f"simulate: {useless}", stacklevel=3)
-    solver, scheme, system = of_one_type((solver or solvers.Auto(), scheme, system))
+    how, scheme, system = of_one_type((solver or solvers.Auto(), scheme, system))
     state, macro_dt = State(*_arrays(state)), _float(macro_dt)
-    return Simulation(
-        system, scheme, solver, state, macro_dt, num_steps, save_every, steps.save_micro, names_of(problem)
-    )
+    return Simulation(system, scheme, how, state, macro_dt, num_steps, save_every, steps.save_micro, names_of(problem))
 
 
 def _arrays(state: State) -> tuple:

@@ -140,7 +140,7 @@ def cost_study(
 
     try:
         for method in methods:
-            solver = vm.solvers.named(method)()  # pyright: ignore[reportArgumentType]
+            solver = solvers.named(method)()
             for n in num_micro:
                 progress(f"{label} {method}, {n} micro steps: compiling".strip(), len(runs), total)
                 num_steps = max(1, round(t_end / (n * micro_dt)))

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from vmri_jax.mechanics.state import Problem
-from vmri_jax.running.arguments import check_run
+from vmri_jax.running.arguments import Steps, check_run
 from vmri_jax.running.simulation import Simulation, prepare
 from vmri_jax.running.timing import MIN_SECONDS, interleaved
 from vmri_jax.running.trajectory import Trajectory
@@ -46,7 +46,8 @@ class Program:
     ):
         self.problem, self.scheme, self.t_end, self.num_saves = problem, scheme, float(t_end), num_saves
         self.solver, self.state, self.fallback = solver or solvers.Auto(), problem.state(), fallback
-        check_run(problem.system, scheme, self.state, self.solver, self.t_end / num_saves, None, num_saves, None, 1)
+        steps = Steps(self.t_end / num_saves, num_steps=num_saves)
+        check_run(problem.system, scheme, self.state, self.solver, steps)
         self.compile_seconds = float("nan")
 
     @cached_property
