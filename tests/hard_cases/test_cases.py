@@ -121,7 +121,7 @@ def test_reasons_are_about_their_own_row(make):
 @pytest.mark.full
 @pytest.mark.parametrize("make", [crane, readme_crane, hoist, damped, two_oscillators])
 def test_every_criterion_that_applies_is_met(make):
-    """At rest, driven or damped; a crane keeps its rope. The tests of pages run `vmri check` on the crane of the README."""
+    """At rest, driven or damped; a crane keeps its rope. The tests of pages run `vmri check` on the crane of the nutshell."""
     report = run_cases(cases_for(make()))
     assert report.passed, report.markdown()
     if make is crane:
