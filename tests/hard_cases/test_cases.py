@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.check.broken_systems import no_potential, swapped_labels, wrong_gradient
+from tests.hard_cases.broken_systems import no_potential, swapped_labels, wrong_gradient
 from tests.scene.gallery_scenes import SCENES, gallery_scene
 from tests.user_systems import two_oscillators
 from vmri_jax import ConstantMass, Problem, Rheonomic, System
