@@ -1,6 +1,5 @@
 """``vmri animate``: what it writes, which drawing it takes, and how it refuses."""
 
-import dataclasses
 import json
 import re
 from pathlib import Path
@@ -103,7 +102,7 @@ def test_pictures_by_their_suffix(vmri):
 def test_a_failed_run_is_drawn_up_to_there_and_says_so(vmri):
     broken = np.where(np.arange(41) < 25, 1.0, np.nan)[:, None]
     fields = {name: getattr(RUN, name) * broken for name in ("q_s", "q_f", "p_s", "p_f")}
-    dataclasses.replace(RUN, **fields, result=4, failed_at=24).save("failed.npz", PENDULUM)
+    RUN.with_arrays(**fields, result=4, failed_at=24).save("failed.npz", PENDULUM)
     code, text = vmri("failed.npz")
     assert code == 0
     assert "failed in macro step 24, after t = 2.4" in text

@@ -40,7 +40,7 @@ def test_cases_say_which_one_runs_where_nobody_listens(monkeypatch):
     works = []
     monkeypatch.setattr(Working, "__call__", lambda work, what, done, total: works.append(f"{work.name}: {what}"))
     run_cases(CASES)
-    assert works == ["run_cases: 1 steady", "run_cases: 2 broken"]
+    assert works == ["check: 1 steady", "check: 2 broken", "check: done"]
 
 
 def test_numbers_choose_cases_and_unknown_ones_are_refused():

@@ -169,7 +169,7 @@ def test_bad_input(changes, message):
 
 
 def test_a_system_by_name_needs_a_problem():
-    with pytest.raises(TypeError, match=r"q_f is a dictionary; give Problem"):
+    with pytest.raises(TypeError, match=r"q_f is a dictionary; give real numbers, or Problem"):
         vm.initial_state(CRANE_BY_NAME, [0.0], {"hook": [3.0, -4.0]}, [0.0], [0.0, 0.0])
     with pytest.raises(ValueError, match=r"sizes of these bodies are not known"):
         vm.initial_state(CRANE_BY_NAME, [0.0], [3.0, -4.0, 3.0, -5.0], [0.0], [0.0] * 4)

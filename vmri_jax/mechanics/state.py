@@ -72,8 +72,8 @@ def initial_state(
     for name, value in {"q_s": q_s, "q_f": q_f, "v_s": v_s, "v_f": v_f}.items():
         if isinstance(value, Mapping):
             raise TypeError(
-                f"initial_state: {name} is a dictionary; give Problem(system, q_s, q_f, v_s, v_f), which knows the order of the bodies, and "
-                "its .state()."
+                f"initial_state: {name} is a dictionary; give real numbers, or Problem(system, q_s, q_f, v_s, v_f).state(): a problem "
+                "knows the order of the bodies."
             )
     check_flags(project=project)
     t = check_number("t", t)

@@ -128,7 +128,9 @@ def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Pr
     if isinstance(progress, bool):
         return progress_shown() if progress else Working(name)
     if not callable(progress):
-        raise TypeError(f"{name}: progress is {progress!r}; give True, False, or a function of (what, done, total).")
+        raise TypeError(
+            f"{name}: progress is {progress!r}; it must be True or False, or a function of (what, done, total)."
+        )
     return nullcontext(progress)
 
 
