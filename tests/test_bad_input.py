@@ -94,11 +94,11 @@ def test_bad_vectors(fpu, changes, message):
 
 
 @pytest.mark.parametrize("junk", [None, "one", [1.0, "a"], [[1.0], [2.0, 3.0]], {"a": 1}, object(), 1j, 10**400])
-def test_what_is_no_number(fpu, junk):
+def test_what_is_no_number(fpu, junk: Any):
     for name in ("q_s", "v_f", "t", "tolerance"):
         with pytest.raises(TypeError, match=rf"{name} is .*; give (a )?real number"):
             start(fpu, **{name: junk})
-    masses = {"a": "heavy"} if isinstance(junk, dict) else junk  # masses may be given by name
+    masses: Any = {"a": "heavy"} if isinstance(junk, dict) else junk  # masses may be given by name
     with pytest.raises(TypeError, match=r"ConstantMass: fast(\['a'\])? is .*; give real numbers"):
         ConstantMass([1.0], masses)
     with pytest.raises(TypeError, match=r"affine: alpha is .*; give a real number"):

@@ -24,6 +24,7 @@ import equinox as eqx
 import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.system import label
 from vmri_jax.schemes.description import TERMS, Description
 from vmri_jax.schemes.path import control_nodes, lagrange_derivative
 from vmri_jax.schemes.quadrature import (
@@ -232,8 +233,8 @@ class Scheme(eqx.Module):
         fast += self.slow.gradient_corrected and self.fast.gradient_corrected  # in the term of both
         placed = self.kinetic, self.slow, self.fast, self.force, self.constraint, self.slow_constraint
         rules = {name: rule.in_words() for name, rule in zip(TERMS, placed, strict=True)}
-        rules |= {name: rule.in_words() for name, rule in self.potentials.items()}
-        evaluations = {name: _evaluations(rule, self.num_micro) for name, rule in self.potentials.items()}
+        rules |= {label(name): rule.in_words() for name, rule in self.potentials.items()}
+        evaluations = {label(name): _evaluations(rule, self.num_micro) for name, rule in self.potentials.items()}
         costs = slow, fast, free, 1, evaluations
         return Description(self.order, self.is_symmetric, rules, 1, self.num_micro, self.degree, *costs)
 
