@@ -1,0 +1,29 @@
+"""The face of the package: users' names in groups, and nothing else."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+import vmri_jax as vm
+
+
+def test_every_name_is_there_and_stands_in_a_group():
+    words = set(re.findall(r"\w+", vm.__doc__ or ""))
+    assert dir(vm) == sorted(vm.__all__)
+    for name in dir(vm):
+        assert getattr(vm, name) is not None
+        assert name in words, f"help(vmri_jax) does not name {name}"
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(AttributeError, match="module 'vmri_jax' has no attribute 'simulat'"):
+        vm.simulat  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_first_import_draws_nothing():
+    """matplotlib and scenes are imported when they are asked for."""
+    program = "import sys, vmri_jax as vm; print({'matplotlib', 'vmri_jax.scene'} & set(sys.modules)); vm.scene.Scene; vm.tune"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
