@@ -121,6 +121,8 @@ def test_arrays_of_any_shape():
     assert jax.tree.map(np.shape, run.q_f) == {"atoms": (4, 3, 3), "wall": (4,)}
     assert run.names.constraint == {"wall": 1}
     np.testing.assert_allclose(run.q_f["wall"], np.sin(run.t), atol=1e-14)
+    assert run.names.fast_coordinates[:4] == ["atoms[0] x", "atoms[0] y", "atoms[0] z", "atoms[1] x"]
+    assert run.names.fast_coordinates[-1] == "wall"
 
 
 def test_layouts_go_through_plain_data():
@@ -173,3 +175,14 @@ def test_a_system_by_name_needs_a_problem():
         vm.initial_state(CRANE_BY_NAME, [0.0], {"hook": [3.0, -4.0]}, [0.0], [0.0, 0.0])
     with pytest.raises(ValueError, match=r"sizes of these bodies are not known"):
         vm.initial_state(CRANE_BY_NAME, [0.0], [3.0, -4.0, 3.0, -5.0], [0.0], [0.0] * 4)
+
+
+def reaching(q_s, q_f, params):
+    return 0.0
+
+
+def test_a_fast_potential_of_slow_variables_is_told_where_stiff_springs_belong():
+    with pytest.raises(
+        TypeError, match=r"whatever a stiff spring joins is fast, also a heavy body.*potentials=\{'fast': W\}"
+    ):
+        vm.System(vm.ConstantMass([1.0], [1.0]), fast_potential=reaching)

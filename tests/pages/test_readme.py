@@ -33,7 +33,7 @@ def test_example_runs(tmp_path):
     assert num_micro > 1
     assert gain > 2  # measured 5.4 alone on a core; the clock of a busy one is noisy
     assert (tmp_path / "run.png").stat().st_size > 10_000
-    assert (tmp_path / "run.csv").read_text().startswith("t,atoms[0],atoms[1],")
+    assert (tmp_path / "run.csv").read_text().startswith('t,"atoms[0,0] x","atoms[0,0] y",')
 
 
 def test_the_program_of_the_nutshell_runs(tmp_path):

@@ -71,7 +71,7 @@ class Names:
         }
 
     def shaped(self, part: Part, vectors) -> Any:
-        """Vectors (..., n) as the user gave the start: a dictionary of arrays (..., *shape) by name, or the vectors themselves.
+        """Vectors (..., n) as the user gave the start: a dictionary of arrays by name, or the vectors themselves.
 
         Args:
             part: whether they are slow or fast.
@@ -163,9 +163,15 @@ class Names:
         return sizes
 
     def _coordinates(self, sizes: Mapping[str, int]) -> list[str]:
-        names = []
+        names, shapes = [], {name: shape for layout in self.layouts if layout for name, shape in layout.shapes}
         for name, size in sizes.items():
-            if name in self.rigid:
+            *rows, columns = shapes.get(name, (size,)) or (1,)
+            if rows:  # an array of points, as of all atoms: "atoms[3] x"; of anything else its indices
+                are_points = columns <= len(AXES)
+                for index in np.ndindex(*rows, *([] if are_points else [columns])):
+                    entry = f"{name}[{','.join(map(str, index))}]"
+                    names += [f"{entry} {axis}" for axis in AXES[:columns]] if are_points else [entry]
+            elif name in self.rigid:
                 parts = [name, *(f"{name} d{i}" for i in range(1, size // len(AXES)))]
                 names += [f"{part} {axis}" for part in parts for axis in AXES]
             elif name in self.numbered or size > len(AXES):

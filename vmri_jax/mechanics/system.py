@@ -34,6 +34,11 @@ ARGUMENTS = {
 """Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
 RESERVED = ("kinetic", "T", "T_s", "V", "W", "F", "g", "g_s", "path", "order", "solves")
 """Names of other terms and of rows of a scheme's description, which no potential in `System.potentials` may have."""
+FAST_ALONE = (
+    "It sees fast variables alone: whatever a stiff spring joins is fast, also a heavy body, and stands in q_f. Or give the function as "
+    "potentials={{'fast': W}}, which may join slow and fast variables on the micro grid."
+)
+"""What a fast potential of slow variables is told."""
 _INSTEAD = {
     "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
     "moving": "Rheonomic(function), whose function gets t first",
@@ -311,4 +316,6 @@ def _check_function(name: str, function, before: str = "") -> None:
         ) from None
     holonomic = name in ("constraint", "slow_constraint", "implied")
     instead = "" if name == "force" else NO_VELOCITY if holonomic else NO_TIME
+    if name == "fast_potential" and "q_s" in getattr(getattr(function, "__code__", None), "co_varnames", ()):
+        instead = FAST_ALONE
     check_arguments(f"System: {name}", function, before + ARGUMENTS[name], instead.format(**_INSTEAD))
