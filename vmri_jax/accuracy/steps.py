@@ -352,9 +352,8 @@ def _menu(scheme, system: System, start: State, accuracy: float, length: float) 
     num_micro = unit * -(-FIRST_MICRO // unit) if micro_steps_help(system, start) else 1
     kicks = base if name is None else base.composed(name), num_micro
     single = of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1
-    has_single = (
-        unit == 1 and start.q_s.size + start.q_f.size <= MOST_COORDINATES
-    )  # a single interval has no k-th micro node
+    # A single interval has no k-th micro node.
+    has_single = unit == 1 and start.q_s.size + start.q_f.size <= MOST_COORDINATES
     return [kicks, single] if has_single else [kicks]
 
 

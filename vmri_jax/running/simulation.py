@@ -219,8 +219,8 @@ class Simulation:
     @cached_property
     def _structures(self) -> tuple:
         """Structures of the `Model` with the first method, and with exact matrices."""
-        solvers = self.solver, self.solver.exact()
-        return tuple(jax.tree.structure(Model(solver, self.scheme, self.system)) for solver in solvers)
+        first_and_exact = self.solver, self.solver.exact()
+        return tuple(jax.tree.structure(Model(solver, self.scheme, self.system)) for solver in first_and_exact)
 
     def check(self, what: str = "simulate: the state", constraints: bool = True) -> None:
         """Refuse a system whose functions return something else than they should, and constraints that cannot be kept."""

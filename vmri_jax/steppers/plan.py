@@ -135,7 +135,7 @@ def plan(
     """
     system, state = start_of("plan", system, state)
     newton = solver or solvers.Auto()
-    falls_back = fallback and isinstance(newton, solvers.Auto) and newton.fixed_iterations is None
+    falls_back = fallback and newton.method == "auto" and newton.fixed_iterations is None
     choice, defers = _Choice(newton, falls_back, reverse_only), False
     if isinstance(newton, solvers.Custom):
         stepper: Stepper = newton.stepper(system, stage_scheme(scheme))
