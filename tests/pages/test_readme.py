@@ -31,7 +31,7 @@ def test_example_runs(tmp_path):
     ]
     num_micro, gain = (int(re.findall(r"explicit\((\d+)", done.stdout)[0]), float(numbers.findall(done.stdout)[-1]))
     assert num_micro > 1
-    assert gain > 2  # measured 5.4 alone on a core; the clock of a busy one is noisy
+    assert gain > 2  # measured 3.5 to 4.6, on a busy core, too
     assert (tmp_path / "run.png").stat().st_size > 10_000
     assert (tmp_path / "run.csv").read_text().startswith('t,"atoms[0,0] x","atoms[0,0] y",')
 

@@ -36,7 +36,7 @@ from vmri_jax.running.memory import check_memory
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
-from vmri_jax.running.timing import seconds_per_call
+from vmri_jax.running.timing import least_seconds
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
@@ -65,7 +65,7 @@ LEAST_TIME, LEAST_SHARE = 0.02, 1e-3
 """Least time of a grid over that of a macro step, and least slow share over the fast one: numbers of micro steps stay finite where a measured
 time or a share vanishes."""
 SAMPLES = 4
-"""Runs whose least time counts; with fewer of them a busy machine makes micro steps look dear or cheap by chance."""
+"""Runs whose least time counts; with fewer of them what runs between makes micro steps look dear or cheap by chance."""
 REPEATS = 5
 """Runs after the first one that may miss the accuracy before the search gives up."""
 RESONANT = 1e-6
@@ -107,7 +107,7 @@ class Trial:
     @cached_property
     def seconds(self) -> float:
         """Time of a macro step."""
-        return _seconds_of_a_step(self.run)
+        return _seconds_of_steps(self.run)[0]
 
     def steps_for(self, error: float) -> int:
         """Macro steps that keep this error, by the order of the scheme."""
@@ -211,11 +211,11 @@ class Search:
             return trial
         by_fast = extrapolated(p, trial.trajectory, finer_trajectory)
         fast, slow = (float(largest_of(part).max()) for part in (by_fast, trial.errors - by_fast))
-        of_two = _seconds_of_a_step(finer)
+        of_one, of_two = _seconds_of_steps(trial.run, finer)
         # b = (time(2 N) - time(N)) / N and a = time(N) - N b; noise of the clock must not make one of them zero
-        least = LEAST_TIME * trial.seconds
-        micro_seconds = max(of_two - trial.seconds, least) / num_micro
-        macro_seconds = max(trial.seconds - num_micro * micro_seconds, least)
+        least = LEAST_TIME * of_one
+        micro_seconds = max(of_two - of_one, least) / num_micro
+        macro_seconds = max(of_one - num_micro * micro_seconds, least)
         slow = max(slow, LEAST_SHARE * fast)
         self.prices = Prices(macro_seconds, micro_seconds, slow, num_micro**p * fast, p)
         best = (macro_seconds / micro_seconds * self.prices.fast / slow) ** (1 / (p + 1))
@@ -367,12 +367,12 @@ def _unit(system: System, scheme: Scheme) -> int:
     return math.lcm(scheme.unit, *(name for name, _ in system.potentials if isinstance(name, int)))
 
 
-def _seconds_of_a_step(run: Simulation) -> float:
-    """Seconds of a macro step: the difference of runs of n and of 2 n steps, without what a call takes besides."""
-    double = replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every)
-    samples = [[seconds_per_call(each.in_pieces, 1) for each in (run, double)] for _ in range(SAMPLES)]
-    once, twice = np.min(samples, axis=0)  # in turns, and the least: other programs only add time
-    return max(twice - once, 0.1 * twice) / run.num_steps
+def _seconds_of_steps(*runs: Simulation) -> np.ndarray:
+    """Seconds of a macro step of each run: the difference of runs of n and of 2 n steps, without what a call takes besides."""
+    doubles = [replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every) for run in runs]
+    seconds = least_seconds([each.in_pieces for each in (*runs, *doubles)], SAMPLES)
+    once, twice = np.reshape(seconds, (2, len(runs)))
+    return np.maximum(twice - once, 0.1 * twice) / [run.num_steps for run in runs]
 
 
 def _beside_resonances(search: Search, trial: Trial, num_steps: int) -> int:
