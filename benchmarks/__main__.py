@@ -1,7 +1,5 @@
 """Measurements of time and memory: each prints tables, writes JSON with machine and versions, and draws figures."""
 
-from contextlib import nullcontext
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +19,6 @@ from benchmarks import (
     ensembles,
     errors,
     floor,
-    fuzz,
     gpu,
     imports,
     instructions,
@@ -30,6 +27,7 @@ from benchmarks import (
     orders,
     peers,
     savings,
+    scenes,
     tricks,
     tuned,
 )
@@ -37,15 +35,12 @@ from benchmarks.gail2014.command import gail2014
 from benchmarks.hard_cases.command import hard
 from benchmarks.measure import prepare
 from benchmarks.report import console, progress
-from vmri_jax.ensembles.executors import local_workers
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__, pretty_exceptions_show_locals=False)
 
 Full = Annotated[bool, typer.Option("--full/--quick", help="All cases and more samples, or the few that show it.")]
 Core = Annotated[int | None, typer.Option(help="Core to keep to; by default the last one allowed, -1 for all.")]
 Out = Annotated[Path, typer.Option(help="Folder for the JSON files and the figures.")]
-Seed = Annotated[int, typer.Option(help="Other seeds are other systems.")]
-Table = StrEnum("Table", ("absence", "presence", "orders"))
 OUT = Path("out/benchmarks")
 
 app.command()(gail2014)
@@ -76,6 +71,7 @@ for _name, _module in {
     "orders": orders,
     "programs": instructions,
     "savings": savings,
+    "scenes": scenes,
 }.items():
     _plain_command(_name, _module)
 
@@ -230,65 +226,6 @@ def ensemble_kills_command(
 ) -> None:
     prepare()
     _measure("ensemble kills", ensemble_kills, False, out, workers=workers, mains=mains)
-
-
-@app.command("fuzz")
-def fuzz_command(
-    count: Annotated[int, typer.Option(min=1, help="Runs in all; those done before are kept.")] = 2000,
-    seed: Seed = 0,
-    limit: Annotated[
-        float, typer.Option(help="Seconds after which a run, compiling included, counts as a hang.")
-    ] = 600.0,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Workers of this machine, by Dask; one by default.")
-    ] = None,
-    reduce: Annotated[
-        int | None, typer.Option(help="Simplify this run, as long as it goes wrong in the same way.")
-    ] = None,
-    core: Core = None,
-    out: Out = OUT,
-) -> None:
-    """Random systems: how their runs end, and every one that ends wrong."""
-    prepare(core)
-    if reduce is not None:
-        for part in fuzz.reduce(seed, reduce, console.log):
-            console.print(part)
-        return
-    with progress("fuzz") as tell, nullcontext() if workers is None else local_workers(workers) as executor:
-        found = fuzz.fuzz(count, seed, out / f"fuzz_{seed}.jsonl", limit, tell, executor)
-    fuzz.table(found, console)
-    if wrong := fuzz.wrong(found):
-        console.print(f"\nsimplify one with: python -m benchmarks fuzz --seed {seed} --reduce {min(wrong)}")
-        raise typer.Exit(1)
-
-
-@app.command("oracle")
-def oracle_command(
-    count: Annotated[int, typer.Option(min=1, help="Systems.")] = 500,
-    seed: Seed = 0,
-    core: Core = None,
-    out: Out = OUT,
-) -> None:
-    """Random systems: every stepper against the textbook."""
-    prepare(core)
-    from benchmarks import oracle  # only now: the textbook starts JAX
-
-    _measure("oracle", oracle, False, out, count=count, seed=seed)
-
-
-@app.command("scenes")
-def scenes_command(
-    full: Full = False,
-    core: Core = None,
-    out: Out = OUT,
-    only: Annotated[list[Table] | None, typer.Option(help="Tables of scenes; may be repeated.")] = None,
-) -> None:
-    """What an effect costs that a scene does not have, a scene against a system by hand, orders under forces."""
-    prepare(core)
-    from benchmarks import scenes  # only now: bodies are arrays, which start JAX
-
-    for name in only or Table:
-        _measure(f"scenes, {name}", scenes.PARTS[name], full, out, markdown=True)
 
 
 @app.command("all")

@@ -104,7 +104,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Part:
-    """One table of a benchmark that has several, with what `python -m benchmarks` asks for."""
+    """One table of a benchmark that has several, with the names that `python -m benchmarks` asks for."""
 
     COLUMNS: tuple[str, ...]
     run: Callable[..., Iterator[Report]]

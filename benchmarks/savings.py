@@ -9,7 +9,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks.measure import Ratio, Tell, silent
 from benchmarks.report import Claim, Report
-from tests.scene.gallery_scenes import gallery_scene
+from benchmarks.scenes import gallery_scene
 from vmri_jax import plots
 from vmri_jax.study.program import Program, joined
 from vmri_jax.study.timing import interleaved

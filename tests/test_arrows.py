@@ -1,4 +1,4 @@
-"""Arrows of the package: a module imports from modules before it, so that the imports have no circle, lazy and typed-only ones included."""
+"""Imports: each module of the package imports from modules before it, lazy and typed-only imports included; benchmarks import no tests."""
 
 import ast
 from collections.abc import Iterator
@@ -49,6 +49,16 @@ def test_no_module_imports_the_face_of_the_package():
     for path in PACKAGE.rglob("*.py"):
         faces = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import)]
         assert not [path for node in faces for alias in node.names if alias.name == "vmri_jax"]
+
+
+def test_benchmarks_and_tests_stand_beside_each_other():
+    """Benchmarks import no test; tests of benchmarks, and of pages that print their commands, import benchmarks, and no others do."""
+    root = PACKAGE.parent
+    for folder, other, allowed in (("benchmarks", "tests", ()), ("tests", "benchmarks", ("benchmarks", "pages"))):
+        for path in (root / folder).rglob("*.py"):
+            if path.relative_to(root).parts[1] not in allowed:
+                nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+                assert not [path for node in nodes if (node.module or "").split(".")[0] == other], path
 
 
 def test_a_circle_is_seen(tmp_path):

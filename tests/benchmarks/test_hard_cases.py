@@ -1,7 +1,9 @@
 """Quick forms of the 28 hard cases: every criterion is met, and what a prototype measured is measured again."""
 
 import pytest
+from typer.testing import CliRunner
 
+from benchmarks.__main__ import app
 from benchmarks.hard_cases import catalogue
 
 CASES = catalogue()
@@ -29,3 +31,24 @@ def test_criterion_is_met(case):
     for (number, name), value in MEASURED.items():
         if number == case.number:
             assert outcome.values[name] == pytest.approx(value, rel=0.2)
+
+
+@pytest.fixture
+def prepared(monkeypatch):
+    """JAX runs already in this process."""
+    monkeypatch.setattr("benchmarks.hard_cases.command.prepare", lambda: None)
+
+
+@pytest.mark.usefixtures("prepared")
+def test_the_command_refuses_an_unknown_case():
+    result = CliRunner().invoke(app, ["hard", "--case", "99"])
+    assert result.exit_code == 2
+    assert "there is no case 99" in result.output
+
+
+@pytest.mark.usefixtures("prepared")
+def test_the_command_runs_a_case_and_writes_files(tmp_path):
+    result = CliRunner().invoke(app, ["hard", "--case", "27", "--out", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    assert "1 of 1 criteria met" in result.output
+    assert (tmp_path / "out" / "cases.md").read_text().count("\n") == 3

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.__main__ import app
 from vmri_jax.cli import app as vmri
 from vmri_jax.hard_cases import Case, Outcome, run_cases
 from vmri_jax.hard_cases.pictures import draw_energy
@@ -84,25 +83,6 @@ def test_a_case_that_does_not_apply_says_why_and_is_not_missed():
     assert report.passed
     assert report.rows[0].verdict == "does not apply"
     assert "it is driven | does not apply" in report.markdown()
-
-
-@pytest.fixture(autouse=True)
-def _prepared(monkeypatch):
-    """JAX runs already in this process."""
-    monkeypatch.setattr("benchmarks.hard_cases.command.prepare", lambda: None)
-
-
-def test_the_command_refuses_an_unknown_case():
-    result = CliRunner().invoke(app, ["hard", "--case", "99"])
-    assert result.exit_code == 2
-    assert "there is no case 99" in result.output
-
-
-def test_the_command_runs_a_case_and_writes_files(tmp_path):
-    result = CliRunner().invoke(app, ["hard", "--case", "27", "--out", str(tmp_path / "out")])
-    assert result.exit_code == 0, result.output
-    assert "1 of 1 criteria met" in result.output
-    assert (tmp_path / "out" / "cases.md").read_text().count("\n") == 3
 
 
 def test_vmri_check_judges_a_system_of_ones_own(tmp_path):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.scene.body_motions import accelerations, state_of
 from tests.scene.test_joint_coordinates import by_directors
 from vmri_jax.scene import (
     Box,
@@ -26,6 +25,7 @@ from vmri_jax.scene import (
     Scene,
     Universal,
 )
+from vmri_jax.scene.body_motions import accelerations, state_of
 
 PLATE = RigidBody("plate", 1.5, Box((0.4, 0.6, 0.2)), [0.3, 0.2, 0.1])
 HAND = RigidBody("hand", 0.5, Box((0.3, 0.1, 0.2)), [0.3, 0.7, 0.1])

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.scene.body_motions import accelerations, state_of
 from tests.scene.random_trees import random_scene
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.motion import motion as motion_of
@@ -35,6 +34,7 @@ from vmri_jax.scene import (
     angular_momentum,
     trees,
 )
+from vmri_jax.scene.body_motions import accelerations, state_of
 
 
 def by_directors(scene, moved):

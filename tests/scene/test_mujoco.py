@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
-from tests.scene.body_motions import accelerations as motions
-from tests.scene.body_motions import state_of
 from vmri_jax.scene import Fixed, Scene, Spherical
+from vmri_jax.scene.body_motions import accelerations as motions
+from vmri_jax.scene.body_motions import state_of
 from vmri_jax.scene.mujoco_fields import IDLE, READ, REFUSED
 from vmri_jax.scene.mujoco_model import Compiled
 

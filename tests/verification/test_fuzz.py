@@ -1,6 +1,6 @@
 """Random systems end in a valid trajectory, a named status or a refusal; and the verdict on them can fail.
 
-`python -m benchmarks fuzz` runs thousands of them over many structures; here are a few structures whose draws Hypothesis
+`python -m tests.fuzz` runs thousands of them over many structures; here are a few structures whose draws Hypothesis
 chooses, and shrinks where one ends wrong.
 """
 
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import vmri_jax as vm
-from benchmarks import fuzz
+from tests import fuzz
 from tests.verification import random_systems as rs
 from vmri_jax.running.trajectory import RunInfo, from_named_arrays
 

@@ -1,6 +1,8 @@
 """Random systems, most of them hard: every run ends in a valid trajectory, a named status or a clear refusal.
 
 Runs happen in a process of their own, which is replaced where it hangs or dies. Outcomes are written as they come.
+
+    python -m tests.fuzz --help
 """
 
 import dataclasses
@@ -10,21 +12,20 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import Future
 from pathlib import Path
 from random import Random
+from typing import Annotated
 
 import jax
 import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
 import vmri_jax as vm
-from benchmarks.measure import Tell, silent
 from tests.verification import random_systems as rs
-from vmri_jax.ensembles.executors import as_done, executor_of
-from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_versions, packed
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE, is_refusal
+from vmri_jax.running.timing import Tell, silent
 
 DRAWS = 50
 """Runs of a structure, which share its compiled programs."""
@@ -187,22 +188,7 @@ def outcomes(seed: int, runs: list[int], limit: float) -> Iterator[tuple[int, st
                 yield run, ended
 
 
-def outcomes_of_workers(seed: int, runs: list[int], executor) -> Iterator[tuple[int, str]]:
-    """The same computed by an executor; "crash" where workers died of a run, hangs are not noticed."""
-    with executor_of("fuzz", executor, None) as (tasks, room):
-
-        def submit(*together: int) -> Future:
-            call = packed("fuzz", (compute, (seed, together)))
-            return tasks.submit(*call_in_worker(known_versions(), call_packed, call))
-
-        for together, future in as_done(submit, room, calls(runs, seed)):
-            try:
-                yield from zip(together, future.result(), strict=False)
-            except Exception as error:
-                yield from ((run, f"crash: {type(error).__name__}") for run in together)
-
-
-def fuzz(count: int, seed: int, path: Path, limit: float, tell: Tell = silent, executor=None) -> dict[int, str]:
+def fuzz(count: int, seed: int, path: Path, limit: float, tell: Tell = silent) -> dict[int, str]:
     """Outcomes of the runs 0 to count - 1; those that `path` has are not computed again."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = path.read_text().splitlines() if path.exists() else []
@@ -210,9 +196,7 @@ def fuzz(count: int, seed: int, path: Path, limit: float, tell: Tell = silent, e
     for run in found:
         tell(f"run {run}")
     with path.open("a") as file:
-        left = [run for run in range(count) if run not in found]
-        ended = outcomes(seed, left, limit) if executor is None else outcomes_of_workers(seed, left, executor)
-        for run, outcome in ended:
+        for run, outcome in outcomes(seed, [run for run in range(count) if run not in found], limit):
             found[run] = outcome
             file.write(json.dumps({"run": run, "outcome": outcome}) + "\n")
             file.flush()
@@ -265,3 +249,31 @@ def reduce(seed: int, run: int, tell: Tell = silent) -> tuple[rs.Structure, rs.D
         if kind(outcome(*case)) == kind(wrong):
             structure, draw = case
     return structure, draw, outcome(structure, draw)
+
+
+def main(
+    count: Annotated[int, typer.Option(min=1, help="Runs in all; those done before are kept.")] = 2000,
+    seed: Annotated[int, typer.Option(help="Other seeds are other systems.")] = 0,
+    limit: Annotated[float, typer.Option(help="Seconds after which a run, compiling included, hangs.")] = 600.0,
+    reduced: Annotated[
+        int | None, typer.Option("--reduce", help="Simplify this run, as long as it goes wrong in the same way.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the outcomes.")] = Path("out/fuzz"),
+) -> None:
+    """Random systems: how their runs end, and every one that ends wrong."""
+    vm.configure()
+    console = Console()
+    if reduced is not None:
+        for part in reduce(seed, reduced, console.log):
+            console.print(part)
+        return
+    with console.status("fuzz") as status:
+        ended = fuzz(count, seed, out / f"fuzz_{seed}.jsonl", limit, status.update)
+    table(ended, console)
+    if bad := wrong(ended):
+        console.print(f"\nsimplify one with: python -m tests.fuzz --seed {seed} --reduce {min(bad)}")
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,10 @@
+"""The benchmark of scenes times a scene and the system written by hand."""
+
+from benchmarks import scenes
+
+
+def test_both_programs_are_timed():
+    (report,) = scenes.run(scenes.Size(("FPU l=3",), ("fully explicit",), 2, 2, 1e-3, 10), "quick")
+    assert [row["program"] for row in report.rows] == ["scene", "by hand"]
+    assert report.claims[0].at_most == scenes.MOST
+    assert "| FPU l=3 | fully explicit | scene |" in report.markdown(scenes.COLUMNS)
