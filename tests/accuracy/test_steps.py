@@ -46,7 +46,11 @@ def test_true_error_is_below_the_accuracy(name, accuracy):
 
 
 def test_a_scheme_of_ones_own_keeps_its_rules():
-    run = vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(2), accuracy=1e-4, t_end=LENGTH, error=True)
+    told = []
+    how = {"accuracy": 1e-4, "t_end": LENGTH, "error": True, "progress": lambda *call: told.append(call)}
+    run = vm.simulate(SYSTEMS["no_constraint"], vm.fully_explicit(2), **how)
+    assert told[0] == ("trial of own, 2 micro, 16 macro steps", 0, 5)
+    assert [done for _, done, _ in told] == [*range(len(told))]
     assert run.error.largest <= 1e-4
     assert run.settings.scheme == vm.fully_explicit(2).with_num_micro(run.settings.scheme.num_micro)
     assert "scheme.with_num_micro(" in repr(run)

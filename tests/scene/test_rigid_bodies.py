@@ -93,6 +93,23 @@ def test_a_steady_top_precesses_without_nutation_to_second_order():
 
 
 @pytest.mark.parametrize(
+    ("shape", "seen"),
+    [
+        (Box((1.0, 2.0, 3.0)), [1.0, 1.0, 1.0]),
+        (Box((1.0, 2.0, 0.0)), [1.0, 1.0, 1.0]),
+        (Rod(2.0), [1.0, 1.0, 0.0]),  # along z
+    ],
+)
+def test_angular_velocity_of_three_two_and_one_directors(shape, seen):
+    """A rod has no spin about itself."""
+    spin = np.array([0.3, -0.5, 0.7])
+    body = RigidBody("body", 3.0, shape, np.ones(3), spin=spin)
+    problem = Scene([body]).problem()
+    q, v = (np.concatenate([problem.q_s, problem.q_f]), np.concatenate([problem.v_s, problem.v_f]))
+    np.testing.assert_allclose(angular_velocity(q, v), spin * seen, atol=1e-14)
+
+
+@pytest.mark.parametrize(
     ("shape", "moments"),
     [
         (Box((1.0, 2.0, 3.0)), [13 / 6, 10 / 6, 5 / 6]),

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import vmri_jax as vm
+from tests.user_systems import double_pendulum
 from vmri_jax.schemes.discrete_lagrangian import lagrangian
 from vmri_jax.steppers.kicked import Kicked
+from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.stepper import Status, StepInfo, Stepper
 
 STEPS = {"macro_dt": 0.01, "num_steps": 20}
@@ -70,6 +72,48 @@ def test_compositions_batches_and_gradients(fpu):
     np.testing.assert_allclose(jax.grad(end)(omega), difference, rtol=1e-5)
 
 
+def by_march(system, scheme):
+    return Marched(vm.solvers.Arrowhead(), "arrowhead")
+
+
+def without_projection(system, scheme):
+    """A whole step that ends with the momenta of the discrete Legendre transform."""
+    whole = vm.plan(system, scheme, double_pendulum().state(), vm.solvers.Arrowhead()).stepper
+    return WithoutProjection(whole.inner)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@dataclasses.dataclass(frozen=True)
+class WithoutProjection(Stepper):
+    inner: Stepper
+
+    def init(self, state, macro_dt):
+        return self.inner.init(state, macro_dt)
+
+    def advance(self, state, memory, macro_dt):
+        return self.inner.advance(state, memory, macro_dt)
+
+    def describe(self):
+        return self.inner.describe()
+
+
+@pytest.mark.parametrize("scheme", [vm.explicit_slow(2), vm.compose(vm.explicit_slow(2), "suzuki4")])
+def test_a_solver_gets_the_kicks_and_the_projection(scheme):
+    """A solver of one's own solves the equations between the kicks; momenta end on the hidden constraints."""
+    pendulum = double_pendulum()
+    ours = vm.simulate(pendulum, scheme, solver=vm.solvers.Custom(by_march), **STEPS)
+    theirs = vm.simulate(pendulum, scheme, solver=vm.solvers.Arrowhead(), **STEPS)
+    np.testing.assert_allclose(ours.states.p_f, theirs.states.p_f, rtol=1e-13)
+    assert ours.constraint_residual.max() < 1e-12
+
+
+def test_momenta_of_a_whole_step_are_projected():
+    pendulum, scheme = double_pendulum(), vm.fully_implicit(2)
+    ours = vm.simulate(pendulum, scheme, solver=vm.solvers.Custom(without_projection), **STEPS)
+    theirs = vm.simulate(pendulum, scheme, solver=vm.solvers.Arrowhead(), **STEPS)
+    assert ours.constraint_residual.max() < 1e-12
+    np.testing.assert_allclose(ours.states.p_f, theirs.states.p_f, atol=1e-12)
+
+
 def nothing(system, scheme):
     return None
 
@@ -81,3 +125,8 @@ def test_bad_input(fpu):
         TypeError, match=r"the stepper of solvers.Custom is NoneType; give a vmri_jax.steppers.stepper.Stepper"
     ):
         vm.simulate(fpu, vm.fully_explicit(1), solver=vm.solvers.Custom(nothing), **STEPS)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(
+        ValueError,
+        match=r"advance of .* returns StepInfo.q_f_micro of shape \(1, 3\); it must be \(2, 3\) for num_micro = 2",
+    ):
+        vm.simulate(fpu, vm.fully_explicit(2), solver=EXACT, **STEPS)

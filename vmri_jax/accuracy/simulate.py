@@ -16,7 +16,7 @@ from vmri_jax.running.arguments import Steps
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.lost_energy import LostEnergyWarning, lost_energy
 from vmri_jax.running.memory import check_memory
-from vmri_jax.running.progress import ShowsProgress
+from vmri_jax.running.progress import ShowsProgress, progress_to
 from vmri_jax.running.simulation import simulation
 from vmri_jax.running.traced import traced_run
 from vmri_jax.running.trajectory import Trajectory, with_origin
@@ -70,8 +70,8 @@ def simulate(
         solver: how implicit equations are solved.
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
             NaN from the failure on.
-        progress: True for a bar, or a function that is told (what, done, total). Without it, and in trial runs for an accuracy, a run that takes more than two seconds says so by a line
-            now and then.
+        progress: True for a bar, or a function that is told (what, done, total), with an accuracy about every trial run. Without it a run that takes more than
+            two seconds says so by a line now and then.
         adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
             "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
         error: estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`. It takes two more runs: one with
@@ -96,7 +96,9 @@ def simulate(
     if accuracy is not None:
         steps = {"macro_dt": macro_dt, "micro_dt": micro_dt, "num_steps": num_steps}
         end = _end(steps, t_end, save_every, save_micro, adjoint, num_saves)
-        best, settings = with_accuracy(system, scheme, state, solver, accuracy, t_end=end, num_saves=num_saves, of=of)
+        length = {"t_end": end, "num_saves": num_saves}
+        with progress_to("simulate", progress) as tell:
+            best, settings = with_accuracy(system, scheme, state, solver, accuracy, **length, of=of, progress=tell)
         run, trajectory = best.run, replace(best.trajectory, origin=replace(best.run.origin, settings=settings))
         if int(trajectory.failed_at) < 0:
             return with_error(run, trajectory, of, shares=error, halved=best.halved)

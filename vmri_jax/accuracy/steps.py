@@ -33,6 +33,7 @@ from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps
 from vmri_jax.running.memory import check_memory
+from vmri_jax.running.progress import Progress, silent
 from vmri_jax.running.run_error import largest_of
 from vmri_jax.running.settings import Settings
 from vmri_jax.running.simulation import Simulation, simulation
@@ -66,6 +67,8 @@ LEAST_TIME, LEAST_SHARE = 0.02, 1e-3
 time or a share vanishes."""
 SAMPLES = 4
 """Runs whose least time counts; with fewer of them what runs between makes micro steps look dear or cheap by chance."""
+USUAL_TRIALS = 5
+"""Trial runs of a usual search, which a bar of progress starts from; with another number the bar moves too fast or too slowly."""
 REPEATS = 5
 """Runs after the first one that may miss the accuracy before the search gives up."""
 RESONANT = 1e-6
@@ -145,11 +148,19 @@ class Search:
         make: a `Simulation` of a scheme, of a single macro step.
         length: time that is simulated, s.
         num_saves: saved intervals; None for at most `SAVED`.
+        progress: told before every trial run.
     """
 
-    def __init__(self, make: Callable[[Scheme | Composition], Simulation], length: float, num_saves: int | None):
-        self.make, self.length, self.num_saves = make, length, num_saves
+    def __init__(
+        self,
+        make: Callable[[Scheme | Composition], Simulation],
+        length: float,
+        num_saves: int | None,
+        progress: Progress = silent,
+    ):
+        self.make, self.length, self.num_saves, self.progress = make, length, num_saves, progress
         self.runs: dict[tuple[str, int], Simulation] = {}
+        self.num_trials = 0
         self.prices: Prices | None = None
 
     def saving(self, num_steps: int) -> tuple[int, int]:
@@ -190,6 +201,9 @@ class Search:
         """
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
+            total = max(USUAL_TRIALS, self.num_trials + 1)
+            self.progress(f"trial of {family.label(num_micro)}, {run.num_steps} macro steps", self.num_trials, total)
+            self.num_trials += 1
             before = time.perf_counter()
             trajectory, halved = run.in_pieces(), companion(run, run.scheme, 2)
             seconds = time.perf_counter() - before
@@ -238,6 +252,7 @@ def with_accuracy(
     t_end: float,
     num_saves: int | None,
     of: Callable | None = None,
+    progress: Progress = silent,
 ) -> tuple[Trial, Settings]:
     """The trial whose largest estimated error of a position is at most `accuracy`, and its settings.
 
@@ -248,6 +263,7 @@ def with_accuracy(
         accuracy: in the unit of the positions.
         num_saves: saved intervals, equally spaced; None for at most `SAVED`.
         of: function of a run, refused before the trials if it returns no numbers.
+        progress: told before every trial run.
 
     Raises:
         TypeError: not a scheme.
@@ -272,7 +288,7 @@ def with_accuracy(
         check_function_of_run(of, True, run)
         return run
 
-    search = Search(make, length, num_saves)
+    search = Search(make, length, num_saves, progress)
     menu = _menu(scheme, opened_system, start, accuracy, length)
     trials = search.first_trials(menu)
     extent = max(extent_of(trial.trajectory) for trial in trials)

@@ -358,13 +358,17 @@ def quaternion(q):
 
 
 def angular_velocity(q, v):
-    """``omega = sum_i d_i x d_i' / 2`` in space, (..., 3) rad/s.
+    """``omega`` of ``d_i' = omega x d_i``, in space, (..., 3) rad/s, from directors d_i of length 1.
+
+    Their sum of ``d_i x d_i' = (1 - d_i d_i^T) omega`` is solved for omega. A body with two directors, a plate, has all three components; a
+    body with one, a rod, has no spin about itself, and gets the omega across it.
 
     Args:
-        q, v: (..., 12) coordinates and velocities, ``run.position("hub")`` and ``run.velocity("hub")``.
+        q, v: (..., 12), (..., 9) or (..., 6) coordinates and velocities, ``run.position("hub")`` and ``run.velocity("hub")``.
     """
     (_, d), (_, rate) = split(np.asarray(q)), split(np.asarray(v))
-    return np.sum(np.cross(d, rate), axis=-2) / 2
+    matrix = np.sum(np.eye(3) - d[..., :, None] * d[..., None, :], axis=-3)
+    return np.squeeze(np.linalg.pinv(matrix, hermitian=True) @ np.sum(np.cross(d, rate), axis=-2)[..., None], -1)
 
 
 def angular_momentum(q, p):

@@ -119,9 +119,14 @@ class Kicked(Stepper):
         projected = ["momenta projected onto the hidden constraints"] if self.projects else []
         if not self.kicks:
             return [*self.inner.describe(), *projected]
-        names = ", ".join(term.name for term in self.kicks)
+        places = {
+            "both ends": [term.name for term in self.kicks if term.start is not None and term.end is not None],
+            "the start": [term.name for term in self.kicks if term.end is None],
+            "the end": [term.name for term in self.kicks if term.start is None],
+        }
         averaged = ", at averaged fast positions" if self.average is not None else ""
-        return [f"kicks of {names} at both ends{averaged}", *indented(self.inner.describe()), *projected]
+        kicks = [f"kicks of {', '.join(names)} at {place}{averaged}" for place, names in places.items() if names]
+        return [*kicks, *indented(self.inner.describe()), *projected]
 
 
 @dataclass(frozen=True)

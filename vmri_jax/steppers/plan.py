@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from vmri_jax.kernels import COLLOCATES, DEFERS_PROJECTION, DRIFTS, Sparsity
-from vmri_jax.mechanics.checks import check_type
 from vmri_jax.mechanics.constraint_pattern import all_rows
 from vmri_jax.mechanics.state import Movable, State, start_of
 from vmri_jax.mechanics.structure import depends_on
@@ -35,6 +34,7 @@ from vmri_jax.steppers import solvers
 from vmri_jax.steppers.collocation import Collocation
 from vmri_jax.steppers.composed import Composed
 from vmri_jax.steppers.coupled import Coupled
+from vmri_jax.steppers.custom import whole_step
 from vmri_jax.steppers.decoupled import Decoupled
 from vmri_jax.steppers.free_flight import FreeFlight
 from vmri_jax.steppers.interval import SMALL, Interval, implicit_terms
@@ -131,15 +131,16 @@ def plan(
         reverse_only: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:
-        ValueError: "nested" is asked for where it is not possible; a scheme that the system does not allow.
+        ValueError: `Nested` is asked for where it is not possible; a scheme that the system does not allow.
     """
     system, state = start_of("plan", system, state)
     newton = solver or solvers.Auto()
     falls_back = fallback and newton.method == "auto" and newton.fixed_iterations is None
     choice, defers = _Choice(newton, falls_back, reverse_only), False
     if isinstance(newton, solvers.Custom):
-        stepper: Stepper = newton.stepper(system, stage_scheme(scheme))
-        check_type("plan: the stepper of solvers.Custom", stepper, Stepper, "a vmri_jax.steppers.stepper.Stepper")
+        stage = stage_scheme(scheme)
+        average = _average(system, stage, replace(choice, newton=solvers.Auto(), falls_back=False))
+        stepper: Stepper = whole_step(newton.stepper(system, stage), system, stage, state, average, reverse_only)
     else:
         kicked = _whole_step(system, stage_scheme(scheme), choice, state.q_s, state.q_f)
         defers = _defers_projection(kicked)
@@ -188,9 +189,8 @@ def _between_kicks(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) ->
     rows = all_rows(system, q_s, q_f)
     if newton.method == "nested" and not can_be_nested:
         raise ValueError(
-            "Newton: method 'nested' needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the "
-            "macro nodes or at every k-th micro node; a term of this scheme has other nodes inside the macro interval. Take 'auto' or "
-            "'arrowhead'."
+            "solvers.Nested needs a ConstantMass, and potentials and forces on the micro grid or as kicks at the macro nodes or at every "
+            "k-th micro node; a term of this scheme has other nodes inside the macro interval. Take solvers.Auto() or solvers.Arrowhead()."
         )
     if _is_drift(system, scheme) and not system.is_constrained:
         return FreeFlight(system)

@@ -116,8 +116,8 @@ class Custom(Newton):
         vm.simulate(chain, scheme, solver=vm.solvers.Custom(rotation), macro_dt=0.01, num_steps=100)
 
     Args:
-        stepper: a function of a module, ``stepper(system, scheme) -> vmri_jax.steppers.stepper.Stepper``; of a composition it gets the
-            scheme of a stage. It is called while JAX traces the run, so that runs, batches, files and gradients work as with other solvers.
+        stepper: a function of a module, ``stepper(system, scheme)``, that returns a `vmri_jax.steppers.stepper.Stepper` for the whole step or
+            a `vmri_jax.steppers.solved.Solver` for the equations between the kicks; of a composition it gets the scheme of a stage. It is called while JAX traces the run, so that runs, batches, files and gradients work as with other solvers.
     """
 
     method = "custom"

@@ -1,0 +1,101 @@
+"""The whole step of a stepper or solver of one's own: kicks and the projection of momenta, where it leaves them out, and its shapes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from vmri_jax.mechanics.checks import check_type
+from vmri_jax.mechanics.constraint_pattern import all_rows
+from vmri_jax.mechanics.projection import project_momentum
+from vmri_jax.mechanics.state import State
+from vmri_jax.mechanics.system import System
+from vmri_jax.schemes.discrete_lagrangian import lagrangian
+from vmri_jax.schemes.scheme import Scheme
+from vmri_jax.steppers.kicked import Kicked
+from vmri_jax.steppers.solved import Solved, Solver
+from vmri_jax.steppers.stepper import StepInfo, Stepper
+
+
+@dataclass(frozen=True)
+class Projecting(Stepper):
+    """A stepper that has no `project`, with the projection of momenta onto the hidden constraints."""
+
+    inner: Stepper
+    system: System
+
+    def init(self, state: State, macro_dt) -> Any:
+        return self.inner.init(state, macro_dt)
+
+    def renew(self, state: State, memory, macro_dt) -> Any:
+        return self.inner.renew(state, memory, macro_dt)
+
+    def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
+        return self.inner.advance(state, memory, macro_dt)
+
+    def project(self, state: State, memory) -> tuple[State, Any]:
+        p_s, p_f, _, _ = project_momentum(self.system, state)
+        return State(state.t, state.q_s, state.q_f, p_s, p_f), memory
+
+    def continued(self, memory, last, state: State, macro_dt) -> Any:
+        return self.inner.continued(memory, last, state, macro_dt)
+
+    def describe(self) -> list[str]:
+        return self.inner.describe()
+
+
+def whole_step(
+    made: Stepper | Solver, system: System, scheme: Scheme, state: State, average: Callable | None, reverse_only: bool
+) -> Kicked:
+    """The step with all that a run needs.
+
+    The equations that a `Solver` and `Solved` solve are those between the kicks, so that the kicks of the scheme are put around them;
+    any other stepper makes the whole step. With constraints every step ends with momenta on the hidden ones.
+
+    Args:
+        made: what the function of `Custom` returned.
+        system, scheme, state: scheme of a stage; of the state only the shapes matter.
+        average: of mollified kicks, see `Kicked`.
+        reverse_only: see `Solved`.
+
+    Raises:
+        TypeError: neither a stepper nor a solver.
+        ValueError: results of other shapes than the state and the scheme have.
+    """
+    if isinstance(made, Solver):
+        made = Solved(system, scheme, made, all_rows(system, state.q_s, state.q_f), reverse_only)
+    check_type("plan: the stepper of solvers.Custom", made, Stepper, "a vmri_jax.steppers.stepper.Stepper")
+    if isinstance(made, Solved):
+        made = Kicked(lagrangian(system, scheme).kicks, made, average)
+    if not isinstance(made, Kicked):
+        made = Kicked((), made)
+    if system.is_constrained and type(made.inner).project is Stepper.project:
+        made = replace(made, inner=Projecting(made.inner, system))
+    made = replace(made, projects=system.is_constrained)
+    _check_shapes(made, system, scheme, state)
+    return made
+
+
+def _check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State) -> None:
+    """Refuse results of other shapes than those of a step."""
+    (n_g, n_gs), n_f, r = system.num_constraints(state.q_s, state.q_f), state.q_f.size, scheme.degree
+
+    def step(state: State):
+        end, info, _ = stepper.step(state, stepper.init(state, 1.0), 1.0)
+        return end, info
+
+    end, info = jax.eval_shape(step, state)
+    expected = {f"State.{name}": np.shape(getattr(state, name)) for name in ("t", "q_s", "q_f", "p_s", "p_f")}
+    micro = scheme.num_micro
+    expected |= {"StepInfo.q_f_micro": (micro, n_f), "StepInfo.multiplier": (micro, r, n_g)}
+    expected |= {"StepInfo.slow_multiplier": (r, n_gs)}
+    for name, shape in expected.items():
+        of, field = name.split(".")
+        came = np.shape(getattr(end if of == "State" else info, field))
+        if came != shape:
+            raise ValueError(
+                f"plan: advance of the stepper of solvers.Custom returns {name} of shape {came}; it must be {shape} for num_micro = {micro}, "
+                f"degree = {r}, {n_g} constraints and {n_gs} slow ones."
+            )
