@@ -119,11 +119,10 @@ class Kicked(Stepper):
         projected = ["momenta projected onto the hidden constraints"] if self.projects else []
         if not self.kicks:
             return [*self.inner.describe(), *projected]
-        places = {
-            "both ends": [term.name for term in self.kicks if term.start is not None and term.end is not None],
-            "the start": [term.name for term in self.kicks if term.end is None],
-            "the end": [term.name for term in self.kicks if term.start is None],
-        }
+        places: dict[str, list[str]] = {"both ends": [], "the start": [], "the end": []}
+        for term in self.kicks:
+            at_start, at_end = (w is not None and not (is_concrete(w) and w == 0) for w in (term.start, term.end))
+            places["both ends" if at_start and at_end else "the start" if at_start else "the end"].append(term.name)
         averaged = ", at averaged fast positions" if self.average is not None else ""
         kicks = [f"kicks of {', '.join(names)} at {place}{averaged}" for place, names in places.items() if names]
         return [*kicks, *indented(self.inner.describe()), *projected]
