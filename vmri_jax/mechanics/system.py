@@ -107,6 +107,7 @@ class System(eqx.Module):
         constraint=None,
         slow_constraint=None,
         force=None,
+        *,
         params=None,
         implied=None,
         slow_kinetic=None,
