@@ -20,10 +20,10 @@ CONSTRAINT_TOLERANCE = 1e-6
 
 
 def check_arrays(**arrays):
-    """Arrays as float64 vectors; slow and fast velocities shaped like their positions; finite where concrete."""
+    """Arrays as float64 vectors, of JAX if they are, else of NumPy; velocities shaped like their positions; finite where concrete."""
     out = {}
     for name, value in arrays.items():
-        array = jnp.asarray(real_array(name, value))
+        array = real_array(name, value)
         if array.ndim != 1:
             raise ValueError(f"{name} has shape {array.shape}; it must be a vector of coordinates, shape (n,).")
         if is_concrete(array) and not np.isfinite(array).all():
@@ -39,7 +39,7 @@ def check_arrays(**arrays):
 
 def check_number(name: str, value):
     """A finite real number, as an array of shape ()."""
-    array = jnp.asarray(real_array(name, value, 0))
+    array = real_array(name, value, 0)
     if is_concrete(array) and not np.isfinite(array):
         raise ValueError(f"{name} is {value}; it must be finite.")
     return array

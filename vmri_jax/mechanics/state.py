@@ -84,8 +84,7 @@ def initial_state(
         check_mass(system, q_s, q_f)
     if project:
         q_s, q_f = _projected_positions(system, t, q_s, q_f)
-    *momenta, taken = _momenta(system, t, q_s, q_f, v_s, v_f)
-    state = State(t, q_s, q_f, *momenta)
+    state, taken = _consistent(system, t, q_s, q_f, v_s, v_f)
     if is_concrete(state):
         advice = (
             "projection did not reach the constraints; start closer to them."
@@ -297,15 +296,15 @@ def start_of(what: str, system, state=None) -> tuple[System, State]:
 
 
 @jax.jit
-def _momenta(system, t, q_s, q_f, v_s, v_f):
-    """Consistent momenta, and the part of the velocities that constraints take away; what functions return is checked while tracing."""
+def _consistent(system, t, q_s, q_f, v_s, v_f):
+    """The state with consistent momenta, and the part of the velocities that constraints take away; what functions return is checked while tracing."""
     check_system(system, q_s, q_f)
     given = legendre(system, q_s, q_f, v_s, v_f)
     p_s, p_f, *velocities = project_momentum(system, State(t, q_s, q_f, *given), (v_s, v_f))
     v, kept, p, kept_p = (jnp.concatenate(a) for a in ((v_s, v_f), velocities, given, (p_s, p_f)))
     size = v @ p
     part = jnp.where(size > 0, (v - kept) @ (p - kept_p) / jnp.where(size > 0, size, 1.0), 0.0)
-    return p_s, p_f, jnp.sqrt(jnp.maximum(part, 0.0))
+    return State(t, q_s, q_f, p_s, p_f), jnp.sqrt(jnp.maximum(part, 0.0))
 
 
 _projected_positions = jax.jit(project_positions)

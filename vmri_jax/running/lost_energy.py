@@ -50,7 +50,7 @@ def lost_energy(run: Trajectory, macro_dt: float) -> str:
     slow = _kinetic(system.kinetic.slow_mass, np.asarray(run.states.p_s)[nodes])
     fast = _kinetic(system.kinetic.fast_mass, np.asarray(run.states.p_f)[nodes])
     kinetic = (slow + fast).max()
-    if not change[worst] > max(LOST * kinetic, _kinetic_of_roundoff(run, macro_dt)):
+    if not change[worst] > LOST * kinetic or not change[worst] > _kinetic_of_roundoff(run, macro_dt):
         return ""
     if not change[worst] > ROUNDOFF * np.max(at_nodes(_size_of_terms, run.origin, _states(run, nodes))):
         return ""
