@@ -91,7 +91,7 @@ def test_body(arguments, message):
         (
             [A, B],
             [RigidLink(("bob", "tip"), 2.0)],
-            "links: length of bob-tip is 2; it starts as 1; give that, move a body",
+            "links: length of bob-tip is 2; it starts as 1; give this value, move a body",
         ),
         (
             [A, B],
@@ -101,7 +101,7 @@ def test_body(arguments, message):
         (
             [A, B],
             [MovingPivot("tip", still, 7.0)],
-            "moving_pivots: length of tip is 7; it starts as .*; give that, move a body",
+            "moving_pivots: length of tip is 7; it starts as .*; give this value, move a body",
         ),
         ([A, B], [MovingPivot("tip", still, -2.0)], "moving_pivots: length is -2.0; it must be positive"),
         (SPACE[:1], [MovingPivot("w", still)], r"moving_pivots: path returns shape \(2,\); w has dimension 3"),
@@ -120,7 +120,7 @@ def test_body(arguments, message):
         (
             [B],
             [Anchor("tip", [0.0, 0.0], 3.0)],
-            "anchors: length of tip is 3; it starts as 1; give that, move a body",
+            "anchors: length of tip is 3; it starts as 1; give this value, move a body",
         ),
         (
             [Body("block", 1.0, np.ones(5)), Body("b", 1.0, np.zeros(5))],

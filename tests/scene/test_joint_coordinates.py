@@ -293,7 +293,7 @@ def test_joints_of_a_loop_follow_those_that_are_named():
     ):
         scene.with_joints({"pin 0": 0.5, "pin 1": 0.0})
     with pytest.raises(
-        ValueError, match=r"stays open by \d\.\d+\. It is kept up to pin 3 at 0\.24; give values within"
+        ValueError, match=r"stays open by \d\.\d+\. It is kept up to pin 3 at 0\.24; give values up to there"
     ):
         scene.with_joints({"pin 3": 0.4})
 

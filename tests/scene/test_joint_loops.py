@@ -95,7 +95,10 @@ def hinge(name, pairs=("ground", "bar")):
 @pytest.mark.parametrize(
     ("joints", "message"),
     [
-        ([hinge("pin"), hinge("pin")], r"the name 'pin' occurs twice; give each body and effect its own, e.g. name="),
+        (
+            [hinge("pin"), hinge("pin")],
+            r"the name 'pin' occurs twice; give each body and effect its own name, e.g. name=",
+        ),
         (
             [hinge("pin"), hinge("again", ("bar", "ground"))],
             r"again bar-ground \[0\].* are 5 constraints of rank 0; joints join the same bodies: bar and ground by pin and again; leave one",

@@ -64,11 +64,11 @@ def bennett(alpha=0.6, beta=1.1, turned=1.2):
 )
 def test_rows_that_depend_on_others_at_the_start_alone_are_not_dropped(parts, message):
     with pytest.raises(
-        ValueError, match=f'redundant="drop" would change the motion: {message}.*Bend what lies in line'
+        ValueError, match=f'redundant="drop" would change the motion: {message}.*Bend bodies that lie in line'
     ):
         Scene(*parts, redundant="drop")
     with pytest.raises(
-        ValueError, match=f"over-constrained at the start: .*; nor can any be left out: {message}"
+        ValueError, match=f"over-constrained at the start: .*; leaving one out would change the motion: {message}"
     ) as refused:
         Scene(*parts)
     assert "drop" not in str(refused.value)

@@ -10,6 +10,7 @@ from vmri_jax.scene.effects.custom import Constraint, CustomEffect, Force, Kinet
 from vmri_jax.scene.effects.damping import Dashpot, LinearDamping, QuadraticDrag, RayleighDamping
 from vmri_jax.scene.effects.drives import ConstantForce, Drive, FollowerForce, HarmonicDrive
 from vmri_jax.scene.effects.fields import Gravity, MagneticField
+from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import (
     JointDamper,
     JointDrive,
@@ -21,7 +22,6 @@ from vmri_jax.scene.effects.joint_effects import (
 from vmri_jax.scene.effects.joints import (
     Cylindrical,
     Fixed,
-    Joint,
     Planar,
     Prismatic,
     Revolute,

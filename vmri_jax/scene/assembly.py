@@ -13,45 +13,47 @@ from vmri_jax.scene.terms import FUNCTIONS, IMPLIED, JOINTS, MASS, Actuation, Dr
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
-    """The system of these bodies with these effects; functions, constraints and forces that nothing calls for are None.
+    """The system of bodies and effects; a function without effects is None.
 
     Args:
-        sorting: bodies at their places.
+        sorting: of the scene.
         placed: the effects, all of the sorting or some.
     """
-    bodies, where = sorting.bodies, sorting.layout
+    bodies, layout = sorting.bodies, sorting.layout
     potentials: dict[str, tuple] = {}
     terms: dict[Any, list] = {}
-    for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):  # forces may build on potentials
-        name, made = part.effect.name, part.effect.terms(part.elements, bodies, where, potentials)
+    # potentials first: a damping force may need the terms of the potentials
+    for part in sorted(placed, key=lambda part: part.effect.kind != "potential"):
+        name, of_effect = part.effect.name, part.effect.terms(part.elements, bodies, layout, potentials)
         if part.effect.kind == "potential":
-            potentials[name] = (*potentials.get(name, ()), *made)
-        terms.setdefault(part.home, []).extend([SomeRows(made, part.dropped)] if part.dropped else made)
+            potentials[name] = (*potentials.get(name, ()), *of_effect)
+        terms.setdefault(part.home, []).extend([SomeRows(of_effect, part.dropped)] if part.dropped else of_effect)
         if part.dropped:
-            terms.setdefault("implied", []).append(DroppedRows(made, part.dropped))
-    if where.kinematics is not None:
+            terms.setdefault("implied", []).append(DroppedRows(of_effect, part.dropped))
+    # with joint coordinates the masses depend on positions, so that T is a function even without kinetic effects
+    if layout.kinematics is not None:
         terms.setdefault("kinetic", [])
-    if "kinetic" in terms and where.sizes[0]:
+    if "kinetic" in terms and layout.sizes[0]:
         terms["slow_kinetic"] = []
     functions: dict[str, Any] = {
-        home: FUNCTIONS[home](tuple(terms[home]), _kinematics(home, terms[home], where))
+        home: FUNCTIONS[home](tuple(terms[home]), _kinematics(home, terms[home], layout))
         for home in FUNCTIONS
         if terms.get(home) or ("kinetic" in home and home in terms)
     }
-    named = [home for home in terms if home == "fast" or isinstance(home, int)]
-    if named:
+    rates = [home for home in terms if home == "fast" or isinstance(home, int)]  # potentials with a rate of their own
+    if rates:
         functions["potentials"] = {
-            home: FUNCTIONS["slow_potential"](tuple(terms[home]), _kinematics("potentials", terms[home], where))
-            for home in named
+            rate: FUNCTIONS["slow_potential"](tuple(terms[rate]), _kinematics("potentials", terms[rate], layout))
+            for rate in rates
         }
     for home in ("constraint", "slow_constraint", "implied"):
         if any(term.timed for term in terms.get(home, ())):
             functions[home] = Rheonomic(functions[home])
     params: dict[str, Any] = {part.effect.name: part.effect.parameters(bodies) for part in placed}
-    slow, fast = (join(bodies, where, part, "masses") for part in ("s", "f"))
+    slow, fast = (join(bodies, layout, part, "masses") for part in ("s", "f"))
     if "kinetic" in functions:
         params[MASS] = {"slow": slow, "fast": fast}
-    if where.kinematics is not None:
+    if layout.kinematics is not None:
         params[JOINTS] = sorting.joints
     if "implied" in functions:
         params[IMPLIED] = np.concatenate([part.sizes for part in placed])
@@ -60,21 +62,22 @@ def build(sorting: Sorting, placed: Sequence[Placed]) -> System:
 
 
 def actuation(sorting: Sorting) -> Actuation | None:
-    """The forces of the controls of a scene, None where nothing is controlled.
+    """The forces of the controls of a scene, None if it has no controls.
 
     Args:
-        sorting: bodies at their places, effects at their homes.
+        sorting: of the scene.
     """
     controls = [part for part in sorting.placed if part.home == "control"]
-    made = [part.effect.terms(part.elements, sorting.bodies, sorting.layout, {}) for part in controls]
-    terms = tuple(term for (term,) in made)
+    of_effects = [part.effect.terms(part.elements, sorting.bodies, sorting.layout, {}) for part in controls]
+    terms = tuple(term for (term,) in of_effects)
     names = tuple(part.effect.components(sorting.bodies) for part in controls)
     return Actuation(terms, _kinematics("control", terms, sorting.layout), names) if controls else None
 
 
 def _kinematics(home: str, terms: Sequence, layout: Layout) -> Kinematics | None:
-    """The kinematics, unless the terms take nothing but coordinates of the scene; of a kinetic energy then those of its own bodies."""
+    """The map from q to Q that a function with these terms needs; None if its terms depend on coordinates of the scene alone."""
     if layout.kinematics is None or not all(term.within(layout.sizes) for term in terms):
         return layout.kinematics
-    own = {"kinetic": layout.kinematics.of_fast, "slow_kinetic": layout.kinematics.of_slow}
-    return own.get(home)
+    # a kinetic energy needs in any case the bodies on joints whose masses are part of it
+    of_energies = {"kinetic": layout.kinematics.of_fast, "slow_kinetic": layout.kinematics.of_slow}
+    return of_energies.get(home)

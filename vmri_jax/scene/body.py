@@ -1,4 +1,4 @@
-"""Bodies: points of a scene, blocks of general coordinates, and what effects see of a body."""
+"""Bodies: points of a scene, blocks of general coordinates, frames, the ground, and the points of a body that effects act on."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
@@ -13,33 +13,33 @@ from vmri_jax.mechanics.arrays import is_concrete, real_array
 
 Pace = Literal["slow", "fast", "auto"]
 LARGEST_POINT = 3
-"""Coordinates of a point at most."""
+"""Most coordinates of a point; a body with more is a block of general coordinates."""
 GROUND = "ground"
-"""What effects call the body that does not move."""
+"""Name in effects of the body that does not move."""
 GROUND_COORDINATES = np.concatenate([np.zeros(3), np.eye(3).ravel()])
-"""Its coordinates as those of a rigid body."""
+"""The twelve coordinates (phi, d_1, d_2, d_3) of the ground as a rigid body."""
 
 
 class Attachment(str):
     """The name of a rigid body, and a point that is fixed in it; users write ``("hub", [0.5, 0, 0])``."""
 
-    at: Any
-    """(3,) from the centre of mass, in the axes of the body; of the ground (d,), in space."""
+    offset: Any
+    """(3,) m from the centre of mass to the point, in the axes of the body; for the ground (d,) m, in space."""
 
-    def __new__(cls, body: str, at: Any):
+    def __new__(cls, body: str, offset: Any):
         attached = super().__new__(cls, body)
-        attached.at = real_array(f"the point in {body}", at, 1)
+        attached.offset = real_array(f"the point in {body}", offset, 1)
         return attached
 
     @property
     def label(self) -> str:
         """``hub (0.5, 0, 0)``."""
-        numbers = ", ".join(f"{x:g}" for x in self.at) if is_concrete(self.at) else "a point"
+        numbers = ", ".join(f"{x:g}" for x in self.offset) if is_concrete(self.offset) else "a point"
         return f"{self} ({numbers})"
 
 
 def is_entry(item: Any) -> bool:
-    """Whether it names a body, or a body and a point in it."""
+    """Whether the item is the name of a body, or a pair of a name and a point in this body."""
     if isinstance(item, str):
         return True
     pair = isinstance(item, tuple | list) and len(item) == 2 and isinstance(item[0], str)
@@ -52,19 +52,19 @@ def entry(item: Any) -> str:
 
 
 def label_of(name: str) -> str:
-    """How messages and drawings call a body or a point in one."""
+    """The name of a body, or of a point in a body, in messages and drawings."""
     return name.label if isinstance(name, Attachment) else name
 
 
 def moving(names: Iterable[str]) -> tuple[str, ...]:
-    """Those of bodies that move, each once: all but the ground."""
+    """The names without repetitions and without the ground."""
     return tuple(dict.fromkeys(str(name) for name in names if name != GROUND))
 
 
 class Point(NamedTuple):
-    """What an effect between points sees of a body.
+    """A body, or a point in a body, as an effect between points takes it.
 
-    mass: None of a point that is only a part of a body.
+    mass: of the whole body; None for a point in a body.
     """
 
     name: str
@@ -79,15 +79,16 @@ class Point(NamedTuple):
 
 
 class AnyBody(ABC):
-    """What every body of a scene says.
+    """Base class of bodies.
 
     Attributes:
         name, pace: see `Body`.
-        coordinates, rates, masses: (n,) at the start, and the masses of ``sum_i m_i v_i^2 / 2``.
-        block: its coordinates are general ones, not those of points.
-        rigid: they are those of a rigid body.
-        rotation: (3, 3) its axes in space at the start as columns; None of what has no axes.
-        wide: which directors are among its coordinates.
+        coordinates, rates: (n,) q and v at the start.
+        masses: (n,) m of the kinetic energy ``sum_i m_i v_i^2 / 2``.
+        block: whether its coordinates are general ones, not the position of a point.
+        rigid: whether its coordinates are a centre and directors.
+        rotation: (3, 3) axes of the body in space at the start as columns; None for a body without axes.
+        wide: numbers of the directors that are among its coordinates.
     """
 
     name: str
@@ -118,23 +119,23 @@ class AnyBody(ABC):
 
     @property
     def motions(self) -> np.ndarray:
-        """(n, f) basis of the velocities that its own constraints allow at the start."""
+        """(n, f) basis of the velocities that the rigidity of the body allows at the start."""
         return np.eye(self.size)
 
-    def weights(self, at: Any) -> Any:
-        """(3,) of the directors in a point ``phi + sum_i X_i d_i`` that is fixed in the body.
+    def weights(self, offset: Any) -> Any:
+        """(3,) components X along the directors of a point ``phi + sum_i X_i d_i`` that is fixed in the body.
 
         Args:
-            at: as of `point`.
+            offset: (3,) m from the centre of mass, in the axes of the body.
         """
-        return joined([at, np.zeros(3 - at.shape[0])])
+        return joined([offset, np.zeros(3 - offset.shape[0])])
 
     @abstractmethod
-    def point(self, at: Any = None) -> Point:
-        """The point itself, or a point fixed in the body.
+    def point(self, offset: Any = None) -> Point:
+        """The centre of the body, or a point fixed in it, at the start.
 
         Args:
-            at: (3,) from the centre of mass, in the axes of the body; None for the centre itself.
+            offset: (3,) m from the centre of mass, in the axes of the body; None for the centre.
         """
 
     @abstractmethod
@@ -142,7 +143,7 @@ class AnyBody(ABC):
         """The same body with other velocities.
 
         Args:
-            rates: (n,) of its coordinates.
+            rates: (n,) rates of its coordinates at the start.
         """
 
     def _check_names(self) -> None:
@@ -151,20 +152,20 @@ class AnyBody(ABC):
             raise ValueError(f"{kind}: name is {self.name!r}; it must be a string that is not empty.")
         if self.name == GROUND:
             raise ValueError(
-                f"{kind}: name is {GROUND!r}, which effects call the body that does not move; take another."
+                f"{kind}: name is {GROUND!r}, which effects call the body that does not move; take another name."
             )
         if self.pace not in ("slow", "fast", "auto"):
             raise ValueError(f"{kind} {self.name}: pace is {self.pace!r}; it must be 'slow', 'fast' or 'auto'.")
 
-    def _numbers(self, name: str, given):
-        """Numbers as an array of float64, of NumPy where they are not traced: so the mode of JAX does not matter."""
-        what = f"{type(self).__name__} {self.name}: {name}"
-        value = real_array(what, given)
-        if not is_concrete(value):
-            return value
-        if not np.isfinite(value).all():
-            raise ValueError(f"{what} is {np.asarray(value)}, which is not finite.")
-        return np.asarray(value)
+    def _numbers(self, name: str, argument):
+        """An argument as an array of float64; of NumPy unless it is traced, so that the precision does not depend on JAX's mode."""
+        about = f"{type(self).__name__} {self.name}: {name}"
+        numbers = real_array(about, argument)
+        if not is_concrete(numbers):
+            return numbers
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"{about} is {np.asarray(numbers)}, which is not finite.")
+        return np.asarray(numbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,18 +175,18 @@ class Body(AnyBody):
     Its kinetic energy is ``sum_i m_i v_i^2 / 2``.
 
     Args:
-        name: what effects call it.
-        mass: kg, positive; one for all coordinates, or (n,) one for each.
-        position: (n,) at the start, n = 1, 2, 3 for a point. A number is a vector of length one.
+        name: of the body in effects.
+        mass: kg, positive; a number for all coordinates, or (n,).
+        position: (n,) at the start, n = 1, 2, 3 and in m for a point. A number is a vector of length one.
         velocity: (n,) at the start; at rest by default.
-        pace: "slow" coordinates take macro steps, "fast" ones micro steps; "auto" lets the scene decide from
+        pace: "slow" coordinates take macro steps, "fast" coordinates micro steps; "auto" lets the scene decide from
             estimates of frequencies.
-        radius: how large it is drawn, in the unit of its position; by default as suits the picture. Of no effect on the
-            motion: contacts have a radius of their own.
-        block: its coordinates are general ones, not those of a point; more than three always are.
+        radius: of the drawn ball, m; by default the drawing chooses it. It does not change the motion: contacts have an argument
+            `radius` of their own.
+        block: the coordinates are general ones, not the position of a point; always so for more than three.
 
     Raises:
-        TypeError: what is no real number.
+        TypeError: an argument that is no real number.
         ValueError: an empty name, a mass or radius that is not positive, numbers that are not finite or of float32,
             shapes that do not match, another pace.
     """
@@ -219,8 +220,8 @@ class Body(AnyBody):
         for name, value in (("position", position), ("velocity", velocity), ("mass", mass), ("block", block)):
             object.__setattr__(self, name, value)
 
-    def _vector(self, name: str, given):
-        value = self._numbers(name, given)
+    def _vector(self, name: str, argument):
+        value = self._numbers(name, argument)
         value = value[None] if value.ndim == 0 else value
         if value.ndim != 1 or not value.size:
             raise ValueError(f"Body {self.name}: {name} has shape {value.shape}; give a vector of coordinates, (n,).")
@@ -241,13 +242,13 @@ class Body(AnyBody):
         """(n,) masses."""
         return self.mass + np.zeros(self.size)
 
-    def point(self, at: Any = None) -> Point:
-        """The point itself.
+    def point(self, offset: Any = None) -> Point:
+        """The position of the body at the start.
 
         Raises:
-            ValueError: a point in it.
+            ValueError: an offset, as if the body were rigid.
         """
-        if at is not None:
+        if offset is not None:
             raise ValueError(f"{self.name} is no rigid body, so that no point is fixed in it; give its name alone.")
         return Point(self.name, self.position, self.mass, self.block)
 
@@ -264,11 +265,11 @@ class Ground(AnyBody):
     rates = property(lambda self: np.zeros(12))
     masses = property(lambda self: np.full(12, np.inf))
 
-    def point(self, at: Any = None) -> Point:
-        """A point that stays where it is."""
-        if at is None:
+    def point(self, offset: Any = None) -> Point:
+        """A point in space that does not move."""
+        if offset is None:
             raise ValueError('the ground has no centre; give a point of it, ("ground", [x, y, z]).')
-        return Point(GROUND, at)
+        return Point(GROUND, offset)
 
     def with_rates(self, rates: np.ndarray) -> "Ground":
         return self
@@ -285,12 +286,12 @@ class Frame(AnyBody):
         ]
         Scene(bodies, joints, coordinates="joint")
 
-    It moves with the joints that it hangs on, so that it needs joint coordinates, and it must carry a body.
+    A frame hangs on a body or on the ground by a joint and carries at least one body; the scene must have joint coordinates.
 
     Args:
-        name: what joints call it.
-        position: (3,) at the start, m; its axes are those of space there.
-        pace: "slow", "fast" or "auto", as of `Body`: that of the joint that it hangs on.
+        name: of the frame in joints.
+        position: (3,) m at the start, where its axes are parallel to those of space.
+        pace: "slow", "fast" or "auto", as of `Body`: of the coordinates of the joint that the frame hangs on.
     """
 
     name: str
@@ -315,9 +316,9 @@ class Frame(AnyBody):
     rates = property(lambda self: np.zeros(12))
     masses = property(lambda self: np.zeros(12))
 
-    def point(self, at: Any = None) -> Point:
-        """The origin, or a point fixed in it, at the start."""
-        return Point(self.name, self.position if at is None else self.position + at)
+    def point(self, offset: Any = None) -> Point:
+        """The origin of the frame, or a point fixed in it, at the start."""
+        return Point(self.name, self.position if offset is None else self.position + offset)
 
     def with_rates(self, rates: np.ndarray) -> "Frame":
         return self
@@ -328,29 +329,29 @@ Bodies = Mapping[str, AnyBody]
 
 
 def body_of(bodies: Bodies, name: str) -> AnyBody:
-    """A body by name, also the ground.
+    """A body by name.
 
     Args:
         bodies: of the scene.
-        name: of one of them.
+        name: of a body or of the ground.
     """
     return Ground() if name == GROUND else bodies[name]
 
 
 def end_of(bodies: Bodies, name: str, whole: bool = False) -> Point:
-    """What an effect sees of a body: the point that it is, the centre of a rigid one, or a point in that.
+    """The point that an effect acts on: a point mass, the centre of a rigid body, or a point fixed in a rigid body.
 
     Args:
         bodies: of the scene.
-        name: of one of them, perhaps an `Attachment`.
+        name: of a body, or an `Attachment`.
         whole: all coordinates of a rigid body instead of its centre.
     """
-    body, at = body_of(bodies, name), getattr(name, "at", None)
-    if whole and body.rigid and at is None:
+    body, offset = body_of(bodies, name), getattr(name, "offset", None)
+    if whole and body.rigid and offset is None:
         return Point(name, body.coordinates)
-    return body.point(at)
+    return body.point(offset)
 
 
 def joined(vectors):
-    """One vector of several, of NumPy where they are not traced."""
+    """Vectors one after the other in one array; of NumPy unless an entry is traced."""
     return np.concatenate(vectors) if is_concrete(vectors) else jnp.concatenate(vectors)

@@ -1,4 +1,4 @@
-"""Effects: what a scene calls for. Each contributes one function to the Lagrangian, the constraints or the forces."""
+"""Effects: each contributes one function of the positions of some bodies to the Lagrangian, the constraints or the forces."""
 
 from abc import ABC
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,67 +21,68 @@ from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, 
 
 Kind = Literal["kinetic", "potential", "constraint", "force", "control"]
 DRAWN = {"link": "links", "spring": "springs"}
-"""What joins two bodies in a drawing, and its entry there."""
+"""For each symbol that an effect may draw between two bodies, the list of the drawing that holds it."""
 MOST_ROLES = 32
-"""Bodies of an element at most: those of sixteen joints that one equation ties."""
+"""Most bodies of an element: the two bodies of each of sixteen joints that one equation couples. A larger number costs nothing."""
 POINTS = tuple(f"at_{role}" for role in range(MOST_ROLES))
-"""Parameters with the points fixed in rigid bodies, role by role."""
+"""Names of the parameters that hold points fixed in rigid bodies, one for each role."""
 ALONE = "alone"
-"""What the term of a single element is called."""
+"""Name of the term of a single element, the same for all effects, so that equal functions share a compiled program."""
 START = 1e-9
-"""How far, relative to its size, what a constraint keeps may be from its value at the start."""
+"""Largest violation of a constraint at the start, relative to the value that it keeps. A larger one would start runs off the constraints;
+a smaller one would refuse lengths that are written with ten digits."""
 
 
 @effect_class
 class Effect(ABC):
-    """What every effect says: its function, the bodies it touches, its parameters.
+    """Base class of effects: a function, the bodies that it depends on, and its parameters.
 
-    An effect has one or more *elements*, each between as many bodies as it has roles: a spring has the roles a and b, and
-    an effect of ten springs has ten elements. Its function depends on `kind`:
+    An effect has one or more *elements*. In an element each *role* is taken by a body: a spring has the roles a and b, and
+    an effect of ten springs has ten elements. The signature of its function depends on `kind`:
 
     | kind | function | returns |
     |---|---|---|
     | "potential" | ``function(q, params)`` | energy, () |
-    | "constraint" | ``function(q, params)``, `timed` ``function(t, q, params)`` | values that are kept zero, (k,) or () for each element |
+    | "constraint" | ``function(q, params)``, `timed` ``function(t, q, params)`` | values that the scene keeps zero, (k,) or () for each element |
     | "kinetic" | ``function(q, v, params)`` | energy added to ``sum m v^2 / 2``, () |
     | "force" | ``function(t, q, v, params)`` | tuple of forces, shaped like q |
     | "control" | ``function(q, u, params)`` | tuple of forces of the controls u, shaped like q |
 
-    q and v are tuples with one entry per role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). Of a rigid
-    body these are its centre's, or those of the point that is given with its name. The ground is a body, too. params
-    are the fields that a class declares as numbers, vectors or arrays (see `vmri_jax.scene.declare`), by name.
+    q and v are tuples with an entry for each role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). For a rigid
+    body these are the coordinates of its centre, or of the point that is given with its name. The ground is a body, too. params
+    holds the fields that a class declares as numbers, vectors or arrays (see `vmri_jax.scene.declare`), by name.
 
-    `bodies` of its methods are those of the scene, by name.
+    The argument `bodies` of the methods holds all bodies of the scene by name.
 
     Args:
         name: of this effect in its scene; by default the name of its class.
-        rate: of a potential, "slow" (V), "fast" (on the micro grid, with the rule of W), a whole number k (on every k-th micro node), or
-            "auto", by stiffness. Of a kinetic effect "slow", "fast" or "auto", but it only makes bodies fast: these terms are all on the
-            micro grid. Bodies that a potential with the rate "fast" or k touches are fast, unless they are given as slow: then the
-            equations of the slow bodies are implicit in it.
+        rate: of a potential, "slow" (part of V), "fast" (on the micro grid, with the rule of W), a whole number k (on every k-th micro
+            node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
+            with the pace "slow": then the equations of these slow bodies are implicit in the potential. Of a kinetic effect "slow",
+            "fast" or "auto"; here the rate decides only whether its bodies are fast, since all kinetic effects are on the micro grid.
     """
 
     kind: ClassVar[Kind]
     function: ClassVar[Any]
     rest: ClassVar[Any] = None
-    """``rest(q, params) -> ()``: the value at the start of a parameter that is `measured`, of one element."""
+    """``rest(q, params) -> ()``: the value of a `measured` parameter of a single element at the start."""
     default_name: ClassVar[str] = ""
     timed: ClassVar[bool] = False
     """Whether a constraint depends on time."""
     dimensions: ClassVar[tuple[int, ...]] = ()
-    """Its bodies are points of one of these dimensions; if there are none, they may be blocks of general coordinates too."""
+    """The effect is between points of one of these dimensions; () also allows blocks of general coordinates."""
     same_size: ClassVar[bool] = True
-    """All bodies of an element have the same dimension."""
+    """Whether all bodies of an element must have the same dimension."""
     apart: ClassVar[bool] = False
-    """Neighbouring bodies of an element, or a body and the point it is tied to, must not start at one place."""
+    """Whether neighbouring bodies of an element, or a body and the fixed point it is tied to, must start at different places."""
     masses: ClassVar[tuple[str, ...]] = ()
-    """The masses of the bodies are parameters of these names, role by role."""
+    """Names of parameters that hold the masses of the bodies, one for each role."""
     derived: ClassVar[tuple[str, ...]] = ()
-    """Parameters besides the declared ones that have a number for each element."""
+    """Names of parameters that are not declared as fields and have an entry for each element."""
     whole: ClassVar[bool] = False
-    """Its function gets all coordinates of a rigid body, not those of its centre."""
+    """Whether the function gets all coordinates of a rigid body instead of the coordinates of its centre."""
     drawn_as: ClassVar[Literal["link", "spring"] | None] = None
-    """What is drawn between neighbouring bodies of an element."""
+    """The symbol that is drawn between neighbouring bodies of an element."""
 
     name: str = field(default="", kw_only=True)
     rate: Literal["slow", "fast", "auto"] | int = field(default="auto", kw_only=True)
@@ -93,10 +94,10 @@ class Effect(ABC):
             object.__setattr__(self, "name", self.default_name)
         for argument in fields(self):
             if "of_time" in argument.metadata:
-                what, function = f"{self.name}: {argument.name}", getattr(self, argument.name)
+                about, function = f"{self.name}: {argument.name}", getattr(self, argument.name)
                 if not callable(function):
-                    raise TypeError(f"{what} is {function!r}; give a function of (t, params).")
-                check_arguments(what, function, "t, params")
+                    raise TypeError(f"{about} is {function!r}; give a function of (t, params).")
+                check_arguments(about, function, "t, params")
         is_number = isinstance(self.rate, int) and not isinstance(self.rate, bool) and self.rate > 0
         if not (is_number and self.kind == "potential") and self.rate not in ("slow", "fast", "auto"):
             number = ", or of a potential a whole number k, for every k-th micro node"
@@ -109,7 +110,7 @@ class Effect(ABC):
 
     @property
     def split(self) -> tuple[str, ...]:
-        """Names of parameters that have an entry for each element, or one for all."""
+        """Names of parameters that have an entry for each element, or a single number for all."""
         declared = [name for name, parameter in self.declared.items() if parameter.shape in ("number", "vector")]
         return (*declared, *self.masses, *self.derived, *POINTS)
 
@@ -119,24 +120,23 @@ class Effect(ABC):
         return ()
 
     def bound(self, effects: Sequence["Effect"]) -> "Effect":
-        """The same with other effects that it builds on, instead of their names.
+        """A copy in which names of other effects, such as joints, are replaced by these effects.
 
         Args:
             effects: of the scene.
 
         Raises:
-            ValueError: one of them is not there.
+            ValueError: a name that no such effect has.
         """
         return self
 
     def elements(self, bodies: Bodies) -> Elements:
         """Names of the bodies of every element."""
-        given = next(f for f in fields(self) if "names" in f.metadata)
-        what = f"{self.name}: {given.name}"
-        return given.metadata["names"].elements(getattr(self, given.name), bodies, what)
+        names = next(f for f in fields(self) if "names" in f.metadata)
+        return names.metadata["names"].elements(getattr(self, names.name), bodies, f"{self.name}: {names.name}")
 
     def parameters(self, bodies: Bodies) -> dict[str, Any]:
-        """What the function gets as params: arrays by name."""
+        """The params of the function: arrays by name."""
         params, elements = {}, self.elements(bodies)
         firsts = [end_of(bodies, element[0], self.whole) for element in elements]
         for name, parameter in self.declared.items():
@@ -151,55 +151,66 @@ class Effect(ABC):
         return params
 
     def points(self, bodies: Bodies) -> dict[str, Any]:
-        """Points fixed in rigid bodies, role by role, as weights of their directors; of bodies without one, zeros."""
-        found = {}
-        for at, role in zip(POINTS, zip(*self.elements(bodies), strict=True), strict=False):
+        """For each role with points fixed in rigid bodies, the components X of these points along the directors; zeros for whole bodies."""
+        points = {}
+        for parameter, role in zip(POINTS, zip(*self.elements(bodies), strict=True), strict=False):
             if any(isinstance(name, Attachment) for name in role):
-                weights = [
-                    body_of(bodies, name).weights(name.at) if isinstance(name, Attachment) else np.zeros(3)
+                components = [
+                    body_of(bodies, name).weights(name.offset) if isinstance(name, Attachment) else np.zeros(3)
                     for name in role
                 ]
-                found[at] = squeeze(jnp.stack(weights))
-        return found
+                points[parameter] = squeeze(jnp.stack(components))
+        return points
 
     def at_start(self, bodies: Bodies, params: dict[str, Any]):
-        """The measured value of every element at the start, (n,), or () of a single one."""
+        """The measured value of every element at the start, (n,), or () of a single element."""
         count = len(self.elements(bodies))
-        return squeeze(jnp.stack([self.rest(*self.one(i, bodies, params)) for i in range(count)]))
+        return squeeze(jnp.stack([self.rest(*self.element_arguments(i, bodies, params)) for i in range(count)]))
 
-    def one(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[tuple, dict[str, Any]]:
-        """What the function sees of the bodies of element i at the start, and its parameters among those of all."""
+    def element_arguments(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[tuple, dict[str, Any]]:
+        """The arguments (q, params) of the function for element i at the start.
+
+        Args:
+            i: number of the element.
+            params: of all elements.
+        """
         q = tuple(end_of(bodies, name, self.whole).position for name in self.elements(bodies)[i])
-        return q, self._own(i, bodies, params)
+        return q, self._element_params(i, bodies, params)
 
-    def alone(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[EffectTerm, dict[str, Any]]:
-        """Element i as a term on the coordinates of its bodies that move, one after the other as q_s, and its params."""
+    def element_term(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[EffectTerm, dict[str, Any]]:
+        """Element i as a term of q_s, which holds the coordinates of the moving bodies of this element one after the other; and its params.
+
+        Args:
+            i: number of the element.
+            params: of all elements.
+        """
         places, end = {}, 0
         for name in moving(self.elements(bodies)[i]):
             places[name] = Place("s", end, bodies[name].size)
             end += bodies[name].size
-        term = replace(self._term((i,), bodies, places), name=ALONE, select=None)  # one program for all of a kind
-        return term, {ALONE: self._own(i, bodies, params)}
+        # without the name and number of the element, equal terms share a compiled program
+        term = replace(self._term((i,), bodies, places), name=ALONE, select=None)
+        return term, {ALONE: self._element_params(i, bodies, params)}
 
     def pairs_of_joints(self, i: int) -> tuple[tuple[str, int], ...]:
-        """The joints, and the numbers of their pairs of bodies, whose freedoms are all that element i depends on; () of other effects."""
+        """(joint, number of its pair) for all joints whose freedoms element i is a function of; () if it depends on other coordinates."""
         return ()
 
-    def _own(self, i: int, bodies: Bodies, params: dict[str, Any]) -> dict[str, Any]:
-        """Parameters of element i among those of all."""
+    def _element_params(self, i: int, bodies: Bodies, params: dict[str, Any]) -> dict[str, Any]:
+        """Parameters of element i, taken from the parameters of all elements."""
         return params if len(self.elements(bodies)) == 1 else choose(params, (i,), self.split)
 
     def check(self, bodies: Bodies, moved: bool = False) -> None:
-        """Refuse what is wrong with this effect between these bodies.
+        """Refuse bodies and parameters that do not fit this effect.
 
         Args:
-            moved: the bodies will be moved onto the constraints, so that what these keep may start otherwise.
+            moved: whether the scene moves the bodies onto the constraints later, so that these may be violated now.
 
         Raises:
             TypeError: parameters that are no real numbers.
             ValueError: unknown bodies, a body twice in one element, bodies of different dimension, at one point, or of
-                general coordinates where points are needed; parameters of another shape, sign or precision, and what
-                the effect itself forbids.
+                general coordinates where points are needed; parameters of another shape, sign or precision, and arguments that
+                the class of the effect forbids.
         """
         self.check_bodies(bodies)
         self.check_parameters(bodies)
@@ -207,7 +218,7 @@ class Effect(ABC):
             self.check_start(bodies)
 
     def check_bodies(self, bodies: Bodies) -> None:
-        """Refuse bodies that are not there, or that do not fit."""
+        """Refuse names of no body, and bodies whose coordinates the function cannot take."""
         elements = self.elements(bodies)
         for element in elements:
             if not moving(element):
@@ -225,9 +236,9 @@ class Effect(ABC):
                     raise ValueError(f"{self.name}: {error}") from None
                 block, size = end.block, end.size
                 if self.dimensions and (block or size not in self.dimensions):
-                    has, allowed = "general " if block else "", " or ".join(map(str, self.dimensions))
+                    general, allowed = "general " if block else "", " or ".join(map(str, self.dimensions))
                     raise ValueError(
-                        f"{self.name}: {name} has {size} {has}coordinates; this effect is between points of dimension {allowed}."
+                        f"{self.name}: {name} has {size} {general}coordinates; this effect is between points of dimension {allowed}."
                     )
             if self.same_size:
                 self._check_sizes(element, bodies)
@@ -244,104 +255,107 @@ class Effect(ABC):
                 if is_concrete(leaf) and not np.isfinite(leaf).all():
                     raise ValueError(f"{self.name}: {name} is {np.asarray(leaf)}, which is not finite.")
         for name, parameter in self.declared.items():
-            given = getattr(self, name)
-            if given is None:
-                continue
-            parameter.check_sign(f"{self.name}: {name}", given)
+            if getattr(self, name) is not None:
+                parameter.check_sign(f"{self.name}: {name}", getattr(self, name))
 
     def by_size(self, select: Sequence[int], bodies: Bodies) -> list[list[int]]:
-        """Some of the elements, those between bodies of the same sizes and kinds together: each of these is a term.
+        """Elements in groups between bodies of the same sizes and kinds: each group is a term.
 
         Args:
-            select: indices of elements.
+            select: numbers of the elements.
         """
-        elements, found = self.elements(bodies), {}
+        elements, groups = self.elements(bodies), {}
         for i in select:
-            found.setdefault(tuple(self._kind(name, bodies) for name in elements[i]), []).append(i)
-        return list(found.values())
+            groups.setdefault(tuple(self._kind(name, bodies) for name in elements[i]), []).append(i)
+        return list(groups.values())
 
     def _kind(self, name: str, bodies: Bodies) -> tuple:
-        """What bodies of one role of a term have in common."""
+        """The properties of a body that must be equal for all bodies of a role in a term."""
         body, end = body_of(bodies, name), end_of(bodies, name, self.whole)
         return name == GROUND, isinstance(name, Attachment), body.size, end.size
 
     def terms(self, select: Sequence[int], bodies: Bodies, layout: Layout, potentials: Mapping[str, Any]):
-        """The terms of some of the elements; those of bodies of other sizes in another term.
+        """The terms of some elements, one for each group of bodies of the same sizes.
 
         Args:
-            select: indices of elements.
+            select: numbers of the elements.
             layout: of all bodies.
             potentials: terms of all potentials of the scene by name of the effect.
         """
-        return tuple(self._term(some, bodies, layout.bodies) for some in self.by_size(select, bodies))
+        return tuple(self._term(group, bodies, layout.bodies) for group in self.by_size(select, bodies))
 
-    def _term(self, some: Sequence[int], bodies: Bodies, places: Mapping[str, Place]) -> EffectTerm:
-        """The term of elements of one kind."""
+    def _term(self, group: Sequence[int], bodies: Bodies, places: Mapping[str, Place]) -> EffectTerm:
+        """The term of a group of elements between bodies of the same sizes and kinds."""
         elements = self.elements(bodies)
-        roles = zip(POINTS, zip(*(elements[i] for i in some), strict=True), strict=False)
-        made = tuple(self._role(at, role, bodies, places) for at, role in roles)
-        chosen = None if len(some) == len(elements) else tuple(some)
-        return EffectTerm(self.name, self.function, made, chosen, self.split, self.timed)
+        names = zip(POINTS, zip(*(elements[i] for i in group), strict=True), strict=False)
+        roles = tuple(self._role(parameter, role, bodies, places) for parameter, role in names)
+        select = None if len(group) == len(elements) else tuple(group)
+        return EffectTerm(self.name, self.function, roles, select, self.split, self.timed)
 
-    def _role(self, at: str, names: Sequence[str], bodies: Bodies, places: Mapping[str, Place]) -> Role:
-        """Where the function gets the coordinates of bodies of one kind from."""
-        first, size = names[0], end_of(bodies, names[0], self.whole).size
-        attached = isinstance(first, Attachment)
-        if first == GROUND:
-            return OnGround(len(names), size, at if attached else None)
-        own = [places[name] for name in names]
-        return InRigidBodies(Rows.of(own), at) if attached else OnBodies(Rows.of(own, size))
+    def _role(self, parameter: str, names: Sequence[str], bodies: Bodies, places: Mapping[str, Place]) -> Role:
+        """The map from q_s and q_f to the coordinates of the bodies of a role.
+
+        Args:
+            parameter: name of the parameter with points fixed in these bodies.
+            names: of bodies of one kind.
+        """
+        size, attached = end_of(bodies, names[0], self.whole).size, isinstance(names[0], Attachment)
+        if names[0] == GROUND:
+            return OnGround(len(names), size, parameter if attached else None)
+        of_bodies = [places[name] for name in names]
+        return InRigidBodies(Rows.of(of_bodies), parameter) if attached else OnBodies(Rows.of(of_bodies, size))
 
     def components(self, bodies: Bodies) -> tuple[str, ...]:
-        """Names of the controls of an effect that is one."""
+        """Names of the controls of this effect; () unless its kind is "control"."""
         return ()
 
     def curvature(self, bodies: Bodies):
-        """Largest second derivative of the energy of each element, () or (n,), where its start does not show it, else None."""
+        """Largest second derivative of the energy of each element, () or (n,), if the start does not show it (contacts that are open); else None."""
         return None
 
     def drawn_points(self, bodies: Bodies) -> dict[str, tuple[str, Any]]:
-        """Points in rigid bodies where something drawn ends: by their names there, body and weights of its directors."""
+        """Points in rigid bodies where a drawn link or spring ends: their labels, with the body and the components of the point in it."""
         if self.drawn_as is None:
             return {}
         names = [name for element in self.elements(bodies) for name in element]
         return {
-            name.label: (str(name), bodies[name].weights(name.at))
+            name.label: (str(name), bodies[name].weights(name.offset))
             for name in names
             if isinstance(name, Attachment) and name != GROUND
         }
 
     def drawing(self, bodies: Bodies) -> dict[str, list]:
-        """What there is to see of it: entries of `Scene.drawing`, and "radii" of bodies, pairs of name and number."""
+        """Entries of this effect in the lists of `Scene.drawing`, and "radii" of bodies as pairs (name, number)."""
         if self.drawn_as is None:
             return {}
         pairs = [pair for element in self.elements(bodies) for pair in pairwise(element)]
         between = [[label_of(a), label_of(b)] for a, b in pairs if GROUND not in (a, b)]
-        held = [(a, b) if b == GROUND else (b, a) for a, b in pairs if GROUND in (a, b)]
+        to_ground = [(a, b) if b == GROUND else (b, a) for a, b in pairs if GROUND in (a, b)]
         anchors = [
-            {"body": label_of(a), "point": end_of(bodies, b).position.tolist(), "kind": self.drawn_as} for a, b in held
+            {"body": label_of(body), "point": end_of(bodies, ground).position.tolist(), "kind": self.drawn_as}
+            for body, ground in to_ground
         ]
         return {DRAWN[self.drawn_as]: between, "anchors": anchors}
 
-    def require(self, condition: Any, what: str, value: Any, expected: str) -> None:
-        """Raise ValueError unless a condition on concrete numbers holds everywhere.
+    def require(self, condition: Any, quantity: str, value: Any, expected: str) -> None:
+        """Raise ValueError unless all entries of a condition are true; a traced condition passes.
 
         Args:
-            what, value, expected: for the message, "{what} is {value}; {expected}."
+            quantity, value, expected: for the message, "{quantity} is {value}; {expected}."
         """
         if is_concrete(condition) and not np.all(condition):
             shown = np.asarray(value) if is_concrete(value) else value
-            raise ValueError(f"{self.name}: {what} is {shown}; {expected}.")
+            raise ValueError(f"{self.name}: {quantity} is {shown}; {expected}.")
 
     def require_apart(self, bodies: Bodies) -> None:
-        """Refuse elements whose neighbouring bodies are at one point at the start."""
+        """Refuse elements whose neighbouring bodies are at the same point at the start."""
         for a, b in (pair for element in self.elements(bodies) for pair in pairwise(element)):
-            apart = jnp.sqrt(jnp.sum((end_of(bodies, b).position - end_of(bodies, a).position) ** 2))
+            distance = jnp.sqrt(jnp.sum((end_of(bodies, b).position - end_of(bodies, a).position) ** 2))
             expected = "they must not start at the same point; move one of them"
-            self.require(apart > 0, f"the distance of {a} and {b}", apart, expected)
+            self.require(distance > 0, f"the distance of {a} and {b}", distance, expected)
 
     def _mass(self, name: str, bodies: Bodies):
-        """The one mass of a body."""
+        """The mass () of a body, refused if it has none or several."""
         mass = end_of(bodies, name).mass
         if mass is None:
             raise ValueError(
@@ -349,7 +363,7 @@ class Effect(ABC):
             )
         if mass.ndim:
             raise ValueError(
-                f"{self.name}: {name} has a mass for each coordinate; it needs bodies with one mass. Give bodies=."
+                f"{self.name}: {name} has a mass for each coordinate; this effect needs bodies with one mass. Give bodies=[...]."
             )
         return mass
 
@@ -357,38 +371,40 @@ class Effect(ABC):
         sizes = {name: end_of(bodies, name, self.whole).size for name in names}
         if len(set(sizes.values())) > 1:
             described = ", ".join(f"{name} {size}" for name, size in sizes.items())
-            raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must be of the same.")
+            raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must have the same.")
 
     def check_start(self, bodies: Bodies) -> None:
-        """Refuse a value that a constraint keeps and that is not the one at the start."""
+        """Refuse a constraint that the start violates: the given length of a link, say, is not the distance of its ends."""
         for name in (name for name, parameter in self.declared.items() if parameter.measured):
             params = self.parameters(bodies)
             start = self.at_start(bodies, params)
             if getattr(self, name) is None or not is_concrete((params[name], start)):
                 continue
             values = np.broadcast_arrays(np.atleast_1d(params[name]), start)
-            for element, given, found in zip(self.elements(bodies), *values, strict=True):
-                right = abs(given - found) <= START * given
-                expected = f"it starts as {found:.12g}; give that, move a body, or let the scene do it, project=True"
-                self.require(right, f"{name} of {'-'.join(map(label_of, element))}", f"{given:g}", expected)
+            for element, kept, measured in zip(self.elements(bodies), *values, strict=True):
+                agrees = abs(kept - measured) <= START * kept
+                expected = (
+                    f"it starts as {measured:.12g}; give this value, move a body, or let the scene do so, project=True"
+                )
+                self.require(agrees, f"{name} of {'-'.join(map(label_of, element))}", f"{kept:g}", expected)
 
 
 def lasting(value):
-    """A value that can be gone through again: an iterator, or a list with iterators in it, as a tuple."""
+    """The value, with iterators replaced by tuples, which can be read more than once."""
     if isinstance(value, Iterator) or (isinstance(value, list | tuple) and any(isinstance(v, Iterator) for v in value)):
         return tuple(lasting(item) for item in value)
     return value
 
 
-def real_tree(what: str, tree):
-    """A pytree of real numbers as one of arrays; what is neither is refused by its place in the tree.
+def real_tree(about: str, tree):
+    """A pytree of real numbers as a pytree of arrays; the error for another leaf names its place in the tree.
 
     Args:
-        what: its name, for messages.
+        about: names of effect and argument, for messages.
         tree: numbers, arrays, lists and dictionaries of them.
     """
 
     def convert(path, leaf):
-        return jnp.asarray(real_array(what + jax.tree_util.keystr(path), leaf))
+        return jnp.asarray(real_array(about + jax.tree_util.keystr(path), leaf))
 
     return jax.tree_util.tree_map_with_path(convert, tree)

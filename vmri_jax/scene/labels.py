@@ -1,4 +1,4 @@
-"""What the coordinates and constraints of a scene are called."""
+"""Names of the coordinates and constraints of a scene."""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -13,10 +13,10 @@ from vmri_jax.scene.sorting import Placed, Sorting
 
 
 def label(effect: Effect, element: Sequence[str]) -> str:
-    """The name of one element of an effect, with its bodies.
+    """The label of an element: the name of its effect and the names of its bodies.
 
     Args:
-        effect: what has several elements.
+        effect: with several elements.
         element: names of the bodies.
     """
     return f"{effect.name} {'-'.join(map(label_of, element))}"
@@ -25,13 +25,13 @@ def label(effect: Effect, element: Sequence[str]) -> str:
 def names_of(sorting: Sorting) -> Names:
     """Bodies and constraints by name, in the order of the coordinates and of the rows.
 
-    An effect with one element gives its name to the constraint, one with several its name and the bodies of each.
+    The rows of an effect with a single element have the name of the effect; with several elements the names of the bodies follow.
 
     Args:
-        sorting: bodies at their places, effects at their homes.
+        sorting: of the scene.
     """
     sizes: dict[str, dict[str, int]] = {"s": {}, "f": {}, "constraint": {}, "slow_constraint": {}}
-    for name, place in sorting.layout.own.items():
+    for name, place in sorting.layout.coordinates.items():
         sizes[place.part][name] = place.size
     for part in sorting.placed:
         if part.home in ("constraint", "slow_constraint"):
@@ -39,21 +39,21 @@ def names_of(sorting: Sorting) -> Names:
     blocks, rigid = (
         [name for name, body in sorting.bodies.items() if getattr(body, kind)] for kind in ("block", "rigid")
     )
-    carried = {name: place for name, place in sorting.places.items() if name not in sorting.layout.own}
+    carried = {name: place for name, place in sorting.places.items() if name not in sorting.layout.coordinates}
     rows = sizes["constraint"], sizes["slow_constraint"]
     return Names(sizes["s"], sizes["f"], *rows, blocks, rigid, carried, sorting.layout.kinematics)
 
 
 def _rows(sorting: Sorting, part: Placed) -> dict[str, int]:
-    """Rows of the elements of an effect, in the order of its terms: those of bodies of the same sizes together."""
+    """Number of kept rows of each element of an effect by its label, in the order of the terms of the effect."""
     bodies, effect = sorting.bodies, part.effect
     elements, params = effect.elements(bodies), effect.parameters(bodies)
     t = (jnp.zeros(()),) if effect.timed else ()
-    rows, at = {}, 0
+    rows, first = {}, 0
     for i in chain(*effect.by_size(part.elements, bodies)):
-        size = jax.eval_shape(effect.function, *t, *effect.one(i, bodies, params)).size
-        kept = sum(k not in part.dropped for k in range(at, at + size))
+        size = jax.eval_shape(effect.function, *t, *effect.element_arguments(i, bodies, params)).size
+        kept = sum(row not in part.dropped for row in range(first, first + size))
         if kept:
             rows[effect.name if len(elements) == 1 else label(effect, elements[i])] = kept
-        at += size
+        first += size
     return rows

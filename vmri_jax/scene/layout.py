@@ -20,26 +20,26 @@ class Pace(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything is.
+    """Places of the coordinates q of the scene and of the coordinates Q of its bodies.
 
     Attributes:
-        bodies: the coordinates of every body as a point or rigid body, in Q_s and Q_f, see `Kinematics`. Those of bodies on no joint are
-            coordinates of the scene, at the same place in q_s and q_f.
-        own: the coordinates of the scene by name: those of bodies, and freedoms of joints.
-        freedoms: the places of the freedoms of joints, by name of the joint, number of its pair of bodies, and name of the freedom.
-        kinematics: the map from q to Q; None without trees.
+        bodies: by name of the body, the place in Q_s or Q_f of its coordinates as a point or rigid body, see `Kinematics`. A body that is
+            no function of joint coordinates has the same place in q_s or q_f.
+        coordinates: by name, the place in q_s or q_f of the coordinates of a body or of a freedom of a joint.
+        freedoms: places of the freedoms of joints in q_s or q_f, by (joint, number of its pair of bodies, freedom).
+        kinematics: the map from q to Q; None if Q = q.
     """
 
     bodies: dict[str, Place]
-    own: dict[str, Place]
+    coordinates: dict[str, Place]
     freedoms: dict[tuple[str, int, str], Place] = field(default_factory=dict)
     kinematics: Kinematics | None = None
 
     @property
     def sizes(self) -> tuple[int, int]:
         """(n_s, n_f)."""
-        slow, fast = (sum(place.size for place in self.own.values() if place.part == part) for part in ("s", "f"))
-        return slow, fast
+        n_s, n_f = (sum(place.size for place in self.coordinates.values() if place.part == part) for part in ("s", "f"))
+        return n_s, n_f
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -48,7 +48,7 @@ class Layout:
             max(
                 (
                     place.start + place.size
-                    for place in (*self.own.values(), *self.bodies.values())
+                    for place in (*self.coordinates.values(), *self.bodies.values())
                     if place.part == part
                 ),
                 default=0,
@@ -58,16 +58,18 @@ class Layout:
         return slow, fast
 
 
-def join(bodies: Bodies, layout: Layout, part: Part, what: str) -> Any:
-    """One vector Q_s or Q_f of all slow or of all fast bodies, at their places; zero for freedoms of joints.
+def join(bodies: Bodies, layout: Layout, part: Part, quantity: Literal["coordinates", "rates", "masses"]) -> Any:
+    """A vector of the length of Q_s or Q_f with a quantity of all bodies at their places, and zeros for freedoms of joints.
 
     Args:
         bodies: by name.
-        layout: of these.
-        part: "s" for slow ones, "f" for fast ones.
-        what: "coordinates", "rates" or "masses".
+        layout: of these bodies.
+        part: "s" for Q_s, "f" for Q_f.
+        quantity: attribute of the bodies.
     """
-    pieces = {place.start: getattr(bodies[name], what) for name, place in layout.bodies.items() if place.part == part}
+    pieces = {
+        place.start: getattr(bodies[name], quantity) for name, place in layout.bodies.items() if place.part == part
+    }
     pieces |= {place.start: np.zeros(1) for place in layout.freedoms.values() if place.part == part}
-    found = [pieces[start] for start in sorted(pieces)]
-    return library(found).concatenate(found) if found else np.zeros(0)
+    ordered = [pieces[start] for start in sorted(pieces)]
+    return library(ordered).concatenate(ordered) if ordered else np.zeros(0)

@@ -1,4 +1,4 @@
-"""The ledger of a scene or of a system of functions: what every body and effect adds to a macro step, and what it costs."""
+"""The ledger of a scene or of a system of functions: grid, unknowns, evaluations and computing time of every body and effect."""
 
 import re
 from collections import Counter
@@ -25,7 +25,7 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.quadrature import PlacedRule
 from vmri_jax.schemes.scheme import Scheme
 
-HOMES: dict[Any, str] = {
+TERMS: dict[Any, str] = {
     "kinetic": "kinetic energy T",
     "slow_potential": "slow potential V",
     "fast_potential": "fast potential W",
@@ -35,21 +35,26 @@ HOMES: dict[Any, str] = {
     "control": "control u",
     "fast": "potential on the micro grid",
 }
+"""For each argument of `System` that an effect may be part of, its name in the ledger."""
 RULES: dict[Any, str] = {"slow_potential": "slow", "fast_potential": "fast", "control": "force"}
-"""What a scheme calls its rules of these parts."""
+"""For each argument of `System` whose rule has another name in a `Scheme`, this name."""
 STEPS = 20
-"""Macro steps of a program that is timed."""
+"""Macro steps of the program that is timed: enough that the call of the program takes little of the time. More take longer."""
+DEFAULT_FREQUENCY = 10.0
+"""rad/s, from which the step size of a timed step follows if the system neither vibrates nor turns. A larger one takes smaller steps."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One body or effect.
+    """A body or effect in the ledger.
 
-    name, kind: what it is called, and "body" or the term it is part of.
-    grid, why: "macro" or "micro", where it lives, and how that was decided.
-    unknowns, multipliers: it adds to the equations of a macro step.
-    evaluations: nodes of a macro step at which its function is evaluated (by implicit schemes in every Newton iteration).
-    microseconds: of its first derivatives at all these nodes once, None where not measured.
+    name: of the body or effect.
+    kind: "body", or the term that the effect is part of.
+    grid: "macro" or "micro", the grid of its unknowns or evaluations.
+    why: the reason for this grid.
+    unknowns, multipliers: numbers of these that it adds to the equations of a macro step.
+    evaluations: number of nodes in a macro step at which its function is evaluated (by implicit schemes in every Newton iteration).
+    microseconds: computing time of its first derivatives once at all these nodes, None if not measured.
     """
 
     name: str
@@ -64,7 +69,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Ledger:
-    """Rows of bodies and effects, and the microseconds of a macro step of the whole scene (None where not measured)."""
+    """Rows of bodies and effects, and the computing time of a macro step of the whole scene in microseconds (None if not measured)."""
 
     rows: tuple[Row, ...]
     microseconds: float | None = None
@@ -75,11 +80,11 @@ class Ledger:
         return sum(row.unknowns + row.multipliers for row in self.rows)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data: "rows", "unknowns", "microseconds"."""
+        """The ledger as a dictionary with the keys "rows", "unknowns", "microseconds"."""
         return asdict(self) | {"rows": [asdict(row) for row in self.rows], "unknowns": self.unknowns}
 
     def table(self) -> PrintedTable:
-        """What each adds; `reasons` says why it is there."""
+        """Unknowns, evaluations and time of every body and effect; the reasons for their grids are in `reasons`."""
         table = PrintedTable("name", "part of", "grid", box=None, pad_edge=False)
         for column in ("unknowns", "evaluations", *(["time"] if self.microseconds is not None else [])):
             table.add_column(column, justify="right")
@@ -95,11 +100,11 @@ class Ledger:
         return str(self.table())
 
     def _repr_mimebundle_(self, include=(), exclude=(), **kwargs) -> dict[str, str]:
-        """What notebooks show: the table."""
+        """The table, for notebooks."""
         return self.table()._repr_mimebundle_(include, exclude, **kwargs)
 
     def reasons(self) -> PrintedTable:
-        """Why each is slow or fast, and on its grid."""
+        """For every body the reason why it is slow or fast, for every effect the reason for its grid."""
         table = PrintedTable("name", "why", box=None, pad_edge=False)
         for row in self.rows:
             table.add_row(f"[bold]{row.name}[/bold]", row.why)
@@ -110,14 +115,12 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
     """The ledger of a scene, see `Scene.explain`.
 
     Args:
-        sorting: bodies at their places, effects at their homes.
+        sorting: of the scene.
         scheme, macro_dt, measure: as of `Scene.explain`.
     """
     if not isinstance(scheme, Scheme | Composition):
         raise TypeError(f"Scene.explain: scheme is {scheme!r}; give a Scheme, e.g. fully_implicit(num_micro=10).")
-    stages = scheme.num_stages if isinstance(scheme, Composition) else 1
-    one = stage_scheme(scheme)
-    intervals = {"macro": stages * one.degree, "micro": stages * one.degree * one.num_micro}
+    stage, stages, intervals = _intervals(scheme)
     rows = []
     sizes = {name: sorting.places[name].size for name in sorting.bodies}
     sizes |= {branch.child: len(branch.joint.freedoms) for branch in sorting.branches}
@@ -125,19 +128,26 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
         grid = "micro" if pace.value == "fast" else "macro"
         unknowns = intervals[grid] * sizes[name]
         rows.append(Row(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
-    whole, times = _measure(sorting, scheme, macro_dt) if measure else (None, [None] * len(sorting.placed))
+    step_time, times = _measure(sorting, scheme, macro_dt) if measure else (None, [None] * len(sorting.placed))
     for part, nanoseconds in zip(sorting.placed, times, strict=True):
-        rule = _rule(one, part.home)
+        rule = _rule(stage, part.home)
         multipliers = intervals[rule.grid] * sum(build(sorting, [part]).num_constraints(*sorting.start[:2]))
-        count = 0 if part.home == "control" else stages * evaluations(rule, one.num_micro)
-        own = None if nanoseconds is None else nanoseconds * count / 1e3
-        kind = HOMES.get(part.home, f"potential on one in {part.home} micro nodes")
-        rows.append(Row(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, own))
-    return Ledger(tuple(rows), whole)
+        count = 0 if part.home == "control" else stages * evaluations(rule, stage.num_micro)
+        microseconds = None if nanoseconds is None else nanoseconds * count / 1e3
+        kind = TERMS.get(part.home, f"potential on one in {part.home} micro nodes")
+        rows.append(Row(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, microseconds))
+    return Ledger(tuple(rows), step_time)
+
+
+def _intervals(scheme: Scheme | Composition) -> tuple[Scheme, int, dict[str, int]]:
+    """The scheme of a stage, the number of stages, and the number of unknown nodes in a macro step on each grid."""
+    stage = stage_scheme(scheme)
+    stages = scheme.num_stages if isinstance(scheme, Composition) else 1
+    return stage, stages, {"macro": stages * stage.degree, "micro": stages * stage.degree * stage.num_micro}
 
 
 def _rule(scheme: Scheme, home: Any) -> PlacedRule:
-    """The rule of the scheme for what is part of this argument of `System`, or of this one of its further potentials."""
+    """The rule of the scheme for an argument of `System`, or for one of the further potentials by its rate."""
     if home == "fast" or isinstance(home, int):
         return scheme.rule_of(home)
     name: str = RULES.get(home, home)  # pyright: ignore[reportAssignmentType]
@@ -150,84 +160,90 @@ def ledger_of_functions(
     """The ledger of a system of functions: its coordinates by name, and each of its functions.
 
     Args:
-        problem: the system and where it starts.
+        problem: the system with its start.
         scheme, macro_dt, measure: as of `Scene.explain`.
     """
-    system, state, one = problem.system, problem.state(), stage_scheme(scheme)
-    stages = scheme.num_stages if isinstance(scheme, Composition) else 1
-    intervals = {"macro": stages * one.degree, "micro": stages * one.degree * one.num_micro}
+    system, state = problem.system, problem.state()
+    stage, stages, intervals = _intervals(scheme)
     names = (problem.names or Names()).of_coordinates(state.q_s.size, state.q_f.size)
     rows = []
     for name, (part, _, size) in names.bodies.items():
         pace, grid = ("fast", "micro") if part == "f" else ("slow", "macro")
         rows.append(Row(name, "body", grid, f"{pace}: it is in q_{part}", intervals[grid] * size, 0, 0))
-    terms = [home for home in HOMES if getattr(system, home, None) is not None]
+
+    def microseconds(alone: System, count: int) -> float | None:
+        """Computing time of the first derivatives of a function at its nodes in a macro step."""
+        if not measure:
+            return None
+        derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
+        return 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
+
+    homes = [home for home in TERMS if getattr(system, home, None) is not None]
     if system.has_constant_mass:
-        terms.remove("kinetic")
-    for home in terms:
+        homes.remove("kinetic")
+    for home in homes:
         alone = _alone(system, home, state)
-        rule = _rule(one, home)
+        rule = _rule(stage, home)
         multipliers = intervals[rule.grid] * sum(alone.num_constraints(state.q_s, state.q_f))
-        count, time = stages * evaluations(rule, one.num_micro), None
-        if measure:
-            derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
-            time = 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
+        count = stages * evaluations(rule, stage.num_micro)
         why = f"the rule of the scheme for it is on the {rule.grid} grid"
-        rows.append(Row(name_of(getattr(system, home)), HOMES[home], rule.grid, why, 0, multipliers, count, time))
+        name, time = name_of(getattr(system, home)), microseconds(alone, count)
+        rows.append(Row(name, TERMS[home], rule.grid, why, 0, multipliers, count, time))
     for name, function in system.potentials:
-        rule = one.rule_of(name)
-        count, time = stages * evaluations(rule, one.num_micro), None
-        if measure:
-            alone = _alone(system, "", state).replace(potentials={name: function})
-            derivatives = _first_derivatives(alone, state.q_s.size, problem.v_s, problem.v_f)
-            time = 1e6 * seconds_each(derivatives, jnp.concatenate([state.q_s, state.q_f])) * count
-        why = f"the rule of the scheme for it: {rule.in_words()}"
+        alone, rule = _alone(system, "", state).replace(potentials={name: function}), stage.rule_of(name)
+        count = stages * evaluations(rule, stage.num_micro)
+        why, time = f"the rule of the scheme for it: {rule.in_words()}", microseconds(alone, count)
         rows.append(Row(name_of(function), f"potential {label(name)}", rule.grid, why, 0, 0, count, time))
-    return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, 10.0) if measure else None)
+    return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, DEFAULT_FREQUENCY) if measure else None)
 
 
 def _alone(system: System, home: str, state: State) -> System:
-    """The system with one of its functions, and unit masses unless that is the kinetic energy."""
+    """The system with the function of the argument `home` alone, and with unit masses unless this is the kinetic energy."""
     masses = ConstantMass(np.ones(state.q_s.size), np.ones(state.q_f.size))
-    others = {name: None for name in HOMES if name not in (home, "kinetic", "control", "fast")}
-    others["potentials"] = None
-    return system.replace(**others, **({} if home == "kinetic" else {"kinetic": masses}))
+    absent = {name: None for name in TERMS if name not in (home, "kinetic", "control", "fast")}
+    absent["potentials"] = None
+    return system.replace(**absent, **({} if home == "kinetic" else {"kinetic": masses}))
 
 
 def evaluations(rule, num_micro: int) -> int:
-    """Nodes of a rule in a macro step, one at the border of two steps counted once."""
+    """Number of nodes of a rule in a macro step; the node that two neighbouring steps share counts once."""
     nodes = rule.composite(num_micro).nodes
     shared = np.isclose(nodes[0], 0.0) and np.isclose(nodes[-1], 1.0)
     return len(nodes) - int(shared)
 
 
 def _measure(sorting: Sorting, scheme, macro_dt) -> tuple[float, list[float]]:
-    """Microseconds of a macro step, and nanoseconds of one evaluation of the first derivatives of every effect."""
+    """Microseconds of a macro step, and nanoseconds of an evaluation of the first derivatives of every effect."""
     system = build(sorting, sorting.placed)
     state = initial_state(system, *sorting.start, project=True)
-    step = _macro_step(system, scheme, state, macro_dt, _turning(sorting) or 10.0)
+    step = _macro_step(system, scheme, state, macro_dt, _turning(sorting) or DEFAULT_FREQUENCY)
     q_s, q_f, v_s, v_f = sorting.start
-    own = [_first_derivatives(build(sorting, [part]), q_s.size, v_s, v_f) for part in sorting.placed]
+    of_effects = [_first_derivatives(build(sorting, [part]), q_s.size, v_s, v_f) for part in sorting.placed]
     q = jnp.concatenate([q_s, q_f])
-    return step, [1e9 * seconds_each(derivatives, q) for derivatives in own]
+    return step, [1e9 * seconds_each(derivatives, q) for derivatives in of_effects]
 
 
-def _macro_step(system: System, scheme, state: State, macro_dt: float | None, otherwise: float) -> float:
-    """Microseconds of a macro step; without a step size of one that the fastest vibration, or else this frequency, suggests."""
+def _macro_step(system: System, scheme, state: State, macro_dt: float | None, frequency: float) -> float:
+    """Microseconds of a macro step.
+
+    Args:
+        macro_dt: s; None for micro steps of 0.1 / w, with the largest frequency w of a vibration.
+        frequency: w of a system without vibrations, rad/s.
+    """
     if macro_dt is None:
-        macro_dt = scheme.num_micro * 0.1 / (float(frequencies(system, state).max(initial=0.0)) or otherwise)
-    step = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
-    return 1e6 * float(np.median(step)) / STEPS
+        macro_dt = scheme.num_micro * 0.1 / (float(frequencies(system, state).max(initial=0.0)) or frequency)
+    seconds = interleaved({"": prepare_steps(system, scheme, state, macro_dt).timed()}, 5)[""]
+    return 1e6 * float(np.median(seconds)) / STEPS
 
 
 def _turning(sorting: Sorting) -> float:
-    """The rate at which the velocities of the start change positions by their own size: that of a body that spins."""
+    """``max |v| / max |q|`` at the start, rad/s: of a spinning body about its angular velocity."""
     q_s, q_f, v_s, v_f = (np.abs(x).max(initial=0.0) for x in sorting.start)
     return float(max(v_s, v_f) / max(q_s, q_f, 1e-300))
 
 
 def _first_derivatives(system: System, n_s: int, v_s, v_f):
-    """All first derivatives that a step takes of a system, as a function of its positions that is shaped like these."""
+    """All first derivatives of a system that a step takes, added up, as a function of its positions q (n,) that returns (n,)."""
 
     def lagrangian(q):
         potentials = invariants.potential_energy(system, q[:n_s], q[n_s:])
@@ -236,18 +252,18 @@ def _first_derivatives(system: System, n_s: int, v_s, v_f):
         return system.kinetic(q[:n_s], q[n_s:], v_s, v_f, system.params) - potentials
 
     def derivatives(q):
-        found = jax.grad(lagrangian)(q)
+        total = jax.grad(lagrangian)(q)
         if system.is_constrained:
-            found += jax.jacrev(lambda q: system.constraints(0.0, q[:n_s], q[n_s:]))(q).sum(axis=0)
+            total += jax.jacrev(lambda q: system.constraints(0.0, q[:n_s], q[n_s:]))(q).sum(axis=0)
         if system.force is not None:
-            found += jnp.concatenate(system.forces(0.0, q[:n_s], q[n_s:], v_s, v_f))
-        return found
+            total += jnp.concatenate(system.forces(0.0, q[:n_s], q[n_s:], v_s, v_f))
+        return total
 
     return derivatives
 
 
 def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt, num_steps: int = STEPS) -> Simulation:
-    """So many macro steps, prepared; `operations` and `temporary_bytes` look into ``.compiled()``.
+    """A prepared simulation that saves the end alone; `operations` and `temporary_bytes` take its ``.compiled()``.
 
     Args:
         system, scheme, state, macro_dt, num_steps: as of `vmri_jax.prepare`.
@@ -256,14 +272,16 @@ def prepare_steps(system: System, scheme: Scheme | Composition, state, macro_dt,
 
 
 NO_OPERATION = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast"}
+"""Names of instructions in a compiled program that compute nothing."""
 INSTRUCTION = re.compile(r"^\s*(?:ROOT )?%?[\w.-]+ = (?:\(.*?\)|\S+) ([a-z][a-z0-9-]*)\(", re.MULTILINE)
+"""A line of XLA's text of a program, with the name of the instruction as its group."""
 
 
 def operations(compiled) -> Counter:
-    """Instructions of a compiled program by name, those inside its fusions and loops included."""
+    """Number of instructions of each name in a compiled program, with the instructions inside its fusions and loops."""
     return Counter(name for name in INSTRUCTION.findall(compiled.as_text()) if name not in NO_OPERATION)
 
 
 def temporary_bytes(compiled) -> int:
-    """Temporary memory of a compiled program."""
+    """Temporary memory of a compiled program, bytes."""
     return compiled.memory_analysis().temp_size_in_bytes

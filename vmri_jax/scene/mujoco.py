@@ -21,8 +21,9 @@ from vmri_jax.scene.body import Frame
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.custom import Potential
 from vmri_jax.scene.effects.fields import Gravity
+from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import JointDamper, JointLimit, JointSpring, RotorInertia
-from vmri_jax.scene.effects.joints import Fixed, Joint, Prismatic, Revolute, Spherical
+from vmri_jax.scene.effects.joints import Fixed, Prismatic, Revolute, Spherical
 from vmri_jax.scene.mujoco_couplings import couplings
 from vmri_jax.scene.mujoco_fields import CONSTRAINTS
 from vmri_jax.scene.mujoco_loops import close, loops

@@ -1,11 +1,12 @@
-"""How fast bodies would move under each effect alone, and the border between slow and fast.
+"""The rate at which each effect alone would move its bodies, and the border between slow and fast rates.
 
-A potential (L = -V) or kinetic effect gives the force ``f(q, v) = L_q - L_vq v`` at constant velocity; gauge terms drop out.
-With the stiffness ``K = -df/dq``, the gyroscopic matrix G, the antisymmetric part of df/dv, and the mass matrix M of its
-bodies, the frequency of an element is the largest w at the start with ``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
+The part L(q, v) of the Lagrangian of a potential (L = -V) or kinetic effect gives the force ``f(q, v) = L_q - L_vq v`` at constant
+velocity, in which gauge terms cancel. The stiffness is ``K = -df/dq``, the gyroscopic matrix G is the antisymmetric part of df/dv, and
+M is the mass matrix of the bodies of an element. The frequency of the element is the largest w at the start with
+``det(K - w^2 M) = 0`` or ``det(G - i w M) = 0``.
 
-The rate is that, or ``sqrt(a / L)`` if larger: a an acceleration of bodies at rest, L the size of the scene. The border is
-the middle of the widest gap between all rates, on a logarithmic scale.
+The rate of the element is the larger of this frequency and ``sqrt(a / L)``, with its largest acceleration a of bodies at rest and the
+size L of the scene. The border is the middle of the widest gap between all rates, on a logarithmic scale.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,22 +25,30 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.terms import EffectTerm
 
 SEPARATION = 3.0
-"""Smallest ratio of two neighbouring rates that separates slow from fast; without, one rate is enough for all."""
+"""Smallest ratio of neighbouring rates that separates slow from fast: below it micro steps cost more than they save. With a larger value
+fewer scenes have fast bodies."""
 SPAN = 1e3
-"""Largest ratio of time scales that counts: slower effects are slow in any case, and would hide the gap between slow and fast ones."""
+"""Largest ratio between the fastest rate and any other: slower rates are raised to this one. Such effects are slow in any case, and with a
+larger value the gap to them may be wider than the gap between slow and fast effects."""
+ROUND_OFF = 1e-12
+"""An eigenvalue of the stiffness below this fraction of its largest entry is round-off, and the frequency zero. A larger value hides soft
+motions of stiff elements."""
 
 
 class Rates(NamedTuple):
-    """Of every element of an effect: the frequency of its linearised motion and the rate of its change, rad/s."""
+    """Frequencies and rates of all elements of an effect, (n,) rad/s each."""
 
     frequency: np.ndarray
     rate: np.ndarray
 
 
 class Linearised(NamedTuple):
-    """An element at the start: its columns, its force on bodies at rest, K, G, and d2L/dv2, its part of the mass matrix.
+    """An element at the start, in the velocities that its bodies can have: for a rigid body those of its centre and its spin.
 
-    All are those of the motions that the bodies can make: of a rigid one the velocity of its centre and its spin.
+    columns: numbers of these velocities among those of all bodies.
+    force: on the bodies at rest.
+    stiffness, gyroscopic: K and G.
+    mass: d2L/dv2, the part of the element in the mass matrix.
     """
 
     columns: np.ndarray
@@ -61,56 +70,66 @@ def measure(bodies: Bodies, effects: Sequence[Effect]) -> dict[str, Rates]:
     """
     sizes = [body.motions.shape[1] for body in bodies.values()]
     columns = dict(zip(bodies, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
+    # M = A^T diag(m) A with the motions A of each body, plus d2L/dv2 of kinetic effects
     mass = np.asarray(block_diag(*(body.motions.T @ (body.masses[:, None] * body.motions) for body in bodies.values())))
-    found = {effect.name: _linearise(effect, bodies, columns) for effect in effects}
-    for element in chain(*found.values()):
+    elements = {effect.name: _linearise(effect, bodies, columns) for effect in effects}
+    for element in chain(*elements.values()):
         mass[np.ix_(element.columns, element.columns)] += element.mass
     positions = _positions(bodies)
     size = max(float(np.ptp(positions, axis=0).max(initial=0.0)), float(np.abs(positions).max()))
-    return {effect.name: _rates(effect, bodies, found[effect.name], mass, size or 1.0) for effect in effects}
+    return {effect.name: _rates(effect, bodies, elements[effect.name], mass, size or 1.0) for effect in effects}
 
 
 def border(rates: Sequence[np.ndarray], slow: float = 0.0, fast: float = np.inf) -> float | None:
-    """The middle of the widest gap between rates, None where there is none.
+    """The border between slow and fast: the middle of the widest gap between rates, rad/s; None if no gap is wide enough.
 
     Args:
         rates: of all effects, rad/s.
-        slow, fast: the border is above the one and below the other, rates of effects that are declared slow and fast.
+        slow: the largest rate of effects that are declared slow; the border is above it.
+        fast: the smallest rate of effects that are declared fast; the border is below it.
     """
-    found = np.sort([rate for some in rates for rate in some if rate > 0])
-    if not found.size:
+    ordered = np.sort([rate for of_effect in rates for rate in of_effect if rate > 0])
+    if not ordered.size:
         return None
-    found = np.maximum(found, found[-1] / SPAN)
-    gaps = [(high / low, np.sqrt(high * low)) for low, high in pairwise(found) if slow <= low and high <= fast]
+    ordered = np.maximum(ordered, ordered[-1] / SPAN)
+    gaps = [(high / low, np.sqrt(high * low)) for low, high in pairwise(ordered) if slow <= low and high <= fast]
     widest, middle = max(gaps, default=(1.0, 0.0))
-    declared = slow > 0 or fast < np.inf
+    declared = slow > 0 or fast < np.inf  # then the user says that there are two time scales: any gap will do
     return float(middle) if widest >= SEPARATION or (declared and widest > 1) else None
 
 
 def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndarray, size: float) -> Rates:
-    known = effect.curvature(bodies)
-    curvatures = np.broadcast_to(-np.inf if known is None else known, len(elements))
+    """Frequencies and rates of the elements of an effect.
+
+    Args:
+        mass: of all bodies.
+        size: L, the size of the scene.
+    """
+    declared = effect.curvature(bodies)
+    curvatures = np.broadcast_to(-np.inf if declared is None else declared, len(elements))
     frequency, rate = np.zeros(len(elements)), np.zeros(len(elements))
     for i, (names, element) in enumerate(zip(effect.elements(bodies), elements, strict=True)):
-        own = mass[np.ix_(element.columns, element.columns)]
-        lightest = np.linalg.eigvalsh(own).min()
+        element_mass = mass[np.ix_(element.columns, element.columns)]
+        lightest = np.linalg.eigvalsh(element_mass).min()
         if not lightest > 0:
             raise ValueError(
                 f"{effect.name}: the kinetic energy of {', '.join(names)} is not positive at the start; change masses or kinetic "
                 "effects, or give every body a pace and every potential between fast bodies a rate."
             )
-        root = np.linalg.cholesky(own)
+        root = np.linalg.cholesky(element_mass)
+        # largest eigenvalue w^2 of M^-1 K, or the curvature that the effect declares over the smallest mass
         matrix = _scaled(root, (element.stiffness + element.stiffness.T) / 2)
         largest = max(np.linalg.eigvalsh(matrix).max(), curvatures[i] / lightest)
-        if largest > 1e-12 * np.abs(matrix).max(initial=0.0):  # else round-off
+        if largest > ROUND_OFF * np.abs(matrix).max(initial=0.0):
             frequency[i] = np.sqrt(largest)
         frequency[i] = max(frequency[i], np.linalg.norm(_scaled(root, element.gyroscopic), 2))
-        rate[i] = max(frequency[i], np.sqrt(np.abs(np.linalg.solve(own, element.force)).max() / size))
-    same: dict[frozenset, list[int]] = {}
+        rate[i] = max(frequency[i], np.sqrt(np.abs(np.linalg.solve(element_mass, element.force)).max() / size))
+    # elements between the same bodies are terms of a series, as of a torsion: they get the rate of the fastest
+    same_bodies: dict[frozenset, list[int]] = {}
     for i, names in enumerate(effect.elements(bodies)):
-        same.setdefault(frozenset(names), []).append(i)
-    for some in same.values():  # terms of one sum, as of a torsion: they belong together
-        frequency[some], rate[some] = frequency[some].max(), rate[some].max()
+        same_bodies.setdefault(frozenset(names), []).append(i)
+    for numbers in same_bodies.values():
+        frequency[numbers], rate[numbers] = frequency[numbers].max(), rate[numbers].max()
     return Rates(frequency, rate)
 
 
@@ -120,47 +139,58 @@ def _scaled(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]) -> list[Linearised]:
-    params, found = effect.parameters(bodies), []
+    """The elements of an effect at the start.
+
+    Args:
+        columns: numbers of the velocities of each body among those of all.
+    """
+    params, linearised = effect.parameters(bodies), []
     for i, element in enumerate(map(moving, effect.elements(bodies))):
-        term, own = effect.alone(i, bodies, params)
-        q, v = (jnp.concatenate([getattr(bodies[name], what) for name in element]) for what in ("coordinates", "rates"))
-        force, *matrices = map(np.asarray, _derivatives(term, effect.kind == "kinetic", q, v, own))
+        term, element_params = effect.element_term(i, bodies, params)
+        q = jnp.concatenate([bodies[name].coordinates for name in element])
+        v = jnp.concatenate([bodies[name].rates for name in element])
+        force, *matrices = map(np.asarray, _derivatives(term, effect.kind == "kinetic", q, v, element_params))
         motions = block_diag(*(bodies[name].motions for name in element))
-        parts = motions.T @ force, *(motions.T @ matrix @ motions for matrix in matrices)
-        found.append(Linearised(np.concatenate([columns[name] for name in element]), *parts))
-        if not all(np.isfinite(part).all() for part in found[-1]):
+        projected = motions.T @ force, *(motions.T @ matrix @ motions for matrix in matrices)
+        if not all(np.isfinite(part).all() for part in projected):
             raise ValueError(
-                f"{effect.name}: its energy between {', '.join(element)} has no finite derivatives at the start; move them, or smooth it."
+                f"{effect.name}: its energy between {', '.join(element)} has no finite derivatives at the start; move these bodies, or "
+                "smooth the energy."
             )
-    return found
+        linearised.append(Linearised(np.concatenate([columns[name] for name in element]), *projected))
+    return linearised
 
 
 @partial(quickly_compiled, static_argnames=("term", "kinetic"))
 def _derivatives(term: EffectTerm, kinetic: bool, q, v, params):
-    """What `Linearised` holds after the columns, before the motions of bodies are chosen."""
-    if not kinetic:  # L = -V(q) has no derivatives by velocities, which would be traced and compiled for nothing
+    """The force, K, G and d2L/dv2 of an element in the coordinates of its bodies."""
+    if (
+        not kinetic
+    ):  # the derivatives of L = -V(q) by velocities are zero: tracing and compiling them would take time for nothing
 
         def gradient(q):
             values = jax.grad(term.value)(q, None, params)
             return values, values
 
         stiffness, values = jax.jacfwd(gradient, has_aux=True)(q)
-        none = jnp.zeros_like(stiffness)
-        return -values, stiffness, none, none
+        zero = jnp.zeros_like(stiffness)
+        return -values, stiffness, zero, zero
 
     def lagrangian(q, v):
         return term.kinetic(q, None, v, None, params)
 
     def force(q, v):
+        """``f = L_q - L_vq v``."""
         momentum = jax.grad(lagrangian, 1)
         return jax.grad(lagrangian)(q, v) - jax.jvp(lambda q: momentum(q, v), (q,), (v,))[1]
 
-    moved = jax.jacfwd(force, 1)(q, v)
+    by_velocities = jax.jacfwd(force, 1)(q, v)
     at_rest = jax.grad(lagrangian)(q, jnp.zeros_like(v))
-    return at_rest, -jax.jacfwd(force)(q, v), (moved - moved.T) / 2, jax.hessian(lagrangian, 1)(q, v)
+    gyroscopic = (by_velocities - by_velocities.T) / 2
+    return at_rest, -jax.jacfwd(force)(q, v), gyroscopic, jax.hessian(lagrangian, 1)(q, v)
 
 
 def _positions(bodies) -> np.ndarray:
-    """All points and centres in one array, blocks left out where there are points; padded with zeros."""
+    """(n, 3) positions of all points and centres, padded with zeros; without the blocks, or the origin if there are only blocks."""
     points = [np.asarray(body.point().position) for body in bodies.values() if not body.block] or [np.zeros(1)]
     return np.stack([np.pad(point, (0, LARGEST_POINT - point.size)) for point in points])

@@ -1,9 +1,9 @@
 """Rigid bodies by directors: a point and three axes, constrained to stay orthonormal.
 
 The coordinates of a body are ``q = (phi, d_1, d_2, d_3)``, its centre of mass and its principal axes of inertia in space.
-A point X of the body, along its principal axes, is at ``phi + sum_i X_i d_i``: linear in q. So is the velocity, and the
-kinetic energy ``m |phi'|^2 / 2 + sum_i E_i |d_i'|^2 / 2`` has the constant masses ``E_i = (J_1 + J_2 + J_3) / 2 - J_i`` of the
-principal moments of inertia J. Rigidity is six constraints, ``d_i . d_j = delta_ij``.
+A point with the components X along the principal axes is at ``phi + sum_i X_i d_i``, which is linear in q. The kinetic energy
+``m |phi'|^2 / 2 + sum_i E_i |d_i'|^2 / 2`` has constant masses ``E_i = (J_1 + J_2 + J_3) / 2 - J_i`` with the principal moments of
+inertia J. Rigidity is six constraints, ``d_i . d_j = delta_ij``.
 
 Source: P. Betsch, S. Leyendecker, The discrete null space method for the energy consistent integration of constrained
 mechanical systems, part II: multibody dynamics, Int. J. Numer. Meth. Engng 67 (2006).
@@ -23,23 +23,26 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.shapes import Ball, Rod, Shape, box_of
 
 THIN = 1e-12
-"""Masses E below this part of the largest one are zero: the body has no width in that direction."""
+"""A mass E below this fraction of the largest is round-off: the body has no width in this direction, and no director. A larger value
+takes the width of thin plates away."""
 COVERED = 1.01
-"""Points as far out as this, in half the size of a body, are drawn within it."""
+"""A point within this multiple of half the size of the drawn shape counts as inside it; slightly above 1, so that points on the surface
+do. With a larger one a point that is visibly outside gets no line to the body."""
 ORTHONORMAL = 1e-9
-"""How far a matrix may be from a rotation, and a quaternion from length one."""
+"""Largest difference of ``R^T R`` from the identity, of the length of a quaternion from 1, and of an inertia matrix from its transpose
+relative to its largest entry. A larger value accepts rotations that stretch bodies; a smaller one refuses numbers with ten digits."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigidBody(AnyBody):
     """A rigid body: ``q = (phi, d_1, d_2, d_3)``, its centre of mass and its principal axes of inertia.
 
-    Effects between points act at its centre where they are given its name, and at a point that is fixed in it where they
-    are given ``(name, [x, y, z])``: from the centre of mass, along the axes of the body. A body without width, a rod or a
-    plate, has fewer axes: only those along which it is wide.
+    Effects between points that name the body act at its centre. With ``(name, [x, y, z])`` they act at a point that is fixed in the body,
+    this far from the centre of mass along the axes of the body. Rods and plates have directors only along the axes in which they have
+    width.
 
     Args:
-        name: what effects call it.
+        name: of the body in effects.
         mass: m, kg, positive.
         inertia: about the centre of mass, kg m^2: (3,) principal moments J, a symmetric matrix (3, 3) in the axes of the
             body, or a `Shape`: `Box`, `Cylinder`, `Ball`, `Rod`.
@@ -49,16 +52,16 @@ class RigidBody(AnyBody):
         velocity: (3,) of the centre of mass, m/s; at rest by default.
         spin: (3,) angular velocity at the start in space, rad/s; none by default.
         pace: "slow", "fast" or "auto", as of `Body`.
-        shape: how it is drawn; that of `inertia` by default.
+        shape: of the drawing; by default the shape of `inertia`.
 
     Attributes:
-        moments: (3,) principal moments of inertia.
-        axes: (3, 3) principal axes in those of the body, as columns.
+        moments: (3,) principal moments of inertia, kg m^2.
+        axes: (3, 3) principal axes as columns, in the axes of the body.
 
     Raises:
-        TypeError: what is no real number.
-        ValueError: a mass or moment of inertia that is not positive, moments that no body has (one larger than the sum of
-            the others), a rotation that is none, numbers that are not finite or of float32, other shapes, another pace.
+        TypeError: an argument that is no real number.
+        ValueError: a mass or moment of inertia that is not positive, moments that no body has (the largest above the sum of
+            the other two), a matrix that is no rotation, numbers that are not finite or of float32, other shapes, another pace.
     """
 
     name: str
@@ -83,69 +86,72 @@ class RigidBody(AnyBody):
         if mass.shape or (is_concrete(mass) and not mass > 0):
             raise ValueError(f"RigidBody {self.name}: mass is {mass}; it must be one positive number.")
         shape = self.inertia if isinstance(self.inertia, Shape) else self.shape
-        given = (
-            self.inertia.inertia(mass) if isinstance(self.inertia, Shape) else self._numbers("inertia", self.inertia)
-        )
-        moments, axes = self._principal(given)
-        found = {"mass": mass, "shape": shape, "moments": moments, "axes": axes}
+        inertia = self.inertia
+        tensor = inertia.inertia(mass) if isinstance(inertia, Shape) else self._numbers("inertia", inertia)
+        moments, axes = self._principal(tensor)
+        fields = {"mass": mass, "shape": shape, "moments": moments, "axes": axes}
         for name in ("position", "velocity", "spin"):
             value = np.zeros(3) if getattr(self, name) is None else self._numbers(name, getattr(self, name))
             if value.shape != (3,):
                 raise ValueError(f"RigidBody {self.name}: {name} has shape {value.shape}; give (3,).")
-            found[name] = value
-        found["rotation"] = self._matrix()
-        for name, value in found.items():
+            fields[name] = value
+        fields["rotation"] = self._matrix()
+        for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     def _principal(self, inertia) -> tuple[Any, np.ndarray]:
-        """Principal moments (3,), and the principal axes in those of the body, as columns."""
-        what = f"RigidBody {self.name}: inertia"
+        """Principal moments (3,), and the principal axes as columns, in the axes of the body.
+
+        Args:
+            inertia: (3,) principal moments, or (3, 3) tensor.
+        """
+        about = f"RigidBody {self.name}: inertia"
         axes = np.eye(3)
         if inertia.shape == (3, 3) and is_concrete(inertia):
             if np.abs(inertia - inertia.T).max() > ORTHONORMAL * np.abs(inertia).max():
-                raise ValueError(f"{what} is {inertia.tolist()}; it must be a symmetric matrix.")
+                raise ValueError(f"{about} is {inertia.tolist()}; it must be a symmetric matrix.")
             if np.count_nonzero(inertia - np.diag(np.diagonal(inertia))):
                 inertia, axes = np.linalg.eigh(inertia)
-                axes[:, 2] *= np.linalg.det(axes)
+                axes[:, 2] *= np.linalg.det(axes)  # eigenvectors may form a left-handed triad
             else:
-                inertia = np.diagonal(inertia)
+                inertia = np.diagonal(inertia)  # keeps the order of the axes, which eigh would sort
         if inertia.shape != (3,):
-            raise ValueError(f"{what} has shape {inertia.shape}; give (3,) principal moments, a matrix, or a shape.")
+            raise ValueError(f"{about} has shape {inertia.shape}; give (3,) principal moments, a matrix, or a shape.")
         if is_concrete(inertia):
             inertia = np.asarray(inertia)
-            largest, others = inertia.max(), inertia.sum() - inertia.max()
+            largest, other_two = inertia.max(), inertia.sum() - inertia.max()
             if inertia.min() < 0 or largest <= 0:
-                raise ValueError(f"{what} has the principal moments {inertia}; they must be positive.")
-            if largest > others * (1 + ORTHONORMAL):
+                raise ValueError(f"{about} has the principal moments {inertia}; they must be positive.")
+            if largest > other_two * (1 + ORTHONORMAL):
                 raise ValueError(
-                    f"{what} has the principal moments {inertia}, which no body has: the largest, {largest:g}, must not be larger than "
-                    f"the sum of the others, {others:g}."
+                    f"{about} has the principal moments {inertia}, which no body has: the largest, {largest:g}, must not be larger than "
+                    f"the sum of the others, {other_two:g}."
                 )
         return inertia, axes
 
     def _matrix(self):
-        """The rotation as a matrix."""
+        """The rotation as a matrix (3, 3)."""
         if self.rotation is None:
             return np.eye(3)
-        what, given = f"RigidBody {self.name}: rotation", self._numbers("rotation", self.rotation)
-        if given.shape not in ((3, 3), (4,), (3,)):
+        about, rotation = f"RigidBody {self.name}: rotation", self._numbers("rotation", self.rotation)
+        if rotation.shape not in ((3, 3), (4,), (3,)):
             raise ValueError(
-                f"{what} has shape {given.shape}; give a matrix (3, 3), a quaternion (w, x, y, z) or a rotation vector (3,)."
+                f"{about} has shape {rotation.shape}; give a matrix (3, 3), a quaternion (w, x, y, z) or a rotation vector (3,)."
             )
-        if not is_concrete(given):
-            return matrix_of(given)
-        if given.shape == (4,) and abs(np.linalg.norm(given) - 1) > ORTHONORMAL:
+        if not is_concrete(rotation):
+            return matrix_of(rotation)
+        if rotation.shape == (4,) and abs(np.linalg.norm(rotation) - 1) > ORTHONORMAL:
             raise ValueError(
-                f"{what} is the quaternion {given} of length {np.linalg.norm(given):.12g}; divide it by its length, which must be 1."
+                f"{about} is the quaternion {rotation} of length {np.linalg.norm(rotation):.12g}; divide it by its length, which must be 1."
             )
-        if given.shape == (3, 3):
-            away = np.abs(given.T @ given - np.eye(3)).max()
-            if away > ORTHONORMAL or np.linalg.det(given) < 0:
+        if rotation.shape == (3, 3):
+            error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+            if error > ORTHONORMAL or np.linalg.det(rotation) < 0:
                 raise ValueError(
-                    f"{what} is {given.tolist()}, which is no rotation: R^T R differs from 1 by {away:.2g} and the determinant is "
-                    f"{np.linalg.det(given):.3g}."
+                    f"{about} is {rotation.tolist()}, which is no rotation: R^T R differs from 1 by {error:.2g} and the determinant is "
+                    f"{np.linalg.det(rotation):.3g}."
                 )
-        return np.asarray(matrix_of(given))
+        return np.asarray(matrix_of(rotation))
 
     @property
     def inertias(self):
@@ -153,12 +159,12 @@ class RigidBody(AnyBody):
         return jnp.sum(self.moments) / 2 - self.moments if not is_concrete(self.moments) else self._inertias()
 
     def _inertias(self) -> np.ndarray:
-        found = np.sum(self.moments) / 2 - self.moments
-        return np.where(found > THIN * found.max(), found, 0.0)
+        masses = np.sum(self.moments) / 2 - self.moments
+        return np.where(masses > THIN * masses.max(), masses, 0.0)
 
     @property
     def wide(self) -> tuple[int, ...]:
-        """Which directors it has: those along which it is wide."""
+        """Numbers of the directors of the body: of the principal axes in which it has width, all three of a traced inertia."""
         return tuple(range(3)) if not is_concrete(self.moments) else tuple(np.flatnonzero(self._inertias()).tolist())
 
     @property
@@ -179,46 +185,52 @@ class RigidBody(AnyBody):
 
     @property
     def masses(self):
-        """(n,) m three times, every E_i three times."""
+        """(n,) the mass m three times, then every E_i three times."""
         inertias = self.inertias
         return joined([self.mass + np.zeros(3), *(inertias[i] + np.zeros(3) for i in self.wide)])
 
     @property
     def motions(self) -> np.ndarray:
-        """(n, 6) velocities by those of the centre and the angular velocity; (6, 5) of a rod."""
+        """(n, 6) matrix from the velocity of the centre and the angular velocity to q'; (6, 5) basis of the same space for a rod."""
         turns = self._turns()
-        whole = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((len(turns), 3)), turns]])
-        return whole if len(self.wide) > 1 else np.linalg.svd(whole)[0][:, :5]
+        matrix = np.block([[np.eye(3), np.zeros((3, 3))], [np.zeros((len(turns), 3)), turns]])
+        return matrix if len(self.wide) > 1 else np.linalg.svd(matrix)[0][:, :5]  # a rod does not turn about itself
 
     def _turns(self) -> np.ndarray:
-        """Rates of the directors by the angular velocity, ``d_i' = -d_i x spin``."""
+        """Matrix from the angular velocity to the rates of the directors, ``d_i' = -d_i x spin``."""
         return np.concatenate([-_cross_matrix(np.asarray(self.directors[i])) for i in self.wide])
 
     def with_rates(self, rates: np.ndarray) -> "RigidBody":
-        """The same body with other velocities; a rod gets no spin about itself."""
+        """The same body with other velocities; the spin of a rod about its axis is zero."""
         return replace(self, velocity=rates[:3], spin=np.linalg.lstsq(self._turns(), rates[3:], rcond=None)[0])
 
     def components(self, vector):
         """(3,) components along the principal axes of a vector in the axes of the body.
 
         Raises:
-            ValueError: a vector that sticks out of a body without width.
+            ValueError: a vector with a component along an axis in which the body has no width, and so no director.
         """
-        along = vector @ self.axes
-        out = [i for i in range(3) if i not in self.wide]
-        if out and is_concrete(along) and np.any(np.abs(np.asarray(along)[out]) > ORTHONORMAL * np.abs(along).max()):
-            raise ValueError(
-                f"{np.asarray(vector)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate or a "
-                "rod, without width there. Give it some."
-            )
-        return along
+        components = vector @ self.axes
+        thin = [i for i in range(3) if i not in self.wide]
+        if thin and is_concrete(components):
+            sizes = np.abs(np.asarray(components))
+            if np.any(sizes[thin] > ORTHONORMAL * sizes.max()):
+                raise ValueError(
+                    f"{np.asarray(vector)} sticks out of {self.name}: with the moments of inertia {np.asarray(self.moments)} it is a plate "
+                    "or a rod without width in this direction. Give the body some width."
+                )
+        return components
 
     @property
     def _drawn_shape(self) -> Shape:
         return self.shape or box_of(float(self.mass), self.moments)
 
     def covers(self, weights) -> bool:
-        """Whether a point in the body, by weights of its directors, is in the box around what is drawn of it."""
+        """Whether a point of the body is inside the bounding box of its drawn shape.
+
+        Args:
+            weights: (3,) components of the point along the directors.
+        """
         shape = self._drawn_shape
         if isinstance(shape, Ball):
             return bool(np.linalg.norm(weights) <= shape.radius)
@@ -228,10 +240,11 @@ class RigidBody(AnyBody):
         return bool(np.all(np.abs(weights[: len(self.wide)]) <= COVERED * np.abs(corners).max(axis=0)))
 
     def drawing(self, part: str, start: int) -> dict[str, list]:
-        """What there is to see of it: entries of `Scene.drawing`.
+        """Entries of the body in the lists of `Scene.drawing`.
 
         Args:
-            part, start: where its coordinates are, "s" or "f" and the first.
+            part: "s" or "f", the part of the coordinates that the body is in.
+            start: number of its first coordinate there.
         """
         shape = self._drawn_shape
         centre = {"name": self.name, "coordinates": [[part, start + i] for i in range(3)]}
@@ -245,28 +258,28 @@ class RigidBody(AnyBody):
             hidden = [{"name": name, "coordinates": form, "shown": ""} for name, form in zip(names, ends, strict=True)]
             return {"bodies": [centre | {"shown": "name"}, *hidden], "links": [names]}
         corners, faces = shape.polyhedron()
-        along = (corners @ self.axes)[:, list(self.wide)]
+        components = (corners @ self.axes)[:, list(self.wide)].tolist()
         coordinates = [[part, start + i] for i in range(self.size)]
-        return {"solids": [{"name": self.name, "coordinates": coordinates, "corners": along.tolist(), "faces": faces}]}
+        return {"solids": [{"name": self.name, "coordinates": coordinates, "corners": components, "faces": faces}]}
 
-    def weights(self, at: Any) -> Any:
-        """(3,) of the directors in a point ``phi + sum_i X_i d_i``."""
-        along = self.components(at)
-        return joined([along[np.array(self.wide)], np.zeros(3 - len(self.wide))])
+    def weights(self, offset: Any) -> Any:
+        """(3,) components X of a point ``phi + sum_i X_i d_i``, first those along the directors that the body has, then zeros."""
+        components = self.components(offset)
+        return joined([components[np.array(self.wide)], np.zeros(3 - len(self.wide))])
 
-    def point(self, at: Any = None) -> Point:
+    def point(self, offset: Any = None) -> Point:
         """The centre of mass, or a point fixed in the body, at the start."""
-        if at is None:
+        if offset is None:
             return Point(self.name, self.position, self.mass)
-        if at.shape != (3,):
-            raise ValueError(f"the point in {self.name} has shape {at.shape}; give (3,), in the axes of the body.")
-        self.components(at)
-        return Point(self.name, self.position + self.rotation @ at)
+        if offset.shape != (3,):
+            raise ValueError(f"the point in {self.name} has shape {offset.shape}; give (3,), in the axes of the body.")
+        self.components(offset)  # refuses a point outside a plate or a rod
+        return Point(self.name, self.position + self.rotation @ offset)
 
 
 @effect_class
 class Rigidity(Effect):
-    """What keeps rigid bodies rigid, ``g = (d_i . d_j - delta_ij) / (1 + delta_ij)``; every scene with such bodies has it.
+    """The constraints of rigid bodies by directors, ``g = (d_i . d_j - delta_ij) / (1 + delta_ij)``; every scene adds this effect itself.
 
     Args:
         bodies: names of the rigid bodies.
@@ -281,7 +294,7 @@ class Rigidity(Effect):
     @staticmethod
     def function(q, params):
         d = split(q[0])[1]
-        products = d @ jnp.swapaxes(d, -1, -2)
+        products = d @ jnp.swapaxes(d, -1, -2)  # d_i . d_j
         rows, columns = np.triu_indices(d.shape[-2])
         return jnp.stack(
             [
@@ -299,14 +312,16 @@ def split(q):
 
 
 def matrix_of(rotation):
-    """(3, 3) matrix of a rotation: itself, a quaternion (w, x, y, z), or a rotation vector."""
+    """(3, 3) matrix of a rotation, which is such a matrix, a quaternion (w, x, y, z) or a rotation vector (3,)."""
     if rotation.shape == (3, 3):
         return rotation
     if rotation.shape == (4,):
+        # R = 1 + 2 w U + 2 U^2 with the matrix U of x -> u x x, u the vector part
         w, u = rotation[0], _cross_matrix(rotation[1:])
         return jnp.eye(3) + 2 * w * u + 2 * u @ u
     if is_concrete(rotation):
         return Rotation.from_rotvec(np.array(rotation)).as_matrix()
+    # Rodrigues: R = 1 + (sin a / a) U + (1 - cos a) / a^2 U^2, with (1 - cos a) / a^2 = (sin(a/2) / (a/2))^2 / 2
     angle = jnp.sqrt(jnp.sum(rotation**2))
     u = _cross_matrix(rotation)
     return jnp.eye(3) + jnp.sinc(angle / np.pi) * u + jnp.sinc(angle / (2 * np.pi)) ** 2 / 2 * u @ u
@@ -317,9 +332,6 @@ def _cross_matrix(u):
     zero = u[0] * 0
     rows = [[zero, -u[2], u[1]], [u[2], zero, -u[0]], [-u[1], u[0], zero]]
     return np.array(rows) if is_concrete(u) else jnp.array(rows)
-
-
-# Where a body is along a run
 
 
 def rotation(q):
@@ -337,24 +349,24 @@ def rotation(q):
 
 
 def quaternion(q):
-    """Quaternions (..., 4), (w, x, y, z), of a rigid body; neighbours along the last axis but one do not change sign.
+    """Quaternions (..., k, 4), (w, x, y, z), of a rigid body; their signs are such that they do not jump along a run.
 
     Args:
         q: (..., k, 12) coordinates along a run.
     """
     matrices = rotation(q)
-    found = (
+    quaternions = (
         Rotation.from_matrix(np.array(matrices.reshape(-1, 3, 3)))
         .as_quat(scalar_first=True)
         .reshape(*matrices.shape[:-2], 4)
     )
-    if found.ndim > 1:
-        turned = np.sign(np.sum(found[..., 1:, :] * found[..., :-1, :], axis=-1))
-        signs = np.concatenate(
-            [np.ones_like(turned[..., :1]), np.cumprod(np.where(turned < 0, -1, 1), axis=-1)], axis=-1
-        )
-        found = found * signs[..., None]
-    return found
+    if quaternions.ndim > 1:
+        # p and -p are the same rotation: a negative product with the quaternion before asks for the other sign from there on
+        products = np.sum(quaternions[..., 1:, :] * quaternions[..., :-1, :], axis=-1)
+        changes = np.where(products < 0, -1, 1)
+        signs = np.concatenate([np.ones_like(products[..., :1]), np.cumprod(changes, axis=-1)], axis=-1)
+        quaternions = quaternions * signs[..., None]
+    return quaternions
 
 
 def angular_velocity(q, v):

@@ -20,20 +20,21 @@ from vmri_jax.scene.sorting import Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm
 
 HOMES: tuple[Home, ...] = ("slow_constraint", "constraint")
-
-
+"""The arguments of `System` that hold constraints, in the order of the grids macro, micro."""
 CANCELLED = 1e-14
-"""Part of the product of the gradient of a row by bodies and the motion of these by a coordinate below which their inner product is zero: so it is with the rows of a planar loop that
-hold it in its plane. A larger one takes a row away whose lever is short, a smaller one takes round-off for an independent row."""
+"""An entry of the Jacobian dg/dq is the product of the row dg/dQ and the column dQ/dq. If it is below this fraction of the product of
+their lengths it is round-off and set to zero, as for the rows that hold a planar loop in its plane. A larger value removes rows with
+short levers; with a smaller value round-off counts as an independent row."""
 
 
 class Row(NamedTuple):
     """A row of a constraint.
 
-    name: of its effect and bodies, with a number where these have several rows.
+    name: of its effect and bodies, with a number if an element has several rows.
     part: number of its entry in `Sorting.placed`.
-    number: of the row in that entry, in the order of its terms.
-    effect, home, kept: of that entry; `kept` is False of a row that is left out.
+    number: of the row in this entry, in the order of its terms.
+    effect, home: of this entry.
+    kept: False for a row that the scene leaves out.
     """
 
     name: str
@@ -45,9 +46,10 @@ class Row(NamedTuple):
 
 
 class _Element(NamedTuple):
-    """An element of a constraint as a function of its coordinates.
+    """An element of a constraint as a function of the coordinates of its bodies.
 
-    columns: where these are among the coordinates of all bodies (Q_s, Q_f).
+    term, params: see `Effect.element_term`.
+    columns: numbers of these coordinates in (Q_s, Q_f), taken as one vector.
     """
 
     term: EffectTerm
@@ -60,14 +62,14 @@ class ConstraintRows:
     """The k rows of all constraints, in the order of `Sorting.placed`, over the n coordinates, slow ones first.
 
     Attributes:
-        rows: one entry for each of them.
+        rows: the k rows.
         elements: their functions.
         start: (n,) coordinates at the start.
-        masses: (n,); 1 each where they are traced, since they only weigh the choice of the rows to drop.
-        scales: (n,) by how much each coordinate changes in a large motion: the extent of the scene for positions, 1 for
+        masses: (n,) of the coordinates; 1 for traced masses, since they only weigh the choice of the rows to drop.
+        scales: (n,) change of each coordinate in a large motion: the extent of the scene for positions, 1 for
             directors of rigid bodies and angles of joints, and for general coordinates their value, at least 1.
         num_slow: number of slow coordinates.
-        to_bodies: the coordinates of all bodies (Q_s, Q_f) one after the other at q, and their Jacobian.
+        to_bodies: (Q_s, Q_f) as one vector at q, and its Jacobian dQ/dq.
     """
 
     rows: tuple[Row, ...]
@@ -80,55 +82,57 @@ class ConstraintRows:
 
     @classmethod
     def of(cls, sorting: Sorting) -> "ConstraintRows | None":
-        """The rows of the constraints of these effects; None where there are none, or where their numbers are traced."""
-        bodies, held = sorting.bodies, [(i, part) for i, part in enumerate(sorting.placed) if part.home in HOMES]
-        params = {i: part.effect.parameters(bodies) for i, part in held}
-        if not held or not is_concrete((sorting.positions, sorting.joints, params)):
+        """The rows of all constraints of a scene; None if it has none, or if their numbers are traced."""
+        bodies, layout, to_bodies = sorting.bodies, sorting.layout, sorting.to_bodies
+        constraints = [(i, part) for i, part in enumerate(sorting.placed) if part.home in HOMES]
+        params = {i: part.effect.parameters(bodies) for i, part in constraints}
+        if not constraints or not is_concrete((sorting.positions, sorting.joints, params)):
             return None
-        where, to_bodies = sorting.layout, sorting.to_bodies
         columns = {
-            name: place.start + np.arange(place.size) + (where.ends[0] if place.part == "f" else 0)
-            for name, place in where.bodies.items()
+            name: place.start + np.arange(place.size) + (layout.ends[0] if place.part == "f" else 0)
+            for name, place in layout.bodies.items()
         }
         start = np.concatenate(sorting.positions)
-        masses = join(bodies, where, "s", "masses"), join(bodies, where, "f", "masses")
-        masses = np.concatenate(masses) if is_concrete(masses) else None
-        extended, jacobian = to_bodies(start)
-        masses = np.ones_like(start) if masses is None else masses @ (jacobian * jacobian)
+        q_bodies, jacobian = to_bodies(start)
+        # the diagonal of J^T M J with J = dQ/dq
+        of_bodies = join(bodies, layout, "s", "masses"), join(bodies, layout, "f", "masses")
+        is_known = is_concrete(of_bodies)
+        masses = np.concatenate(of_bodies) @ (jacobian * jacobian) if is_known else np.ones_like(start)
         rows, elements = [], []
-        for i, part in held:
+        for i, part in constraints:
             number = 0
             for names, element in _elements(part, bodies, columns, params[i]):
                 elements.append(element)
-                size = _evaluated(element, extended, 0.0)[0].size
+                size = _evaluated(element, q_bodies, 0.0)[0].size
                 for j in range(size):
                     name = names if size == 1 else f"{names} [{j}]"
                     rows.append(Row(name, i, number, part.effect, part.home, number not in part.dropped))
                     number += 1
         scales = _scales(sorting, _extent(bodies))
-        return cls(tuple(rows), tuple(elements), start, masses, scales, where.sizes[0], to_bodies)
+        return cls(tuple(rows), tuple(elements), start, masses, scales, layout.sizes[0], to_bodies)
 
-    def at(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values (k,) and Jacobian (k, n) at a time and at positions (n,)."""
-        bodies, of_bodies = self.to_bodies(q)
-        values, jacobian, first = np.empty(len(self.rows)), np.zeros((len(self.rows), bodies.size)), 0
+    def evaluate(self, t: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values g (k,) and Jacobian dg/dq (k, n) at a time and at positions (n,)."""
+        q_bodies, by_coordinates = self.to_bodies(q)
+        values, by_bodies, first = np.empty(len(self.rows)), np.zeros((len(self.rows), q_bodies.size)), 0
         for element in self.elements:
-            value, entries = _evaluated(element, bodies, t)
+            value, entries = _evaluated(element, q_bodies, t)
             values[first : first + value.size] = value
-            jacobian[first : first + value.size, element.columns] = entries
+            by_bodies[first : first + value.size, element.columns] = entries
             first += value.size
-        found = jacobian @ of_bodies
-        largest = np.linalg.norm(jacobian, axis=1)[:, None] * np.sqrt((of_bodies * of_bodies).sum(axis=0))
-        return values, np.where(np.abs(found) > CANCELLED * largest, found, 0.0)
+        # dg/dq = dg/dQ dQ/dq, without entries that are round-off
+        jacobian = by_bodies @ by_coordinates
+        lengths = np.linalg.norm(by_bodies, axis=1)[:, None] * np.sqrt((by_coordinates * by_coordinates).sum(axis=0))
+        return values, np.where(np.abs(jacobian) > CANCELLED * lengths, jacobian, 0.0)
 
     @cached_property
     def jacobian(self) -> np.ndarray:
         """The Jacobian (k, n) at the start."""
-        return self.at(0.0, self.start)[1]
+        return self.evaluate(0.0, self.start)[1]
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """By how much each row changes in a large motion, (k,): the length of its gradient in coordinates over `scales`, 1 where that is zero."""
+        """(k,) change of each row in a large motion: the length of its gradient by coordinates over `scales`; 1 if this is zero."""
         lengths = np.linalg.norm(self.jacobian * self.scales, axis=1)
         return np.where(lengths > 0, lengths, 1.0)
 
@@ -138,7 +142,7 @@ class ConstraintRows:
         return any(row.effect.timed for row in self.rows)
 
     def numbers(self, home: Home | None = None) -> list[int]:
-        """Numbers of the rows that are kept, all or those of a home."""
+        """Numbers of the kept rows: of all, or of those with a certain home."""
         return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
 
     def names(self, numbers: Sequence[int]) -> list[str]:
@@ -147,16 +151,16 @@ class ConstraintRows:
 
 
 def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], params: dict[str, Any]):
-    """Elements of an effect in the order of its terms, each with its name."""
+    """Labels and elements of an effect, in the order of its terms."""
     effect = part.effect
     elements = effect.elements(bodies)
     for i in chain(*effect.by_size(part.elements, bodies)):
         of_element = np.concatenate([columns[name] for name in moving(elements[i])])
-        yield label(effect, elements[i]), _Element(*effect.alone(i, bodies, params), of_element)
+        yield label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
 
 
 def _evaluated(element: _Element, q: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values (m,) of an element at positions q (n,) of all bodies, and their derivatives by its own coordinates."""
+    """Values (m,) of an element at positions q of all bodies, and their derivatives by the coordinates of the bodies of this element."""
     values, jacobian = _value_and_jacobian(element.term, q[element.columns], element.params, t)
     return np.asarray(values), np.asarray(jacobian)
 
@@ -172,7 +176,10 @@ def _value_and_jacobian(term: EffectTerm, q, params, t):
 
 
 def _extent(bodies: Bodies) -> float:
-    """Largest distance of a body from their mean along an axis; of a single place, its largest coordinate, or 1 at the origin."""
+    """Extent of the scene: the largest distance of a body from the mean of all positions along an axis.
+
+    If all bodies are at the same place, the largest coordinate of this place, or 1 at the origin.
+    """
     points = [np.asarray(body.coordinates)[:LARGEST_POINT] for body in bodies.values() if not body.block]
     points = np.array([np.pad(point, (0, LARGEST_POINT - point.size)) for point in points]).reshape(-1, LARGEST_POINT)
     if not points.size:
@@ -181,18 +188,19 @@ def _extent(bodies: Bodies) -> float:
 
 
 def _scales(sorting: Sorting, extent: float) -> np.ndarray:
-    """By how much each coordinate changes in a large motion, see `ConstraintRows`."""
-    turning = {place: freedom in ANGLES for (_, _, freedom), place in sorting.layout.freedoms.items()}
-    places = sorted(sorting.layout.own.items(), key=lambda item: (item[1].part == "f", item[1].start))
-    found = [
-        np.full(1, 1.0 if turning[place] else extent) if place in turning else _scales_of(sorting.bodies[name], extent)
-        for name, place in places
-    ]
-    return np.concatenate(found)
+    """(n,) change of each coordinate in a large motion, see `ConstraintRows`."""
+    of_joints = {
+        place: np.full(1, 1.0 if freedom in ANGLES else extent)
+        for (_, _, freedom), place in sorting.layout.freedoms.items()
+    }
+    places = sorted(sorting.layout.coordinates.items(), key=lambda item: (item[1].part == "f", item[1].start))
+    return np.concatenate(
+        [of_joints[place] if place in of_joints else _scales_of(sorting.bodies[name], extent) for name, place in places]
+    )
 
 
 def _scales_of(body: AnyBody, extent: float) -> np.ndarray:
-    """By how much each coordinate of a body changes in a large motion."""
+    """Change of each coordinate of a body in a large motion."""
     q = np.asarray(body.coordinates)
     if body.block:
         return np.maximum(np.abs(q), 1.0)

@@ -7,15 +7,15 @@ import numpy as np
 from vmri_jax.mechanics.arrays import library
 
 SIDES = 20
-"""Of a cylinder as it is drawn."""
+"""Side faces of a drawn cylinder. More look rounder and take longer to draw."""
 
 Polyhedron = tuple[np.ndarray, list[list[int]]]
-"""Corners (n, 3) in the axes of a body, and faces as their numbers, anticlockwise from outside."""
+"""Corners (n, 3) in the axes of a body, and faces as lists of numbers of corners, anticlockwise as seen from outside."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """A solid box with edges (a, b, c), m, along the axes of the body; one of them may be zero: a plate."""
+    """A solid box with edges (a, b, c), m, along the axes of the body; an edge of zero makes a plate."""
 
     edges: tuple[float, float, float]
 
@@ -33,7 +33,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A solid cylinder, m, its axis along the third axis of the body."""
+    """A solid cylinder with this radius and length, m, its axis along the third axis of the body."""
 
     radius: float
     length: float
@@ -44,7 +44,7 @@ class Cylinder:
         return library(across, self.radius).stack([across, across, mass * self.radius**2 / 2])
 
     def polyhedron(self) -> Polyhedron:
-        """Two polygons of so many `SIDES`, and what is between them."""
+        """Two polygons with `SIDES` corners each, and the side faces between them."""
         angle = 2 * np.pi * np.arange(SIDES) / SIDES
         circle = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         ends = [np.column_stack([circle, np.full(SIDES, z)]) for z in (-self.length / 2, self.length / 2)]
@@ -54,7 +54,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Ball:
-    """A solid ball, m."""
+    """A solid ball with this radius, m."""
 
     radius: float
 
@@ -65,7 +65,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class Rod:
-    """A thin rod, m, along the third axis of the body: it has no other axes."""
+    """A thin rod of this length, m, along the third axis of the body; it has no directors across."""
 
     length: float
 
@@ -79,7 +79,8 @@ Shape = Box | Cylinder | Ball | Rod
 
 
 def box_of(mass: float, moments) -> Box:
-    """The solid box with these principal moments of inertia."""
+    """The solid box with this mass, kg, and these principal moments of inertia (3,), kg m^2."""
+    # J_1 = m (b^2 + c^2) / 12 and so on, solved for the squares of the edges: a^2 = 6 (J_1 + J_2 + J_3 - 2 J_1) / m
     squares = 6 * (np.sum(moments) - 2 * np.asarray(moments)) / mass
     a, b, c = np.sqrt(np.maximum(squares, 0.0)).tolist()
     return Box((a, b, c))

@@ -1,13 +1,22 @@
-"""Who is slow and who is fast: bodies by pace, effects by what they touch and how stiff they are.
+"""Sorting of bodies into slow and fast, and of effects into the functions of a `System`.
 
-A potential that touches a slow body is part of V, unless its rate is declared. One that touches only fast bodies is part of W if it is
-stiff, else of V, where it is evaluated less often. One of the declared rate k is evaluated at every k-th micro node, and one that is
-declared fast and touches a slow body is on the micro grid. A constraint that touches a fast body is held on the micro grid, one between slow
-bodies on the macro grid: on the micro grid it would be over-determined. Kinetic effects are on the micro grid always,
-because momenta need them there; the kinetic energy of bodies that depend on slow coordinates alone is on the macro grid.
+An effect touches the bodies whose coordinates it depends on. It becomes part of a function as follows:
 
-A body is fast that a stiff potential (not one of V) or kinetic effect touches: one whose frequency is above the border
-between slow and fast, see `vmri_jax.scene.rates`.
+| effect | part of |
+|---|---|
+| potential that touches a slow body | V |
+| potential between fast bodies, stiff | W |
+| potential between fast bodies, not stiff | V, where it is evaluated less often |
+| potential with the rate k | the potential at every k-th micro node |
+| potential with the rate "fast" that touches a slow body | the potential on the micro grid |
+| constraint that touches a fast body | g, on the micro grid |
+| constraint between slow bodies | g_s, on the macro grid; on the micro grid there would be more rows than unknowns |
+| kinetic effect | T, on the micro grid, where momenta need it |
+
+The kinetic energy of bodies that depend on slow coordinates alone is on the macro grid.
+
+A body with the pace "auto" is fast if a stiff kinetic effect, or a stiff potential outside V, touches it. An effect is stiff if its
+frequency is above the border between slow and fast, see `vmri_jax.scene.rates`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,27 +40,29 @@ from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
 from vmri_jax.scene.trees import Branch, Link, joint_numbers, layout, nearest_rates, with_weight
 
 NAMED = 3
-"""Most bodies that a reason names."""
+"""Most bodies that a reason names; with more the table of reasons is too wide."""
 
 Home = (
     Literal["kinetic", "slow_potential", "fast_potential", "constraint", "slow_constraint", "force", "control", "fast"]
     | int
 )
-"""The argument of `System` that an element is part of; "fast" or a whole number: the potential of this name in `System.potentials`."""
+"""The argument of `System` that an element is part of; "fast" or a whole number is the key of a potential in `System.potentials`."""
 
 
 class Reason(NamedTuple):
-    """Why an element is where it is; the text has places for its bodies and "is" or "are", if it is about some."""
+    """Why an element has its home. A text about bodies has two braces ``{}``, for their names and for "is" or "are"."""
 
     text: str
     bodies: tuple[str, ...] = ()
 
 
 class Placed(NamedTuple):
-    """Some elements of an effect, the argument of `System` that they are part of, and why.
+    """Some elements of an effect with a common home.
 
-    dropped: rows of a constraint that are left out, numbers in the order of its terms.
-    sizes: by how much the values of these change in a large motion, see `vmri_jax.scene.rows`.
+    effect, elements: the effect, and the numbers of these elements.
+    home, reason: the argument of `System` that they are part of, and why.
+    dropped: numbers of the rows of a constraint that the scene leaves out, in the order of its terms.
+    sizes: of the dropped rows, see `ConstraintRows.sizes`.
     """
 
     effect: Effect
@@ -64,12 +75,15 @@ class Placed(NamedTuple):
 
 @dataclass(frozen=True)
 class Sorting:
-    """Bodies by name, their paces, their places, and where every effect lives.
+    """Bodies with their paces and places, and the homes of all effects.
 
     Attributes:
-        links: the frames of bodies on joints, in the order of the kinematics; None where a way has ended.
-        joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`; others are zero, with the
-            rates that the velocities of bodies give.
+        bodies, paces: by name.
+        layout: places of all coordinates.
+        placed: the effects, each with its home.
+        links: the frames of bodies on joints, in the order of the kinematics; None pads paths to the same length.
+        joint_starts: values and rates of freedoms of joints at the start, by the keys of `Layout.freedoms`. Other freedoms start at zero,
+            with the rates that follow from the velocities of bodies.
     """
 
     bodies: Bodies
@@ -86,13 +100,12 @@ class Sorting:
 
     @property
     def places(self) -> dict[str, Place]:
-        """Where the coordinates of bodies are in Q_s and Q_f, see `Layout`."""
+        """Places of the coordinates of bodies in Q_s and Q_f, see `Layout`."""
         return self.layout.bodies
 
     @property
     def start(self) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """(q_s, q_f, v_s, v_f) at the start."""
-
         if self.layout.kinematics is None:
             return (*self._of_bodies("coordinates"), *self._of_bodies("rates"))
         return self._on_joints[0]
@@ -104,38 +117,39 @@ class Sorting:
 
     @property
     def assembled(self) -> tuple[Any, Any]:
-        """(q_s, q_f) where the bodies are as they are given, and freedoms of joints are zero."""
+        """(q_s, q_f) at the positions of the bodies as the user gave them, where freedoms of joints are zero."""
         slow, fast = self._of_bodies("coordinates")
         n_s, n_f = self.layout.sizes
         return slow[:n_s], fast[:n_f]
 
-    def _with_joint_starts(self, slow, fast, which: int) -> tuple[Any, Any]:
-        """Slow and fast coordinates with the values that freedoms of joints start with, or (1) velocities with their rates."""
-        for key, value in self.joint_starts.items():
+    def _with_joint_starts(self, slow, fast, order: Literal[0, 1]) -> tuple[Any, Any]:
+        """Coordinates (order 0) or velocities (order 1), slow and fast, with the values or rates in `joint_starts` put in."""
+        for key, value_and_rate in self.joint_starts.items():
             part, start, _ = self.layout.freedoms[key]
-            given = (slow, fast)[part == "f"]
-            pieces = given[:start], library(value[which]).reshape(value[which], (1,)), given[start + 1 :]
+            vector, number = (slow, fast)[part == "f"], value_and_rate[order]
+            pieces = vector[:start], library(number).reshape(number, (1,)), vector[start + 1 :]
             changed = library(pieces).concatenate(pieces)
             slow, fast = (changed, fast) if part == "s" else (slow, changed)
         return slow, fast
 
     @property
-    def missed(self) -> Any:
-        """The part of the velocities of bodies that their joints do not allow, in the norm of the kinetic energy; see `start`."""
+    def violation(self) -> Any:
+        """The part of the velocities of bodies that their joints do not allow, relative to all, in the norm of the kinetic energy."""
         return self._on_joints[1] if self.layout.kinematics is not None else 0.0
 
     @cached_property
     def _on_joints(self) -> tuple[tuple, Any]:
+        """`start` and `violation` of a scene in joint coordinates."""
         q, n_s = library(self.assembled).concatenate(self.assembled), self.layout.sizes[0]
-        rates, masses = (library(both).concatenate(both) for both in map(self._of_bodies, ("rates", "masses")))
-        v, missed = nearest_rates(self.to_bodies(q)[1], rates, masses)
-        return (*self.positions, *self._with_joint_starts(v[:n_s], v[n_s:], 1)), missed
+        rates, masses = (library(parts).concatenate(parts) for parts in map(self._of_bodies, ("rates", "masses")))
+        v, violation = nearest_rates(self.to_bodies(q)[1], rates, masses)
+        return (*self.positions, *self._with_joint_starts(v[:n_s], v[n_s:], 1)), violation
 
-    def _of_bodies(self, what: str) -> tuple[jax.Array, jax.Array]:
-        return join(self.bodies, self.layout, "s", what), join(self.bodies, self.layout, "f", what)
+    def _of_bodies(self, quantity: Literal["coordinates", "rates", "masses"]) -> tuple[jax.Array, jax.Array]:
+        return join(self.bodies, self.layout, "s", quantity), join(self.bodies, self.layout, "f", quantity)
 
     def to_bodies(self, q: Any) -> tuple[Any, Any]:
-        """The coordinates of all bodies (Q_s, Q_f) one after the other, and their Jacobian, of q = (q_s, q_f)."""
+        """Q = (Q_s, Q_f) of q = (q_s, q_f), each one vector, and the Jacobian dQ/dq."""
         if self.layout.kinematics is None:
             return q, eye_array(q.size)
         bodies, jacobian = _bodies_and_jacobian(self.layout.kinematics, q, self.joints)
@@ -143,7 +157,7 @@ class Sorting:
 
     @cached_property
     def joints(self) -> dict[str, Any]:
-        """Points and triads of the joints that carry bodies, see `Kinematics`; empty without such."""
+        """Constants of the joints that carry bodies, see `joint_numbers`; empty if no joint does."""
         return joint_numbers(self.bodies, self.links) if self.links else {}
 
 
@@ -153,18 +167,18 @@ def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
 
     def bodies(q):
         n_s = kinematics.sizes[0]
-        found = jnp.concatenate(kinematics(q[:n_s], q[n_s:], joints))
-        return found, found
+        coordinates = jnp.concatenate(kinematics(q[:n_s], q[n_s:], joints))
+        return coordinates, coordinates
 
-    jacobian, found = jax.jacfwd(bodies, has_aux=True)(q)
-    return found, jacobian
+    jacobian, coordinates = jax.jacfwd(bodies, has_aux=True)(q)
+    return coordinates, jacobian
 
 
 class Owners(NamedTuple):
     """The bodies whose coordinates an element of an effect depends on.
 
-    all: every one of them.
-    between: those that move its bodies against each other.
+    all: all these bodies.
+    between: those of them whose coordinates move the bodies of the element against each other, not together.
     """
 
     all: tuple[str, ...]
@@ -175,29 +189,30 @@ def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[
     """The bodies whose coordinates each element of an effect depends on."""
     on_joints = {branch.child: branch for branch in branches}
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
-    found = []
+    owners = []
     for i, names in enumerate(effect.elements(bodies)):
         pairs = effect.pairs_of_joints(i)
         if pairs and all(pair in carried for pair in pairs):
             chains = [[carried[pair]] for pair in pairs]
         else:
             chains = [_chain(name, on_joints) for name in dict.fromkeys(map(str, names))]
-        everything = tuple(dict.fromkeys(name for chain in chains for name in chain))
+        names_of_all = tuple(dict.fromkeys(name for chain in chains for name in chain))
+        # a body that carries all bodies of the element moves them together
         shared = set.intersection(*map(set, chains)) if len(chains) > 1 else set()
-        found.append(Owners(everything, tuple(name for name in everything if name not in shared) or everything))
-    return found
+        owners.append(Owners(names_of_all, tuple(name for name in names_of_all if name not in shared) or names_of_all))
+    return owners
 
 
 def _chain(name: str, branches: Mapping[str, Branch]) -> list[str]:
-    """The bodies whose coordinates a body depends on, itself first."""
-    found = []
+    """The bodies whose coordinates the position of a body depends on, from this body to the root of its tree."""
+    chain = []
     while name != GROUND:
-        if name not in branches or branches[name].joint.freedoms:
-            found.append(name)
+        if name not in branches or branches[name].joint.freedoms:  # a body on a `Fixed` joint has no coordinates
+            chain.append(name)
         if name not in branches:
             break
         name = branches[name].parent
-    return found
+    return chain
 
 
 def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] = ()) -> Sorting:
@@ -209,7 +224,7 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
         branches: bodies that are functions of the freedoms of joints, parents before children.
 
     Raises:
-        ValueError: something to be decided by numbers that are traced; joints that leave no freedom.
+        ValueError: a decision between slow and fast that depends on traced numbers; joints that leave no freedom.
     """
     energies = [effect for effect in effects if effect.kind in ("potential", "kinetic")]
     owned = {effect.name: _owners(effect, bodies, branches) for effect in effects}
@@ -230,22 +245,22 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
         homes: dict[Home, dict[int, Reason]] = {}
         for i, (names, _) in enumerate(owned[effect.name]):
             if (effect.name, i) in carrying:
-                continue  # it has no equation
+                continue  # a joint that carries a body has coordinates instead of constraint rows
             slow = tuple(name for name in names if paces[name].value == "slow")
             home, reason = _home(effect, i, slow, len(names), measured, limit)
             homes.setdefault(home, {})[i] = reason
-        placed += [Placed(effect, tuple(some), home, _together(some.values())) for home, some in homes.items()]
-    where, ordered = layout(bodies, paces, branches)
-    if not any(where.sizes):
+        placed += [Placed(effect, tuple(reasons), home, _summary(reasons.values())) for home, reasons in homes.items()]
+    places, links = layout(bodies, paces, branches)
+    if not any(places.sizes):
         joints = dict.fromkeys(branch.joint.name for branch in branches)
         raise ValueError(
-            f"Scene: nothing can move: {', '.join(joints)} leave no freedom to any body. Leave one of them out."
+            f"Scene: nothing can move: {', '.join(joints)} leave no freedom to any body. Leave one of these joints out."
         )
-    return Sorting(bodies, paces, where, tuple(placed), ordered)
+    return Sorting(bodies, paces, places, tuple(placed), links)
 
 
 def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[str, Rates]:
-    """Rates of potentials and kinetic effects, if a decision depends on them."""
+    """Rates of potentials and kinetic effects; {} if no decision depends on them, since they need concrete numbers."""
     undecided = []
     for effect in energies:
         free = [all(bodies[name].pace != "slow" for name in names) for names, _ in owned[effect.name]]
@@ -264,6 +279,7 @@ def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[st
 
 
 def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owners]]) -> dict[str, Pace]:
+    """The pace of every body: as the user gave it, or fast if a stiff effect moves it, else slow."""
     paces = {}
     for name, body in bodies.items():
         if body.pace != "auto":
@@ -276,16 +292,16 @@ def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owner
         for i, (names, between) in enumerate(owned[effect.name]):
             declared = effect.rate == "fast" or isinstance(effect.rate, int)
             if effect.kind == "potential" and not declared and any(bodies[name].pace == "slow" for name in names):
-                continue  # it is part of V
-            why = _stiff(effect, i, measured, limit)
-            for name in between if why else ():
+                continue  # the potential is part of V, however stiff
+            reason = _stiff(effect, i, measured, limit)
+            for name in between if reason else ():
                 if paces[name].value == "slow" and bodies[name].pace == "auto":
-                    paces[name] = Pace("fast", f"touched by {effect.name}, {why}")
+                    paces[name] = Pace("fast", f"touched by {effect.name}, {reason}")
     return paces
 
 
 def _stiff(effect: Effect, i: int, measured, limit) -> str:
-    """Why an element makes bodies fast; empty if it does not."""
+    """The reason why element i makes bodies fast; "" if it does not."""
     if isinstance(effect.rate, int):
         return f"declared for every {effect.rate} micro nodes"
     if effect.rate != "auto":
@@ -296,7 +312,14 @@ def _stiff(effect: Effect, i: int, measured, limit) -> str:
 
 
 def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, limit) -> tuple[Home, Reason]:
-    """Where an element of an effect belongs that touches these slow bodies, and why."""
+    """The home of element i, and why, see the table of this module.
+
+    Args:
+        slow: the slow bodies that the element touches.
+        size: number of all bodies that it touches.
+        measured: rates of effects by name.
+        limit: border between slow and fast, rad/s; None if there is none.
+    """
     if effect.kind == "kinetic":
         return "kinetic", Reason("depends on velocities")
     if effect.kind == "force":
@@ -321,15 +344,15 @@ def _home(effect: Effect, i: int, slow: tuple[str, ...], size: int, measured, li
     return "slow_potential", Reason(f"between fast bodies but soft, below {limit:.3g} rad/s")
 
 
-def _together(reasons: Iterable[Reason]) -> str:
-    """All distinct reasons, each with the number of its elements if there are others; its bodies named together."""
-    found: dict[str, list[tuple[str, ...]]] = {}
+def _summary(reasons: Iterable[Reason]) -> str:
+    """The distinct reasons of the elements of an effect, each with all its bodies; of several reasons each with its number of elements."""
+    bodies_by_text: dict[str, list[tuple[str, ...]]] = {}
     for reason in reasons:
-        found.setdefault(reason.text, []).append(reason.bodies)
+        bodies_by_text.setdefault(reason.text, []).append(reason.bodies)
     parts = []
-    for text, bodies in found.items():
+    for text, bodies in bodies_by_text.items():
         names = tuple(dict.fromkeys(chain(*bodies)))
         listed = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
-        count = f" ({len(bodies)})" if len(found) > 1 else ""
+        count = f" ({len(bodies)})" if len(bodies_by_text) > 1 else ""
         parts.append(text.format(listed, "is" if len(names) == 1 else "are") + count)
     return "; ".join(parts)

@@ -1,6 +1,6 @@
-"""Terms: effects at their places in q_s and q_f, and the functions of a `System` as sums of terms.
+"""Terms: effects as functions of q_s and q_f, and the functions of a `System` as sums of terms.
 
-Everything here is compared by value: scenes of the same structure give equal functions, and nothing is compiled twice.
+All classes here are compared by value: scenes of the same structure give equal functions, which JAX compiles only once.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,21 +19,21 @@ from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.body import GROUND_COORDINATES
 
 IMPLIED = "implied"
-"""Where the sizes of rows that are left out are in params."""
+"""Key of params that holds the sizes of the dropped rows."""
 RESERVED = {
     MASS: "the masses",
     IMPLIED: "the sizes of rows that are left out",
     JOINTS: "the points and axes of joints that carry bodies",
 }
-"""Names in params that no effect may have, and what stands there."""
+"""Keys of params that no effect may have as its name, and their content, for messages."""
 
 
 @dataclass(frozen=True)
 class OnBodies:
-    """A role whose bodies are points, blocks, rigid bodies as a whole or their centres: it gets their coordinates.
+    """A role whose bodies are points, blocks, whole rigid bodies or their centres: it takes their coordinates.
 
     Args:
-        rows: where these are.
+        rows: places of the coordinates in q_s and q_f.
     """
 
     rows: Rows
@@ -43,7 +43,7 @@ class OnBodies:
         return self.rows.take(q_s, q_f)
 
     def velocities(self, v_s, v_f, params):
-        """Their rates."""
+        """(d,) or (n, d) rates of the coordinates."""
         return self.rows.take(v_s, v_f)
 
     def put(self, force, params, n_s: int, n_f: int):
@@ -56,50 +56,52 @@ class InRigidBodies:
     """A role whose points are fixed in rigid bodies: ``phi + sum_i X_i d_i`` with the components X in params.
 
     Args:
-        rows: where the coordinates of the bodies are.
-        at: name of the parameter X.
+        rows: places of the coordinates of the bodies in q_s and q_f.
+        parameter: name of the parameter X.
     """
 
     rows: Rows
-    at: str
+    parameter: str
 
     def positions(self, q_s, q_f, params):
         """(3,) or (n, 3) points."""
-        q, at = self.rows.take(q_s, q_f), params[self.at]
+        # phi + sum_i X_i d_i; bodies without width have fewer than three directors
+        q, components = self.rows.take(q_s, q_f), params[self.parameter]
         triples = q.reshape(*q.shape[:-1], -1, 3)
-        arms = at[..., : triples.shape[-2] - 1, None] * triples[..., 1:, :]
+        arms = components[..., : triples.shape[-2] - 1, None] * triples[..., 1:, :]
         return triples[..., 0, :] + jnp.sum(arms, axis=-2)
 
     def velocities(self, v_s, v_f, params):
-        """Their velocities: the same map, which is linear."""
+        """(3,) or (n, 3) velocities of the points: the map of the positions is linear."""
         return self.positions(v_s, v_f, params)
 
     def put(self, force, params, n_s: int, n_f: int):
         """Forces on all slow and on all fast coordinates."""
-        at = params[self.at][..., : self.rows.stride // 3 - 1, None]
-        force = jnp.broadcast_to(force, (*jnp.broadcast_shapes(force.shape[:-1], at.shape[:-2]), 3))
-        triples = jnp.concatenate([force[..., None, :], at * force[..., None, :]], axis=-2)
+        # the transpose of the map of positions: F on the centre, X_i F on the director d_i
+        components = params[self.parameter][..., : self.rows.stride // 3 - 1, None]
+        force = jnp.broadcast_to(force, (*jnp.broadcast_shapes(force.shape[:-1], components.shape[:-2]), 3))
+        triples = jnp.concatenate([force[..., None, :], components * force[..., None, :]], axis=-2)
         return self.rows.put(triples.reshape(*triples.shape[:-2], -1), n_s, n_f)
 
 
 @dataclass(frozen=True)
 class OnGround:
-    """A role that stays where it is: points given in params, or the ground as a rigid body whose axes are those of space.
+    """A role that does not move: points in params, or the ground as a rigid body with the axes of space.
 
     Args:
-        count: of elements.
-        size: of a point; 12 for the ground as a whole.
-        at: name of the parameter with the points; None for the ground as a whole.
+        count: number of elements.
+        size: number of coordinates of a point; 12 for the ground as a whole.
+        parameter: name of the parameter with the points; None for the ground as a whole.
     """
 
     count: int
     size: int
-    at: str | None = None
+    parameter: str | None = None
 
     def positions(self, q_s, q_f, params):
         """(d,) or (n, d) points."""
-        if self.at is not None:
-            return params[self.at][..., : self.size]
+        if self.parameter is not None:
+            return params[self.parameter][..., : self.size]
         return self._shaped(jnp.asarray(GROUND_COORDINATES))
 
     def velocities(self, v_s, v_f, params):
@@ -107,7 +109,7 @@ class OnGround:
         return self._shaped(jnp.zeros(self.size))
 
     def put(self, force, params, n_s: int, n_f: int):
-        """Nothing: what holds the ground is not part of the scene."""
+        """Zero: no coordinate of the scene feels a force on the ground."""
         return jnp.zeros(n_s), jnp.zeros(n_f)
 
     def _shaped(self, vector):
@@ -119,10 +121,15 @@ Role = OnBodies | InRigidBodies | OnGround
 
 @dataclass(frozen=True)
 class EffectTerm:
-    """The function of an effect on the elements `select` (None: all of them), whose roles lie at `roles`.
+    """The function of an effect on some of its elements.
 
-    `split` names the parameters that have an entry for each element. The function of a `timed` one has the time before its
-    other arguments.
+    Args:
+        name: of the effect, the key of its parameters in params.
+        function: of the effect.
+        roles: the maps from q_s and q_f to the coordinates of each role.
+        select: numbers of the elements; None for all.
+        split: names of the parameters that have an entry for each element.
+        timed: whether the first argument of the function is the time.
     """
 
     name: str
@@ -133,34 +140,41 @@ class EffectTerm:
     timed: bool = False
 
     def params_of(self, params):
-        """What the function gets as params."""
+        """The params of the function: those of the effect, for the selected elements."""
         return params[self.name] if self.select is None else choose(params[self.name], self.select, self.split)
 
     def value(self, q_s, q_f, params, t=None):
         """Energy or constraint values."""
-        own = self.params_of(params)
-        return self.function(*((t,) if self.timed else ()), self._positions(q_s, q_f, own), own)
+        params = self.params_of(params)
+        return self.function(*((t,) if self.timed else ()), self._positions(q_s, q_f, params), params)
 
     def kinetic(self, q_s, q_f, v_s, v_f, params):
         """Velocity-dependent energy."""
-        own = self.params_of(params)
-        return self.function(self._positions(q_s, q_f, own), self._velocities(v_s, v_f, own), own)
+        params = self.params_of(params)
+        return self.function(self._positions(q_s, q_f, params), self._velocities(v_s, v_f, params), params)
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
         """Force on all slow and on all fast coordinates."""
-        own, sizes = self.params_of(params), (q_s.shape[0], q_f.shape[0])
-        forces = self.function(t, self._positions(q_s, q_f, own), self._velocities(v_s, v_f, own), own)
-        return totals([role.put(force, own, *sizes) for role, force in zip(self.roles, forces, strict=True)])
+        params = self.params_of(params)
+        forces = self.function(t, self._positions(q_s, q_f, params), self._velocities(v_s, v_f, params), params)
+        return self._put(forces, params, q_s.shape[0], q_f.shape[0])
 
     def controlled(self, q_s, q_f, u, params):
-        """Force on all slow and on all fast coordinates of controls u."""
-        own, sizes = self.params_of(params), (q_s.shape[0], q_f.shape[0])
-        forces = self.function(self._positions(q_s, q_f, own), u, own)
-        return totals([role.put(force, own, *sizes) for role, force in zip(self.roles, forces, strict=True)])
+        """Force of the controls u on all slow and on all fast coordinates."""
+        params = self.params_of(params)
+        forces = self.function(self._positions(q_s, q_f, params), u, params)
+        return self._put(forces, params, q_s.shape[0], q_f.shape[0])
 
     def within(self, sizes: tuple[int, int]) -> bool:
-        """Whether it takes nothing but the coordinates of the scene, the first (n_s, n_f) of Q."""
+        """Whether the term depends only on the coordinates of the scene, the first n_s of Q_s and the first n_f of Q_f.
+
+        Args:
+            sizes: (n_s, n_f).
+        """
         return all(isinstance(role, OnGround) or role.rows.within(sizes) for role in self.roles)
+
+    def _put(self, forces, params, n_s: int, n_f: int):
+        return totals([role.put(force, params, n_s, n_f) for role, force in zip(self.roles, forces, strict=True)])
 
     def _positions(self, q_s, q_f, params):
         return tuple(role.positions(q_s, q_f, params) for role in self.roles)
@@ -171,22 +185,22 @@ class EffectTerm:
 
 @dataclass(frozen=True)
 class SomeRows:
-    """The values of some terms of a constraint one after the other, without those that are `dropped`."""
+    """The values of some terms of a constraint one after the other, without the rows with the numbers `dropped`."""
 
     terms: tuple[EffectTerm, ...]
     dropped: tuple[int, ...]
 
     @property
     def timed(self) -> bool:
-        """Whether one of them depends on time."""
+        """Whether a term depends on time."""
         return any(term.timed for term in self.terms)
 
     def within(self, sizes: tuple[int, int]) -> bool:
-        """As of `EffectTerm`."""
+        """Whether all terms depend only on the coordinates of the scene, see `EffectTerm.within`."""
         return all(term.within(sizes) for term in self.terms)
 
     def value(self, q_s, q_f, params, t=None):
-        """The values that stay, by static slices."""
+        """The values of the rows that are kept, by static slices."""
         values = joined([term.value(q_s, q_f, params, t) for term in self.terms])
         ends = [-1, *self.dropped, values.shape[0]]
         return joined([values[low + 1 : high] for low, high in pairwise(ends)])
@@ -194,23 +208,23 @@ class SomeRows:
 
 @dataclass(frozen=True)
 class DroppedRows(SomeRows):
-    """The values that `SomeRows` leaves out."""
+    """The values of the rows that `SomeRows` leaves out."""
 
     def value(self, q_s, q_f, params, t=None):
-        """These values, by static slices."""
+        """The values of the dropped rows, by static slices."""
         values = joined([term.value(q_s, q_f, params, t) for term in self.terms])
         return joined([values[k : k + 1] for k in self.dropped])
 
 
 @dataclass(frozen=True)
 class TangentDamping:
-    """``F = -beta K v``, K the Hessian of the energy of some terms."""
+    """``F = -beta K v`` with the Hessian K of the energy of some terms; beta is the parameter "stiffness"."""
 
     name: str
     terms: tuple[EffectTerm, ...]
 
     def within(self, sizes: tuple[int, int]) -> bool:
-        """As of `EffectTerm`."""
+        """Whether all terms depend only on the coordinates of the scene, see `EffectTerm.within`."""
         return all(term.within(sizes) for term in self.terms)
 
     def forces(self, t, q_s, q_f, v_s, v_f, params):
@@ -220,17 +234,24 @@ class TangentDamping:
             q_s, q_f = q
             return total([term.value(q_s, q_f, params) for term in self.terms])
 
-        rates = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
-        return tuple(-params[self.name]["stiffness"] * rate for rate in rates)
+        # K v as the derivative of the gradient along v, without the matrix K
+        products = jax.jvp(jax.grad(energy), ((q_s, q_f),), ((v_s, v_f),))[1]
+        return tuple(-params[self.name]["stiffness"] * product for product in products)
 
 
 def choose(params, select: Sequence[int], split: Sequence[str]):
-    """Parameters of some elements: entries of those in `split` that have one for each element."""
+    """The parameters of some elements.
+
+    Args:
+        params: of all elements.
+        select: numbers of the elements.
+        split: names of parameters that may have an entry for each element.
+    """
     return params | {name: pick(params[name], select) for name in split if name in params and jnp.ndim(params[name])}
 
 
 def pick(values, select: Sequence[int]):
-    """Entries of an array by static slices; a single one without its axis."""
+    """Entries of an array by static slices; a single entry without its axis."""
     if len(select) == 1:
         return values[select[0]]
     if list(select) == list(range(select[0], select[0] + len(select))):
@@ -244,7 +265,7 @@ def total(values: Sequence):
 
 
 def totals(pairs: Sequence):
-    """Sums of the first and of the second ones of pairs (slow, fast)."""
+    """Sum of pairs (slow, fast): the pair of the sums."""
     return tuple(total(parts) for parts in zip(*pairs, strict=True))
 
 
@@ -258,28 +279,28 @@ class _OfTerms:
     """A function of a `System` that is made of terms; compared by class, terms and kinematics.
 
     Args:
-        terms: functions of the coordinates of bodies Q.
-        kinematics: from the coordinates of the scene q to Q; None where they are the same.
+        terms: functions of the coordinates Q of bodies.
+        kinematics: the map from the coordinates q of the scene to Q; None if Q = q.
     """
 
     terms: tuple[Any, ...]
     kinematics: Kinematics | None = None
 
     def bodies(self, q_s, q_f, params) -> tuple[Any, Any]:
-        """(Q_s, Q_f) of q_s and q_f, one of which may be None: the terms do not depend on it, zeros are as good."""
+        """(Q_s, Q_f) of q_s and q_f; one of these may be None if the terms do not depend on it, and zeros take its place."""
         if self.kinematics is None:
             return q_s, q_f
         slow, fast = (jnp.zeros(n) if q is None else q for q, n in zip((q_s, q_f), self.kinematics.sizes, strict=True))
         return self.kinematics(slow, fast, params[JOINTS])
 
     def motions(self, q_s, q_f, v_s, v_f, params):
-        """(Q_s, Q_f) and their rates."""
+        """((Q_s, Q_f), (V_s, V_f)) with the velocities ``V = dQ/dq v`` of the bodies."""
         if self.kinematics is None:
             return (q_s, q_f), (v_s, v_f)
         return jax.jvp(lambda q_s, q_f: self.bodies(q_s, q_f, params), (q_s, q_f), (v_s, v_f))
 
     def forces_on(self, q_s, q_f, params, forces):
-        """(F_s, F_f) of forces on the coordinates of bodies: ``(dQ/dq)^T F``."""
+        """Generalised forces on (q_s, q_f) of forces F on the coordinates of bodies: ``(dQ/dq)^T F``."""
         if self.kinematics is None:
             return forces
         return jax.vjp(lambda q_s, q_f: self.bodies(q_s, q_f, params), q_s, q_f)[1](forces)
@@ -320,14 +341,14 @@ class MacroConstraint(_OfTerms):
 
 
 class ImpliedRows(MicroConstraint):
-    """``g_i(q_s, q_f, params)``, or ``g_i(t, q_s, q_f, params)``: the values of rows that are left out, in parts of their sizes."""
+    """``g_i(q_s, q_f, params)``, or ``g_i(t, q_s, q_f, params)``: the values of the dropped rows over their sizes."""
 
     def __call__(self, *arguments):
         return super().__call__(*arguments) / arguments[-1][IMPLIED]
 
 
 class KineticEnergy(_OfTerms):
-    """``T = sum m V_f^2 / 2`` of the rates V_f of bodies that depend on fast coordinates, and the velocity-dependent terms."""
+    """``T = sum m V_f^2 / 2`` of the velocities V_f of bodies that depend on fast coordinates, plus the velocity-dependent terms."""
 
     def __call__(self, q_s, q_f, v_s, v_f, params):
         bodies, rates = self.motions(q_s, q_f, v_s, v_f, params)
@@ -336,7 +357,7 @@ class KineticEnergy(_OfTerms):
 
 
 class SlowKineticEnergy(_OfTerms):
-    """``T_s = sum m V_s^2 / 2`` of the rates V_s of bodies that depend on slow coordinates alone."""
+    """``T_s = sum m V_s^2 / 2`` of the velocities V_s of bodies that depend on slow coordinates alone."""
 
     def __call__(self, q_s, v_s, params):
         none = jnp.zeros(0 if self.kinematics is None else self.kinematics.sizes[1])
@@ -358,7 +379,7 @@ class Actuation(_OfTerms):
     """Forces of the controls of a scene, ``(q_s, q_f, u, params) -> (F_s, F_f)``, see `vmri_jax.control.minimize`.
 
     Args:
-        terms: one of each effect.
+        terms: a term for each effect.
         names: of the controls of each effect.
     """
 
@@ -372,7 +393,7 @@ class Actuation(_OfTerms):
     def __call__(self, q_s, q_f, u, params):
         ends, bodies = np.cumsum([len(names) for names in self.names])[:-1], self.bodies(q_s, q_f, params)
         controls = zip(self.terms, jnp.split(u, ends), strict=True)
-        forces = totals([term.controlled(*bodies, own, params) for term, own in controls])
+        forces = totals([term.controlled(*bodies, u_effect, params) for term, u_effect in controls])
         return self.forces_on(q_s, q_f, params, forces)
 
 
@@ -386,4 +407,4 @@ FUNCTIONS = {
     "force": TotalForce,
     "implied": ImpliedRows,
 }
-"""What is made of the terms of a home."""
+"""For each argument of `System`, the class that makes a function of its terms."""

@@ -1,8 +1,10 @@
 """Trees of bodies on joints: which joints carry a body as a function of their freedoms, and which close loops.
 
-Every joint whose freedoms are coordinates without a pole may carry a body. Of those that form a loop one is cut: its rows stay as
-constraints. A spanning tree that grows from the ground, or from a body of what floats (one that is said to be slow, or else the heaviest), takes the joint with the most rows first
-(Prim's algorithm), so that the fewest rows are left, and the one nearest to the root among equals, so that trees are not deep.
+A joint whose freedoms are coordinates without a singularity may carry a body. In each loop of such joints one joint closes the loop: it
+carries no body, and its rows stay constraints. Prim's algorithm chooses these joints. It grows a spanning tree from the ground, and from
+a body of each mechanism that is not tied to the ground: a body with the pace "slow", or else the heaviest. It adds the joint with the
+fewest freedoms first, so that the joints left over have the fewest rows, and among equals the joint nearest to the root, so that trees
+are not deep.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,21 +19,21 @@ from vmri_jax.mechanics.kinematics import UNMOVED, Frames, Grid, Kinematics, Mov
 from vmri_jax.mechanics.rows import Part, Place, Rows
 from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
 from vmri_jax.scene.effect import Effect
-from vmri_jax.scene.effects.joints import Joint
+from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.layout import Layout, Pace
 from vmri_jax.scene.rigid import RigidBody
 
 LONGEST = 50
-"""Bodies on a way from the root of a tree, up to which joint coordinates are chosen by themselves. All joints of a tree are coupled by its
-kinetic energy, so that their time for a step grows nearly with the third power of the length; by directors it grows with the first. With a
-hinged chain of 30 bars joints take 0.45 of the time of directors, with 100 bars 2.9 times as long."""
+"""Most bodies between the root and a leaf of a tree for which coordinates="auto" chooses joint coordinates. The kinetic energy couples all
+joints of a tree, so that the time of a step grows nearly with the third power of this length; by directors it grows in proportion. On a
+hinged chain of 30 bars a step in joint coordinates takes 0.45 of the time by directors, on 100 bars 2.9 times as long."""
 
 
 class Branch(NamedTuple):
-    """A body that hangs on another one, or on the ground, by a pair of a joint.
+    """A body (the child) that a joint carries, and the body or ground (the parent) that it hangs on.
 
-    element: number of the pair.
-    forward: whether the body is the second one of the pair.
+    element: number of the pair of bodies in the joint.
+    forward: whether the child is the second body of this pair.
     """
 
     child: str
@@ -42,25 +44,25 @@ class Branch(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of frames from the parent to the child, the latter included."""
+        """Number of frames between the parent and the child, including the child."""
         return max(1, len(self.joint.moves))
 
     @property
     def keys(self) -> list[tuple[str, int, str]]:
-        """Its freedoms as keys of `Layout.freedoms`."""
+        """The freedoms of the joint as keys of `Layout.freedoms`."""
         return [(self.joint.name, self.element, freedom) for freedom in self.joint.freedoms]
 
     def labels(self, bodies: Bodies) -> list[str]:
-        """What its coordinates are called."""
+        """Names of the coordinates of the joint."""
         name = self.joint.label(self.element, bodies)
         freedoms = self.joint.freedoms
         return [name] if len(freedoms) == 1 else [f"{name} {freedom}" for freedom in freedoms]
 
 
 class Link(NamedTuple):
-    """A frame of a tree that hangs on another one: the body of a branch, or a frame between two moves of its joint.
+    """A frame of a tree with a single coordinate or none: the child of a branch, or a frame between two moves of its joint.
 
-    step: number of its move, from the parent of the branch on.
+    step: number of the move, counted from the parent of the branch.
     """
 
     branch: Branch
@@ -68,39 +70,42 @@ class Link(NamedTuple):
 
     @property
     def is_first(self) -> bool:
-        """Whether it hangs on a body."""
+        """Whether the frame hangs on a body, not on a frame of the same joint."""
         return self.step == 0
 
     @property
     def is_last(self) -> bool:
-        """Whether it is a body."""
+        """Whether the frame is the child of the branch."""
         return self.step + 1 >= len(self.branch.joint.moves)
 
     @property
     def coordinate(self) -> int | None:
-        """Number of its move among those of the joint; None of one that leaves nothing free."""
+        """Number of the move among the moves of the joint; None if the joint has no freedom."""
         count = len(self.branch.joint.moves)
-        return None if not count else self.step if self.branch.forward else count - 1 - self.step
+        if not count:
+            return None
+        # the moves are defined from body a to body b of the joint; a child that is body a undoes them, the last one first
+        return self.step if self.branch.forward else count - 1 - self.step
 
     @property
     def move(self) -> Move | None:
-        """What its coordinate does."""
+        """The motion of this frame by its coordinate."""
         return None if self.coordinate is None else self.branch.joint.moves[self.coordinate]
 
     @property
     def key(self) -> tuple[str, int, str] | None:
-        """Its freedom as a key of `Layout.freedoms`."""
+        """The freedom of this frame as a key of `Layout.freedoms`."""
         return None if self.coordinate is None else self.branch.keys[self.coordinate]
 
     def amount(self, kind: Literal["turn", "slide"]) -> float:
-        """1 or -1, forwards or backwards, where its coordinate turns or slides like this, else 0."""
+        """1 (forwards) or -1 (backwards) if the coordinate of this frame turns or slides it, as `kind` asks; else 0."""
         kinds = ("turn", "screw") if kind == "turn" else ("slide",)
         sign = 1.0 if self.branch.forward else -1.0
         return sign if self.move is not None and self.move.kind in kinds else 0.0
 
     @property
     def pitch(self):
-        """How far it moves along the axis in a turn, m; zero unless it is a screw."""
+        """How far the frame moves along the axis per turn, m; zero unless the joint is a screw."""
         return self.branch.joint.pitch_of(self.branch.element)
 
 
@@ -117,14 +122,15 @@ def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:
             if body_of(bodies, a).rigid and body_of(bodies, b).rigid:
                 edges.setdefault(a, []).append((b, joint, i, True))
                 edges.setdefault(b, []).append((a, joint, i, False))
-    found, reached, order = [], set(), count()
-    for root in (GROUND, *sorted(edges, key=lambda name: _as_root(name, bodies))):
+    branches, reached, order = [], set(), count()
+    for root in (GROUND, *sorted(edges, key=lambda name: _root_rank(name, bodies))):
         if root not in edges or root in reached:
             continue
         reached.add(root)
         waiting: list[tuple] = []
 
         def offer(parent: str, depth: int, waiting=waiting):
+            """Put the joints of a body that has been reached into the heap, fewest freedoms first, then least depth."""
             for child, joint, i, forward in edges[parent]:
                 if child not in reached:
                     heappush(waiting, (len(joint.moves), depth, next(order), Branch(child, parent, joint, i, forward)))
@@ -134,13 +140,13 @@ def grow(bodies: Bodies, effects: Sequence[Effect]) -> tuple[Branch, ...]:
             _, depth, _, branch = heappop(waiting)
             if branch.child not in reached:
                 reached.add(branch.child)
-                found.append(branch)
+                branches.append(branch)
                 offer(branch.child, depth + 1)
-    return tuple(found)
+    return tuple(branches)
 
 
 def shallow(branches: Sequence[Branch]) -> tuple[Branch, ...]:
-    """The branches of trees on whose ways at most `LONGEST` bodies follow each other.
+    """The branches of trees with at most `LONGEST` bodies between the root and any leaf.
 
     Args:
         branches: of all trees, parents before children.
@@ -149,7 +155,7 @@ def shallow(branches: Sequence[Branch]) -> tuple[Branch, ...]:
     roots: dict[str, str] = {}
     for branch in branches:
         depths[branch.child] = depths.get(branch.parent, 0) + 1
-        # on the ground each body that hangs on it begins a tree of its own
+        # each body on the ground is the root of a tree of its own: the ground does not couple their coordinates
         roots[branch.child] = branch.child if branch.parent == GROUND else roots.get(branch.parent, branch.parent)
     deepest: dict[str, int] = {}
     for name, depth in depths.items():
@@ -157,8 +163,8 @@ def shallow(branches: Sequence[Branch]) -> tuple[Branch, ...]:
     return tuple(branch for branch in branches if deepest[roots[branch.child]] <= LONGEST)
 
 
-def _as_root(name: str, bodies: Bodies) -> tuple:
-    """The smaller, the better a body is a root: one that is said to be slow, that has all directors, that is heavy."""
+def _root_rank(name: str, bodies: Bodies) -> tuple:
+    """Sort key, the best root first: the ground, bodies with the pace "slow", with all three directors, with a large mass."""
     if name == GROUND:
         return (False,)
     body = bodies[name]
@@ -167,11 +173,11 @@ def _as_root(name: str, bodies: Bodies) -> tuple:
 
 
 def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
-    """Refuse frames that hang on no joint, or that carry nothing.
+    """Refuse frames that hang on no joint, or that carry no body.
 
     Args:
         bodies: by name.
-        branches: of all trees; () by directors.
+        branches: of all trees; () if all bodies have directors.
 
     Raises:
         ValueError: with the name of the frame.
@@ -185,60 +191,69 @@ def check_frames(bodies: Bodies, branches: Sequence[Branch]) -> None:
                 f'Scene: {name} is a frame without mass, which moves with joints alone; give the scene coordinates="joint".'
             )
         if name not in hanging or name not in carrying:
-            where = "hangs on no body, by no joint that may carry it," if name not in hanging else "carries no body"
+            lack = "hangs on no body, by no joint that may carry it," if name not in hanging else "carries no body"
             raise ValueError(
-                f"Scene: the frame {name} {where} and has no mass of its own; tie it to what it hangs on and to what it carries by joints "
-                "with coordinates, such as Revolute, or leave it out."
+                f"Scene: the frame {name} {lack} and has no mass of its own; join it to the body that it hangs on and to a body that it "
+                "carries by joints with coordinates, such as Revolute, or leave it out."
             )
 
 
 def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
-    """The bodies with frames as heavy as what they carry: so frequencies of what acts on them can be estimated.
+    """The bodies, with a rigid body of the mass of a carried body in place of each frame: the frequency of an effect on a frame needs a mass.
 
     Args:
         bodies: by name.
         branches: of all trees, parents before children.
     """
-    found = dict(bodies)
-    for branch in reversed(branches):
-        frame, carried = bodies.get(branch.parent), found[branch.child]
-        if isinstance(frame, Frame) and isinstance(carried, RigidBody):
-            found[frame.name] = RigidBody(frame.name, carried.mass, carried.moments, frame.position, pace=frame.pace)
-    return found
+    weighted = dict(bodies)
+    for branch in reversed(branches):  # children first: a frame may carry a frame
+        frame, child = bodies.get(branch.parent), weighted[branch.child]
+        if isinstance(frame, Frame) and isinstance(child, RigidBody):
+            weighted[frame.name] = RigidBody(frame.name, child.mass, child.moments, frame.position, pace=frame.pace)
+    return weighted
 
 
 def layout(
     bodies: Bodies, paces: Mapping[str, Pace], branches: Sequence[Branch] = ()
 ) -> tuple[Layout, tuple[Link | None, ...]]:
-    """The places of all bodies: slow ones in order in q_s, fast ones in order in q_f; of bodies on joints the freedoms of these.
+    """The places of all coordinates: in the order of the bodies, those of slow bodies in q_s and those of fast bodies in q_f.
+
+    A body on a joint has the freedoms of this joint as coordinates.
 
     Args:
         bodies, paces: by name.
         branches: bodies on joints, parents before children.
 
     Returns:
-        The layout, and the links of the frames of its kinematics, in their order.
+        The layout, and the links of the frames of its kinematics, in the order of these frames.
     """
     ends: dict[Part, int] = {"s": 0, "f": 0}
     on_joints = {branch.child: branch for branch in branches}
-    own, places, freedoms = {}, {}, {}
+    coordinates, places, freedoms = {}, {}, {}
     for name, body in bodies.items():
         part: Part = "f" if paces[name].value == "fast" else "s"
         branch = on_joints.get(name)
         if branch is None:
-            own[name] = places[name] = Place(part, ends[part], body.size)
+            coordinates[name] = places[name] = Place(part, ends[part], body.size)
             ends[part] += body.size
             continue
         for freedom, label in zip(branch.joint.freedoms, branch.labels(bodies), strict=True):
-            own[label] = freedoms[branch.joint.name, branch.element, freedom] = Place(part, ends[part], 1)
+            place = Place(part, ends[part], 1)
+            coordinates[label] = freedoms[branch.joint.name, branch.element, freedom] = place
             ends[part] += 1
     if not branches:
-        return Layout(places, own), ()
-    return _with_kinematics(bodies, branches, places, own, freedoms, (ends["s"], ends["f"]))
+        return Layout(places, coordinates), ()
+    return _with_kinematics(bodies, branches, places, coordinates, freedoms, (ends["s"], ends["f"]))
 
 
-def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, own, freedoms, sizes):
-    """The layout with the bodies on joints, and the links of their frames."""
+def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, coordinates, freedoms, sizes):
+    """The layout with the bodies on joints, and the links of their frames.
+
+    Args:
+        places: of the bodies on no joint.
+        coordinates, freedoms: as of `Layout`.
+        sizes: (n_s, n_f).
+    """
     grids: dict[str, Grid] = {name: place.part for name, place in places.items()}
     grids[GROUND] = "s"
     depths: dict[str, int] = {}
@@ -250,7 +265,7 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, own, fr
     roots = list(dict.fromkeys(branch.parent for branch in branches if branch.parent in places))
     numbers = {GROUND: -1} | {name: i for i, name in enumerate(roots)}
     carriers = _carriers_of_fast(branches, grids)
-    # by grid, and whether fast bodies need them; in the order of `Kinematics.frames`
+    # branches by grid, and by whether the positions of fast bodies depend on them; in the order of `Kinematics.frames`
     groups: dict[tuple[Grid, bool], list[Branch]] = {
         ("s", True): [],
         ("f", True): [],
@@ -261,51 +276,55 @@ def _with_kinematics(bodies: Bodies, branches: Sequence[Branch], places, own, fr
         grid = grids[branch.child]
         groups[grid, grid != "s" or branch.child in carriers].append(branch)
     frames, links, carried, num_fast = [], [], [], 0
-    for (grid, is_needed), some in groups.items():
-        some.sort(key=lambda branch: depths[branch.child])  # as the frames are: taken by few slices
-        if some:
-            made, ordered = _frames(grid, len(links), some, bodies, freedoms, numbers)
-            numbers |= {branch.child: len(roots) + len(carried) + i for i, branch in enumerate(some)}
-            frames.append(made)
-            links += ordered
-            carried += [branch.child for branch in some]
+    for (grid, is_needed), group in groups.items():
+        group.sort(key=lambda branch: depths[branch.child])  # the order of the frames, which few slices then take
+        if group:
+            of_group, links_of_group = _frames(grid, len(links), group, bodies, freedoms, numbers)
+            numbers |= {branch.child: len(roots) + len(carried) + i for i, branch in enumerate(group)}
+            frames.append(of_group)
+            links += links_of_group
+            carried += [branch.child for branch in group]
             num_fast += is_needed
     kinematics = Kinematics(tuple(places[name] for name in roots), tuple(frames), sizes, num_fast)
-    where = dict(zip(carried, kinematics.places, strict=True))
-    everywhere = {name: places.get(name) or where[name] for name in bodies}
-    return Layout(everywhere, own, freedoms, kinematics), tuple(links)
+    on_joints = dict(zip(carried, kinematics.places, strict=True))
+    all_places = {name: places.get(name) or on_joints[name] for name in bodies}
+    return Layout(all_places, coordinates, freedoms, kinematics), tuple(links)
 
 
 def _carriers_of_fast(branches: Sequence[Branch], grids: Mapping[str, Grid]) -> set[str]:
     """The bodies that carry, at any depth, bodies which depend on fast coordinates."""
-    found: set[str] = set()
+    carriers: set[str] = set()
     for branch in reversed(branches):  # children before parents
-        if grids[branch.child] != "s" or branch.child in found:
-            found.add(branch.parent)
-    return found
+        if grids[branch.child] != "s" or branch.child in carriers:
+            carriers.add(branch.parent)
+    return carriers
 
 
 def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, freedoms, numbers: Mapping[str, int]):
-    """The frames of bodies that depend on the same coordinates, and their links in the same order, None beyond the end of a way.
+    """The frames of bodies that depend on the same part of the coordinates, and their links in the same order.
+
+    Paths from a root to a leaf are padded with None to the same length.
 
     Args:
-        first: number of their first frame.
+        grid: the part of the coordinates: slow, fast, or both.
+        first: number of the first of these frames.
         branches: parents before children.
-        numbers: of the bodies that they may hang on.
+        freedoms: as of `Layout`.
+        numbers: of the bodies that the branches may hang on.
     """
     branch_of = {branch.child: branch for branch in branches}
-    outermost = [branch for branch in branches if all(other.parent != branch.child for other in branches)]
-    ways = [_way(branch, branch_of) for branch in outermost]
+    parents = {branch.parent for branch in branches}
+    ways = [_way(branch, branch_of) for branch in branches if branch.child not in parents]
     depth = max(map(len, ways))
     links = [way[level] if level < len(way) else None for level in range(depth) for way in ways]
     coordinates = [freedoms[link.key] for link in links if link is not None and link.key is not None]
-    which = iter(range(len(coordinates)))
+    numbers_of_coordinates = iter(range(len(coordinates)))
     frames = Frames(
         grid,
         first,
         tuple(numbers[way[0].branch.parent] for way in ways),
         Rows.of(coordinates) if coordinates else None,
-        tuple(-1 if link is None or link.key is None else next(which) for link in links),
+        tuple(-1 if link is None or link.key is None else next(numbers_of_coordinates) for link in links),
         any(link is not None and link.move is not None and link.move.kind != "turn" for link in links),
         tuple(links.index(Link(branch, branch.size - 1)) for branch in branches),
         tuple(bodies[branch.child].wide for branch in branches),
@@ -314,7 +333,7 @@ def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, 
 
 
 def _way(branch: Branch | None, branch_of: Mapping[str, Branch]) -> list[Link]:
-    """The links from a root to the body of a branch."""
+    """The links from a root to the child of a branch."""
     way: list[Link] = []
     while branch is not None:
         way = [*(Link(branch, step) for step in range(branch.size)), *way]
@@ -323,7 +342,9 @@ def _way(branch: Branch | None, branch_of: Mapping[str, Branch]) -> list[Link]:
 
 
 def joint_numbers(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, Any]:
-    """The constants C, P, S, E (n, 4, 3) of all links, see `vmri_jax.mechanics.kinematics`; of None those of what does not move.
+    """The constants C, P, S, E (n, 4, 3) of all links, see `vmri_jax.mechanics.kinematics`.
+
+    The rows (r, M) of a frame are ``C + P cos x + S sin x + E x``. A link of None gets the constants of a frame that does not move.
 
     Args:
         bodies: by name.
@@ -332,69 +353,75 @@ def joint_numbers(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, Any
     known = list(dict.fromkeys(link for link in links if link is not None))
     ends = _ends(bodies, known)
     xp = library(ends)
+    # triads in cyclic order with the axis of the motion last, so that the turn is in the first two rows
     axes = [link.move.axis if link.move else 2 for link in known]
     cyclic = np.array([[(k + 1) % 3, (k + 2) % 3, k] for k in axes])
     inner, outer = (ends[name][np.arange(len(known))[:, None], cyclic] for name in ("frame_a", "frame_b"))
 
     def dyads(i: int, j: int):
+        """``f_i^T a_j`` with the rows f of F_b and a of F_a."""
         return outer[:, i, :, None] * inner[:, j, None, :]
 
     def rows(matrix, point):
         """(r, M) with ``r = X - X_b M``."""
-        turned = xp.sum(ends["point_b"][:, :, None] * matrix, axis=1)
-        return xp.concatenate([(point - turned)[:, None], matrix], axis=1)
+        rotated = xp.sum(ends["point_b"][:, :, None] * matrix, axis=1)
+        return xp.concatenate([(point - rotated)[:, None], matrix], axis=1)
 
     turns, ways = (np.array([link.amount(kind) for link in known])[:, None, None] for kind in ("turn", "slide"))
     pitches = [link.pitch / (2 * np.pi) for link in known]
     screws = library(pitches).stack(pitches)[:, None]
+    # M = F_b^T T(x) F_a = f_2^T a_2 + cos x (f_0^T a_0 + f_1^T a_1) + sin x (f_0^T a_1 - f_1^T a_0); without a turn cos x = 1
     across, along = dyads(0, 0) + dyads(1, 1), dyads(2, 2)
     zero = xp.zeros_like(ends["point_a"])
-    found = {
+    constants = {
         "constant": rows(along + (1 - np.abs(turns)) * across, ends["point_a"]),
         "cosine": rows(np.abs(turns) * across, zero),
         "sine": rows(turns * (dyads(0, 1) - dyads(1, 0)), zero),
         "way": xp.pad(((ways[:, 0] + turns[:, 0] * screws) * inner[:, 2])[:, None], ((0, 0), (0, 3), (0, 0))),
     }
-    which = np.array([len(known) if link is None else known.index(link) for link in links])
-    unmoved = {name: UNMOVED if name == "constant" else np.zeros((4, 3)) for name in found}
-    return {name: xp.concatenate([values, unmoved[name][None]])[which] for name, values in found.items()}
+    numbers = np.array([len(known) if link is None else known.index(link) for link in links])
+    unmoved = {name: UNMOVED if name == "constant" else np.zeros((4, 3)) for name in constants}
+    return {name: xp.concatenate([values, unmoved[name][None]])[numbers] for name, values in constants.items()}
 
 
 def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
-    """Points and triads of all links in what they hang on and in their own frames, "point_a", "frame_a", "point_b", "frame_b"."""
+    """The points X and triads F of all links: "point_a", "frame_a" in the frame that a link hangs on, "point_b", "frame_b" in its own."""
     carried = {link.branch.child for link in links}
     joints = {link.branch.joint.name: link.branch.joint for link in links}
     points = {name: joint.joining_points(bodies) for name, joint in joints.items()}
     triads: dict[str, Any] = {name: joint.frame(len(points[name])) for name, joint in joints.items()}
-    found: dict[str, list] = {}
+    ends: dict[str, list] = {}
     for link in links:
         branch = link.branch
         point, triad = points[branch.joint.name][branch.element], triads[branch.joint.name][branch.element]
-        first, last = (0, 1) if branch.forward else (1, 0)
-        for role, name, which, here in (
-            ("a", branch.parent, first, link.is_first),
-            ("b", branch.child, last, link.is_last),
+        of_parent, of_child = (0, 1) if branch.forward else (1, 0)
+        for role, name, number, is_body in (
+            ("a", branch.parent, of_parent, link.is_first),
+            ("b", branch.child, of_child, link.is_last),
         ):
             body = body_of(bodies, name)
-            along = body.components if isinstance(body, RigidBody) and name in carried else body.weights
-            at = along((point[which] - body.position) @ body.rotation) if here else np.zeros(3)
-            axes = [along(row @ body.rotation) for row in triad] if here else list(np.eye(3))
-            found.setdefault(f"point_{role}", []).append(at)
-            found.setdefault(f"frame_{role}", []).append(library(axes).stack(axes))
-    return {name: library(values).stack(values) for name, values in found.items()}
+            # a root has only the directors in `wide`, a carried body all three, as rows of its frame
+            components = body.components if isinstance(body, RigidBody) and name in carried else body.weights
+            # a frame between two moves of a joint is the triad itself, with its origin at the point of the joint
+            x = components((point[number] - body.position) @ body.rotation) if is_body else np.zeros(3)
+            axes = [components(row @ body.rotation) for row in triad] if is_body else list(np.eye(3))
+            ends.setdefault(f"point_{role}", []).append(x)
+            ends.setdefault(f"frame_{role}", []).append(library(axes).stack(axes))
+    return {name: library(values).stack(values) for name, values in ends.items()}
 
 
 def nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
-    """The velocities v of the scene nearest to those V of the bodies, ``J^T M J v = J^T M V``.
+    """The velocities v of the scene for which ``J v`` is nearest to the velocities V of the bodies, ``J^T M J v = J^T M V``.
 
     Args:
         jacobian: J = dQ/dq.
-        rates, masses: V and the masses M of (Q_s, Q_f) one after the other.
+        rates: V of (Q_s, Q_f) one after the other.
+        masses: M, likewise.
 
     Returns:
-        v, and the part of V that the joints do not allow, in the norm of the kinetic energy.
+        v, and the part ``V - J v`` that the joints do not allow, relative to V in the norm of the kinetic energy.
     """
     xp = library(jacobian, rates, masses)
     v = xp.linalg.solve(jacobian.T @ (masses[:, None] * jacobian), jacobian.T @ (masses * rates))
-    missed, whole = rates - jacobian @ v, xp.sum(masses * rates**2)
-    return v, xp.sqrt(xp.sum(masses * missed**2) / xp.where(whole > 0, whole, 1.0))
+    violation, square = rates - jacobian @ v, xp.sum(masses * rates**2)
+    return v, xp.sqrt(xp.sum(masses * violation**2) / xp.where(square > 0, square, 1.0))

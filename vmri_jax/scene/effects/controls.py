@@ -12,8 +12,8 @@ from vmri_jax.scene.body import Attachment, body_of, entry, is_entry, label_of
 from vmri_jax.scene.declare import effect_class, names, vector
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import FREEDOMS
+from vmri_jax.scene.effects.joint_base import Joint
 from vmri_jax.scene.effects.joint_effects import InJoint
-from vmri_jax.scene.effects.joints import Joint
 from vmri_jax.scene.rigid import split
 
 Load = Literal["force", "torque"]
@@ -107,8 +107,8 @@ class Controlled(Effect):
         if self.along is not None:
             params["along"] = self.declared["along"].array(f"{self.name}: along", self.along, [body.point()])
         if body.rigid:
-            at = jnp.asarray(name.at) if isinstance(name, Attachment) else jnp.zeros(3)
-            params["point"] = jnp.asarray(body.weights(at))
+            offset = jnp.asarray(name.offset) if isinstance(name, Attachment) else jnp.zeros(3)
+            params["point"] = jnp.asarray(body.weights(offset))
         return params
 
     def check_bodies(self, bodies):

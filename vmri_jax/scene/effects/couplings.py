@@ -15,7 +15,7 @@ from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class
 from vmri_jax.scene.effect import MOST_ROLES, START, Effect, real_tree
 from vmri_jax.scene.effects.freedoms import FREEDOMS, Freedom
-from vmri_jax.scene.effects.joints import Joint, freedom_of
+from vmri_jax.scene.effects.joint_base import Joint, freedom_of
 from vmri_jax.scene.terms import EffectTerm, OnBodies
 
 

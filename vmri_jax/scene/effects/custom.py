@@ -84,7 +84,7 @@ class CustomEffect(Effect):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         params, t = self.parameters(bodies), jnp.zeros(())
-        q, _ = self.one(0, bodies, params)
+        q, _ = self.element_arguments(0, bodies, params)
         q = tuple(map(jnp.asarray, q))
         known = {"potential": (q,), "constraint": (t, q) if self.timed else (q,), "kinetic": (q, q), "force": (t, q, q)}
         value = shape_of(f"{self.name}: function", self.function, *known[self.kind], params)

@@ -1,4 +1,4 @@
-"""What joints measure: the gap between their points, their triads, and the freedoms that they leave, by the coordinates of two bodies.
+"""Functions of the coordinates of two joined bodies: the gap between the points of the joint, its triads, and its freedoms.
 
 Letters are those of `vmri_jax.scene.effects.joints`.
 """
@@ -10,17 +10,17 @@ import jax.numpy as jnp
 from vmri_jax.scene.rigid import split
 
 Freedom = Literal["turn", "slide", "tilt", "along", "across"]
-"""An angle about the axis n, a way along it, an angle about the second axis e, ways along m and m' of a plane."""
+"""In this order: the angle about the axis n, the distance along n, the angle about the second axis e, the distances along m and m'."""
 
 
 def place(q, weights):
-    """``phi + sum_i X_i d_i``, (..., 3)."""
+    """``phi + sum_i X_i d_i``, (..., 3), of the coordinates q of a body and the components X of a point."""
     phi, d = split(q)
     return phi + jnp.sum(weights[..., : d.shape[-2], None] * d, axis=-2)
 
 
 def gap(q, params):
-    """``D``, (..., 3)."""
+    """``D = phi_b + rho_b - phi_a - rho_a``, (..., 3) m."""
     a, b = q
     return place(b, params["point_b"]) - place(a, params["point_a"])
 
@@ -36,7 +36,7 @@ def dot(u, v):
 
 
 def aligned(q, params, *pairs: tuple[int, int]):
-    """Products of the i-th vector of a with the j-th of b, (..., number of pairs)."""
+    """Dot products of the i-th vector of the triad of a with the j-th vector of the triad of b, for all `pairs` (i, j): (..., pairs)."""
     of_a, of_b = triads(q, params)
     return jnp.stack([dot(of_a[..., i, :], of_b[..., j, :]) for i, j in pairs], axis=-1)
 
@@ -44,26 +44,26 @@ def aligned(q, params, *pairs: tuple[int, int]):
 M, M_PRIME, N = range(3)
 """Rows of a triad."""
 PARALLEL = ((N, M), (N, M_PRIME))
-"""Products that vanish where the axes of both bodies are parallel."""
+"""Pairs of vectors of both triads whose dot products vanish if the axes n and f are parallel."""
 UNTURNED = (M, M_PRIME)
-"""The product that vanishes where b has not turned about the axis."""
+"""Pair of vectors of both triads whose dot product vanishes if b has not turned about the axis."""
 
 
 def across(q, params):
     """``(m . D, m' . D)``, (..., 2)."""
-    apart, (of_a, _) = gap(q, params), triads(q, params)
-    return jnp.stack([dot(of_a[..., i, :], apart) for i in (M, M_PRIME)], axis=-1)
+    d, (of_a, _) = gap(q, params), triads(q, params)
+    return jnp.stack([dot(of_a[..., i, :], d) for i in (M, M_PRIME)], axis=-1)
 
 
 def turn_by_sine(q, params):
-    """``(m' . e, m . e)``: sine and cosine of the angle by which b has turned about the axis since the start, times one factor."""
+    """``(m' . e, m . e)``: sine and cosine of the angle by which b has turned about n since the start, times a common factor near 1."""
     of_a, of_b = triads(q, params)
     e = of_b[..., M, :]
     return dot(of_a[..., M_PRIME, :], e), dot(of_a[..., M, :], e)
 
 
 def tilt_by_sine(q, params):
-    """``(n . e', n . f)``: sine and cosine of the angle by which b has turned about its own axis e since the start, times one factor."""
+    """``(n . e', n . f)``: sine and cosine of the angle by which b has turned about its axis e since the start, times a common factor near 1."""
     of_a, of_b = triads(q, params)
     n = of_a[..., N, :]
     return dot(of_b[..., M_PRIME, :], n), dot(of_b[..., N, :], n)
@@ -75,7 +75,7 @@ def turn(q, params):
 
 
 def tilt(q, params):
-    """The angle by which b has turned about its own axis e since the start, rad, between -pi and pi, (...)."""
+    """The angle by which b has turned about its axis e since the start, rad, between -pi and pi, (...)."""
     return jnp.arctan2(*tilt_by_sine(q, params))
 
 
@@ -95,7 +95,7 @@ def along_m_prime(q, params):
 
 
 ANGLES: dict[str, Any] = {"turn": turn_by_sine, "tilt": tilt_by_sine}
-"""Sine and cosine of the freedoms that are angles."""
+"""For each freedom that is an angle, the function that gives its sine and cosine."""
 FREEDOMS: dict[str, Any] = {
     "turn": turn,
     "slide": slide,
@@ -103,4 +103,4 @@ FREEDOMS: dict[str, Any] = {
     "along": along_m,
     "across": along_m_prime,
 }
-"""What a joint can leave free."""
+"""For each freedom, the function ``(q, params) -> (...)`` of the coordinates of both bodies that gives its value, rad or m."""

@@ -13,7 +13,7 @@ from vmri_jax.mechanics.rows import Rows
 from vmri_jax.scene.declare import effect_class, number, of_time, positive
 from vmri_jax.scene.effect import Effect, real_tree
 from vmri_jax.scene.effects.freedoms import ANGLES, FREEDOMS, Freedom
-from vmri_jax.scene.effects.joints import Joint, freedom_of
+from vmri_jax.scene.effects.joint_base import Joint, freedom_of
 from vmri_jax.scene.effects.springs import elastic_energy
 from vmri_jax.scene.terms import EffectTerm, OnBodies
 

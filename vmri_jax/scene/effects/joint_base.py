@@ -1,0 +1,245 @@
+"""What all joints share: two bodies, the points and triads of the joint in them, and the freedoms that it leaves.
+
+Letters are those of `vmri_jax.scene.effects.joints`.
+"""
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vmri_jax.mechanics.arrays import is_concrete, library, real_array
+from vmri_jax.mechanics.kinematics import Move
+from vmri_jax.scene.body import GROUND, GROUND_COORDINATES, Attachment, Bodies, body_of, label_of
+from vmri_jax.scene.declare import effect_class, names, squeeze
+from vmri_jax.scene.effect import START, Effect
+from vmri_jax.scene.effects.freedoms import FREEDOMS, Freedom
+from vmri_jax.scene.rigid import RigidBody
+
+
+@effect_class
+class Joint(Effect):
+    """What all joints share: two bodies, one of them perhaps the ground, and the point where they are joined.
+
+    Args:
+        between: names (a, b), or a list of such pairs. A name may come with a point that is fixed in the body,
+            ``(("hub", [1, 0, 0]), ("arm", [-1, 0, 0]))``: the body is joined there, and both points must coincide at the start.
+        at: (3,) m, the point of the joint in space at the start; or a point for each pair, (n, 3). It takes the place of points in `between`.
+
+    Raises:
+        ValueError: (of the scene) no point, or points that do not coincide; an axis along which a body has no director.
+    """
+
+    between: Any = names(2)
+    at: Any = None
+
+    kind = "constraint"
+    whole = True
+    same_size = False
+    derived = ("point_a", "point_b", "frame_a", "frame_b")
+    carries: ClassVar[bool] = False
+    """Whether the position of b may be a function of the freedoms of the joint: whether these are coordinates without a singularity."""
+    moves: ClassVar[tuple[Move, ...]] = ()
+    """The motions of the triad of b against the triad of a, one for each freedom, applied one after the other."""
+    freedoms: ClassVar[tuple[Freedom, ...]] = ()
+    """Names of the freedoms, in the order of `moves`."""
+
+    def elements(self, bodies):
+        return tuple(tuple(map(str, element)) for element in super().elements(bodies))
+
+    def parameters(self, bodies):
+        return {name: squeeze(library(values).stack(values)) for name, values in self._frames(bodies).items()}
+
+    def points(self, bodies):
+        return {}
+
+    def label(self, i: int, bodies: Bodies) -> str:
+        """The name of the i-th pair: that of the joint, followed by the names of both bodies if the joint has several pairs."""
+        elements = self.elements(bodies)
+        return self.name if len(elements) == 1 else f"{self.name} {'-'.join(elements[i])}"
+
+    def pitch_of(self, i: int):
+        """How far b moves along the axis per turn of the i-th pair, m; zero unless the joint is a screw."""
+        return np.zeros(())
+
+    def frame(self, count: int) -> list | None:
+        """(n, 3, 3) triads (m, m', n) of all pairs in space where the freedoms are zero; None if the joint has no axis."""
+        return None
+
+    def check_bodies(self, bodies):
+        super().check_bodies(bodies)
+        for element in self.elements(bodies):
+            for name in element:
+                body = body_of(bodies, name)
+                if not body.rigid and (body.block or body.size != 3):
+                    raise ValueError(
+                        f"{self.name}: {name} has {body.size} coordinates; joints are between rigid bodies and points in space."
+                    )
+
+    def check_parameters(self, bodies):
+        super().check_parameters(bodies)
+        for (a, b), points in zip(self._pairs(bodies), self.joining_points(bodies), strict=True):
+            if not is_concrete(points):
+                continue
+            distance = np.linalg.norm(points[1] - points[0])
+            size = max(np.max(np.abs(points[0])), 1.0)
+            positions = " and ".join(
+                f"{label_of(name)} is at {np.asarray(p)}" for name, p in zip((a, b), points, strict=True)
+            )
+            self.require(
+                distance <= START * size,
+                f"the distance of the points of {a}-{b}",
+                f"{float(distance):.6g}",
+                f"{positions}; they must coincide at the start",
+            )
+
+    def drawn_points(self, bodies):
+        params = self.parameters(bodies)
+        points = {role: np.atleast_2d(params[f"point_{role}"]) for role in "ab"}
+        return {
+            f"{self.name} {'-'.join(element)} in {name}": (name, points[role][i])
+            for i, element in enumerate(self.elements(bodies))
+            for role, name in zip("ab", element, strict=True)
+            if self._sticks_out(name, points[role][i], bodies)
+        }
+
+    def drawing(self, bodies):
+        return {"links": [[name, end] for end, (name, _) in self.drawn_points(bodies).items()]}
+
+    @staticmethod
+    def _sticks_out(name: str, point, bodies) -> bool:
+        """Whether the point of the joint lies outside the drawn shape of a body, so that a line to it is drawn from the centre."""
+        body = body_of(bodies, name)
+        return isinstance(body, RigidBody) and not body.covers(point)
+
+    def _pairs(self, bodies):
+        """The pairs (a, b) as the user wrote them: `Attachment` where a name came with a point."""
+        return super().elements(bodies)
+
+    def joining_points(self, bodies):
+        """For each pair the point of the joint in space as a has it and as b has it, at the start: [((3,), (3,)), ...]."""
+        pairs = self._pairs(bodies)
+        if self.at is not None:
+            if any(isinstance(name, Attachment) for pair in pairs for name in pair):
+                raise ValueError(
+                    f"{self.name}: between has points in the bodies, and at is given too; give one of them."
+                )
+            return [(point, point) for point in _vectors(f"{self.name}: at", self.at, len(pairs))]
+        joining = []
+        for pair in pairs:
+            # a point mass is its own point; a rigid body without a given point is joined where the other body is
+            points = [
+                body_of(bodies, name).point(getattr(name, "offset", None)).position
+                for name in pair
+                if isinstance(name, Attachment) or (name != GROUND and not bodies[name].rigid)
+            ]
+            if not points:
+                raise ValueError(
+                    f"{self.name}: nothing says where {pair[0]} and {pair[1]} are joined; give at=[x, y, z], or a point in one of "
+                    f"them, as in ({pair[0]!r}, ({pair[1]!r}, [x, y, z]))."
+                )
+            joining.append((points[0], points[-1]))
+        return joining
+
+    def _frames(self, bodies) -> dict[str, list]:
+        """Points and triads of every pair as components along the directors of each body: "point_a", "frame_a", "point_b", "frame_b"."""
+        elements, points = self.elements(bodies), self.joining_points(bodies)
+        triads = self.frame(len(elements))
+        components: dict[str, list] = {}
+        for i, element in enumerate(elements):
+            for role, name, point in zip("ab", element, points[i], strict=True):
+                body = body_of(bodies, name)
+                if not body.rigid:
+                    if triads is not None:
+                        raise ValueError(
+                            f"{self.name}: {name} is a point, which has no axes; a point can be joined by Spherical alone."
+                        )
+                    components.setdefault(f"point_{role}", []).append(np.zeros(3))
+                    continue
+                # X = R^T (x - phi): the point in the axes of the body
+                offset = (point - body.position) @ body.rotation
+                components.setdefault(f"point_{role}", []).append(body.weights(offset))
+                if triads is not None:
+                    try:
+                        rows = [body.weights(vector @ body.rotation) for vector in triads[i]]
+                    except ValueError as error:
+                        raise ValueError(f"{self.name}: {error}") from None
+                    components.setdefault(f"frame_{role}", []).append(library(rows).stack(rows))
+        return components
+
+
+@effect_class
+class AboutAxis(Joint):
+    """Joints with an axis.
+
+    Args:
+        between, at: as of `Joint`.
+        axis: (3,) direction n in space at the start, of any length; or a direction for each pair, (n, 3).
+    """
+
+    axis: Any = (0.0, 0.0, 1.0)
+
+    def frame(self, count: int):
+        return [_triad(axis) for axis in self._directions("axis", count)]
+
+    def _directions(self, name: str, count: int):
+        """(n, 3) the vectors of the field `name`, one for each pair, scaled to length one."""
+        vectors = _vectors(f"{self.name}: {name}", getattr(self, name), count)
+        lengths = library(vectors).linalg.norm(vectors, axis=-1, keepdims=True)
+        self.require(lengths > 0, name, getattr(self, name), "it must not be zero")
+        return vectors / lengths
+
+
+def freedom_of(joint: Joint, of: str) -> Freedom:
+    """The freedom of a joint with the name `of`; with "auto" its only freedom.
+
+    Raises:
+        ValueError: the joint has no freedom of this name, or with "auto" none or several.
+    """
+    fitting: list[Freedom] = [freedom for freedom in joint.freedoms if of in (freedom, "auto")]
+    if len(fitting) == 1:
+        return fitting[0]
+    free = " and ".join(joint.freedoms) or "neither an angle nor a way along an axis"
+    raise ValueError(f"of is {of!r}; {joint.name} leaves {free} free.")
+
+
+def along_run(joint: Joint, run, bodies: Bodies, of: str, pair: int) -> np.ndarray:
+    """The freedom of a joint along a run, (k,) rad or m, angles without jumps of 2 pi; see `Scene.joint_motion`.
+
+    Args:
+        joint, bodies: of the scene.
+        run: of the scene.
+        of: name of the freedom, or "auto", see `freedom_of`.
+        pair: number of the pair of bodies, if the joint has several.
+
+    Raises:
+        IndexError: no such pair.
+    """
+    freedom, element = freedom_of(joint, of), joint.elements(bodies)[pair]
+    _, params = joint.element_arguments(pair, bodies, joint.parameters(bodies))
+    q = tuple(GROUND_COORDINATES if body == GROUND else np.asarray(run.position(body)) for body in element)
+    values = np.asarray(FREEDOMS[freedom](q, params))
+    return np.unwrap(values) if freedom == "turn" else values
+
+
+def _triad(axis):
+    """(3, 3) orthonormal (m, m', n) with n along a unit vector."""
+    xp = library(axis)
+    least_parallel = xp.eye(3)[
+        xp.argmin(xp.abs(axis))
+    ]  # the axis of space furthest from n: the product below is not small
+    m = xp.cross(least_parallel, axis)
+    m = m / xp.linalg.norm(m)
+    return xp.stack([m, xp.cross(axis, m), axis])
+
+
+def _vectors(argument: str, numbers, count: int):
+    """(count, 3) vectors from a single vector (3,), or from a vector for each pair.
+
+    Args:
+        argument: name of effect and argument, for messages.
+    """
+    vectors = real_array(argument, numbers)
+    if vectors.shape not in ((3,), (count, 3)):
+        for_pairs = f", or one for each pair, ({count}, 3)" if count > 1 else ""
+        raise ValueError(f"{argument} has shape {vectors.shape}; give (3,){for_pairs}.")
+    return library(vectors).broadcast_to(vectors, (count, 3))
