@@ -134,7 +134,10 @@ def joined(*effects):
         ((Revolute(("a", "b"), AT, [0, 1.0]),), r"axis has shape \(2,\); give \(3,\)"),
         ((Universal(("a", "b"), AT, X, X),), "the axes must be perpendicular"),
         ((JointSpring("hinge", 1.0),), "joint_springs: .*'hinge'"),
-        ((Spherical(("a", "b"), AT, name="ball"), JointSpring("ball", 1.0)), "ball leaves neither an angle nor a way"),
+        (
+            (Spherical(("a", "b"), AT, name="ball"), JointSpring("ball", 1.0)),
+            "ball leaves neither an angle nor a displacement",
+        ),
         (
             (Cylindrical(("a", "b"), AT, name="pipe"), JointSpring("pipe", 1.0)),
             "of is 'auto'; pipe leaves turn and slide free",

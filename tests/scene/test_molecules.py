@@ -119,7 +119,7 @@ def numpy_potential(q, params):
 def test_custom_functions_are_tried_when_the_scene_is_made():
     with pytest.raises(ValueError, match=r"numpy_potential: function cannot be traced, line \d+ of test_molecules.py"):
         Scene(BODIES, [Potential(numpy_potential, "a", {"k": 2.0})])
-    with pytest.raises(ValueError, match=r"pull: bodies is .*each such tuple an effect of its own"):
+    with pytest.raises(ValueError, match=r"pull: bodies is .*for several tuples of bodies write"):
         Scene(BODIES, [Potential(numpy_potential, [("a", "b"), ("c", "d")], name="pull")])
 
 

@@ -244,7 +244,9 @@ def test_limits_as_springs():
     names = [effect.name for effect in Scene.from_mujoco(model, limits="spring").effects]
     assert [name for name in names if name.endswith("limit")] == ["hip pitch limit", "knee limit"]
     limited = '<tendon><fixed name="t" limited="true" range="0 1"><joint joint="hinge" coef="1"/></fixed></tendon>'
-    with pytest.raises(ValueError, match=r"for limits of hinges and slides, and t have others\. .*ignore=\['limits'\]"):
+    with pytest.raises(
+        ValueError, match=r"for limits of hinges and slides, and t have limits of another kind\. .*ignore=\['limits'\]"
+    ):
         Scene.from_mujoco(arm(limited), limits="spring")
     assert Scene.from_mujoco(arm(limited), limits="spring", ignore=["limits"]).bodies
     pendulum = arm(joint='range="-20 20" solreflimit="0.1 1"', option='gravity="0 0 0"')
@@ -257,7 +259,7 @@ def test_limits_as_springs():
 
 def test_starts_that_equalities_and_keyframes_do_not_allow():
     model = mujoco.MjModel.from_xml_string(ROBOT.format(flags='limit="disable"'))
-    with pytest.raises(ValueError, match=r"bend is missed by 0\.\d+ at the start\. Here equalities hold exactly"):
+    with pytest.raises(ValueError, match=r"bend is violated by 0\.\d+ at the start\. Here equalities hold exactly"):
         Scene.from_mujoco(model, key="leap")
     with pytest.raises(ValueError, match=r"there is no keyframe 'jump'.*leap"):
         Scene.from_mujoco(model, key="jump")

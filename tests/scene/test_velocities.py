@@ -109,7 +109,7 @@ def test_every_pair_of_a_joint_has_a_rate():
     [
         (3.0, TypeError, 'rates is 3.0; give rates by the names of joints, {"bearing": 100.0}'),
         ({"bering": 1.0}, ValueError, "there is no joint 'bering'.*bearing"),
-        ({"crank pin": 1.0}, ValueError, "crank pin leaves neither an angle nor a way"),
+        ({"crank pin": 1.0}, ValueError, "crank pin leaves neither an angle nor a displacement"),
         ({"bearing": {"slide": 1.0}}, ValueError, "of is 'slide'; bearing leaves turn free"),
         ({"bearing": [1.0, 2.0]}, ValueError, r"the rate of bearing has shape \(2,\); give one number"),
         ({"bearing": np.nan}, ValueError, "the rate of bearing is nan; it must be finite"),

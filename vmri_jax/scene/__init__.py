@@ -1,4 +1,4 @@
-"""Scenes: bodies and effects, turned into a `System` in which only what the scene calls for exists."""
+"""Scenes: bodies and the effects between them, from which a scene builds a `System` without unneeded terms."""
 
 from vmri_jax.scene.body import Body, Frame
 from vmri_jax.scene.effect import Effect

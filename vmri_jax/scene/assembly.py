@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
 from vmri_jax.mechanics.system import ConstantMass, Rheonomic, System
+from vmri_jax.scene.functions import FUNCTIONS, IMPLIED, Actuation
 from vmri_jax.scene.layout import Layout, join
 from vmri_jax.scene.sorting import Placed, Sorting
-from vmri_jax.scene.terms import FUNCTIONS, IMPLIED, JOINTS, MASS, Actuation, DroppedRows, SomeRows
+from vmri_jax.scene.terms import DroppedRows, SomeRows
 
 
 def build(sorting: Sorting, placed: Sequence[Placed]) -> System:

@@ -9,7 +9,7 @@
 `Effect` reads these declarations to make elements and arrays of parameters, to check them, and to word messages.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field
 from itertools import combinations
 from typing import Any, Literal, TypeVar, dataclass_transform
@@ -188,3 +188,24 @@ def effect_class(cls: type[Class]) -> type[Class]:
 def squeeze(values):
     """The values (n, ...) of n elements; for n = 1 without this axis."""
     return values[0] if len(values) == 1 else values
+
+
+def lasting(value):
+    """The value, with iterators replaced by tuples, which can be read more than once."""
+    if isinstance(value, Iterator) or (isinstance(value, list | tuple) and any(isinstance(v, Iterator) for v in value)):
+        return tuple(lasting(item) for item in value)
+    return value
+
+
+def real_tree(about: str, tree):
+    """A pytree of real numbers as a pytree of arrays; the error for another leaf names its place in the tree.
+
+    Args:
+        about: names of effect and argument, for messages.
+        tree: numbers, arrays, lists and dictionaries of them.
+    """
+
+    def convert(path, leaf):
+        return jnp.asarray(real_array(about + jax.tree_util.keystr(path), leaf))
+
+    return jax.tree_util.tree_map_with_path(convert, tree)

@@ -1,7 +1,7 @@
 """Effects: each contributes one function of the positions of some bodies to the Lagrangian, the constraints or the forces."""
 
 from abc import ABC
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field, fields, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Literal
@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vmri_jax.mechanics.arrays import is_concrete, real_array
+from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.functions import check_arguments
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Place, Rows
 from vmri_jax.scene.body import GROUND, Attachment, Bodies, body_of, end_of, label_of, moving
-from vmri_jax.scene.declare import Elements, Parameter, effect_class, squeeze
+from vmri_jax.scene.declare import Elements, Parameter, effect_class, lasting, squeeze
 from vmri_jax.scene.layout import Layout
 from vmri_jax.scene.terms import EffectTerm, InRigidBodies, OnBodies, OnGround, Role, choose
 
@@ -37,8 +37,8 @@ a smaller one would refuse lengths that are written with ten digits."""
 class Effect(ABC):
     """Base class of effects: a function, the bodies that it depends on, and its parameters.
 
-    An effect has one or more *elements*. In an element each *role* is taken by a body: a spring has the roles a and b, and
-    an effect of ten springs has ten elements. The signature of its function depends on `kind`:
+    An effect has one or more *elements*, and an element has a body in each *role*: ``Spring([("hub", "tip"), ("tip", "load")], 1.0)`` has
+    two elements; "hub" and "tip" have the role a in them, "tip" and "load" the role b. The signature of its function depends on `kind`:
 
     | kind | function | returns |
     |---|---|---|
@@ -56,8 +56,8 @@ class Effect(ABC):
 
     Args:
         name: of this effect in its scene; by default the name of its class.
-        rate: of a potential, "slow" (part of V), "fast" (on the micro grid, with the rule of W), a whole number k (on every k-th micro
-            node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
+        rate: how often a potential is evaluated: "slow" (as part of V), "fast" (on the micro grid, with the rule of W), a whole number k
+            (on every k-th micro node), or "auto" (the scene decides by stiffness). A potential with the rate "fast" or k makes its bodies fast, except bodies
             with the pace "slow": then the equations of these slow bodies are implicit in the potential. Of a kinetic effect "slow",
             "fast" or "auto"; here the rate decides only whether its bodies are fast, since all kinetic effects are on the micro grid.
     """
@@ -78,7 +78,7 @@ class Effect(ABC):
     masses: ClassVar[tuple[str, ...]] = ()
     """Names of parameters that hold the masses of the bodies, one for each role."""
     derived: ClassVar[tuple[str, ...]] = ()
-    """Names of parameters that are not declared as fields and have an entry for each element."""
+    """Names of parameters that are computed from fields and bodies, and have an entry for each element."""
     whole: ClassVar[bool] = False
     """Whether the function gets all coordinates of a rigid body instead of the coordinates of its centre."""
     drawn_as: ClassVar[Literal["link", "spring"] | None] = None
@@ -178,7 +178,9 @@ class Effect(ABC):
         return q, self._element_params(i, bodies, params)
 
     def element_term(self, i: int, bodies: Bodies, params: dict[str, Any]) -> tuple[EffectTerm, dict[str, Any]]:
-        """Element i as a term of q_s, which holds the coordinates of the moving bodies of this element one after the other; and its params.
+        """Element i as a term of the coordinates of its moving bodies, one after the other, and its params.
+
+        The term takes these coordinates as q_s, and no q_f: whether a body is slow or fast does not matter for a single element.
 
         Args:
             i: number of the element.
@@ -387,24 +389,3 @@ class Effect(ABC):
                     f"it starts as {measured:.12g}; give this value, move a body, or let the scene do so, project=True"
                 )
                 self.require(agrees, f"{name} of {'-'.join(map(label_of, element))}", f"{kept:g}", expected)
-
-
-def lasting(value):
-    """The value, with iterators replaced by tuples, which can be read more than once."""
-    if isinstance(value, Iterator) or (isinstance(value, list | tuple) and any(isinstance(v, Iterator) for v in value)):
-        return tuple(lasting(item) for item in value)
-    return value
-
-
-def real_tree(about: str, tree):
-    """A pytree of real numbers as a pytree of arrays; the error for another leaf names its place in the tree.
-
-    Args:
-        about: names of effect and argument, for messages.
-        tree: numbers, arrays, lists and dictionaries of them.
-    """
-
-    def convert(path, leaf):
-        return jnp.asarray(real_array(about + jax.tree_util.keystr(path), leaf))
-
-    return jax.tree_util.tree_map_with_path(convert, tree)

@@ -1,10 +1,16 @@
 """Scenes from models of MuJoCo: MJCF and URDF files, read by MuJoCo's own parser as a compiled `mujoco.MjModel`.
 
-Bodies that are welded together are one rigid body; those welded to the world are the ground. Joints become `Spherical`,
-`Revolute` and `Prismatic`, with a `Frame` between two joints of one body; their springs, dampers and armature `JointSpring`,
-`JointDamper` and `RotorInertia`; the equalities connect and weld `Spherical` and `Fixed`, and those of joints and of fixed tendons
-`JointCoupling`. MuJoCo keeps equalities softly; here they are constraints, kept to round-off. What becomes of every
-field of a model is in `mujoco_fields`.
+| MuJoCo | scene |
+|---|---|
+| bodies that are welded together | one `RigidBody`, or the ground if they are welded to the world |
+| joints ball, hinge, slide | `Spherical`, `Revolute`, `Prismatic`, with a `Frame` between two joints of the same body |
+| stiffness, damping, armature of joints | `JointSpring`, `JointDamper`, `RotorInertia` |
+| limits of joints, with limits="spring" | `JointLimit` |
+| equalities connect, weld | `Spherical`, `Fixed` |
+| equalities joint, tendon (fixed) | `JointCoupling` |
+| gravity, gravcomp | `Gravity`, `Potential` |
+
+MuJoCo's equalities are soft; here they are constraints, satisfied to round-off. The use of every field of a model is in `mujoco_fields`.
 """
 
 from collections.abc import Collection, Iterator
@@ -31,10 +37,10 @@ from vmri_jax.scene.mujoco_model import Compiled
 from vmri_jax.scene.rigid import RigidBody
 
 SMOOTHING = 1e-3
-"""Way within which a limit as a spring sets in, in parts of the range. A larger one lets the stop be felt before it is reached, a smaller
-one needs smaller steps there."""
-OLDEST = 4
-"""The first version of MuJoCo whose fields are those of `mujoco_fields`; older ones have other flags."""
+"""Smoothing of a limit as a spring, relative to the range of the joint. With a larger value the force sets in visibly before the limit;
+a smaller value needs smaller steps there."""
+OLDEST_VERSION = 4
+"""First major version of MuJoCo with the fields of `mujoco_fields`; older versions have other flags."""
 
 
 def bodies_and_effects(
@@ -46,14 +52,18 @@ def bodies_and_effects(
     limits: Literal["refuse", "spring"],
     coordinates: Literal["joint", "directors"],
 ) -> tuple[list[RigidBody | Frame], list[Effect]]:
-    """What a scene is made of, see `Scene.from_mujoco`, whose arguments these are."""
+    """Bodies and effects of the scene of a model.
+
+    Args:
+        model, qpos, qvel, key, ignore, limits, coordinates: as of `Scene.from_mujoco`.
+    """
     try:
         import mujoco  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ImportError("Scene.from_mujoco needs the package mujoco: pip install 'vmri_jax[mujoco]'.") from error
-    if int(mujoco.__version__.split(".")[0]) < OLDEST:
+    if int(mujoco.__version__.split(".")[0]) < OLDEST_VERSION:
         raise ImportError(
-            f"Scene.from_mujoco needs mujoco {OLDEST}.0 or newer, and finds {mujoco.__version__}: pip install 'vmri_jax[mujoco]'."
+            f"Scene.from_mujoco needs mujoco {OLDEST_VERSION}.0 or newer, and finds {mujoco.__version__}: pip install 'vmri_jax[mujoco]'."
         )
     if isinstance(model, str | PathLike):
         if not Path(model).is_file():
@@ -71,8 +81,8 @@ def bodies_and_effects(
     reader = _Reader(compiled, _start(compiled, qpos, qvel, key))
     bodies = reader.bodies()
     springs = list(reader.limits("limits" in ignore)) if limits == "spring" else []
-    tied = couplings(compiled, reader.data)
-    return bodies, [*reader.joints(), *springs, *reader.equalities(), *tied, *reader.gravity(bodies)]
+    coupled = couplings(compiled, reader.data)
+    return bodies, [*reader.joints(), *springs, *reader.equalities(), *coupled, *reader.gravity(bodies)]
 
 
 def _start(compiled: Compiled, qpos: Any, qvel: Any, key: str | int | None) -> Any:
@@ -80,7 +90,9 @@ def _start(compiled: Compiled, qpos: Any, qvel: Any, key: str | int | None) -> A
     data = compiled.mujoco.MjData(compiled.model)
     if key is not None:
         if qpos is not None or qvel is not None:
-            raise ValueError("Scene.from_mujoco: key and qpos or qvel are given; both say where the motion starts.")
+            raise ValueError(
+                "Scene.from_mujoco: key and qpos or qvel are given; both define the start. Give one of them."
+            )
         number = _keyframe(compiled.model, key)
         qpos, qvel = compiled.model.key_qpos[number], compiled.model.key_qvel[number]
     for name, value in (("qpos", qpos), ("qvel", qvel)):
@@ -116,27 +128,32 @@ def lift(q, params):
 
 @dataclass(frozen=True)
 class _Reader:
-    """A compiled model at one configuration, where its joints are as MuJoCo's kinematics have them."""
+    """A compiled model at its start.
+
+    Args:
+        data: `mujoco.MjData` with the positions and axes of bodies and joints at the start.
+    """
 
     compiled: Compiled
     data: Any
 
     def bodies(self) -> list[RigidBody | Frame]:
-        """One of all bodies that are welded together, at their common centre of mass, after frames between its joints."""
-        made: list[RigidBody | Frame] = []
+        """A rigid body for each group of bodies that are welded together, after the frames between its joints."""
+        bodies: list[RigidBody | Frame] = []
         for root in self.compiled.roots:
-            made += [Frame(self._frame(j), self.data.xanchor[j]) for j in self.compiled.joints_of(root)[:-1]]
-            made.append(self._body(root))
-        return made
+            bodies += [Frame(self._frame(j), self.data.xanchor[j]) for j in self.compiled.joints_of(root)[:-1]]
+            bodies.append(self._body(root))
+        return bodies
 
     def _body(self, root: int) -> RigidBody:
-        """All that is welded to a body, as one."""
+        """The rigid body of all bodies that are welded to `root`, at their common centre of mass."""
         model, name = self.compiled.model, self.compiled.name("body", root)
         members = np.flatnonzero(model.body_weldid == root)
         masses, centres = model.body_mass[members], self.data.xipos[members]
         mass = float(masses.sum())
         centre = masses @ centres / mass
         inertia = np.zeros((3, 3))
+        # parallel axes: J = sum R J_b R^T + m (r^2 1 - r r^T) with the arm r from the common centre
         for b, m, position in zip(members, masses, centres, strict=True):
             axes, arm = self.data.ximat[b].reshape(3, 3), position - centre
             inertia += axes @ np.diag(model.body_inertia[b]) @ axes.T
@@ -146,7 +163,7 @@ class _Reader:
         return RigidBody(name, mass, inertia, centre, velocity=velocity, spin=spin)
 
     def joints(self) -> Iterator[Effect]:
-        """Joints, and the linear springs, dampers and rotors in them."""
+        """All joints, each followed by its linear spring, damper and rotor."""
         compiled, model = self.compiled, self.compiled.model
         kinds = compiled.mujoco.mjtJoint
         for j in range(model.njnt):
@@ -154,7 +171,7 @@ class _Reader:
             name, anchor, axis = compiled.name("joint", j), self.data.xanchor[j].copy(), self.data.xaxis[j].copy()
             kind = model.jnt_type[j]
             if kind == kinds.mjJNT_FREE:
-                continue
+                continue  # a body without a joint is free in a scene
             if kind == kinds.mjJNT_BALL:
                 yield Spherical(between, anchor, name=name)
                 continue
@@ -163,8 +180,8 @@ class _Reader:
             stiffness, damping, rotor = (
                 float(x) for x in (model.jnt_stiffness[j], model.dof_damping[dof], model.dof_armature[dof])
             )
-            curved = np.any(model.jnt_stiffnesspoly[j]) or model.jnt_springyield[j]
-            if stiffness and not curved and not compiled.off("SPRING"):
+            is_nonlinear = np.any(model.jnt_stiffnesspoly[j]) or model.jnt_springyield[j]
+            if stiffness and not is_nonlinear and not compiled.off("SPRING"):
                 relaxed = float(model.qpos_spring[place] - self.data.qpos[place])
                 yield JointSpring(name, stiffness, relaxed, name=f"{name} spring")
             if damping and not np.any(model.dof_dampingpoly[dof]) and not compiled.off("DAMPER"):
@@ -173,7 +190,7 @@ class _Reader:
                 yield RotorInertia(name, rotor, name=f"{name} rotor")
 
     def _between(self, j: int) -> tuple[str, str]:
-        """The bodies or frames that a joint is between."""
+        """Names of both bodies or frames of a joint."""
         compiled, child = self.compiled, int(self.compiled.model.jnt_bodyid[j])
         joints = compiled.joints_of(child)
         parent = compiled.group(compiled.model.body_parentid[child])
@@ -183,32 +200,30 @@ class _Reader:
         )
 
     def _frame(self, j: int) -> str:
-        """What the frame between a joint and the next one of the same body is called."""
+        """Name of the frame between a joint and the next joint of the same body."""
         return f"{self.compiled.name('joint', j)} frame"
 
     def limits(self, ignored: bool) -> Iterator[JointLimit]:
-        """Limits of joints as springs: MuJoCo's stiffness for the inertia that the joint moves at qpos0.
+        """Limits of joints as springs, with MuJoCo's stiffness for the inertia that the joint moves at qpos0.
 
-        By its reference of solref, a limit pulls back with the acceleration ``d / (T z)^2`` at the depth d, of the time constant T and the
-        damping ratio z; negative numbers are its stiffness and damping. The inertia is ``1 / dof_invweight0``.
+        MuJoCo's solref of a limit is (T, z), its time constant and damping ratio: at the depth d it pulls back with the acceleration
+        ``d / (T z)^2``. Negative numbers are (-k, -c), with the acceleration ``k d``. The inertia is ``1 / dof_invweight0``.
 
         Args:
-            ignored: whether limits of ball joints and of tendons may be left out.
+            ignored: whether the scene may leave out limits of ball joints and of tendons.
 
         Raises:
-            ValueError: limits of ball joints or of tendons that may not.
+            ValueError: limits of ball joints or of tendons, unless they are ignored.
         """
         compiled, model = self.compiled, self.compiled.model
         if compiled.off(CONSTRAINTS, "LIMIT"):
             return
-        others = [
-            model.joint(int(j)).name or f"joint {j}" for j in np.flatnonzero(model.jnt_limited & compiled.turning)
-        ]
-        others += [model.tendon(int(i)).name or f"tendon {i}" for i in np.flatnonzero(model.tendon_limited)]
-        if others and not ignored:
+        unfit = [model.joint(int(j)).name or f"joint {j}" for j in np.flatnonzero(model.jnt_limited & compiled.turning)]
+        unfit += [model.tendon(int(i)).name or f"tendon {i}" for i in np.flatnonzero(model.tendon_limited)]
+        if unfit and not ignored:
             raise ValueError(
-                f"Scene.from_mujoco: limits='spring' is for limits of hinges and slides, and {', '.join(others)} have others. Leave these "
-                "out of the motion, ignore=['limits'], or change the model."
+                f"Scene.from_mujoco: limits='spring' is for limits of hinges and slides, and {', '.join(unfit)} have limits of another "
+                "kind. Leave these out of the motion, ignore=['limits'], or change the model."
             )
         for j in np.flatnonzero(np.asarray(model.jnt_limited) & ~compiled.turning).tolist():
             time, ratio = model.jnt_solref[j]
@@ -220,7 +235,7 @@ class _Reader:
             yield JointLimit(name, lower, upper, stiffness=stiffness, smoothing=smoothing, name=f"{name} limit")
 
     def equalities(self) -> Iterator[Joint]:
-        """Loops that are closed by connect or weld."""
+        """Joints that close loops, from the equalities connect and weld."""
         for loop in loops(self.compiled, self.data):
             first, second = loop.ends
             between = self.compiled.group(first.body), self.compiled.group(second.body)
@@ -228,7 +243,7 @@ class _Reader:
             yield kind(between, first.point, name=self.compiled.name("equality", loop.number))
 
     def gravity(self, bodies: list[RigidBody | Frame]) -> Iterator[Effect]:
-        """Unless it is switched off; and the forces ``-c m g`` that compensate a part c of it, in the centres of mass.
+        """Gravity, unless the model switches it off, and the forces ``-c m g`` in centres of mass that compensate a fraction c of it.
 
         Args:
             bodies: of the scene.

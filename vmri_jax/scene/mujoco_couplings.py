@@ -1,9 +1,9 @@
-"""The equalities of a model of MuJoCo that tie joints, or fixed tendons: one is a polynomial of the other,
+"""The equalities of a model of MuJoCo that couple two joints, or two fixed tendons, by a polynomial,
 
-    y - y_0 = a_0 + a_1 (x - x_0) + ... + a_4 (x - x_0)^4,
+    y - y_0 = a_0 + a_1 (x - x_0) + ... + a_4 (x - x_0)^4.
 
-where y and x are each a coordinate of a joint, or the length of a fixed tendon, a sum of such coordinates in constant ratios; y_0 and
-x_0 are theirs at qpos0. Without a second one y is held at ``y_0 + a_0``.
+y and x are the coordinates of the joints, or the lengths of the tendons: sums of joint coordinates with constant ratios. y_0 and
+x_0 are their values at qpos0. Without a second joint or tendon the equality is ``y = y_0 + a_0``.
 
 Source: MuJoCo's documentation, "XML reference", equality/joint and equality/tendon.
 """
@@ -15,25 +15,25 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.scene.effects.couplings import JointCoupling
-from vmri_jax.scene.mujoco_loops import WIDEST
+from vmri_jax.scene.mujoco_loops import WIDEST_GAP
 from vmri_jax.scene.mujoco_model import Compiled
 
 
 def polynomial(x, params):
-    """``y - sum_k a_k z^k``, with y and z the sums ``r . x + c`` of coordinates x."""
+    """``y - sum_k a_k z^k``, where y and z are sums ``r . x + c`` of the joint coordinates x."""
     y, z = params["ratios"] @ x + params["offsets"]
     return y - jnp.polyval(params["coefficients"][::-1], z)
 
 
 def couplings(compiled: Compiled, data: Any) -> Iterator[JointCoupling]:
-    """Those that act.
+    """The couplings that the model does not switch off.
 
     Args:
         compiled: the model.
         data: `mujoco.MjData` at the start.
 
     Raises:
-        ValueError: one that the start does not keep.
+        ValueError: an equality that the start violates.
     """
     model = compiled.model
     for i in compiled.equalities:
@@ -50,17 +50,22 @@ def couplings(compiled: Compiled, data: Any) -> Iterator[JointCoupling]:
             "coefficients": coefficients,
         }
         name = compiled.name("equality", i)
-        apart = abs(float(polynomial(jnp.zeros(len(joints)), params)))
-        if apart > WIDEST:
+        violation = abs(float(polynomial(jnp.zeros(len(joints)), params)))
+        if violation > WIDEST_GAP:
             raise ValueError(
-                f"Scene.from_mujoco: {name} is missed by {apart:.3g} at the start. Here equalities hold exactly: give a qpos where it is "
-                "kept, as one at which MuJoCo's simulation comes to rest, or switch it off in the model."
+                f"Scene.from_mujoco: {name} is violated by {violation:.3g} at the start. Here equalities hold exactly: give a qpos where "
+                "it holds, as one at which MuJoCo's simulation comes to rest, or switch the equality off in the model."
             )
         yield JointCoupling([compiled.name("joint", j) for j in joints], polynomial, params, name=name)
 
 
 def _ratios(compiled: Compiled, i: int, number: int) -> dict[int, float]:
-    """The ratios of one side of an equality by the joints in it; none where the side is not there."""
+    """The ratios of the joints on a side of an equality, by number of the joint; {} for an equality without this side.
+
+    Args:
+        i: number of the equality.
+        number: of the joint or tendon on this side; negative if there is none.
+    """
     model = compiled.model
     if number < 0:
         return {}

@@ -1,8 +1,7 @@
-"""Every field of a compiled `mujoco.MjModel`, and what becomes of it in a scene: read, refused by name, or of no mechanics.
+"""Every field of a compiled `mujoco.MjModel` and its use in a scene: read, refused by name, or without influence on the motion.
 
-A field is called as in Python: ``jnt_stiffness``, ``opt.density``, ``vis.map.force``, and a flag by its bit,
-``opt.disableflags.SPRING``. ``flex*`` stands for all fields that begin so and are not named elsewhere: parts of the model that
-are refused, or of no mechanics, as a whole.
+A field has its name in Python, ``jnt_stiffness``, ``opt.density``, ``vis.map.force``, and a flag the name of its bit,
+``opt.disableflags.SPRING``. ``flex*`` stands for all fields that begin with "flex" and have no entry of their own.
 
 Source: the comments in MuJoCo's mjmodel.h, and its documentation, "XML reference".
 """
@@ -12,7 +11,7 @@ from dataclasses import dataclass, field
 CONSTRAINTS = "CONSTRAINT"
 """The flag that switches off contact, limits, dry friction and equalities at once."""
 PASSIVE = "SPRING DAMPER"
-"""The flags that together switch off all passive forces, those of the fluid and the compensation of gravity too."""
+"""The flags that together switch off all passive forces, with the forces of the fluid and the compensation of gravity."""
 
 READ = {
     "bodies, their masses, and which are welded together": """nbody body_mass body_inertia body_ipos body_iquat body_pos body_quat
@@ -32,7 +31,7 @@ READ = {
         opt.disableflags.SPRING opt.disableflags.DAMPER opt.disableflags.GRAVITY opt.disableflags.FILTERPARENT
         opt.disableflags.ACTUATION""",
 }
-"""What the reader uses itself, or through MuJoCo's kinematics: fields by what is read from them."""
+"""Fields that the reader uses itself or through MuJoCo's kinematics, by their content."""
 
 IDLE = {
     "shapes and pictures": """vis.* cam_* ncam light_* nlight mat_* nmat tex_* ntex ntexdata skin_* nskin* mesh_* nmesh* npolygonmax hfield_*
@@ -53,7 +52,7 @@ IDLE = {
         opt.disableflags.AUTORESET opt.disableflags.NATIVECCD opt.disableflags.ISLAND opt.disableflags.MULTICCD
         opt.enableflags.ENERGY opt.enableflags.FWDINV opt.enableflags.INVDISCRETE opt.enableflags.DIAGEXACT""",
 }
-"""Of no mechanics: fields by what they are for."""
+"""Fields without influence on the motion, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,10 @@ class Refusal:
     """A part of a model that no scene expresses.
 
     Attributes:
-        without: how the rest moves where `ignore` names this part; or, where nothing right would be left, what to do.
-        fields: the fields by which it is there, with the flags that switch it off: any of them, and of two in one string both.
-        parts: fields that mean nothing without it.
-        ignorable: whether `ignore` may name it.
+        without: the motion of the model if `ignore` names this part; for a part that `ignore` may not name, advice.
+        fields: the fields whose entries define the part, each with the flags that switch it off: any of them, or all flags of a string.
+        parts: fields without meaning if the part is absent.
+        ignorable: whether `ignore` may name this part.
     """
 
     without: str
@@ -156,4 +155,4 @@ REFUSED = {
         ignorable=False,
     ),
 }
-"""What is refused, by its name in messages and in `ignore`."""
+"""The parts that the reader refuses, by their names in messages and in `ignore`."""

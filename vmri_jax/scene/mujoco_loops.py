@@ -1,10 +1,11 @@
-"""The equalities connect and weld of a model of MuJoCo, which close its loops: where both ends are, and how far apart.
+"""The equalities connect and weld of a model of MuJoCo, which close its loops: both ends of each, and the gap between them.
 
-MuJoCo keeps equalities softly. A start that it has come to has gaps, for a scene to close: Newton's iteration on its coordinates,
+MuJoCo's equalities are soft, so that a configuration from a simulation of MuJoCo has gaps. Newton's iteration on MuJoCo's coordinates
+closes them,
 
     J dq = -r,    r = (x_1 - x_2, rotation vector of R_1 R_2^T),    J = (J_x1 - J_x2, J_w1 - J_w2),
 
-with the points x and frames R of both ends (frames of welds only) and their Jacobians; ``dq`` is the smallest solution.
+with the points x and frames R of both ends (frames of welds only) and their Jacobians; ``dq`` is the shortest solution.
 """
 
 from typing import Any, NamedTuple
@@ -14,19 +15,23 @@ from scipy.spatial.transform import Rotation
 
 from vmri_jax.scene.mujoco_model import Compiled
 
-WIDEST = 1e-3
-"""Gap, in extents of the model or rad, up to which a start is moved to close its loops: MuJoCo's softness leaves some 1e-4. A
-start that is further open has another shape than the file says, and no nearest closed one that its author would expect."""
-CLOSED = 1e-13
-"""Gap, likewise, that is round-off: Newton's iteration ends there."""
-LEFT = 1e-6
-"""Gap, likewise, that may be left: files have about seven digits, and what these leave open no motion of the joints can close."""
+WIDEST_GAP = 1e-3
+"""Widest gap that the reader closes, in extents of the model or rad; MuJoCo's softness leaves some 1e-4. To close a wider gap joints would
+move so far that the start has another shape than in the file."""
+ROUND_OFF_GAP = 1e-13
+"""Gap that is round-off, in extents of the model or rad: Newton's iteration ends there. A larger value leaves wider gaps in the scene."""
+WIDEST_LEFT = 1e-6
+"""Widest gap after the iteration, in extents of the model or rad. Files have about seven digits, and in planar loops no motion of the
+joints closes a gap out of the plane. A larger value accepts loops that do not fit."""
 ITERATIONS = 50
-"""Most iterations; about three are needed, and 20 for a start where the Jacobian loses rank."""
+"""Most iterations; about three are needed, and 20 at a start where the Jacobian loses rank. More only delay the error message."""
+RANK = 1e-10
+"""Singular values of the Jacobian below this fraction of the largest count as zero, so that dependent rows do no harm. A larger value
+ignores motions that close a gap."""
 
 
 class End(NamedTuple):
-    """One end of an equality: the body, and point (3,) and frame (3, 3) in space."""
+    """An end of an equality: number of its body, and its point (3,) and frame (3, 3) in space."""
 
     body: int
     point: np.ndarray
@@ -34,12 +39,12 @@ class End(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """An equality that acts.
+    """An equality connect or weld.
 
     Attributes:
-        number: in the model.
-        welded: a weld, which keeps frames together too.
-        ends: both of them.
+        number: of the equality in the model.
+        welded: whether it is a weld, which holds the frames of both ends together, too.
+        ends: both ends.
     """
 
     number: int
@@ -48,28 +53,28 @@ class Loop(NamedTuple):
 
     @property
     def gap(self) -> np.ndarray:
-        """Points apart, m, (3,); of a weld and then frames apart, rad, (6,)."""
+        """r of the module: (3,) m between the points; of a weld (6,), followed by the rotation vector between the frames, rad."""
         first, second = self.ends
-        apart = first.point - second.point
+        distance = first.point - second.point
         if not self.welded:
-            return apart
-        return np.concatenate([apart, Rotation.from_matrix(first.frame @ second.frame.T).as_rotvec()])
+            return distance
+        return np.concatenate([distance, Rotation.from_matrix(first.frame @ second.frame.T).as_rotvec()])
 
 
 def loops(compiled: Compiled, data: Any) -> list[Loop]:
-    """The connects and welds that act between bodies that can move against each other.
+    """The active equalities connect and weld between bodies that can move against each other.
 
     Args:
         compiled: the model.
-        data: `mujoco.MjData` after its kinematics.
+        data: `mujoco.MjData` with the positions of bodies.
     """
-    found = []
+    closed = []
     for i in compiled.equalities:
         if compiled.closes(i):
             ends = _ends(compiled, data, i)
             if compiled.group(ends[0].body) != compiled.group(ends[1].body):
-                found.append(Loop(i, compiled.model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_WELD, ends))
-    return found
+                closed.append(Loop(i, compiled.model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_WELD, ends))
+    return closed
 
 
 def close(compiled: Compiled, data: Any) -> None:
@@ -79,32 +84,32 @@ def close(compiled: Compiled, data: Any) -> None:
         compiled, data: as of `loops`.
 
     Raises:
-        ValueError: a loop that is open, or does not close.
+        ValueError: a loop whose gap is too wide, or that does not close.
     """
     model, mujoco, extent = compiled.model, compiled.mujoco, float(compiled.model.stat.extent)
-    _refuse(compiled, loops(compiled, data), WIDEST, "is open at the start by")
+    _refuse_gaps(compiled, loops(compiled, data), WIDEST_GAP, "is open at the start by")
     for _ in range(ITERATIONS):
-        open_ones = loops(compiled, data)
-        if not open_ones or max(_size(loop, extent) for loop in open_ones) <= CLOSED:
+        closing = loops(compiled, data)
+        if not closing or max(_size(loop, extent) for loop in closing) <= ROUND_OFF_GAP:
             return
-        jacobian = np.concatenate([_jacobian(compiled, data, loop) for loop in open_ones])
-        gaps = np.concatenate([loop.gap for loop in open_ones])
-        mujoco.mj_integratePos(model, data.qpos, np.linalg.lstsq(jacobian, -gaps, rcond=1e-10)[0], 1.0)
+        jacobian = np.concatenate([_jacobian(compiled, data, loop) for loop in closing])
+        gaps = np.concatenate([loop.gap for loop in closing])
+        mujoco.mj_integratePos(model, data.qpos, np.linalg.lstsq(jacobian, -gaps, rcond=RANK)[0], 1.0)
         mujoco.mj_forward(model, data)
-    _refuse(compiled, loops(compiled, data), LEFT, "does not close; what stays open is")
+    _refuse_gaps(compiled, loops(compiled, data), WIDEST_LEFT, "does not close; its remaining gap is")
 
 
-def _refuse(compiled: Compiled, several: list[Loop], most: float, how: str) -> None:
-    """Raise ValueError where one of them is open by more than this."""
+def _refuse_gaps(compiled: Compiled, closing: list[Loop], widest: float, phrase: str) -> None:
+    """Raise ValueError if a loop has a gap above `widest`; the message says "{name} {phrase} {gap}"."""
     extent = float(compiled.model.stat.extent)
-    far = [loop for loop in several if _size(loop, extent) > most]
-    if not far:
-        return
     gaps = []
-    for loop in far:
-        apart = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
-        turned = f" and {apart[1]:.3g} rad" if loop.welded else ""
-        gaps.append(f"{compiled.name('equality', loop.number)} {how} {apart[0]:.3g} m{turned}")
+    for loop in closing:
+        if _size(loop, extent) > widest:
+            distances = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
+            angle = f" and {distances[1]:.3g} rad" if loop.welded else ""
+            gaps.append(f"{compiled.name('equality', loop.number)} {phrase} {distances[0]:.3g} m{angle}")
+    if not gaps:
+        return
     raise ValueError(
         f"Scene.from_mujoco: {'; '.join(gaps)}. Here equalities hold exactly: give a qpos where they do, as one at which MuJoCo's "
         "simulation comes to rest, or switch the equality off in the model."
@@ -112,13 +117,13 @@ def _refuse(compiled: Compiled, several: list[Loop], most: float, how: str) -> N
 
 
 def _size(loop: Loop, extent: float) -> float:
-    """The gap of a loop in extents of the model or rad."""
-    apart = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
-    return float(np.max(apart / [extent, 1.0][: len(apart)]))
+    """The gap of a loop, in extents of the model or rad."""
+    distances = np.linalg.norm(loop.gap.reshape(-1, 3), axis=1)
+    return float(np.max(distances / [extent, 1.0][: len(distances)]))
 
 
 def _ends(compiled: Compiled, data: Any, i: int) -> tuple[End, End]:
-    """Both ends of an equality, as MuJoCo's engine has them."""
+    """Both ends of an equality, as MuJoCo's engine defines them."""
     model = compiled.model
     objects = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
     if model.eq_objtype[i] == compiled.mujoco.mjtObj.mjOBJ_SITE:
@@ -127,24 +132,23 @@ def _ends(compiled: Compiled, data: Any, i: int) -> tuple[End, End]:
             for s in objects
         )
         return first, second
-    in_first, in_second, turned = model.eq_data[i, :3], model.eq_data[i, 3:6], np.eye(3)
-    if (
-        model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_WELD
-    ):  # anchor in the second body, pose of the second in the first
+    in_first, in_second, rotation = model.eq_data[i, :3], model.eq_data[i, 3:6], np.eye(3)
+    if model.eq_type[i] == compiled.mujoco.mjtEq.mjEQ_WELD:
+        # eq_data of a weld: anchor in the second body, then position and quaternion of the second body in the first
         in_first, in_second = in_second, in_first
-        turned = Rotation.from_quat(model.eq_data[i, 6:10], scalar_first=True).as_matrix()
+        rotation = Rotation.from_quat(model.eq_data[i, 6:10], scalar_first=True).as_matrix()
     frames = [data.xmat[b].reshape(3, 3).copy() for b in objects]
     points = [
         data.xpos[b] + frame @ point for b, frame, point in zip(objects, frames, (in_first, in_second), strict=True)
     ]
-    return End(objects[0], points[0], frames[0] @ turned), End(objects[1], points[1], frames[1])
+    return End(objects[0], points[0], frames[0] @ rotation), End(objects[1], points[1], frames[1])
 
 
 def _jacobian(compiled: Compiled, data: Any, loop: Loop) -> np.ndarray:
-    """Of the gap by MuJoCo's velocities, (3 or 6, nv)."""
+    """The Jacobian of the gap with respect to MuJoCo's velocities, (3, nv), of a weld (6, nv)."""
     sides = []
     for end in loop.ends:
-        moved, turned = np.zeros((3, compiled.model.nv)), np.zeros((3, compiled.model.nv))
-        compiled.mujoco.mj_jac(compiled.model, data, moved, turned, end.point, end.body)
-        sides.append(np.concatenate([moved, turned]) if loop.welded else moved)
+        of_point, of_rotation = np.zeros((3, compiled.model.nv)), np.zeros((3, compiled.model.nv))
+        compiled.mujoco.mj_jac(compiled.model, data, of_point, of_rotation, end.point, end.body)
+        sides.append(np.concatenate([of_point, of_rotation]) if loop.welded else of_point)
     return sides[0] - sides[1]

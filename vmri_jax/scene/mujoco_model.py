@@ -1,4 +1,4 @@
-"""A compiled model of MuJoCo: what its bodies are called, what is switched off, and what of it no scene expresses."""
+"""A compiled model of MuJoCo: names of its elements, its flags, and the features that no scene expresses."""
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -12,13 +12,15 @@ from vmri_jax.scene.body import GROUND
 from vmri_jax.scene.mujoco_fields import CONSTRAINTS, PASSIVE, REFUSED, Refusal
 
 SOFTEST_TIME = 0.02
-"""s, the time constant in solref of MuJoCo's equalities by default; one that takes longer to close is meant as a spring."""
+"""s, default time constant in MuJoCo's solref. The author of a model sets a larger one to get a spring, which a constraint does not
+replace; a larger value here accepts such equalities."""
 SOFTEST_IMPEDANCE = 0.9
-"""The least impedance in solimp by default; an equality of less is meant to give way."""
+"""Default of the smallest impedance in MuJoCo's solimp. The author of a model sets a smaller one to get a soft equality, which a
+constraint does not replace; a larger value here refuses equalities with default numbers."""
 ELEMENTS = {"jnt": "joint", "dof": "joint", "body": "body", "tendon": "tendon", "actuator": "actuator"}
-"""Prefixes of fields with one row for each element, and what their elements are called."""
+"""For each prefix of fields with a row for each element, the word for these elements."""
 NAMED = 8
-"""Most elements that a message names."""
+"""Most elements that a message names; with more it is hard to read."""
 
 
 @dataclass(frozen=True)
@@ -36,29 +38,29 @@ class Compiled:
     coordinates: str = "joint"
 
     def off(self, *flags: str) -> bool:
-        """Whether one of these is set among opt.disableflags; of several flags in one string all must be."""
-        bits, named = int(self.model.opt.disableflags), self.mujoco.mjtDisableBit
-        return any(all(bits & int(getattr(named, f"mjDSBL_{flag}")) for flag in both.split()) for both in flags)
+        """Whether opt.disableflags has one of these flags, or all flags in one of these strings ("SPRING DAMPER")."""
+        bits, kinds = int(self.model.opt.disableflags), self.mujoco.mjtDisableBit
+        return any(all(bits & int(getattr(kinds, f"mjDSBL_{flag}")) for flag in group.split()) for group in flags)
 
     @property
     def gravity(self) -> np.ndarray:
-        """(3,) acceleration, m/s^2; zero where it is switched off."""
+        """(3,) acceleration, m/s^2; zero if the model switches gravity off."""
         return np.zeros(3) if self.off("GRAVITY") else np.array(self.model.opt.gravity)
 
     @property
     def compensated(self) -> list[int]:
-        """Bodies whose weight is compensated."""
+        """Numbers of the moving bodies with gravcomp."""
         if self.off(PASSIVE) or not self.gravity.any():
             return []
         return [b for b in np.flatnonzero(self.model.body_gravcomp).tolist() if self.root(b)]
 
     @property
     def equalities(self) -> list[int]:
-        """The equalities that act."""
+        """Numbers of the active equalities."""
         return [] if self.off(CONSTRAINTS, "EQUALITY") else np.flatnonzero(self.model.eq_active0).tolist()
 
     def closes(self, i: int) -> bool:
-        """Whether an equality is a connect or a weld, of bodies or of sites."""
+        """Whether an equality closes a loop: a connect or a weld of bodies or of sites."""
         model, kinds, objects = self.model, self.mujoco.mjtEq, self.mujoco.mjtObj
         return model.eq_type[i] in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)) and model.eq_objtype[i] in (
             int(objects.mjOBJ_BODY),
@@ -66,7 +68,7 @@ class Compiled:
         )
 
     def ties(self, i: int) -> bool:
-        """Whether an equality ties joints with one coordinate, or fixed tendons of such."""
+        """Whether an equality couples hinges and slides, or fixed tendons of hinges and slides."""
         model, kinds = self.model, self.mujoco.mjtEq
         numbers = [int(n) for n in (model.eq_obj1id[i], model.eq_obj2id[i]) if n >= 0]
         if model.eq_type[i] == int(kinds.mjEQ_TENDON):
@@ -80,22 +82,22 @@ class Compiled:
 
     @property
     def turning(self) -> np.ndarray:
-        """(njnt,) whether a joint is a ball joint or free, so that its coordinates are no single number."""
+        """(njnt,) whether a joint is a ball joint or free: it has several coordinates, with a quaternion."""
         kinds = self.mujoco.mjtJoint
         return np.isin(self.model.jnt_type, [int(kinds.mjJNT_FREE), int(kinds.mjJNT_BALL)])
 
     def joints_of(self, body: int) -> list[int]:
-        """The joints of a body, one after the other from its parent on."""
+        """Numbers of the joints of a body, in the order from its parent to the body."""
         model = self.model
         return list(range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]))
 
     @cached_property
     def roots(self) -> list[int]:
-        """The first of every group of bodies that are welded together, without those that rest: the world and mocap bodies."""
+        """The first body of every group of bodies that are welded together, without the groups of the world and of mocap bodies."""
         return [b for b in range(1, self.model.nbody) if self.root(b) == b]
 
     def root(self, body: int) -> int:
-        """The first of the bodies that a body is welded to, itself perhaps; 0 of one that rests."""
+        """The first body of the group that a body is welded to; 0 for the groups of the world and of mocap bodies, which do not move."""
         root = int(self.model.body_weldid[body])
         return 0 if self.model.body_mocapid[root] >= 0 else root
 
@@ -105,7 +107,7 @@ class Compiled:
         return self.name("body", root) if root else GROUND
 
     def name(self, kind: str, i: int) -> str:
-        """What an element is called in the scene: as in the model, or by its number; "arm joint" where a body is "arm" too."""
+        """Name of an element in the scene: its name in the model, or else its number; "arm joint" if a body has the name "arm", too."""
         name = getattr(self.model, kind)(int(i)).name or f"{kind} {int(i)}"
         return f"{name} {kind}" if name == GROUND or (kind != "body" and name in self._bodies) else name
 
@@ -114,7 +116,7 @@ class Compiled:
         return {self.model.body(b).name for b in range(self.model.nbody)}
 
     def refuse(self, ignore: Collection[str]) -> None:
-        """Raise ValueError with all that the model has and a scene does not express, but for what is ignored.
+        """Raise ValueError with all features of the model that a scene does not express, except the ignored ones.
 
         Args:
             ignore: names in `REFUSED`.
@@ -125,19 +127,19 @@ class Compiled:
         for kind in ignore:
             if kind not in REFUSED:
                 raise ValueError(f"Scene.from_mujoco: ignore: {unknown('name', kind, ignorable)}")
-        left = {kind: part for kind, part in self.beyond() if kind not in ignore or not REFUSED[kind].ignorable}
-        if not left:
+        refused = {kind: part for kind, part in self.beyond() if kind not in ignore or not REFUSED[kind].ignorable}
+        if not refused:
             return
-        named = [kind for kind in left if REFUSED[kind].ignorable]
-        advice = [f"leave it out of the motion, ignore={named}"] if named else []
-        advice += [f"for {kind}, {REFUSED[kind].without}" for kind in left if not REFUSED[kind].ignorable]
+        leave_out = [kind for kind in refused if REFUSED[kind].ignorable]
+        advice = [f"leave them out of the motion, ignore={leave_out}"] if leave_out else []
+        advice += [f"for {kind}, {REFUSED[kind].without}" for kind in refused if not REFUSED[kind].ignorable]
         raise ValueError(
-            "Scene.from_mujoco: the model has what a scene of rigid bodies does not express: "
-            f"{'; '.join(f'{kind} ({part})' for kind, part in left.items())}. Change the model, or {'; '.join(advice)}."
+            "Scene.from_mujoco: the model has features that a scene of rigid bodies does not express: "
+            f"{'; '.join(f'{kind} ({part})' for kind, part in refused.items())}. Change the model, or {'; '.join(advice)}."
         )
 
     def beyond(self) -> Iterator[tuple[str, str]]:
-        """What a scene does not express: its name in `REFUSED`, and which elements of the model it is."""
+        """The features of the model that a scene does not express: the name in `REFUSED`, and the elements that have the feature."""
         looks: dict[str, Callable[[], str]] = {
             "actuators": self._actuators,
             "contact": self._contact,
@@ -155,7 +157,7 @@ class Compiled:
                 yield kind, part
 
     def _acting(self, refusal: Refusal) -> str:
-        """The elements of the model whose fields are not zero, nor switched off."""
+        """The elements with a field of this refusal that is not zero and that no flag switches off."""
         parts = []
         for name, flags in refusal.fields.items():
             values = np.asarray(getattr(self.model.opt if name.startswith("opt.") else self.model, name.split(".")[-1]))
@@ -173,14 +175,14 @@ class Compiled:
     def _listed(self, kind: str, rows) -> str:
         """ "joint a, joint b, ..." without repetitions."""
         names = list(dict.fromkeys(f"{kind} {getattr(self.model, kind)(int(i)).name or int(i)}" for i in rows))
-        more = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
-        return ", ".join(names[:NAMED] + more)
+        unnamed = [f"and {len(names) - NAMED} more"] if len(names) > NAMED else []
+        return ", ".join(names[:NAMED] + unnamed)
 
     def _actuators(self) -> str:
-        """Those of groups that are not disabled and that exert something with controls of zero; armature and damping act in any case."""
+        """Actuators with a force at zero control, unless their group is disabled, and all actuators with armature or damping."""
         fields = REFUSED["actuators"].fields
         groups = np.asarray(self.model.actuator_group)
-        # a bit for each of the groups 0 to 30; others cannot be disabled
+        # disableactuator has a bit for each of the groups 0 to 30; other groups cannot be disabled
         disabled = (
             (groups >= 0) & (groups < 31) & ((int(self.model.opt.disableactuator) >> groups.clip(0, 30)) & 1 == 1)
         )
@@ -191,14 +193,14 @@ class Compiled:
         return self._listed("actuator", np.flatnonzero(acting))
 
     def _exert_nothing(self) -> np.ndarray:
-        """(nactuator,) those whose force is a multiple of the control, or of what integrates or filters it from zero."""
+        """(nactuator,) whether the force is a multiple of the control, or of an integral of it from zero or a filter of it."""
         model, mujoco = self.model, self.mujoco
         gains = [int(kind) for kind in (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)]
         dynamics = mujoco.mjtDyn
-        plain = [dynamics.mjDYN_NONE, dynamics.mjDYN_INTEGRATOR, dynamics.mjDYN_FILTER, dynamics.mjDYN_FILTEREXACT]
+        linear = [dynamics.mjDYN_NONE, dynamics.mjDYN_INTEGRATOR, dynamics.mjDYN_FILTER, dynamics.mjDYN_FILTEREXACT]
         return (
             np.isin(model.actuator_gaintype, gains)
-            & np.isin(model.actuator_dyntype, [int(kind) for kind in plain])
+            & np.isin(model.actuator_dyntype, [int(kind) for kind in linear])
             & ~_rows(model.actuator_biasprm)
         )
 
@@ -211,7 +213,7 @@ class Compiled:
         return f"{len(pairs)} pair{several} of geoms, as of {bodies[0]} and {bodies[1]}"
 
     def touching(self) -> np.ndarray:
-        """(n, 2) pairs of geoms that may collide by MuJoCo's rules: types, parents, exclusions; and those that are named as pairs."""
+        """(n, 2) pairs of geoms that may collide by MuJoCo's rules for types, parents and exclusions, and pairs that the model names."""
         model = self.model
         if self.off(CONSTRAINTS, "CONTACT"):
             return np.zeros((0, 2), dtype=int)
@@ -226,9 +228,9 @@ class Compiled:
         for first, second in zip(*np.divmod(model.exclude_signature, 1 << 16), strict=True):
             excluded = (body[:, None] == first) & (body == second)
             meet &= ~(excluded | excluded.T)
-        for first, second in zip(model.pair_geom1, model.pair_geom2, strict=True):  # has precedence over exclusion
+        for first, second in zip(model.pair_geom1, model.pair_geom2, strict=True):  # named pairs override exclusions
             meet[first, second] = meet[second, first] = True
-        meet &= group[:, None] != group  # those that are welded together do not move against each other
+        meet &= group[:, None] != group  # bodies that are welded together do not move against each other
         return np.argwhere(np.triu(meet))
 
     def _turning_springs(self) -> str:
@@ -245,11 +247,11 @@ class Compiled:
         return self._listed("joint", [j for j in rows if self.turning[j]])
 
     def _couplings(self) -> str:
-        """Equalities that are neither connect nor weld, nor tie joints with one coordinate."""
+        """Equalities that neither close a loop nor couple hinges and slides."""
         return self._listed("equality", [i for i in self.equalities if not (self.closes(i) or self.ties(i))])
 
     def _soft_equalities(self) -> str:
-        """Equalities that are softer than by default; with negative numbers solref is a spring."""
+        """Equalities that are softer than by default, or whose solref has negative numbers, which define a spring."""
         model = self.model
         soft = [
             i
@@ -264,17 +266,17 @@ class Compiled:
         return "the flag sleep" if asleep else ""
 
     def _several_joints(self) -> str:
-        """Bodies with several, of which one is a ball or the scene is by directors."""
+        """Bodies with several joints, if one of them is a ball joint or the scene has directors alone."""
         several = np.flatnonzero(np.asarray(self.model.body_jntnum) > 1)
         if self.coordinates != "directors":
             several = [b for b in several if np.any(self.turning[self.joints_of(int(b))])]
         return self._listed("body", several)
 
     def _actuated_compensation(self) -> str:
-        """Joints whose actuators compensate gravity, where it is compensated at all."""
+        """Joints whose actuators compensate gravity, if a body has gravcomp."""
         return self._acting(REFUSED["compensation of gravity by actuators"]) if self.compensated else ""
 
 
 def _rows(values: Any) -> np.ndarray:
-    """Which rows of a field have an entry that is not zero."""
+    """(n,) whether a row of a field has an entry that is not zero."""
     return np.any(values, axis=tuple(range(1, np.ndim(values))))

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vmri_jax.mechanics.arrays import quickly_compiled
-from vmri_jax.scene.body import LARGEST_POINT, Bodies, moving
+from vmri_jax.scene.body import LARGEST_POINT, Bodies, label_of, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.terms import EffectTerm
 
@@ -154,8 +154,8 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
         projected = motions.T @ force, *(motions.T @ matrix @ motions for matrix in matrices)
         if not all(np.isfinite(part).all() for part in projected):
             raise ValueError(
-                f"{effect.name}: its energy between {', '.join(element)} has no finite derivatives at the start; move these bodies, or "
-                "smooth the energy."
+                f"{effect.name}: its energy between {', '.join(map(label_of, effect.elements(bodies)[i]))} has no finite derivatives at the "
+                "start; move these bodies, or smooth the energy."
             )
         linearised.append(Linearised(np.concatenate([columns[name] for name in element]), *projected))
     return linearised

@@ -2,8 +2,8 @@
 
 A row whose gradient depends on the gradients of the other rows at the start need not depend on them elsewhere: examples are the third
 distance of three atoms in line, and a linkage that lies flat. The kept rows g_k are independent at the start, so that ``g_k = 0`` is a
-smooth surface there. The dropped rows follow from the kept rows if and only if they vanish on this surface around the start. The check
-evaluates them at the ends of random motions along the surface.
+smooth surface there. The dropped rows follow from the kept rows, that is are implied by them, if and only if they vanish on this surface
+around the start. The check evaluates them at the ends of random motions along the surface.
 """
 
 from collections.abc import Callable, Sequence
@@ -215,13 +215,13 @@ def _in_words(rows: ConstraintRows, opening: Opening) -> str:
     errors = _listed([f"{name} by {value:.1e}" for name, value in zip(names, opening.values, strict=True)])
     if not opening.motion:
         return (
-            f"{_listed(names)} contradicts the other constraints: where they hold, it is violated, relative to its size, {errors}. "
+            f"{_listed(names)} contradicts the other constraints. Where they hold, its violation relative to its size is not zero: {errors}. "
             "Correct its numbers, or leave it out"
         )
     return (
         f"{_listed(names)} depends on the other constraints at the start alone. Nearby, where coordinates have moved by some "
-        f"{opening.motion:.1g} of the extent of the scene and the other constraints hold, it is violated, relative to its size, {errors}. "
-        f"{BEND}"
+        f"{opening.motion:.1g} of the extent of the scene and the other constraints hold, its violation relative to its size is not zero: "
+        f"{errors}. {BEND}"
     )
 
 

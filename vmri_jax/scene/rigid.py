@@ -197,7 +197,7 @@ class RigidBody(AnyBody):
         return matrix if len(self.wide) > 1 else np.linalg.svd(matrix)[0][:, :5]  # a rod does not turn about itself
 
     def _turns(self) -> np.ndarray:
-        """Matrix from the angular velocity to the rates of the directors, ``d_i' = -d_i x spin``."""
+        """(3 k, 3) matrix from the angular velocity to the rates of the k directors, ``d_i' = -d_i x spin``."""
         return np.concatenate([-_cross_matrix(np.asarray(self.directors[i])) for i in self.wide])
 
     def with_rates(self, rates: np.ndarray) -> "RigidBody":
@@ -306,7 +306,7 @@ class Rigidity(Effect):
 
 
 def split(q):
-    """Centre (..., 3) and directors (..., 3, 3), one per row, of the coordinates of a rigid body (..., 12)."""
+    """Centre (..., 3) and directors (..., k, 3), a director per row, of the coordinates q (..., 3 + 3 k) of a rigid body."""
     triples = q.reshape(*q.shape[:-1], -1, 3)
     return triples[..., 0, :], triples[..., 1:, :]
 
@@ -387,8 +387,8 @@ def angular_momentum(q, p):
     """``L = phi x p_phi + sum_i d_i x p_i`` about the origin, in space, (..., 3) kg m^2/s.
 
     Args:
-        q: (..., 12) coordinates, ``run.position("hub")``.
-        p: (..., 12) momenta, ``run.momentum("hub")``.
+        q: (..., n) coordinates, ``run.position("hub")``.
+        p: (..., n) momenta, ``run.momentum("hub")``.
     """
     (phi, d), (push, turn) = split(np.asarray(q)), split(np.asarray(p))
     return np.cross(phi, push) + np.sum(np.cross(d, turn), axis=-2)

@@ -1,19 +1,21 @@
 """Sorting of bodies into slow and fast, and of effects into the functions of a `System`.
 
-An effect touches the bodies whose coordinates it depends on. It becomes part of a function as follows:
+An effect touches the bodies whose coordinates it depends on. Each of its elements has a home, the argument of `System` that it is part of:
 
-| effect | part of |
-|---|---|
-| potential that touches a slow body | V |
-| potential between fast bodies, stiff | W |
-| potential between fast bodies, not stiff | V, where it is evaluated less often |
-| potential with the rate k | the potential at every k-th micro node |
-| potential with the rate "fast" that touches a slow body | the potential on the micro grid |
-| constraint that touches a fast body | g, on the micro grid |
-| constraint between slow bodies | g_s, on the macro grid; on the micro grid there would be more rows than unknowns |
-| kinetic effect | T, on the micro grid, where momenta need it |
+| element of a | home | function |
+|---|---|---|
+| potential that touches a slow body | "slow_potential" | V |
+| potential between fast bodies, stiff | "fast_potential" | W(q_f) |
+| potential between fast bodies, not stiff | "slow_potential" | V, which is evaluated less often than W |
+| potential with the rate k | k | V_k, at every k-th micro node |
+| potential with the rate "fast" that touches a slow body | "fast" | on the micro grid like W, but of q_s too |
+| constraint that touches a fast body | "constraint" | g, on the micro grid |
+| constraint between slow bodies | "slow_constraint" | g_s, on the macro grid; on the micro grid it would have more rows than unknowns |
+| kinetic effect | "kinetic" | T, on the micro grid, where momenta need it |
+| force | "force" | F |
+| control | "control" | none: a run has no controls |
 
-The kinetic energy of bodies that depend on slow coordinates alone is on the macro grid.
+The kinetic energy T_s of bodies that depend on slow coordinates alone is on the macro grid.
 
 A body with the pace "auto" is fast if a stiff kinetic effect, or a stiff potential outside V, touches it. An effect is stiff if its
 frequency is above the border between slow and fast, see `vmri_jax.scene.rates`.
@@ -35,9 +37,10 @@ from vmri_jax.mechanics.kinematics import Kinematics
 from vmri_jax.mechanics.rows import Place
 from vmri_jax.scene.body import GROUND, Bodies
 from vmri_jax.scene.effect import Effect
+from vmri_jax.scene.joint_constants import joint_constants
 from vmri_jax.scene.layout import Layout, Pace, join
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
-from vmri_jax.scene.trees import Branch, Link, joint_numbers, layout, nearest_rates, with_weight
+from vmri_jax.scene.trees import Branch, Link, layout, with_weight
 
 NAMED = 3
 """Most bodies that a reason names; with more the table of reasons is too wide."""
@@ -142,7 +145,7 @@ class Sorting:
         """`start` and `violation` of a scene in joint coordinates."""
         q, n_s = library(self.assembled).concatenate(self.assembled), self.layout.sizes[0]
         rates, masses = (library(parts).concatenate(parts) for parts in map(self._of_bodies, ("rates", "masses")))
-        v, violation = nearest_rates(self.to_bodies(q)[1], rates, masses)
+        v, violation = _nearest_rates(self.to_bodies(q)[1], rates, masses)
         return (*self.positions, *self._with_joint_starts(v[:n_s], v[n_s:], 1)), violation
 
     def _of_bodies(self, quantity: Literal["coordinates", "rates", "masses"]) -> tuple[jax.Array, jax.Array]:
@@ -157,8 +160,8 @@ class Sorting:
 
     @cached_property
     def joints(self) -> dict[str, Any]:
-        """Constants of the joints that carry bodies, see `joint_numbers`; empty if no joint does."""
-        return joint_numbers(self.bodies, self.links) if self.links else {}
+        """Constants of the joints that carry bodies, see `joint_constants`; empty if no joint does."""
+        return joint_constants(self.bodies, self.links) if self.links else {}
 
 
 @partial(quickly_compiled, static_argnames="kinematics")
@@ -174,6 +177,23 @@ def _bodies_and_jacobian(kinematics: Kinematics, q, joints):
     return coordinates, jacobian
 
 
+def _nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
+    """The velocities v of the scene for which ``J v`` is nearest to the velocities V of the bodies, ``J^T M J v = J^T M V``.
+
+    Args:
+        jacobian: J = dQ/dq.
+        rates: V of (Q_s, Q_f) one after the other.
+        masses: M, likewise.
+
+    Returns:
+        v, and the part ``V - J v`` that the joints do not allow, relative to V in the norm of the kinetic energy.
+    """
+    xp = library(jacobian, rates, masses)
+    v = xp.linalg.solve(jacobian.T @ (masses[:, None] * jacobian), jacobian.T @ (masses * rates))
+    violation, square = rates - jacobian @ v, xp.sum(masses * rates**2)
+    return v, xp.sqrt(xp.sum(masses * violation**2) / xp.where(square > 0, square, 1.0))
+
+
 class Owners(NamedTuple):
     """The bodies whose coordinates an element of an effect depends on.
 
@@ -186,7 +206,11 @@ class Owners(NamedTuple):
 
 
 def _owners(effect: Effect, bodies: Bodies, branches: Sequence[Branch]) -> list[Owners]:
-    """The bodies whose coordinates each element of an effect depends on."""
+    """The bodies whose coordinates each element of an effect depends on.
+
+    Every body of an element depends on a chain of bodies, from itself to the root of its tree. `Owners.all` is the union of these chains;
+    `Owners.between` is this union without the bodies that are in every chain.
+    """
     on_joints = {branch.child: branch for branch in branches}
     carried = {(branch.joint.name, branch.element): branch.child for branch in branches}
     owners = []
@@ -287,7 +311,7 @@ def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owner
         elif limit is None:
             paces[name] = Pace("slow", f"no gap of a factor {SEPARATION:g} between the rates of the effects")
         else:
-            paces[name] = Pace("slow", f"touched by nothing stiff, above {limit:.3g} rad/s")
+            paces[name] = Pace("slow", f"no effect above {limit:.3g} rad/s touches it")
     for effect in energies:
         for i, (names, between) in enumerate(owned[effect.name]):
             declared = effect.rate == "fast" or isinstance(effect.rate, int)

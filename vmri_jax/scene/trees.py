@@ -12,10 +12,8 @@ from heapq import heappop, heappush
 from itertools import count
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
-
-from vmri_jax.mechanics.arrays import is_concrete, library
-from vmri_jax.mechanics.kinematics import UNMOVED, Frames, Grid, Kinematics, Move
+from vmri_jax.mechanics.arrays import is_concrete
+from vmri_jax.mechanics.kinematics import Frames, Grid, Kinematics, Move
 from vmri_jax.mechanics.rows import Part, Place, Rows
 from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
 from vmri_jax.scene.effect import Effect
@@ -339,89 +337,3 @@ def _way(branch: Branch | None, branch_of: Mapping[str, Branch]) -> list[Link]:
         way = [*(Link(branch, step) for step in range(branch.size)), *way]
         branch = branch_of.get(branch.parent)
     return way
-
-
-def joint_numbers(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, Any]:
-    """The constants C, P, S, E (n, 4, 3) of all links, see `vmri_jax.mechanics.kinematics`.
-
-    The rows (r, M) of a frame are ``C + P cos x + S sin x + E x``. A link of None gets the constants of a frame that does not move.
-
-    Args:
-        bodies: by name.
-        links: of a layout.
-    """
-    known = list(dict.fromkeys(link for link in links if link is not None))
-    ends = _ends(bodies, known)
-    xp = library(ends)
-    # triads in cyclic order with the axis of the motion last, so that the turn is in the first two rows
-    axes = [link.move.axis if link.move else 2 for link in known]
-    cyclic = np.array([[(k + 1) % 3, (k + 2) % 3, k] for k in axes])
-    inner, outer = (ends[name][np.arange(len(known))[:, None], cyclic] for name in ("frame_a", "frame_b"))
-
-    def dyads(i: int, j: int):
-        """``f_i^T a_j`` with the rows f of F_b and a of F_a."""
-        return outer[:, i, :, None] * inner[:, j, None, :]
-
-    def rows(matrix, point):
-        """(r, M) with ``r = X - X_b M``."""
-        rotated = xp.sum(ends["point_b"][:, :, None] * matrix, axis=1)
-        return xp.concatenate([(point - rotated)[:, None], matrix], axis=1)
-
-    turns, ways = (np.array([link.amount(kind) for link in known])[:, None, None] for kind in ("turn", "slide"))
-    pitches = [link.pitch / (2 * np.pi) for link in known]
-    screws = library(pitches).stack(pitches)[:, None]
-    # M = F_b^T T(x) F_a = f_2^T a_2 + cos x (f_0^T a_0 + f_1^T a_1) + sin x (f_0^T a_1 - f_1^T a_0); without a turn cos x = 1
-    across, along = dyads(0, 0) + dyads(1, 1), dyads(2, 2)
-    zero = xp.zeros_like(ends["point_a"])
-    constants = {
-        "constant": rows(along + (1 - np.abs(turns)) * across, ends["point_a"]),
-        "cosine": rows(np.abs(turns) * across, zero),
-        "sine": rows(turns * (dyads(0, 1) - dyads(1, 0)), zero),
-        "way": xp.pad(((ways[:, 0] + turns[:, 0] * screws) * inner[:, 2])[:, None], ((0, 0), (0, 3), (0, 0))),
-    }
-    numbers = np.array([len(known) if link is None else known.index(link) for link in links])
-    unmoved = {name: UNMOVED if name == "constant" else np.zeros((4, 3)) for name in constants}
-    return {name: xp.concatenate([values, unmoved[name][None]])[numbers] for name, values in constants.items()}
-
-
-def _ends(bodies: Bodies, links: Sequence[Link]) -> dict[str, Any]:
-    """The points X and triads F of all links: "point_a", "frame_a" in the frame that a link hangs on, "point_b", "frame_b" in its own."""
-    carried = {link.branch.child for link in links}
-    joints = {link.branch.joint.name: link.branch.joint for link in links}
-    points = {name: joint.joining_points(bodies) for name, joint in joints.items()}
-    triads: dict[str, Any] = {name: joint.frame(len(points[name])) for name, joint in joints.items()}
-    ends: dict[str, list] = {}
-    for link in links:
-        branch = link.branch
-        point, triad = points[branch.joint.name][branch.element], triads[branch.joint.name][branch.element]
-        of_parent, of_child = (0, 1) if branch.forward else (1, 0)
-        for role, name, number, is_body in (
-            ("a", branch.parent, of_parent, link.is_first),
-            ("b", branch.child, of_child, link.is_last),
-        ):
-            body = body_of(bodies, name)
-            # a root has only the directors in `wide`, a carried body all three, as rows of its frame
-            components = body.components if isinstance(body, RigidBody) and name in carried else body.weights
-            # a frame between two moves of a joint is the triad itself, with its origin at the point of the joint
-            x = components((point[number] - body.position) @ body.rotation) if is_body else np.zeros(3)
-            axes = [components(row @ body.rotation) for row in triad] if is_body else list(np.eye(3))
-            ends.setdefault(f"point_{role}", []).append(x)
-            ends.setdefault(f"frame_{role}", []).append(library(axes).stack(axes))
-    return {name: library(values).stack(values) for name, values in ends.items()}
-
-
-def nearest_rates(jacobian, rates, masses) -> tuple[Any, Any]:
-    """The velocities v of the scene for which ``J v`` is nearest to the velocities V of the bodies, ``J^T M J v = J^T M V``.
-
-    Args:
-        jacobian: J = dQ/dq.
-        rates: V of (Q_s, Q_f) one after the other.
-        masses: M, likewise.
-
-    Returns:
-        v, and the part ``V - J v`` that the joints do not allow, relative to V in the norm of the kinetic energy.
-    """
-    xp = library(jacobian, rates, masses)
-    v = xp.linalg.solve(jacobian.T @ (masses[:, None] * jacobian), jacobian.T @ (masses * rates))
-    violation, square = rates - jacobian @ v, xp.sum(masses * rates**2)
-    return v, xp.sqrt(xp.sum(masses * violation**2) / xp.where(square > 0, square, 1.0))

@@ -63,7 +63,7 @@ def with_rates(
     def momentum(v):
         return jnp.concatenate(legendre(system, q_s, q_f, v[:n_s], v[n_s:]))
 
-    # rows dg/dq v = -dg/dt of the constraints, then dx/dq v = x' of the freedoms x with a given rate
+    # rows dg/dq v = -dg/dt of the constraints, then dx/dq v = x' of the freedoms x whose rates the user gives
     t = jnp.zeros(())
     rows = [np.asarray(jax.jacfwd(constraints, 1)(t, q))]
     values = [-np.asarray(jax.jacfwd(constraints)(t, q))]

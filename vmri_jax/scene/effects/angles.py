@@ -1,4 +1,4 @@
-"""Terms of three and four points: angles, bending, torsion."""
+"""Potentials of three and four points: angles, bending, torsion."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from vmri_jax.scene.effects.springs import elastic_energy
 
 
 class _AmongPoints(Effect):
-    """What terms of angles share."""
+    """Base class of the potentials here: between different points in the plane or in space."""
 
     kind = "potential"
     dimensions = (2, 3)
@@ -91,7 +91,7 @@ class Bending(_AmongPoints):
 class Torsion(_AmongPoints):
     """Torsion about the middle one of three bonds, ``V = sum k (1 - cos(m (phi - phi_0)))``, phi the dihedral angle.
 
-    phi is 0 where a and d are on one side of b-c (cis) and pi on opposite ones (trans).
+    phi is 0 if a and d are on the same side of b-c (cis), and pi if they are on opposite sides (trans).
 
     Args:
         between: names (a, b, c, d) of points in space, or a list of such.
@@ -115,6 +115,7 @@ class Torsion(_AmongPoints):
     @staticmethod
     def function(q, params):
         a, b, c, d = q
+        # with b_1 = b - a, b_2 = c - b, b_3 = d - c: tan phi = |b_2| b_1 . (b_2 x b_3) / ((b_1 x b_2) . (b_2 x b_3))
         first, axis, last = b - a, c - b, d - c
         left, right = jnp.cross(first, axis), jnp.cross(axis, last)
         sine = jnp.linalg.norm(axis, axis=-1) * jnp.sum(first * right, axis=-1)

@@ -14,14 +14,14 @@ from vmri_jax.scene.effect import Effect
 
 
 def penalty(gap, params):
-    """``k/2 d^2`` of the smooth depth ``d = s log(1 + exp(-gap / s))``, which is -gap inside and falls off within s."""
+    """``k/2 d^2`` of the smooth depth ``d = s log(1 + exp(-gap / s))``: about -gap if the bodies overlap, falling to zero within a gap of s."""
     depth = params["smoothing"] * jax.nn.softplus(-gap / params["smoothing"])
     return jnp.sum(params["stiffness"] / 2 * depth**2)
 
 
 @effect_class
 class _Contact(Effect):
-    """What contacts share: stiffness, smoothing and radius of the bodies."""
+    """Base class of contacts: stiffness, smoothing, and radius of the bodies."""
 
     _: KW_ONLY
     stiffness: Any = positive()
@@ -45,14 +45,14 @@ class _Contact(Effect):
 class PlaneContact(_Contact):
     """Contact with the side of a plane that its normal points to: ``V = k/2 sum d^2``, ``d = s log(1 + exp(-gap / s))``.
 
-    ``gap = n . (q - p) - r``; smooth to every order, so that schemes keep theirs once H resolves the contact.
+    ``gap = n . (q - p) - r``. The energy has derivatives of every order, so that schemes keep their order once the step H resolves the contact.
 
     Args:
         point: p, (d,), in the plane.
         normal: n, (d,), towards the free side; scaled to length one.
         stiffness: k, N/m, positive; one number, or one for each body.
         smoothing: s, m, positive: the distance within which the force sets in.
-        radius: r, m, of the bodies.
+        radius: r, m, of the bodies; one number, or one for each.
         bodies: names; all bodies of the scene by default.
 
     Raises:
@@ -117,8 +117,8 @@ class SphereContact(_Contact):
         super().check_parameters(bodies)
         for (name,) in self.elements(bodies):
             position = end_of(bodies, name).position
-            away = jnp.any(position != jnp.asarray(self.center))
-            self.require(away, f"the start of {name}", position, "it must not be the center of the sphere")
+            differs = jnp.any(position != jnp.asarray(self.center))
+            self.require(differs, f"the start of {name}", position, "it must not be the center of the sphere")
 
     def drawing(self, bodies):
         params = self.parameters(bodies)

@@ -1,4 +1,4 @@
-"""What an optimisation may set: forces and torques on bodies and in joints, see `vmri_jax.control.minimize`."""
+"""Controls: forces and torques on bodies and in joints that an optimisation sets, see `vmri_jax.control.minimize`."""
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
@@ -23,7 +23,7 @@ Load = Literal["force", "torque"]
 class LoadOf:
     """The generalised force of controls u on a body; compared by value.
 
-    A force acts on directors by the weights X of its point, ``f_i = X_i F``, a torque by ``f_i = M x d_i / 2``.
+    A force F at the point X puts ``f_i = X_i F`` on the director d_i, a torque M ``f_i = M x d_i / 2``.
     """
 
     load: Load
@@ -44,19 +44,19 @@ class LoadOf:
 
 @effect_class
 class Controlled(Effect):
-    """A force or a torque that `vmri_jax.control.minimize` sets; in a run it is zero, and costs nothing.
+    """A force or a torque that `vmri_jax.control.minimize` sets; in a run it is zero and takes no time.
 
         Scene([hub, ...], [Controlled("hub", "torque"), Controlled(("hub", [0.5, 0, 0]), "force", along=[0, 1, 0])])
 
     Args:
-        body: a body, a point in a rigid body, or a joint. In a joint the torque is that about its axis, the force that along it;
-            b gets it and a its opposite.
-        load: "force" or "torque", the latter on a rigid body or in a joint.
-        along: (d,) the direction of a single control, of any length; without it there is a control for each axis.
-        axes: whether components are along the axes of space, or along those of the rigid body.
+        body: name of a body or of a joint, or a point in a rigid body. In a joint the torque acts about its axis and the force along it,
+            on b, with the opposite on a.
+        load: "force" or "torque"; a torque acts on a rigid body or in a joint.
+        along: (d,) the direction of a single control, of any length; by default there is a control for each axis.
+        axes: whether components are along the axes of "space" or of the rigid "body".
 
     Raises:
-        ValueError: (of the scene) a body that is not there or not rigid, a joint that leaves no such freedom, a vector of
+        ValueError: (of the scene) no body of this name, a torque on a body that is not rigid, a joint without this freedom, a vector of
             another dimension.
     """
 
@@ -71,8 +71,8 @@ class Controlled(Effect):
 
     def __post_init__(self):
         if not self.name:
-            known = is_entry(self.body)
-            object.__setattr__(self, "name", f"{label_of(entry(self.body))} {self.load}" if known else str(self.load))
+            named = is_entry(self.body)
+            object.__setattr__(self, "name", f"{label_of(entry(self.body))} {self.load}" if named else str(self.load))
         super().__post_init__()
         for argument, allowed in (("load", ("force", "torque")), ("axes", ("space", "body"))):
             if getattr(self, argument) not in allowed:
@@ -81,7 +81,7 @@ class Controlled(Effect):
                 )
 
     def bound(self, effects):
-        """The same, or what acts in the joint of this name."""
+        """The effect itself, or a `ControlledJoint` if `body` is the name of a joint."""
         joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
         if not isinstance(self.body, str) or self.body not in joints:
             return self
@@ -96,9 +96,7 @@ class Controlled(Effect):
 
     def elements(self, bodies):
         if not is_entry(self.body):
-            raise ValueError(
-                f"{self.name}: body is {self.body!r}; give one body or joint, and each its own Controlled."
-            )
+            raise ValueError(f"{self.name}: body is {self.body!r}; give one body or joint, and a Controlled for each.")
         return ((str(entry(self.body)),),)
 
     def parameters(self, bodies):
@@ -123,9 +121,9 @@ class Controlled(Effect):
                 f"{self.name}: {name} is a point; only rigid bodies have points in them. Give the name alone."
             )
         if (self.load == "torque" or self.axes == "body") and directors < 3:
-            what = "a torque" if self.load == "torque" else "axes of its own"
-            has = f"{directors} of three directors" if body.rigid else "no directors"
-            raise ValueError(f"{self.name}: {name} has {has}; {what} needs a rigid body with three.")
+            load = "a torque" if self.load == "torque" else "axes of its own"
+            directors_of_body = f"{directors} of three directors" if body.rigid else "no directors"
+            raise ValueError(f"{self.name}: {name} has {directors_of_body}; {load} needs a rigid body with three.")
 
     def components(self, bodies) -> tuple[str, ...]:
         """Names of the controls."""
@@ -161,7 +159,7 @@ class ControlOnCoordinate:
 
 @effect_class
 class ControlledJoint(InJoint):
-    """What `Controlled` is in a joint.
+    """The force or torque of `Controlled` in a joint.
 
     Args:
         joint, of: as of `InJoint`.

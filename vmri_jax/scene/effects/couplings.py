@@ -1,4 +1,4 @@
-"""Equations between the freedoms of several joints: gears, racks, differentials, fingers that a tendon bends."""
+"""Equations between the freedoms of several joints: gears, racks, differentials, tendon-driven fingers."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -12,8 +12,8 @@ from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_VELOCITY, check_arguments
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
-from vmri_jax.scene.declare import effect_class
-from vmri_jax.scene.effect import MOST_ROLES, START, Effect, real_tree
+from vmri_jax.scene.declare import effect_class, real_tree
+from vmri_jax.scene.effect import MOST_ROLES, START, Effect
 from vmri_jax.scene.effects.freedoms import FREEDOMS, Freedom
 from vmri_jax.scene.effects.joint_base import Joint, freedom_of
 from vmri_jax.scene.terms import EffectTerm, OnBodies
@@ -21,22 +21,22 @@ from vmri_jax.scene.terms import EffectTerm, OnBodies
 
 @dataclass(frozen=True)
 class EquationOfBodies:
-    """``g(x, params)`` of the freedoms x of joints by the coordinates of their bodies, a and b of each; compared by value."""
+    """``g(x, params)`` with the freedoms x as functions of the coordinates of both bodies of each joint; compared by value."""
 
     law: Callable
     freedoms: tuple[Freedom, ...]
 
     def __call__(self, q, params):
         x = [
-            FREEDOMS[of](q[2 * i : 2 * i + 2], joint)
-            for i, (of, joint) in enumerate(zip(self.freedoms, params["joints"], strict=True))
+            FREEDOMS[freedom](q[2 * i : 2 * i + 2], of_joint)
+            for i, (freedom, of_joint) in enumerate(zip(self.freedoms, params["joints"], strict=True))
         ]
         return self.law(jnp.stack(x), params["law"])
 
 
 @dataclass(frozen=True)
 class EquationOfCoordinates:
-    """``g(x, params)`` of freedoms x that are coordinates; compared by value."""
+    """``g(x, params)`` with freedoms x that are all coordinates of the scene; compared by value."""
 
     law: Callable
 
@@ -49,11 +49,11 @@ class _Coupling(Effect):
     """An equation between freedoms of joints.
 
     Args:
-        joints: names of joints of the scene, each between two bodies; of one that leaves several freedoms ``(name, freedom)``.
+        joints: names of joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
 
     Raises:
-        ValueError: none, or more than 16 joints; (of the scene) no joint of this name, one between several pairs of bodies, one that leaves no such
-            freedom; an equation that is not kept at the start.
+        ValueError: no joints, or more than 16; (of the scene) no joint of this name, a joint with several pairs of bodies, a joint
+            without this freedom; an equation that the start violates.
     """
 
     joints: Any
@@ -73,25 +73,25 @@ class _Coupling(Effect):
 
     def __post_init__(self):
         super().__post_init__()
-        given = () if isinstance(self.joints, str) else tuple(self.joints)
-        if not 1 <= len(given) <= MOST_ROLES // 2:
+        joints = () if isinstance(self.joints, str) else tuple(self.joints)
+        if not 1 <= len(joints) <= MOST_ROLES // 2:
             raise ValueError(
                 f"{self.name}: joints is {self.joints!r}; give names of 1 to {MOST_ROLES // 2} joints, ['motor', 'wheel']."
             )
-        object.__setattr__(self, "joints", given)
+        object.__setattr__(self, "joints", joints)
 
     def bound(self, effects):
-        """The same with the joints themselves, each with its freedom, instead of their names."""
-        known, found = {effect.name: effect for effect in effects if isinstance(effect, Joint)}, []
-        for given in self.joints:
-            name, of = (given, "auto") if isinstance(given, str) else given
+        """A copy with pairs (joint, freedom) in `joints` instead of names."""
+        known, pairs = {effect.name: effect for effect in effects if isinstance(effect, Joint)}, []
+        for item in self.joints:
+            name, freedom = (item, "auto") if isinstance(item, str) else item
             if name not in known:
                 raise ValueError(f"{self.name}: {unknown('joint', name, known)}")
             try:
-                found.append((known[name], freedom_of(known[name], of)))
+                pairs.append((known[name], freedom_of(known[name], freedom)))
             except ValueError as error:
                 raise ValueError(f"{self.name}: {error}") from None
-        return replace(self, joints=tuple(found))
+        return replace(self, joints=tuple(pairs))
 
     def elements(self, bodies):
         return (tuple(name for joint, _ in self.joints for name in joint.elements(bodies)[0]),)
@@ -101,20 +101,20 @@ class _Coupling(Effect):
 
     @property
     def function(self):
-        return EquationOfBodies(self.equation, tuple(of for _, of in self.joints))
+        return EquationOfBodies(self.equation, tuple(freedom for _, freedom in self.joints))
 
     def parameters(self, bodies):
         return {"law": self.numbers(), "joints": tuple(joint.parameters(bodies) for joint, _ in self.joints)}
 
     def terms(self, select, bodies, layout, potentials):
-        keys = [(joint.name, 0, of) for joint, of in self.joints]
+        keys = [(joint.name, 0, freedom) for joint, freedom in self.joints]
         if not all(key in layout.freedoms for key in keys):
             return super().terms(select, bodies, layout, potentials)
         roles = tuple(OnBodies(Rows.of([layout.freedoms[key]])) for key in keys)
         return (EffectTerm(self.name, EquationOfCoordinates(self.equation), roles),)
 
     def check_bodies(self, bodies):
-        """Nothing: those of the joints are checked there."""
+        """Nothing: the joints check their bodies themselves."""
 
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
@@ -125,11 +125,11 @@ class _Coupling(Effect):
             )
 
     def check_start(self, bodies):
-        apart = jnp.abs(self.equation(jnp.zeros(len(self.joints)), self.numbers()))
+        violation = jnp.abs(self.equation(jnp.zeros(len(self.joints)), self.numbers()))
         self.require(
-            apart < START,
+            violation < START,
             "the equation",
-            apart,
+            violation,
             "freedoms are counted from the start, where it must be zero; or let the scene move the joints, project=True",
         )
 
@@ -145,15 +145,15 @@ class JointCoupling(_Coupling):
         JointCoupling(["camshaft", "valve"], cam, {"stroke": 0.01})
 
     Args:
-        joints: names of joints of the scene, each between two bodies; of one that leaves several freedoms ``(name, freedom)``.
-        law: ``g(x, params) -> ()`` or (k,), x the freedoms in the order of `joints`, rad and m since the start, (n,); zero at x = 0. Define
-            it at module level, it is compared by identity.
+        joints: names of joints of the scene, each with a single pair of bodies; ``(name, freedom)`` for a joint with several freedoms.
+        law: ``g(x, params) -> ()`` or (k,) with the freedoms x (n,) in the order of `joints`, rad and m since the start; zero at x = 0.
+            Define the law at module level: functions are compared by identity.
         params: numbers, arrays or trees of them that the law gets; traced.
 
     Raises:
         TypeError: a law that is no function of (x, params).
-        ValueError: none, or more than 16 joints; (of the scene) no joint of this name, one between several pairs of bodies, one that leaves no such
-            freedom; a law that returns no vector, or that is not zero at the start.
+        ValueError: no joints, or more than 16; (of the scene) no joint of this name, a joint with several pairs of bodies, a joint
+            without this freedom; a law that returns no vector, or that is not zero at the start.
     """
 
     law: Callable
@@ -195,10 +195,10 @@ class Gear(_Coupling):
 
     Args:
         joints: as of `JointCoupling`.
-        ratios: (n,) r, one for each of the joints, none of them zero.
+        ratios: (n,) r, not zero, in the order of `joints`.
 
     Raises:
-        ValueError: as of `JointCoupling`; ratios of another number, or a zero among them.
+        ValueError: as of `JointCoupling`; another number of ratios than joints, or a ratio of zero.
     """
 
     ratios: Any

@@ -1,4 +1,4 @@
-"""Custom effects are a function and one line:
+"""Custom effects: a function of the user, and the bodies that it takes:
 
 def magnet(q, params):
     ball, coil = q
@@ -16,11 +16,11 @@ import jax.numpy as jnp
 from vmri_jax.mechanics.checks import describe, shape_of
 from vmri_jax.mechanics.functions import NO_TIME, NO_VELOCITY, check_arguments
 from vmri_jax.scene.body import end_of, entry, is_entry
-from vmri_jax.scene.declare import effect_class
-from vmri_jax.scene.effect import DRAWN, Effect, real_tree
+from vmri_jax.scene.declare import effect_class, real_tree
+from vmri_jax.scene.effect import DRAWN, Effect
 
 ARGUMENTS = {"potential": "q, params", "constraint": "q, params", "kinetic": "q, v, params", "force": "t, q, v, params"}
-"""Arguments of the functions; a constraint that is timed gets t before them."""
+"""Arguments of the functions by kind; a constraint with timed=True takes t first."""
 _INSTEAD = {
     "force": "Force(function, bodies), function(t, q, v, params)",
     "moving": "Constraint(..., timed=True), whose function gets t first",
@@ -29,15 +29,15 @@ _INSTEAD = {
 
 @effect_class
 class CustomEffect(Effect):
-    """An effect given by a function of one element.
+    """An effect with a single element, whose function the user gives.
 
     Args:
-        function: see `Effect`; define it at module level, it is compared by identity.
-        bodies: names of the bodies it touches, in the order in which the function takes them. Of a rigid body it gets all
-            coordinates, of a point in one, ``(name, [x, y, z])``, those of the point.
-        params: numbers, arrays or trees of them that the function gets; traced.
+        function: see `Effect`; define it at module level: functions are compared by identity.
+        bodies: names of the bodies, in the order in which the function takes them. The function gets all coordinates of a rigid body;
+            with ``(name, [x, y, z])`` the position of this point in it, and with ``("ground", [x, y, z])`` a fixed point.
+        params: of the function: numbers, arrays, or lists and dictionaries of them; traced.
         name: the name of the function by default.
-        drawn_as: "link" or "spring", between each of its bodies and the next one; None for nothing to see.
+        drawn_as: "link" or "spring", drawn between each of the bodies and the next; None draws nothing.
 
     Raises:
         TypeError: a function that cannot be called, or that takes other arguments.
@@ -65,13 +65,14 @@ class CustomEffect(Effect):
             raise ValueError(f"{self.name}: drawn_as is {self.drawn_as!r}; it must be 'link', 'spring' or None.")
 
     def elements(self, bodies):
-        given = (self.bodies,) if is_entry(self.bodies) else tuple(self.bodies)
-        if not given or not all(map(is_entry, given)):
+        names = (self.bodies,) if is_entry(self.bodies) else tuple(self.bodies)
+        if not names or not all(map(is_entry, names)):
+            kind = type(self).__name__
             raise ValueError(
-                f"{self.name}: bodies is {self.bodies!r}; give names of the bodies that the function takes, and each such tuple an effect "
-                "of its own, with its own name=..."
+                f"{self.name}: bodies is {self.bodies!r}; give the names of the bodies that the function takes. A custom effect has one "
+                f"element: for several tuples of bodies write a {kind}(...) for each, with name=..."
             )
-        return (tuple(map(entry, given)),)
+        return (tuple(map(entry, names)),)
 
     def parameters(self, bodies):
         params, points = real_tree(f"{self.name}: params", self.params), self.points(bodies)
@@ -86,12 +87,17 @@ class CustomEffect(Effect):
         params, t = self.parameters(bodies), jnp.zeros(())
         q, _ = self.element_arguments(0, bodies, params)
         q = tuple(map(jnp.asarray, q))
-        known = {"potential": (q,), "constraint": (t, q) if self.timed else (q,), "kinetic": (q, q), "force": (t, q, q)}
-        value = shape_of(f"{self.name}: function", self.function, *known[self.kind], params)
+        arguments = {
+            "potential": (q,),
+            "constraint": (t, q) if self.timed else (q,),
+            "kinetic": (q, q),  # velocities have the shapes of positions
+            "force": (t, q, q),
+        }
+        value = shape_of(f"{self.name}: function", self.function, *arguments[self.kind], params)
         self._check_value(value, [x.shape for x in q])
 
     def _check_value(self, value: Any, sizes: list[tuple[int, ...]]) -> None:
-        """Refuse an energy that is no scalar, rows that are no vector, forces that are not one for each body."""
+        """Refuse an energy that is no scalar, constraint values that are no vector, and another number of forces than bodies."""
         shape = getattr(value, "shape", None)
         if self.kind == "force":
             fits = isinstance(value, tuple | list) and [getattr(x, "shape", None) for x in value] == sizes

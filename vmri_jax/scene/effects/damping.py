@@ -94,13 +94,13 @@ class Dashpot(BetweenPoints):
 class RayleighDamping(Effect):
     """Rayleigh damping of the whole scene, ``F = -(alpha M + beta K(q)) v``, K the Hessian of potentials.
 
-    A vibration of frequency w is damped by the ratio ``alpha / (2 w) + beta w / 2``. K is taken at the present
-    configuration; where a potential has negative curvature this part gives energy instead.
+    The damping ratio of a vibration of frequency w is ``alpha / (2 w) + beta w / 2``. K is the Hessian at the present configuration; along
+    directions of negative curvature the force adds energy.
 
     Args:
-        mass: alpha, 1/s, positive; None for none.
-        stiffness: beta, s, positive; None for none.
-        of: names of the potentials whose stiffness damps; all of the scene by default.
+        mass: alpha, 1/s, positive; None for zero.
+        stiffness: beta, s, positive; None for zero.
+        of: names of the potentials in K; all potentials of the scene by default.
 
     Raises:
         ValueError: (of the scene) neither alpha nor beta, numbers that are not positive, a name in `of` that is no potential.

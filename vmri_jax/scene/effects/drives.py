@@ -1,4 +1,4 @@
-"""Forces from outside: constant, following a direction of the motion, harmonic, and any function of time."""
+"""External forces: constant, harmonic, any function of time, and a force that turns with two bodies."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.checks import shape_of
 from vmri_jax.scene.body import end_of
-from vmri_jax.scene.declare import effect_class, names, number, of_time, positive, vector
-from vmri_jax.scene.effect import Effect, real_tree
+from vmri_jax.scene.declare import effect_class, names, number, of_time, positive, real_tree, vector
+from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import BetweenPoints
 
 
@@ -80,8 +80,8 @@ class Drive(Effect):
 
     Args:
         bodies: a name, or a list of names; each gets this force.
-        history: ``history(t, params) -> (d,)``, N; define it at module level, it is compared by identity.
-        params: what `history` gets as params; traced.
+        history: ``history(t, params) -> (d,)``, N; define it at module level: functions are compared by identity.
+        params: of `history`; traced.
     """
 
     bodies: Any = names()

@@ -1,4 +1,4 @@
-"""Uniform fields: gravity on masses, a magnetic field on charges that move."""
+"""Uniform fields: gravity on masses, a magnetic field on moving charges."""
 
 from typing import Any
 

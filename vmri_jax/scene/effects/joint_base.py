@@ -1,4 +1,4 @@
-"""What all joints share: two bodies, the points and triads of the joint in them, and the freedoms that it leaves.
+"""Base classes of joints: two bodies, the points and triads of the joint in them, and its freedoms.
 
 Letters are those of `vmri_jax.scene.effects.joints`.
 """
@@ -18,7 +18,7 @@ from vmri_jax.scene.rigid import RigidBody
 
 @effect_class
 class Joint(Effect):
-    """What all joints share: two bodies, one of them perhaps the ground, and the point where they are joined.
+    """Base class of joints between two bodies, or between a body and the ground.
 
     Args:
         between: names (a, b), or a list of such pairs. A name may come with a point that is fixed in the body,
@@ -198,7 +198,7 @@ def freedom_of(joint: Joint, of: str) -> Freedom:
     fitting: list[Freedom] = [freedom for freedom in joint.freedoms if of in (freedom, "auto")]
     if len(fitting) == 1:
         return fitting[0]
-    free = " and ".join(joint.freedoms) or "neither an angle nor a way along an axis"
+    free = " and ".join(joint.freedoms) or "neither an angle nor a displacement along an axis"
     raise ValueError(f"of is {of!r}; {joint.name} leaves {free} free.")
 
 

@@ -1,4 +1,4 @@
-"""What acts in a joint, along the freedom that it leaves: springs, dampers, drives, a motion that is given, limits."""
+"""Effects along a freedom of a joint: springs, limits, dampers, rotors, drives, prescribed motions."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -10,8 +10,8 @@ import jax.numpy as jnp
 
 from vmri_jax.mechanics.names import unknown
 from vmri_jax.mechanics.rows import Rows
-from vmri_jax.scene.declare import effect_class, number, of_time, positive
-from vmri_jax.scene.effect import Effect, real_tree
+from vmri_jax.scene.declare import effect_class, number, of_time, positive, real_tree
+from vmri_jax.scene.effect import START, Effect
 from vmri_jax.scene.effects.freedoms import ANGLES, FREEDOMS, Freedom
 from vmri_jax.scene.effects.joint_base import Joint, freedom_of
 from vmri_jax.scene.effects.springs import elastic_energy
@@ -70,14 +70,14 @@ class ForceOnCoordinate:
 
 @effect_class
 class InJoint(Effect):
-    """What acts along the freedom x of a joint: the angle by which b has turned, or how far it has moved, since the start.
+    """Base class of effects along the freedom x of a joint: the angle or displacement of b against a since the start.
 
     Args:
-        joint: name of the joint in the scene, one that leaves an angle or a way free.
-        of: which of its freedoms, where it leaves several; "auto" for the one that there is.
+        joint: name of a joint in the scene with an angle or a displacement.
+        of: name of the freedom, if the joint has several; "auto" for the only freedom.
 
     Raises:
-        ValueError: (of the scene) no joint of this name, or one that leaves no such freedom.
+        ValueError: (of the scene) no joint of this name, or a joint without this freedom.
     """
 
     joint: Any
@@ -88,7 +88,7 @@ class InJoint(Effect):
     derived = Joint.derived
 
     def bound(self, effects):
-        """The same with the joint itself instead of its name."""
+        """A copy with the joint itself instead of its name."""
         joints = {effect.name: effect for effect in effects if isinstance(effect, Joint)}
         if self.joint not in joints:
             raise ValueError(f"{self.name}: {unknown('joint', self.joint, joints)}")
@@ -96,7 +96,7 @@ class InJoint(Effect):
 
     @property
     def freedom(self) -> Freedom:
-        """Which freedom of the joint it acts on."""
+        """Name of the freedom that the effect acts on."""
         try:
             return freedom_of(self.joint, self.of)
         except ValueError as error:
@@ -105,7 +105,7 @@ class InJoint(Effect):
     @property
     @abstractmethod
     def of_coordinate(self) -> Callable:
-        """Its function where the freedom is a coordinate of the scene: an element has this coordinate (1,) as its one body."""
+        """The function for a freedom that is a coordinate of the scene: q of an element is then this coordinate, ``((1,),)``."""
 
     def elements(self, bodies):
         return self.joint.elements(bodies)
@@ -114,20 +114,21 @@ class InJoint(Effect):
         return ((self.joint.name, i),)
 
     def terms(self, select, bodies, layout, potentials):
+        # pairs that carry a body have x as a coordinate; those that close loops have x as a function of the coordinates of both bodies
         keys = {i: (self.joint.name, i, self.freedom) for i in select}
-        direct = [i for i in select if keys[i] in layout.freedoms]
-        terms = super().terms([i for i in select if i not in direct], bodies, layout, potentials)
-        if not direct:
+        carrying = [i for i in select if keys[i] in layout.freedoms]
+        terms = super().terms([i for i in select if i not in carrying], bodies, layout, potentials)
+        if not carrying:
             return terms
-        chosen = None if len(direct) == len(self.elements(bodies)) else tuple(direct)
-        roles = (OnBodies(Rows.of([layout.freedoms[keys[i]] for i in direct])),)
-        return (*terms, EffectTerm(self.name, self.of_coordinate, roles, chosen, self.split, self.timed))
+        numbers = None if len(carrying) == len(self.elements(bodies)) else tuple(carrying)
+        roles = (OnBodies(Rows.of([layout.freedoms[keys[i]] for i in carrying])),)
+        return (*terms, EffectTerm(self.name, self.of_coordinate, roles, numbers, self.split, self.timed))
 
     def parameters(self, bodies):
         return super().parameters(bodies) | self.joint.parameters(bodies)
 
     def check_bodies(self, bodies):
-        """Nothing: those of the joint are checked there."""
+        """Refuse a joint without this freedom; the joint checks its bodies itself."""
         _ = self.freedom
 
 
@@ -135,12 +136,12 @@ class InJoint(Effect):
 class JointSpring(InJoint):
     """Springs in joints, ``V = sum k/2 (x - x_0)^2``.
 
-    An angle is between -pi and pi: the spring must not turn further.
+    An angle that is no joint coordinate is between -pi and pi: such a spring must not turn further.
 
     Args:
         joint, of: as of `InJoint`.
         stiffness: k, N m/rad or N/m, positive; one number, or one for each pair of the joint.
-        neutral: x_0, rad or m, where it is relaxed; likewise. The start by default.
+        neutral: x_0, rad or m, where the spring is relaxed; likewise. The start by default.
     """
 
     stiffness: Any = positive()
@@ -170,7 +171,7 @@ class JointLimit(InJoint):
         joint, of: as of `InJoint`.
         lower, upper: rad or m, since the start; one number, or one for each pair of the joint.
         stiffness: k, N m/rad or N/m, positive; likewise.
-        smoothing: s, rad or m, positive: the way within which the stop sets in.
+        smoothing: s, rad or m, positive: the distance from the limit at which the force sets in.
 
     Raises:
         ValueError: (of the scene) lower above upper.
@@ -253,12 +254,12 @@ def energy_of_rate(q, v, params):
 
 @effect_class
 class RotorInertia(InJoint):
-    """What turns or slides with a joint and nowhere else, such as the rotor of its motor: ``T = J x'^2 / 2``; MuJoCo's armature.
+    """Inertia that moves with a joint alone, such as the rotor of its motor: ``T = J x'^2 / 2``; MuJoCo's armature.
 
     Args:
         joint, of: as of `InJoint`.
-        inertia: J, kg m^2 of an angle, kg of a way, positive: that of the rotor times its gear ratio squared; one number, or one for each
-            pair of the joint.
+        inertia: J, positive, kg m^2 for an angle and kg for a displacement: the inertia of the rotor times its gear ratio squared; one
+            number, or one for each pair of the joint.
     """
 
     inertia: Any = positive()
@@ -291,8 +292,8 @@ class JointDrive(InJoint):
 
     Args:
         joint, of: as of `InJoint`.
-        history: ``history(t, params) -> ()``, N m or N; define it at module level, it is compared by identity.
-        params: what `history` gets as params; traced.
+        history: ``history(t, params) -> ()``, N m or N; define it at module level: functions are compared by identity.
+        params: of `history`; traced.
     """
 
     history: Callable = of_time()
@@ -325,27 +326,27 @@ class GivenCoordinate:
 
 @dataclass(frozen=True)
 class GivenMotion:
-    """``x - a(t)``, of an angle x as ``sin x cos a - cos x sin a``, which is homogeneous in the directors; compared by value."""
+    """``x - a(t)``; for an angle x ``sin x cos a - cos x sin a``, which is homogeneous in the directors. Compared by value."""
 
     path: Callable
     freedom: Freedom
 
     def __call__(self, t, q, params):
-        given = self.path(t, params["path"])
+        a = self.path(t, params["path"])
         if self.freedom not in ANGLES:
-            return FREEDOMS[self.freedom](q, params) - given
+            return FREEDOMS[self.freedom](q, params) - a
         sine, cosine = ANGLES[self.freedom](q, params)
-        return sine * jnp.cos(given) - cosine * jnp.sin(given)
+        return sine * jnp.cos(a) - cosine * jnp.sin(a)
 
 
 @effect_class
 class JointMotion(InJoint):
-    """The angle of a joint, or the way along it, is given; what holds it there does the work that is needed.
+    """A prescribed angle or displacement of a joint, ``x = a(t)``; the multiplier is the drive that it takes, and does work.
 
     Args:
         joint, of: as of `InJoint`.
-        path: ``path(t, params) -> ()``, rad or m since the start, zero at t = 0; define it at module level.
-        params: what `path` gets as params; traced.
+        path: a, ``path(t, params) -> ()``, rad or m since the start, zero at t = 0; define it at module level.
+        params: of `path`; traced.
 
     Raises:
         ValueError: (of the scene) a path that does not start at zero.
@@ -372,4 +373,4 @@ class JointMotion(InJoint):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         start = self.path(jnp.zeros(()), real_tree(f"{self.name}: params", self.params))
-        self.require(jnp.abs(jnp.asarray(start)) < 1e-9, "path(0)", start, "the joint starts at zero")
+        self.require(jnp.abs(jnp.asarray(start)) < START, "path(0)", start, "the joint starts at zero")

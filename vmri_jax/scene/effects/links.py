@@ -1,4 +1,4 @@
-"""Rigid links: between points, to fixed points and to moving ones; a body whose motion is given."""
+"""Rigid links between points, to fixed points and to moving points; bodies with a prescribed motion."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ class _Rigid(Effect):
 class RigidLink(_Rigid, BetweenPoints):
     """Massless rigid links, ``g = (|q_b - q_a|^2 - l^2) / 2 = 0``.
 
-    A link between slow bodies is held at the macro nodes, one that touches a fast body at the micro nodes.
+    A link between slow bodies holds at the macro nodes, a link that touches a fast body at the micro nodes.
 
     Args:
         between: names of two bodies, or a list of such pairs.
@@ -72,7 +72,7 @@ class MovingPivot(_Rigid, ToPath):
         bodies: a name, or a list of names.
         path: ``path(t, params) -> (d,)``, the point; define it at module level.
         length: l, positive; one number, or one for each. The distance at the start, t = 0, by default.
-        params: what `path` gets as params.
+        params: of `path`.
 
     Raises:
         TypeError: (of the scene) a path that is no function.
@@ -85,16 +85,16 @@ class MovingPivot(_Rigid, ToPath):
 
 @effect_class
 class Guide(ToPath):
-    """A body whose motion is given, ``g = q - a(t) = 0``; what holds it there does the work that is needed.
+    """A body with a prescribed motion, ``g = q - a(t) = 0``; the multiplier is the force that it takes, and does work.
 
     Args:
         bodies: a name.
-        path: ``path(t, params) -> (d,)``, where it is; define it at module level.
-        params: what `path` gets as params.
+        path: a, ``path(t, params) -> (d,)``; define it at module level.
+        params: of `path`.
 
     Raises:
         TypeError: (of the scene) a path that is no function.
-        ValueError: (of the scene) a body that does not start there.
+        ValueError: (of the scene) a body that does not start at a(0).
     """
 
     kind = "constraint"
@@ -106,7 +106,7 @@ class Guide(ToPath):
 
     def check_start(self, bodies):
         super().check_start(bodies)
-        away = self.at_start(bodies, self.parameters(bodies))
+        distance = self.at_start(bodies, self.parameters(bodies))
         size = jnp.max(jnp.abs(jnp.stack([end_of(bodies, name).position for (name,) in self.elements(bodies)])))
-        what = "the distance of the body from its point at t = 0"
-        self.require(away <= START * jnp.maximum(size, 1.0), what, away, "it must start there")
+        quantity = "the distance of the body from its point at t = 0"
+        self.require(distance <= START * jnp.maximum(size, 1.0), quantity, distance, "it must start there")

@@ -9,8 +9,8 @@ import numpy as np
 
 from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.names import unknown
-from vmri_jax.scene.declare import array, effect_class, names, number, positive, squeeze
-from vmri_jax.scene.effect import Effect, real_tree
+from vmri_jax.scene.declare import array, effect_class, names, number, positive, real_tree, squeeze
+from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.points import distance
 
 
@@ -48,7 +48,7 @@ class NBodyGravity(Effect):
 
 @effect_class
 class _Nonbonded(Effect):
-    """Forces between pairs of points, some of them left out."""
+    """Base class of potentials between pairs of points, without the pairs in `exclude`."""
 
     exclude: Any = field(default=(), kw_only=True)
 
@@ -75,25 +75,25 @@ class _Nonbonded(Effect):
 
 
 def within_bonds(bonds: Iterable[tuple[str, str]], number: int = 3) -> list[tuple[str, str]]:
-    """Pairs of bodies with at most so many bonds between them, for `exclude` of `LennardJones` and `Coulomb`.
+    """Pairs of bodies with at most `number` bonds between them, for `exclude` of `LennardJones` and `Coulomb`.
 
-    1 are neighbours, 2 the ends of an angle, 3 those of a torsion.
+    One bond is between neighbours, two bonds between the ends of an angle, three between the ends of a torsion.
 
     Args:
         bonds: pairs of names.
-        number: of bonds from one to the other.
+        number: largest number of bonds on the shortest path between the bodies of a pair.
     """
     near: dict[str, set[str]] = {}
     for a, b in bonds:
         near.setdefault(a, set()).add(b)
         near.setdefault(b, set()).add(a)
-    found = set()
+    pairs = set()
     for start in near:
         reached = {start}
         for _ in range(number):
             reached = reached.union(*(near[name] for name in reached))
-        found |= {(min(start, name), max(start, name)) for name in reached - {start}}
-    return sorted(found)
+        pairs |= {(min(start, name), max(start, name)) for name in reached - {start}}
+    return sorted(pairs)
 
 
 @effect_class
@@ -104,7 +104,7 @@ class Coulomb(_Nonbonded):
         charges: Q by name of the body, a dictionary.
         constant: C, in the units of the scene: 8.99e9 N m^2/C^2 in SI units.
         between: a list of pairs; all pairs of the charges by default.
-        exclude: pairs that are left out, see `within_bonds`.
+        exclude: pairs without this force, see `within_bonds`.
 
     Raises:
         ValueError: (of the scene) a pair without a charge, bodies that start at one point.
@@ -143,7 +143,7 @@ class LennardJones(_Nonbonded):
         depth: eps, J, positive; one number, or one for each pair.
         distance: s, m, positive; likewise.
         between: names of bodies, every pair of which interacts; or a list of pairs. All bodies by default, bonded ones too.
-        exclude: pairs that are left out, see `within_bonds`.
+        exclude: pairs without this force, see `within_bonds`.
 
     Raises:
         ValueError: (of the scene) numbers that are not positive, bodies that start at one point.

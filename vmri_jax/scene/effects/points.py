@@ -1,6 +1,6 @@
-"""Attachments: between two points, or between bodies and a point that is fixed or moves.
+"""Base classes of effects between two points, or between a body and a point that is fixed or moves.
 
-Each gives the line x from one end to the other; ``law(x, params)`` of a class makes an energy, a constraint or a force of it.
+Each computes the vector x between both ends; ``law(x, params)`` of a derived class makes an energy, a constraint or a force of it.
 """
 
 from collections.abc import Callable
@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.scene.body import end_of, label_of
-from vmri_jax.scene.declare import effect_class, names, of_time, vector
-from vmri_jax.scene.effect import Effect, real_tree
+from vmri_jax.scene.declare import effect_class, names, of_time, real_tree, vector
+from vmri_jax.scene.effect import Effect
 
 
 def distance(q, params=None):
-    """``|q_b - q_a|`` of the first two roles."""
+    """``|q_b - q_a|``, (...) m."""
     a, b = q
     return jnp.linalg.norm(b - a, axis=-1)
 
@@ -41,16 +41,16 @@ class BetweenPoints(Effect):
 
 @effect_class
 class ToPoint(Effect):
-    """Between each body and a point p that is given; ``x = q - p``."""
+    """Between each body and a point p, which `point` or `path` of a derived class gives; ``x = q - p``."""
 
     bodies: Any = names()
 
     law: ClassVar[Any]
     advice: ClassVar[str] = "move one of them"
-    """What to do about bodies that start at the point."""
+    """End of the message about bodies that start at the point."""
 
     def point_at_start(self, params):
-        """Where the point is at t = 0."""
+        """The point p at t = 0."""
         return params["point"]
 
     def rest(self, q, params):
@@ -60,13 +60,14 @@ class ToPoint(Effect):
 
     def require_apart(self, bodies):
         """Refuse bodies that start at the point."""
-        away, what = self.at_start(bodies, self.parameters(bodies)), "the distance of a body from its point"
-        self.require(away > 0, what, away, f"bodies must not start there; {self.advice}")
+        distance = self.at_start(bodies, self.parameters(bodies))
+        expected = f"bodies must not start there; {self.advice}"
+        self.require(distance > 0, "the distance of a body from its point", distance, expected)
 
 
 @effect_class
 class ToFixedPoint(ToPoint):
-    """To a point that stays where it is."""
+    """Between each body and a fixed point."""
 
     point: Any = vector()
 
@@ -106,7 +107,7 @@ class AlongPath:
 
 @effect_class
 class ToPath(ToPoint):
-    """To a point that moves along a path."""
+    """Between each body and a point that moves along a path."""
 
     path: Callable = of_time()
     params: Any = field(default_factory=dict, kw_only=True)

@@ -1,4 +1,4 @@
-"""Springs: between points, to fixed points and to moving ones."""
+"""Springs between points, to fixed points and to moving points."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from vmri_jax.scene.effects.points import BetweenPoints, ToFixedPoint, ToPath
 
 
 def elastic_energy(stiffness, elongation):
-    """``sum k/2 e^2``."""
+    """``sum k/2 e^2`` of stiffnesses k and elongations e."""
     return jnp.sum(stiffness / 2 * elongation**2)
 
 
@@ -70,8 +70,8 @@ class NonlinearSpring(BetweenPoints):
     def check_parameters(self, bodies):
         super().check_parameters(bodies)
         coefficients = self.parameters(bodies)["coefficients"]
-        one = coefficients.ndim == 1 and coefficients.size > 0
-        self.require(one, "coefficients", repr(self.coefficients), "give (k_1, k_2, ...), at least one number")
+        is_vector = coefficients.ndim == 1 and coefficients.size > 0
+        self.require(is_vector, "coefficients", repr(self.coefficients), "give (k_1, k_2, ...), at least one number")
 
 
 @effect_class
@@ -82,7 +82,7 @@ class SpringAnchor(ToFixedPoint):
         bodies: a name, or a list of names.
         point: a, (d,); or one for each body, (n, d).
         stiffness: k, N/m, positive; one number, or one for each.
-        length: l, at rest, positive; likewise; None for a spring that pulls down to the point itself.
+        length: l, at rest, positive; likewise; None for a spring that is relaxed at the point itself.
 
     Raises:
         TypeError: a function as point.
@@ -109,13 +109,13 @@ class SpringAnchor(ToFixedPoint):
 
 @effect_class
 class MovingAnchor(ToPath):
-    """Springs to a moving point, ``F = k (a(t) - q)``: an elastic hold, and a force, because it does work.
+    """Springs to a moving point, ``F = k (a(t) - q)``: a force and not a potential, because it depends on time.
 
     Args:
         bodies: a name, or a list of names.
         path: ``path(t, params) -> (d,)``, the point; define it at module level.
         stiffness: k, N/m, positive; one number, or one for each body.
-        params: what `path` gets as params.
+        params: of `path`.
 
     Raises:
         TypeError: (of the scene) a path that is no function.
