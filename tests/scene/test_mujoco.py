@@ -494,14 +494,14 @@ def treatments(name):
     return exact or [(how, why) for how, why, entry in entries if fnmatchcase(name, entry)]
 
 
-def test_every_field_is_read_or_refused_or_of_no_mechanics():
+def test_every_field_is_read_or_refused_or_without_influence():
     names = list(fields(arm()))
     assert {name: treatments(name) for name in names if len(treatments(name)) != 1} == {}
     every = " ".join([*READ.values(), *IDLE.values(), *(" ".join([*r.fields, r.parts]) for r in REFUSED.values())])
     assert [entry for entry in every.split() if not any(fnmatchcase(name, entry) for name in names)] == []
     counts = Counter(treatments(name)[0][0] for name in names)
     said = f"{len(names)} fields of a model: {counts['read']} are read, {counts['refused']} refused when they are not at their default, "
-    assert f"{said}and {counts['idle']} are of no mechanics" in PAGE.read_text(), counts
+    assert f"{said}and {counts['idle']} have no influence on the motion" in PAGE.read_text(), counts
 
 
 QUIET = {

@@ -85,10 +85,10 @@ class AnyBody(ABC):
         name, pace: see `Body`.
         coordinates, rates: (n,) q and v at the start.
         masses: (n,) m of the kinetic energy ``sum_i m_i v_i^2 / 2``.
-        block: whether its coordinates are general ones, not the position of a point.
+        block: whether it has general coordinates, not the position of a point.
         rigid: whether its coordinates are a centre and directors.
         rotation: (3, 3) axes of the body in space at the start as columns; None for a body without axes.
-        wide: numbers of the directors that are among its coordinates.
+        wide: numbers of the directors that are among its coordinates: of the axes along which the body has a width.
     """
 
     name: str
@@ -183,7 +183,8 @@ class Body(AnyBody):
             estimates of frequencies.
         radius: of the drawn ball, m; by default the drawing chooses it. It does not change the motion: contacts have an argument
             `radius` of their own.
-        block: the coordinates are general ones, not the position of a point; always so for more than three.
+        block: whether the coordinates are general coordinates of any kind, not the position of a point; more than three always are. Effects
+            between points refuse a block; custom effects take it.
 
     Raises:
         TypeError: an argument that is no real number.
@@ -257,7 +258,7 @@ class Body(AnyBody):
 
 
 class Ground(AnyBody):
-    """The body that does not move: its axes are those of space."""
+    """The body that does not move, with the axes of space."""
 
     name, pace, radius, block, rigid = GROUND, "slow", None, False, True
     position, rotation = np.zeros(3), np.eye(3)
@@ -277,7 +278,7 @@ class Ground(AnyBody):
 
 @dataclass(frozen=True, eq=False)
 class Frame(AnyBody):
-    """A frame without mass between joints of one body: three hinges in a row make a hip, two slides and a hinge a planar robot.
+    """A frame without mass between two joints: a hip is three hinges with frames between them, a planar robot two slides and a hinge.
 
         bodies = [Frame("yoke", [0, 0, 1]), RigidBody("thigh", 4.0, Rod(0.4), [0, 0, 0.8])]
         joints = [
@@ -290,7 +291,7 @@ class Frame(AnyBody):
 
     Args:
         name: of the frame in joints.
-        position: (3,) m at the start, where its axes are parallel to those of space.
+        position: (3,) m at the start, where its axes are parallel to the axes of space.
         pace: "slow", "fast" or "auto", as of `Body`: of the coordinates of the joint that the frame hangs on.
     """
 

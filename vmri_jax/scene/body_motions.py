@@ -1,4 +1,4 @@
-"""How the bodies of a scene move at one state, by its continuous equations of motion."""
+"""Accelerations of the bodies of a scene at a state, by its continuous equations of motion."""
 
 import jax
 import jax.numpy as jnp
@@ -10,18 +10,20 @@ from vmri_jax.scene.scene import Scene
 
 
 def state_of(scene: Scene) -> State:
-    """The state at the start, of velocities that keep all constraints."""
+    """The state at the start, whose velocities must satisfy all constraints."""
     system, (q_s, q_f, v_s, v_f) = scene.system(), scene.start
     return State(jnp.zeros(()), q_s, q_f, *jax.jit(legendre)(system, q_s, q_f, v_s, v_f))
 
 
 def accelerations(scene: Scene, state: State) -> dict[str, tuple[jax.Array, jax.Array, jax.Array]]:
-    """Positions, velocities and accelerations of all bodies by name.
+    """Position, velocity and acceleration of every body by name: (d,) each for a point, (12,) for a rigid body, its centre and directors.
 
-    Each is a vector of the size of the body: (d,) of a point; (12,) of a rigid body, its centre of mass and its three directors.
+    Args:
+        scene: with joint coordinates or directors.
+        state: of the scene.
     """
-    moved = jax.jit(motion)(scene.system(), state)
-    q, v, a = (state.q_s, state.q_f), (moved.v_s, moved.v_f), (moved.a_s, moved.a_f)
+    derivatives = jax.jit(motion)(scene.system(), state)
+    q, v, a = (state.q_s, state.q_f), (derivatives.v_s, derivatives.v_f), (derivatives.a_s, derivatives.a_f)
     layout, joints = scene.sorting.layout, scene.sorting.joints
     kinematics = layout.kinematics
     if kinematics is not None:  # joint coordinates x: positions q(x), velocities q' v, accelerations d/dt (q' v)
@@ -35,6 +37,6 @@ def accelerations(scene: Scene, state: State) -> dict[str, tuple[jax.Array, jax.
 
         q, v, a = of_bodies(q, v, a)
     return {
-        name: tuple(both[part == "f"][start : start + size] for both in (q, v, a))
+        name: tuple(slow_and_fast[part == "f"][start : start + size] for slow_and_fast in (q, v, a))
         for name, (part, start, size) in layout.bodies.items()
     }

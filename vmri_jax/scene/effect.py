@@ -48,8 +48,8 @@ class Effect(ABC):
     | "force" | ``function(t, q, v, params)`` | tuple of forces, shaped like q |
     | "control" | ``function(q, u, params)`` | tuple of forces of the controls u, shaped like q |
 
-    q and v are tuples with an entry for each role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). For a rigid
-    body these are the coordinates of its centre, or of the point that is given with its name. The ground is a body, too. params
+    q and v are tuples with an entry for each role: the coordinates (d,) of its body or, with n > 1 elements, (n, d). A rigid body
+    enters with the coordinates of its centre, or of the point in ``(name, [x, y, z])``. The ground is a body, too. params
     holds the fields that a class declares as numbers, vectors or arrays (see `vmri_jax.scene.declare`), by name.
 
     The argument `bodies` of the methods holds all bodies of the scene by name.
@@ -376,7 +376,7 @@ class Effect(ABC):
             raise ValueError(f"{self.name}: bodies of different dimension ({described}); they must have the same.")
 
     def check_start(self, bodies: Bodies) -> None:
-        """Refuse a constraint that the start violates: the given length of a link, say, is not the distance of its ends."""
+        """Refuse a constraint that the start violates, such as a link whose length is not the distance of its ends."""
         for name in (name for name, parameter in self.declared.items() if parameter.measured):
             params = self.parameters(bodies)
             start = self.at_start(bodies, params)

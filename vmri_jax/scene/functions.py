@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vmri_jax.mechanics.kinematics import JOINTS, MASS, Kinematics
-from vmri_jax.scene.terms import joined, total, totals
+from vmri_jax.scene.terms import concatenated, total, totals
 
 IMPLIED = "implied"
 """Key of params that holds the sizes of the dropped rows."""
@@ -78,7 +78,7 @@ class MicroConstraint(_OfTerms):
     def __call__(self, *arguments):
         *t, q_s, q_f, params = arguments
         bodies = self.bodies(q_s, q_f, params)
-        return joined([term.value(*bodies, params, *t) for term in self.terms])
+        return concatenated([term.value(*bodies, params, *t) for term in self.terms])
 
 
 class MacroConstraint(_OfTerms):
@@ -87,7 +87,7 @@ class MacroConstraint(_OfTerms):
     def __call__(self, *arguments):
         *t, q_s, params = arguments
         bodies = self.bodies(q_s, None, params)
-        return joined([term.value(*bodies, params, *t) for term in self.terms])
+        return concatenated([term.value(*bodies, params, *t) for term in self.terms])
 
 
 class ImpliedRows(MicroConstraint):

@@ -1,6 +1,6 @@
 """The constants of joints that carry bodies, from which the kinematics compute the frames of these bodies.
 
-Letters are those of `vmri_jax.mechanics.kinematics`.
+For the letters see `vmri_jax.mechanics.kinematics`.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ def joint_constants(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, A
         rotated = xp.sum(ends["point_b"][:, :, None] * matrix, axis=1)
         return xp.concatenate([(point - rotated)[:, None], matrix], axis=1)
 
-    turns, ways = (np.array([link.amount(kind) for link in frames])[:, None, None] for kind in ("turn", "slide"))
+    turns, slides = (np.array([link.amount(kind) for link in frames])[:, None, None] for kind in ("turn", "slide"))
     pitches = [link.pitch / (2 * np.pi) for link in frames]
     screws = library(pitches).stack(pitches)[:, None]
     # M = F_b^T T(x) F_a = f_2^T a_2 + cos x (f_0^T a_0 + f_1^T a_1) + sin x (f_0^T a_1 - f_1^T a_0); without a turn cos x = 1
@@ -51,7 +51,7 @@ def joint_constants(bodies: Bodies, links: Sequence[Link | None]) -> dict[str, A
         "constant": rows(along + (1 - np.abs(turns)) * across, ends["point_a"]),
         "cosine": rows(np.abs(turns) * across, zero),
         "sine": rows(turns * (dyads(0, 1) - dyads(1, 0)), zero),
-        "way": xp.pad(((ways[:, 0] + turns[:, 0] * screws) * inner[:, 2])[:, None], ((0, 0), (0, 3), (0, 0))),
+        "way": xp.pad(((slides[:, 0] + turns[:, 0] * screws) * inner[:, 2])[:, None], ((0, 0), (0, 3), (0, 0))),
     }
     numbers = np.array([len(frames) if link is None else frames.index(link) for link in links])
     unmoved = {name: UNMOVED if name == "constant" else np.zeros((4, 3)) for name in constants}

@@ -12,7 +12,7 @@ from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.sorting import Placed, Sorting
 
 
-def label(effect: Effect, element: Sequence[str]) -> str:
+def element_label(effect: Effect, element: Sequence[str]) -> str:
     """The label of an element: the name of its effect and the names of its bodies.
 
     Args:
@@ -54,6 +54,6 @@ def _rows(sorting: Sorting, part: Placed) -> dict[str, int]:
         size = jax.eval_shape(effect.function, *t, *effect.element_arguments(i, bodies, params)).size
         kept = sum(row not in part.dropped for row in range(first, first + size))
         if kept:
-            rows[effect.name if len(elements) == 1 else label(effect, elements[i])] = kept
+            rows[effect.name if len(elements) == 1 else element_label(effect, elements[i])] = kept
         first += size
     return rows

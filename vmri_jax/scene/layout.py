@@ -11,7 +11,7 @@ from vmri_jax.mechanics.rows import Part, Place
 from vmri_jax.scene.body import Bodies
 
 
-class Pace(NamedTuple):
+class DecidedPace(NamedTuple):
     """Whether a body is slow or fast, and why."""
 
     value: Literal["slow", "fast"]

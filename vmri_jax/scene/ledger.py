@@ -45,7 +45,7 @@ DEFAULT_FREQUENCY = 10.0
 
 
 @dataclass(frozen=True)
-class Row:
+class LedgerRow:
     """A body or effect in the ledger.
 
     name: of the body or effect.
@@ -71,7 +71,7 @@ class Row:
 class Ledger:
     """Rows of bodies and effects, and the computing time of a macro step of the whole scene in microseconds (None if not measured)."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[LedgerRow, ...]
     microseconds: float | None = None
 
     @property
@@ -127,7 +127,7 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
     for name, pace in sorting.paces.items():
         grid = "micro" if pace.value == "fast" else "macro"
         unknowns = intervals[grid] * sizes[name]
-        rows.append(Row(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
+        rows.append(LedgerRow(name, "body", grid, f"{pace.value}: {pace.reason}", unknowns, 0, 0))
     step_time, times = _measure(sorting, scheme, macro_dt) if measure else (None, [None] * len(sorting.placed))
     for part, nanoseconds in zip(sorting.placed, times, strict=True):
         rule = _rule(stage, part.home)
@@ -135,7 +135,7 @@ def ledger(sorting: Sorting, scheme: Scheme | Composition, macro_dt: float | Non
         count = 0 if part.home == "control" else stages * evaluations(rule, stage.num_micro)
         microseconds = None if nanoseconds is None else nanoseconds * count / 1e3
         kind = TERMS.get(part.home, f"potential on one in {part.home} micro nodes")
-        rows.append(Row(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, microseconds))
+        rows.append(LedgerRow(part.effect.name, kind, rule.grid, part.reason, 0, multipliers, count, microseconds))
     return Ledger(tuple(rows), step_time)
 
 
@@ -169,7 +169,7 @@ def ledger_of_functions(
     rows = []
     for name, (part, _, size) in names.bodies.items():
         pace, grid = ("fast", "micro") if part == "f" else ("slow", "macro")
-        rows.append(Row(name, "body", grid, f"{pace}: it is in q_{part}", intervals[grid] * size, 0, 0))
+        rows.append(LedgerRow(name, "body", grid, f"{pace}: it is in q_{part}", intervals[grid] * size, 0, 0))
 
     def microseconds(alone: System, count: int) -> float | None:
         """Computing time of the first derivatives of a function at its nodes in a macro step."""
@@ -188,12 +188,12 @@ def ledger_of_functions(
         count = stages * evaluations(rule, stage.num_micro)
         why = f"the rule of the scheme for it is on the {rule.grid} grid"
         name, time = name_of(getattr(system, home)), microseconds(alone, count)
-        rows.append(Row(name, TERMS[home], rule.grid, why, 0, multipliers, count, time))
+        rows.append(LedgerRow(name, TERMS[home], rule.grid, why, 0, multipliers, count, time))
     for name, function in system.potentials:
         alone, rule = _alone(system, "", state).replace(potentials={name: function}), stage.rule_of(name)
         count = stages * evaluations(rule, stage.num_micro)
         why, time = f"the rule of the scheme for it: {rule.in_words()}", microseconds(alone, count)
-        rows.append(Row(name_of(function), f"potential {label(name)}", rule.grid, why, 0, 0, count, time))
+        rows.append(LedgerRow(name_of(function), f"potential {label(name)}", rule.grid, why, 0, 0, count, time))
     return Ledger(tuple(rows), _macro_step(system, scheme, state, macro_dt, DEFAULT_FREQUENCY) if measure else None)
 
 

@@ -255,7 +255,7 @@ class _Reader:
         by_name = {body.name: body for body in bodies}
         for b in compiled.compensated:
             body, force = by_name[compiled.group(b)], -model.body_gravcomp[b] * model.body_mass[b] * g
-            point = self.data.xipos[b] - body.position  # the axes of the body are those of space at the start
+            point = self.data.xipos[b] - body.position  # at the start the axes of the body are the axes of space
             name = f"{compiled.name('body', b)} gravity compensation"
             yield Potential(lift, ((body.name, point.tolist()),), {"force": force}, name=name)
 

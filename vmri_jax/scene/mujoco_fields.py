@@ -19,14 +19,14 @@ READ = {
     "joints": """njnt nq nv jnt_type jnt_bodyid jnt_pos jnt_axis jnt_qposadr jnt_dofadr dof_jntid body_jntadr
         body_jntnum""",
     "springs, dampers and armature in joints": "jnt_stiffness dof_damping qpos_spring dof_armature",
-    "limits of joints, where they are to be springs": "jnt_range jnt_solref dof_invweight0",
+    'limits of joints, for limits="spring"': "jnt_range jnt_solref dof_invweight0",
     "the start, where no qpos is given": "qpos0 nkey key_qpos key_qvel",
-    "gravity, and what compensates it": "opt.gravity body_gravcomp",
+    "gravity and its compensation": "opt.gravity body_gravcomp",
     "equalities connect, weld, and of joints and fixed tendons": """tendon_adr tendon_num wrap_type wrap_objid wrap_prm neq eq_type eq_objtype eq_obj1id eq_obj2id eq_active0 eq_data
         nsite site_bodyid site_pos site_quat""",
     "which bodies could touch": "ngeom geom_bodyid pair_geom1 pair_geom2 nexclude exclude_signature",
     "names": "names name_*",
-    "what is switched off": """opt.disableflags opt.enableflags opt.disableactuator opt.disableflags.CONSTRAINT
+    "flags that switch features off": """opt.disableflags opt.enableflags opt.disableactuator opt.disableflags.CONSTRAINT
         opt.disableflags.EQUALITY opt.disableflags.FRICTIONLOSS opt.disableflags.LIMIT opt.disableflags.CONTACT
         opt.disableflags.SPRING opt.disableflags.DAMPER opt.disableflags.GRAVITY opt.disableflags.FILTERPARENT
         opt.disableflags.ACTUATION""",
@@ -37,9 +37,9 @@ IDLE = {
     "shapes and pictures": """vis.* cam_* ncam light_* nlight mat_* nmat tex_* ntex ntexdata skin_* nskin* mesh_* nmesh* npolygonmax hfield_*
         nhfield* geom_matid geom_group geom_castshadow geom_rgba site_type site_dataid site_matid site_group site_size site_rgba
         site_sameframe jnt_group paths npaths""",
-    "what a sensor measures": "sensor_* nsensor* opt.magnetic opt.disableflags.SENSOR",
-    "data of users, and states that may be given as qpos": "body_user jnt_user geom_user site_user nuser* numeric_* nnumeric* text_* ntext* tuple_* ntuple* key_*",
-    "what MuJoCo derives from other fields": """stat.* signature flg_* ngravcomp body_rootid body_dofnum body_dofadr
+    "sensors": "sensor_* nsensor* opt.magnetic opt.disableflags.SENSOR",
+    "data of users, and states for qpos": "body_user jnt_user geom_user site_user nuser* numeric_* nnumeric* text_* ntext* tuple_* ntuple* key_*",
+    "values that MuJoCo derives from other fields": """stat.* signature flg_* ngravcomp body_rootid body_dofnum body_dofadr
         body_treeid body_geomnum body_geomadr body_simple body_sameframe body_subtreemass body_invweight0 body_margin body_contype
         body_conaffinity body_bvhadr body_bvhnum bvh_* nbvh* oct_* noct dof_bodyid dof_parentid dof_treeid dof_Madr dof_simplenum
         dof_M0 dof_length tree_bodyadr tree_bodynum tree_dofadr tree_dofnum ntree B_* D_* M_* mapD2M mapM2D mapM2M

@@ -43,9 +43,10 @@ class Rates(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """An element at the start, in the velocities that its bodies can have: for a rigid body those of its centre and its spin.
+    """An element at the start. All derivatives are with respect to the velocities that its bodies can have: of a rigid body the velocity
+    of its centre and its spin.
 
-    columns: numbers of these velocities among those of all bodies.
+    columns: numbers of these velocities among the velocities of all bodies.
     force: on the bodies at rest.
     stiffness, gyroscopic: K and G.
     mass: d2L/dv2, the part of the element in the mass matrix.
@@ -134,7 +135,7 @@ def _rates(effect: Effect, bodies, elements: Sequence[Linearised], mass: np.ndar
 
 
 def _scaled(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """``R^-1 X R^-T``, whose eigenvalues are those of M^-1 X for ``M = R R^T``."""
+    """``R^-1 X R^-T``, which has the eigenvalues of ``M^-1 X`` for ``M = R R^T`` and is symmetric with X."""
     return np.linalg.solve(root, np.linalg.solve(root, matrix).T).T
 
 
@@ -142,7 +143,7 @@ def _linearise(effect: Effect, bodies: Bodies, columns: Mapping[str, np.ndarray]
     """The elements of an effect at the start.
 
     Args:
-        columns: numbers of the velocities of each body among those of all.
+        columns: numbers of the velocities of each body among the velocities of all bodies.
     """
     params, linearised = effect.parameters(bodies), []
     for i, element in enumerate(map(moving, effect.elements(bodies))):

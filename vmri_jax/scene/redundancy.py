@@ -24,7 +24,7 @@ NAMED = 8
 MOTIONS = 3
 """Number of random motions on which dropped rows are evaluated: on a single motion a row may by chance change little. More take longer."""
 NEARBY = 0.1
-"""Length of a motion, as a fraction of the smallest singular value of the kept rows, which bounds the region where they are independent. A
+"""Length of a motion, as a fraction of the smallest singular value of the kept rows: this value bounds the region where they are independent. A
 row that changes with the second power of the motion changes by some 1e-3; a longer motion may reach another branch of a mechanism."""
 CONTRACTION = 0.1
 """Largest ratio of consecutive corrections of Newton's iteration from the end of a motion back to the surface. With a larger ratio the

@@ -1,4 +1,4 @@
-"""The rows of a scene's constraints one by one: their names, their values and their Jacobian at any positions."""
+"""The rows of a scene's constraints: their names, and their values and Jacobian at any positions."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from vmri_jax.mechanics.arrays import is_concrete, quickly_compiled
 from vmri_jax.scene.body import LARGEST_POINT, AnyBody, Bodies, moving
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.freedoms import ANGLES
-from vmri_jax.scene.labels import label
+from vmri_jax.scene.labels import element_label
 from vmri_jax.scene.layout import join
 from vmri_jax.scene.sorting import Home, Placed, Sorting
 from vmri_jax.scene.terms import EffectTerm
@@ -142,7 +142,7 @@ class ConstraintRows:
         return any(row.effect.timed for row in self.rows)
 
     def numbers(self, home: Home | None = None) -> list[int]:
-        """Numbers of the kept rows: of all, or of those with a certain home."""
+        """Numbers of the kept rows, all or only the rows with a certain home."""
         return [i for i, row in enumerate(self.rows) if row.kept and home in (None, row.home)]
 
     def names(self, numbers: Sequence[int]) -> list[str]:
@@ -156,11 +156,11 @@ def _elements(part: Placed, bodies: Bodies, columns: dict[str, np.ndarray], para
     elements = effect.elements(bodies)
     for i in chain(*effect.by_size(part.elements, bodies)):
         of_element = np.concatenate([columns[name] for name in moving(elements[i])])
-        yield label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
+        yield element_label(effect, elements[i]), _Element(*effect.element_term(i, bodies, params), of_element)
 
 
 def _evaluated(element: _Element, q: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values (m,) of an element at positions q of all bodies, and their derivatives by the coordinates of the bodies of this element."""
+    """Values (m,) of an element at positions q of all bodies, and their derivatives with respect to the coordinates of its own bodies."""
     values, jacobian = _value_and_jacobian(element.term, q[element.columns], element.params, t)
     return np.asarray(values), np.asarray(jacobian)
 

@@ -174,7 +174,7 @@ class Scene:
 
     @cached_property
     def everything(self) -> tuple[Effect, ...]:
-        """All effects: `Rigidity` of the bodies by directors first, then those of the user, with joints instead of names of joints."""
+        """All effects: `Rigidity` of the bodies by directors, then the effects of the user, with joints instead of names of joints."""
         carried = {branch.child for branch in self.branches}
         rigid = [body.name for body in self.bodies if body.rigid and body.name not in carried]
         effects = tuple(effect.bound(self.effects) for effect in self.effects)

@@ -38,9 +38,9 @@ from vmri_jax.mechanics.rows import Place
 from vmri_jax.scene.body import GROUND, Bodies
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.joint_constants import joint_constants
-from vmri_jax.scene.layout import Layout, Pace, join
+from vmri_jax.scene.layout import DecidedPace, Layout, join
 from vmri_jax.scene.rates import SEPARATION, Rates, border, measure
-from vmri_jax.scene.trees import Branch, Link, layout, with_weight
+from vmri_jax.scene.trees import Branch, Link, make_layout, with_weight
 
 NAMED = 3
 """Most bodies that a reason names; with more the table of reasons is too wide."""
@@ -90,7 +90,7 @@ class Sorting:
     """
 
     bodies: Bodies
-    paces: dict[str, Pace]
+    paces: dict[str, DecidedPace]
     layout: Layout
     placed: tuple[Placed, ...]
     links: tuple[Link | None, ...] = ()
@@ -198,7 +198,7 @@ class Owners(NamedTuple):
     """The bodies whose coordinates an element of an effect depends on.
 
     all: all these bodies.
-    between: those of them whose coordinates move the bodies of the element against each other, not together.
+    between: the bodies in `all` whose coordinates move the bodies of the element against each other, not together.
     """
 
     all: tuple[str, ...]
@@ -274,7 +274,7 @@ def sort(bodies: Bodies, effects: Sequence[Effect], branches: Sequence[Branch] =
             home, reason = _home(effect, i, slow, len(names), measured, limit)
             homes.setdefault(home, {})[i] = reason
         placed += [Placed(effect, tuple(reasons), home, _summary(reasons.values())) for home, reasons in homes.items()]
-    places, links = layout(bodies, paces, branches)
+    places, links = make_layout(bodies, paces, branches)
     if not any(places.sizes):
         joints = dict.fromkeys(branch.joint.name for branch in branches)
         raise ValueError(
@@ -302,16 +302,16 @@ def _measure(bodies, energies, owned: Mapping[str, Sequence[Owners]]) -> dict[st
     return measure(bodies, energies)
 
 
-def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owners]]) -> dict[str, Pace]:
+def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owners]]) -> dict[str, DecidedPace]:
     """The pace of every body: as the user gave it, or fast if a stiff effect moves it, else slow."""
     paces = {}
     for name, body in bodies.items():
         if body.pace != "auto":
-            paces[name] = Pace(body.pace, "as given")
+            paces[name] = DecidedPace(body.pace, "as given")
         elif limit is None:
-            paces[name] = Pace("slow", f"no gap of a factor {SEPARATION:g} between the rates of the effects")
+            paces[name] = DecidedPace("slow", f"no gap of a factor {SEPARATION:g} between the rates of the effects")
         else:
-            paces[name] = Pace("slow", f"no effect above {limit:.3g} rad/s touches it")
+            paces[name] = DecidedPace("slow", f"no effect above {limit:.3g} rad/s touches it")
     for effect in energies:
         for i, (names, between) in enumerate(owned[effect.name]):
             declared = effect.rate == "fast" or isinstance(effect.rate, int)
@@ -320,7 +320,7 @@ def _paces(bodies, energies, measured, limit, owned: Mapping[str, Sequence[Owner
             reason = _stiff(effect, i, measured, limit)
             for name in between if reason else ():
                 if paces[name].value == "slow" and bodies[name].pace == "auto":
-                    paces[name] = Pace("fast", f"touched by {effect.name}, {reason}")
+                    paces[name] = DecidedPace("fast", f"touched by {effect.name}, {reason}")
     return paces
 
 

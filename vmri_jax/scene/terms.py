@@ -128,7 +128,7 @@ class EffectTerm:
     timed: bool = False
 
     def params_of(self, params):
-        """The params of the function: those of the effect, for the selected elements."""
+        """The params of the function: the parameters of the effect, for the selected elements."""
         return params[self.name] if self.select is None else choose(params[self.name], self.select, self.split)
 
     def value(self, q_s, q_f, params, t=None):
@@ -189,9 +189,9 @@ class SomeRows:
 
     def value(self, q_s, q_f, params, t=None):
         """The values of the rows that are kept, by static slices."""
-        values = joined([term.value(q_s, q_f, params, t) for term in self.terms])
+        values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
         ends = [-1, *self.dropped, values.shape[0]]
-        return joined([values[low + 1 : high] for low, high in pairwise(ends)])
+        return concatenated([values[low + 1 : high] for low, high in pairwise(ends)])
 
 
 @dataclass(frozen=True)
@@ -200,8 +200,8 @@ class DroppedRows(SomeRows):
 
     def value(self, q_s, q_f, params, t=None):
         """The values of the dropped rows, by static slices."""
-        values = joined([term.value(q_s, q_f, params, t) for term in self.terms])
-        return joined([values[k : k + 1] for k in self.dropped])
+        values = concatenated([term.value(q_s, q_f, params, t) for term in self.terms])
+        return concatenated([values[k : k + 1] for k in self.dropped])
 
 
 @dataclass(frozen=True)
@@ -257,6 +257,6 @@ def totals(pairs: Sequence):
     return tuple(total(parts) for parts in zip(*pairs, strict=True))
 
 
-def joined(values: Sequence):
+def concatenated(values: Sequence):
     """One vector of arrays of any shape."""
     return jnp.concatenate([jnp.ravel(value) for value in values])

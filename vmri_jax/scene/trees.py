@@ -18,7 +18,7 @@ from vmri_jax.mechanics.rows import Part, Place, Rows
 from vmri_jax.scene.body import GROUND, Bodies, Frame, body_of
 from vmri_jax.scene.effect import Effect
 from vmri_jax.scene.effects.joint_base import Joint
-from vmri_jax.scene.layout import Layout, Pace
+from vmri_jax.scene.layout import DecidedPace, Layout
 from vmri_jax.scene.rigid import RigidBody
 
 LONGEST = 50
@@ -211,10 +211,10 @@ def with_weight(bodies: Bodies, branches: Sequence[Branch]) -> Bodies:
     return weighted
 
 
-def layout(
-    bodies: Bodies, paces: Mapping[str, Pace], branches: Sequence[Branch] = ()
+def make_layout(
+    bodies: Bodies, paces: Mapping[str, DecidedPace], branches: Sequence[Branch] = ()
 ) -> tuple[Layout, tuple[Link | None, ...]]:
-    """The places of all coordinates: in the order of the bodies, those of slow bodies in q_s and those of fast bodies in q_f.
+    """The places of all coordinates, of slow bodies in q_s and of fast bodies in q_f, in the order of the bodies.
 
     A body on a joint has the freedoms of this joint as coordinates.
 
@@ -312,15 +312,15 @@ def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, 
     """
     branch_of = {branch.child: branch for branch in branches}
     parents = {branch.parent for branch in branches}
-    ways = [_way(branch, branch_of) for branch in branches if branch.child not in parents]
-    depth = max(map(len, ways))
-    links = [way[level] if level < len(way) else None for level in range(depth) for way in ways]
+    paths = [_path(branch, branch_of) for branch in branches if branch.child not in parents]
+    depth = max(map(len, paths))
+    links = [path[level] if level < len(path) else None for level in range(depth) for path in paths]
     coordinates = [freedoms[link.key] for link in links if link is not None and link.key is not None]
     numbers_of_coordinates = iter(range(len(coordinates)))
     frames = Frames(
         grid,
         first,
-        tuple(numbers[way[0].branch.parent] for way in ways),
+        tuple(numbers[path[0].branch.parent] for path in paths),
         Rows.of(coordinates) if coordinates else None,
         tuple(-1 if link is None or link.key is None else next(numbers_of_coordinates) for link in links),
         any(link is not None and link.move is not None and link.move.kind != "turn" for link in links),
@@ -330,10 +330,10 @@ def _frames(grid: Grid, first: int, branches: Sequence[Branch], bodies: Bodies, 
     return frames, links
 
 
-def _way(branch: Branch | None, branch_of: Mapping[str, Branch]) -> list[Link]:
+def _path(branch: Branch | None, branch_of: Mapping[str, Branch]) -> list[Link]:
     """The links from a root to the child of a branch."""
-    way: list[Link] = []
+    path: list[Link] = []
     while branch is not None:
-        way = [*(Link(branch, step) for step in range(branch.size)), *way]
+        path = [*(Link(branch, step) for step in range(branch.size)), *path]
         branch = branch_of.get(branch.parent)
-    return way
+    return path

@@ -141,7 +141,7 @@ def joint_starts(sorting: Sorting, effects: Sequence[Effect], starts: Mapping[st
 
 
 def with_closed_loops(sorting: Sorting, starts: dict[Key, tuple[Any, Any]]) -> dict[Key, tuple[Any, Any]]:
-    """The starts, extended by those of all other joint coordinates that rows of loops and couplings tie to them.
+    """The starts of the named joint coordinates and of all other joint coordinates that loops and couplings tie to them.
 
     The named coordinates go to their values in steps. In each step Newton's iteration on ``g(q) = 0`` moves the other joint coordinates
     x, ``dx = -(dg/dx)^+ g``. At the end the rates of x solve ``dg/dq v = 0``. Rows that bodies with directors can satisfy, such as the

@@ -130,7 +130,7 @@ class CustomEffect(Effect):
 class Potential(CustomEffect):
     """A custom potential, ``function(q, params) -> ()``.
 
-    Arguments are those of `CustomEffect`.
+    For the arguments see `CustomEffect`.
     """
 
     kind = "potential"
@@ -140,10 +140,10 @@ class Potential(CustomEffect):
 class Constraint(CustomEffect):
     """A custom holonomic constraint, ``function(q, params) -> (k,)``, kept zero.
 
-    Arguments are those of `CustomEffect`, and
+    For the other arguments see `CustomEffect`.
 
     Args:
-        timed: it depends on time, ``function(t, q, params)``.
+        timed: whether the constraint depends on time, ``function(t, q, params)``.
     """
 
     timed: bool = field(default=False, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -154,16 +154,16 @@ class Constraint(CustomEffect):
 class Kinetic(CustomEffect):
     """A velocity-dependent part of the Lagrangian, ``function(q, v, params) -> ()``, added to the kinetic energy.
 
-    Arguments are those of `CustomEffect`.
+    For the arguments see `CustomEffect`.
     """
 
     kind = "kinetic"
 
 
 class Force(CustomEffect):
-    """A custom force, ``function(t, q, v, params)`` -> a tuple of one force per body, shaped like q.
+    """A custom force, ``function(t, q, v, params)``, which returns a tuple with a force for each body, shaped like q.
 
-    Arguments are those of `CustomEffect`.
+    For the arguments see `CustomEffect`.
     """
 
     kind = "force"

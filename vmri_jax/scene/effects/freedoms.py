@@ -1,6 +1,6 @@
 """Functions of the coordinates of two joined bodies: the gap between the points of the joint, its triads, and its freedoms.
 
-Letters are those of `vmri_jax.scene.effects.joints`.
+For the letters see `vmri_jax.scene.effects.joints`.
 """
 
 from typing import Any, Literal

@@ -1,6 +1,6 @@
 """Base classes of joints: two bodies, the points and triads of the joint in them, and its freedoms.
 
-Letters are those of `vmri_jax.scene.effects.joints`.
+For the letters see `vmri_jax.scene.effects.joints`.
 """
 
 from typing import Any, ClassVar
@@ -37,7 +37,7 @@ class Joint(Effect):
     same_size = False
     derived = ("point_a", "point_b", "frame_a", "frame_b")
     carries: ClassVar[bool] = False
-    """Whether the position of b may be a function of the freedoms of the joint: whether these are coordinates without a singularity."""
+    """Whether the joint can carry a body, whose position is then a function of the freedoms: these must be coordinates without a singularity."""
     moves: ClassVar[tuple[Move, ...]] = ()
     """The motions of the triad of b against the triad of a, one for each freedom, applied one after the other."""
     freedoms: ClassVar[tuple[Freedom, ...]] = ()
@@ -53,7 +53,7 @@ class Joint(Effect):
         return {}
 
     def label(self, i: int, bodies: Bodies) -> str:
-        """The name of the i-th pair: that of the joint, followed by the names of both bodies if the joint has several pairs."""
+        """The name of the joint, followed by the names of both bodies of the i-th pair if the joint has several pairs."""
         elements = self.elements(bodies)
         return self.name if len(elements) == 1 else f"{self.name} {'-'.join(elements[i])}"
 
@@ -126,7 +126,7 @@ class Joint(Effect):
             return [(point, point) for point in _vectors(f"{self.name}: at", self.at, len(pairs))]
         joining = []
         for pair in pairs:
-            # a point mass is its own point; a rigid body without a given point is joined where the other body is
+            # a point mass is joined at its position; a rigid body that came without a point, at the point of the other body
             points = [
                 body_of(bodies, name).point(getattr(name, "offset", None)).position
                 for name in pair
@@ -182,7 +182,7 @@ class AboutAxis(Joint):
         return [_triad(axis) for axis in self._directions("axis", count)]
 
     def _directions(self, name: str, count: int):
-        """(n, 3) the vectors of the field `name`, one for each pair, scaled to length one."""
+        """(n, 3) the vectors of the field `name` for all pairs, scaled to length one."""
         vectors = _vectors(f"{self.name}: {name}", getattr(self, name), count)
         lengths = library(vectors).linalg.norm(vectors, axis=-1, keepdims=True)
         self.require(lengths > 0, name, getattr(self, name), "it must not be zero")
