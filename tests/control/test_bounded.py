@@ -131,7 +131,7 @@ def test_bad_input(message, options):
 
 
 def test_a_start_of_another_duration():
-    with pytest.raises(ValueError, match="start is an Optimum over 1; this one is over 2"):
+    with pytest.raises(ValueError, match="start is an Optimum of duration 1; num_steps macro steps last 2"):
         minimize(CART, effort, scheme=vm.fully_explicit(1), macro_dt=0.1, num_steps=20, start=least())
 
 

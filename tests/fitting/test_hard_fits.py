@@ -32,7 +32,7 @@ def test_long_motion_in_several_parts():
     assert "10 segments" in str(fit)
     again = fit.bootstrap(2)
     np.testing.assert_allclose(again.errors[:, 0], fit.standard_errors["omega"], rtol=0.01)
-    assert np.all(np.abs(again.found - again.truth) < 5 * again.errors)
+    assert np.all(np.abs(again.estimates - again.truth) < 5 * again.errors)
 
 
 def test_several_starts_find_the_best_one():

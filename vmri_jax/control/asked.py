@@ -1,4 +1,4 @@
-"""What is asked of an optimisation: checks of its arguments, and where it starts."""
+"""Arguments of `minimize`: their checks, the `Transcription` that they make, and the point where the iteration starts."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
@@ -21,25 +21,27 @@ from vmri_jax.steppers.solvers import Newton
 
 
 def actuation_of(problem, actuate, num_controls) -> tuple[Callable, tuple[str, ...]]:
-    """Forces of the controls, and the names of these."""
-    found = getattr(problem, "actuation", None)
+    """The function that turns controls into generalised forces, and the names of the controls."""
+    scene_actuation = getattr(problem, "actuation", None)
     if actuate is None:
-        if found is None:
+        if scene_actuation is None:
             raise ValueError(
                 'minimize: nothing is controlled; give a scene with Controlled effects, e.g. Controlled("hub", "torque"), or actuate= '
                 "and num_controls=."
             )
-        if num_controls not in (None, len(found.labels)):
-            raise ValueError(f"minimize: num_controls is {num_controls}; the scene has {len(found.labels)} controls.")
-        return found, found.labels
-    if found is not None:
+        if num_controls not in (None, len(scene_actuation.labels)):
+            raise ValueError(
+                f"minimize: num_controls is {num_controls}; the scene has {len(scene_actuation.labels)} controls."
+            )
+        return scene_actuation, scene_actuation.labels
+    if scene_actuation is not None:
         raise ValueError("minimize: actuate is given, and the scene has Controlled effects; leave one of them out.")
     whole_number("minimize: num_controls", num_controls)
     return actuate, tuple(f"u {i}" for i in range(num_controls)) if num_controls > 1 else ("u",)
 
 
 class Aims(NamedTuple):
-    """What an optimal control is to reach, as of `vmri_jax.control.minimize`."""
+    """Costs, goal and inequalities of an optimal control, as in `vmri_jax.control.minimize`."""
 
     cost: Callable
     final_cost: Callable | None
@@ -49,7 +51,7 @@ class Aims(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """The steps between which controls are held, as of `vmri_jax.control.minimize`."""
+    """The grid of the motion and of the controls, as in `vmri_jax.control.minimize`."""
 
     scheme: Scheme | Composition
     macro_dt: float
@@ -59,7 +61,11 @@ class Grid(NamedTuple):
 
 
 def transcribed(problem, actuate: Callable, num_controls: int, aims: Aims, grid: Grid) -> Transcription:
-    """The problem as it is transcribed, with controls that `actuate` makes forces of."""
+    """The optimal control problem on the grid of the scheme.
+
+    Raises:
+        ValueError, TypeError: bad arguments, functions that return other shapes.
+    """
     cost, final_cost, goal, limits, bounds = aims
     scheme, macro_dt, num_steps, kind, solver = grid
     whole_number("minimize: num_steps", num_steps)
@@ -71,7 +77,8 @@ def transcribed(problem, actuate: Callable, num_controls: int, aims: Aims, grid:
         raise TypeError(
             f"minimize: system.params is {type(params).__name__}; the controls need it to be a dict, or None."
         )
-    prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # the checks of a run
+    prepare(problem, scheme, macro_dt=macro_dt, num_steps=1, solver=solver)  # makes the checks of a run
+    # A fallback is a branch of the compiled step. `jax.vmap` over all steps would compute both of its sides for every step.
     if solver is None and plan(system, scheme, state).has_fallback:
         solver = solvers.Nested()
     u = np.zeros(num_controls)
@@ -82,12 +89,12 @@ def transcribed(problem, actuate: Callable, num_controls: int, aims: Aims, grid:
             f"minimize: actuate returns {forces}; it must return forces on the slow and on the fast variables, of shapes "
             f"{expected[0]} and {expected[1]}."
         )
-    for name, function, given in (("cost", cost, (state, u)), ("final_cost", final_cost, (state,))):
-        shape = () if function is None else jax.eval_shape(lambda f=function, g=given: f(*g)).shape
+    for name, function, arguments in (("cost", cost, (state, u)), ("final_cost", final_cost, (state,))):
+        shape = () if function is None else jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape
         if shape != ():
             raise ValueError(f"minimize: {name} has shape {shape}; it must be a number.")
-    for name, function, given in (("goal", goal, (state,)), ("limits", limits, (state, u))):
-        if function is not None and len(jax.eval_shape(lambda f=function, g=given: f(*g)).shape) != 1:
+    for name, function, arguments in (("goal", goal, (state,)), ("limits", limits, (state, u))):
+        if function is not None and len(jax.eval_shape(lambda f=function, g=arguments: f(*g)).shape) != 1:
             raise ValueError(f"minimize: {name} must return a vector, (n,).")
     return Transcription(
         system.replace(params=params),
@@ -106,34 +113,44 @@ def transcribed(problem, actuate: Callable, num_controls: int, aims: Aims, grid:
 
 
 def free(state):
-    """The final cost where there is none."""
+    """The final cost of a problem without one."""
     return jnp.zeros(())
 
 
 def unaimed(state):
-    """The goal where there is none."""
+    """The goal of a problem without one: no equations."""
     return jnp.zeros(0)
 
 
-def _bounds(given, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(bounds, num_controls: int) -> tuple[np.ndarray, np.ndarray]:
     """The least and the largest controls, (m,) each."""
-    if given is None:
+    if bounds is None:
         return np.full(num_controls, -np.inf), np.full(num_controls, np.inf)
-    if not isinstance(given, tuple) or len(given) != 2:
-        raise ValueError(f"minimize: bounds is {given!r}; give (least, largest), each a number or ({num_controls},).")
-    both = [np.asarray(real_array("minimize: bounds", -np.inf if side is None else side)) for side in given]
-    both[1] = np.full((), np.inf) if given[1] is None else both[1]
-    if any(side.shape not in ((), (num_controls,)) for side in both):
-        shapes = " and ".join(str(side.shape) for side in both)
+    if not isinstance(bounds, tuple) or len(bounds) != 2:
+        raise ValueError(f"minimize: bounds is {bounds!r}; give (least, largest), each a number or ({num_controls},).")
+    sides = [np.asarray(real_array("minimize: bounds", -np.inf if side is None else side)) for side in bounds]
+    sides[1] = np.full((), np.inf) if bounds[1] is None else sides[1]
+    if any(side.shape not in ((), (num_controls,)) for side in sides):
+        shapes = " and ".join(str(side.shape) for side in sides)
         raise ValueError(f"minimize: bounds have shapes {shapes}; each is a number or ({num_controls},).")
-    lower, upper = (np.broadcast_to(side, (num_controls,)) for side in both)
+    lower, upper = (np.broadcast_to(side, (num_controls,)) for side in sides)
     if not np.all(lower < upper):
         raise ValueError(f"minimize: bounds are {lower} and {upper}; the least controls must be below the largest.")
     return lower, upper
 
 
 def started(search: Search, start, num_steps: int, num_controls: int, grid: str) -> Point:
-    """Nodes and controls to start from; what these miss is not computed."""
+    """Nodes and controls of the first iteration, without their gaps and the miss of the goal.
+
+    Args:
+        search: of the problem.
+        start: the argument of `minimize`: None, controls, or an `Optimum`.
+        num_steps, num_controls: N and m.
+        grid: "macro" or "micro".
+
+    Raises:
+        ValueError: controls of another shape, an optimum of another problem, or a motion that fails.
+    """
     setup, nodes = search.setup, None
     shape = (num_steps, setup.parts, num_controls)
     if isinstance(start, Optimum):
@@ -147,30 +164,36 @@ def started(search: Search, start, num_steps: int, num_controls: int, grid: str)
             raise ValueError(f"minimize: start has shape {controls.shape}; the controls have {expected}.")
         controls = controls.reshape(shape)
     u = jnp.asarray(np.clip(controls, *setup.bounds))
+    # Given controls start from the motion that they make, without gaps; the nodes of an optimum are interpolated, with gaps.
     if nodes is None:
         nodes, _ = search.rolled(u)
         if not np.isfinite(nodes).all():
             raise ValueError(
-                "minimize: the motion with the controls to start from fails; give others, start=..., or a smaller macro_dt."
+                "minimize: the motion with the first controls fails; give other controls, start=..., or a smaller macro_dt."
             )
     return Point(nodes, u, np.zeros(0), np.zeros(0))
 
 
 def _resampled(setup: Transcription, start: Optimum, num_steps: int):
-    """Nodes and controls of another optimum at the times of this one."""
+    """Nodes (N, n) and controls (N, parts, m) of an optimum, interpolated to the grid of another problem of the same duration."""
     run, m = start.trajectory, start.controls.shape[-1]
-    known = np.concatenate(
+    old_nodes = np.concatenate(
         [np.asarray(x) for x in (run.states.q_s, run.states.q_f, run.states.p_s, run.states.p_f)], axis=1
     )
-    duration, asked = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
-    if abs(duration - asked) > 1e-9 * asked:
-        raise ValueError(f"minimize: start is an Optimum over {duration:g}; this one is over {asked:g}.")
-    if m != len(setup.bounds[0]) or known.shape[1] != setup.z_start.size:
-        raise ValueError("minimize: start is an Optimum of another system or other controls; give one of this.")
+    duration, expected = float(run.t[-1] - run.t[0]), num_steps * setup.macro_dt
+    if abs(duration - expected) > 1e-9 * expected:
+        raise ValueError(
+            f"minimize: start is an Optimum of duration {duration:g}; num_steps macro steps last {expected:g}."
+        )
+    if m != len(setup.bounds[0]) or old_nodes.shape[1] != setup.z_start.size:
+        raise ValueError(
+            "minimize: start is an Optimum of another system or other controls; give an Optimum of this problem."
+        )
     t = float(setup.start.t) + setup.macro_dt * np.arange(1, num_steps + 1)
-    nodes = np.stack([np.interp(t, np.asarray(run.t), column) for column in known.T], axis=1)
-    from_times, times = start.t.ravel(), setup.times(num_steps)
-    half = [(duration / from_times.size) / 2, setup.macro_dt / setup.parts / 2]
+    nodes = np.stack([np.interp(t, np.asarray(run.t), column) for column in old_nodes.T], axis=1)
+    # A control is constant over its interval: both grids are compared at the middles of the intervals.
+    old_times, times = start.t.ravel(), setup.times(num_steps)
+    old_half, half = (duration / old_times.size) / 2, setup.macro_dt / setup.parts / 2
     columns = start.controls.reshape(-1, m).T
-    controls = [np.interp(times.ravel() + half[1], from_times + half[0], column) for column in columns]
+    controls = [np.interp(times.ravel() + half, old_times + old_half, column) for column in columns]
     return jnp.asarray(nodes), np.stack(controls, axis=1).reshape(*times.shape, m)

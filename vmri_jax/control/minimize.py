@@ -51,7 +51,7 @@ def minimize(
 
         scene = Scene([Body("cart", 1.0, [0.0])], [Controlled("cart", "force")])
 
-        found = vm.control.minimize(
+        optimum = vm.control.minimize(
             scene, lambda state, u: u @ u / 2, goal=lambda state: jnp.concatenate([state.q_s - 1.0, state.p_s]),
             bounds=(-5.0, 5.0), scheme=scheme, macro_dt=0.01, num_steps=100,
         )
@@ -59,34 +59,36 @@ def minimize(
     Sequential quadratic programming with the nodes among the unknowns: all steps are linearised side by side, and the
     linear-quadratic problem is solved by a Riccati sweep (`vmri_jax.control.riccati`), or by the interior-point method of PIQP
     where there are bounds or limits (extra ``control``), so that time grows with the number of steps.
-    Costs enter with their second derivatives, without negative parts; steps and limits with their first ones.
+    Costs enter with their second derivatives, without negative curvature; steps and limits with their first derivatives.
 
     Args:
-        problem: what moves and where it starts, a scene with `vmri_jax.scene.Controlled` effects or a problem; its
-            ``system.params`` is a dict or None.
-        cost: per time, ``cost(state, u) -> ()``; with a positive second derivative by u.
-        scheme, macro_dt, num_steps, solver: as of `simulate`. Forces act on the grid that the scheme holds them on.
-        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for those of a scene.
-        num_controls: m, length of u; of a scene it is known.
-        final_cost: of the last state, ``final_cost(state) -> ()``.
-        goal: of the last state, ``goal(state) -> (e,)``.
+        problem: system and start, a scene with `vmri_jax.scene.Controlled` effects or a problem; its ``system.params`` is a
+            dict or None.
+        cost: C, cost per time, ``cost(state, u) -> ()``, with a positive second derivative by u.
+        scheme, macro_dt, num_steps, solver: as in `simulate`. Forces act on the grid of the scheme for forces.
+        actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``; None for
+            a scene, which has its own.
+        num_controls: m, length of u; a scene knows its number.
+        final_cost: cost of the last state, ``final_cost(state) -> ()``.
+        goal: equations for the last state, ``goal(state) -> (e,)``, zero where the goal is reached.
         bounds: the least and the largest controls, numbers or (m,); None and infinite ones do not bound.
-        limits: what must not be above zero at the end of any interval, ``limits(state, u) -> (c,)``.
-        start: controls to start from, of the shape of `Optimum.controls`, or an `Optimum` of the same duration, perhaps on
+        limits: inequalities, ``limits(state, u) -> (c,)``, not above zero at the end of every interval.
+        start: controls of the first iteration, of the shape of `Optimum.controls`, or an `Optimum` of the same duration, perhaps on
             a coarser grid; zero if None.
         grid: controls for every macro interval, or for every micro interval.
-        tolerance: of updates, gaps, the goal and limits, relative to the motion and to the controls.
-        max_iterations: most linear-quadratic problems that are solved.
-        progress: show cost and misses of each iteration as a bar; without it a line tells them now and then, where it takes more
-            than two seconds.
+        tolerance: largest update, gap, miss of the goal and violation of a limit of a converged optimum; updates and gaps are relative to
+            the largest node and the largest control.
+        max_iterations: largest number of linear-quadratic problems that are solved.
+        progress: show cost and misses of each iteration as a bar; without it, a search of more than two seconds prints a line now
+            and then.
 
     Returns:
-        The `Optimum`; where the goal was not reached, the best that was found, which says so.
+        The `Optimum`. If the iteration does not converge, its last point, with ``converged`` false.
 
     Raises:
         ImportError: bounds or limits without the package piqp.
         RuntimeError: PIQP solves none of the linear-quadratic problems.
-        ValueError, TypeError: bad arguments, functions of other shapes.
+        ValueError, TypeError: bad arguments, functions that return other shapes.
     """
     whole_number("minimize: max_iterations", max_iterations)
     if not check_number("minimize: tolerance", tolerance) > 0:
@@ -104,28 +106,34 @@ def minimize(
         for count in range(1, max_iterations + 1):
             try:
                 change, steepest, stages, final = search.update(point)
-            except bounded.Unsolved:
+            except bounded.Unsolved:  # the points of earlier iterations are still worth returning
                 if not history:
                     raise
                 break
+            # The merit  cost + rho sum |misses|  is exact for rho above the largest multiplier; twice that leaves a margin.
             nu, rho = change.nu, max(rho, 2 * steepest)
-            point, told = search.line_search(point._replace(gaps=stages.c, goal=final.g), change, rho)
-            history.append(told)
-            tell(f"cost {told['cost']:.6g}, goal {told['miss']:.1e}, steps {told['gap']:.1e}", count, max_iterations)
-            if max(told["update"], told["gap"]) <= tolerance or told["part"] == 0.0:
+            point, record = search.line_search(point._replace(gaps=stages.c, goal=final.g), change, rho)
+            history.append(record)
+            tell(
+                f"cost {record['cost']:.6g}, goal {record['miss']:.1e}, steps {record['gap']:.1e}",
+                count,
+                max_iterations,
+            )
+            if max(record["update"], record["gap"]) <= tolerance or record["part"] == 0.0:
                 break
     last = history[-1]
     converged = all(last[name] <= tolerance for name in ("update", "gap", "miss", "over"))
     u = point.u
     driven = setup.driven(u)
     origin = replace(Origin.of(driven), names=names_of(opened_problem))
+    # The last nodes may have gaps; the trajectory is the motion that the controls make.
     trajectory = with_origin(_trajectory(setup, *search.rolled(u)), origin)
-    controls, held = np.asarray(u), setup.times(num_steps)
+    controls, times = np.asarray(u), setup.times(num_steps)
     if grid == "macro":
-        controls, held = controls[:, 0], held[:, 0]
+        controls, times = controls[:, 0], times[:, 0]
     return Optimum(
         controls,
-        held,
+        times,
         labels,
         setup.bounds,
         trajectory,
@@ -142,7 +150,7 @@ def minimize(
 
 
 def _trajectory(setup: Transcription, z, status: Status) -> Trajectory:
-    """The run with these nodes after the first one."""
+    """The run with nodes z (N, n) after the start."""
     count = len(z)
     nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(count + 1))
     phases = nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f

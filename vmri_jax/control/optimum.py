@@ -1,4 +1,4 @@
-"""What an optimisation of controls hands back."""
+"""The result of an optimisation of controls."""
 
 from dataclasses import dataclass, field
 
@@ -11,24 +11,24 @@ from vmri_jax.running.trajectory import Trajectory
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """Controls that were found, and the motion that they make.
+    """Controls at the end of the search, and the motion that they make.
 
     Attributes:
         controls: (N, m), or (N, num_micro, m) for controls on the micro grid.
-        t: (N,) or (N, num_micro) times from which on they are held.
-        labels: m names of the controls.
-        bounds: the least and the largest controls that were allowed, (m,) each.
-        trajectory: the motion, all macro nodes saved.
-        cost: its cost.
-        multipliers: (e,) change of the cost with the goal.
-        miss: the most that the goal is missed by.
-        over: the most that a limit is passed by.
-        gap: the most that a step misses the next node by.
-        iterations: linear-quadratic problems that were solved.
-        converged: whether updates, gaps, the goal and the limits ended below the tolerance.
-        problem: what moves, with the forces of these controls: ``vm.simulate(found.problem, ...)`` runs it again, on other
-            grids too.
-        history: cost, gap, miss, over, update and the part of it that was taken, of every iteration.
+        t: (N,) or (N, num_micro) starts of the intervals over which each control is constant.
+        labels: names of the m controls.
+        bounds: (m,) lower and upper bounds of the controls.
+        trajectory: the motion at all macro nodes.
+        cost: of the motion.
+        multipliers: (e,) derivatives of the least cost by the values that the goal is set to.
+        miss: largest absolute value of the goal equations.
+        over: largest violation of a limit, 0 for none.
+        gap: largest distance between the end of a step and the next node, relative to the largest node.
+        iterations: number of linear-quadratic problems that were solved.
+        converged: whether update, gap, miss and over are all below the tolerance.
+        problem: the problem with the forces of these controls: ``vm.simulate(optimum.problem, ...)`` runs it again, on other grids
+            too.
+        history: of every iteration cost, gap, miss, over, the largest update, and the part of the update that was taken.
     """
 
     controls: Float[np.ndarray, "N ..."]
@@ -47,9 +47,9 @@ class Optimum:
     history: list[dict] = field(repr=False, default_factory=list)
 
     def __repr__(self) -> str:
-        how = "converged" if self.converged else "not converged: the best that was found"
+        status = "converged" if self.converged else "not converged: the best that was found"
         over = f", limits by {self.over:.1e}" if self.over > 0 else ""
         return (
-            f"cost {self.cost:.8g} after {self.iterations} iterations, {how}; goal missed by {self.miss:.1e}{over}, "
+            f"cost {self.cost:.8g} after {self.iterations} iterations, {status}; goal missed by {self.miss:.1e}{over}, "
             f"steps by {self.gap:.1e}"
         )

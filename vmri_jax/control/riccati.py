@@ -1,4 +1,4 @@
-"""The linear-quadratic problem of a stage structure, in one sweep back and one forward: O(N).
+"""The linear-quadratic problem of N stages, solved by one sweep back and one forward: time O(N).
 
     min  sum_k (1/2 (dz, du) H_k (dz, du) + h_k . (dz, du))_k + 1/2 dz_N S dz_N + s . dz_N
     dz_{k+1} = A_k dz_k + B_k du_k + c_k        dz_0 = 0        G dz_N + g = 0
@@ -19,7 +19,7 @@ from vmri_jax.mechanics.arrays import Numbers
 
 
 class Stages(NamedTuple):
-    """All stages, each with n numbers of the state and m of the control."""
+    """The N stages; a state has n numbers, a control m."""
 
     hessian: Float[Numbers, "N n+m n+m"]
     gradient: Float[Numbers, "N n+m"]
@@ -29,7 +29,7 @@ class Stages(NamedTuple):
 
 
 class Final(NamedTuple):
-    """What is asked of the last state: a quadratic cost and ``G dz + g = 0``."""
+    """Conditions on the last state: the cost ``1/2 dz S dz + s . dz`` and the goal ``G dz + g = 0``."""
 
     S: Float[Numbers, "n n"]
     s: Float[Numbers, "n"]
@@ -46,6 +46,8 @@ class Solution(NamedTuple):
 
 
 class _Value(NamedTuple):
+    """Coefficients of the cost from a stage on, see the head of this file."""
+
     S: Float[Numbers, "n n"]
     s: Float[Numbers, "n"]
     M: Float[Numbers, "n e"]
@@ -54,7 +56,10 @@ class _Value(NamedTuple):
 
 
 def solve(stages: Stages, final: Final) -> Solution:
-    """The solution; where the goal cannot be reached, the one that misses it least."""
+    """The solution of the linear-quadratic problem.
+
+    A goal that cannot be reached is missed by as little as possible, in least squares.
+    """
     n, e = final.S.shape[0], len(final.g)
 
     def back(value: _Value, stage: Stages):
@@ -62,14 +67,17 @@ def solve(stages: Stages, final: Final) -> Solution:
         Q, N, R = stage.hessian[:n, :n], stage.hessian[n:, :n], stage.hessian[n:, n:]
         q, r = stage.gradient[:n], stage.gradient[n:]
         S, s, M = value.S, value.s, value.M
+        # du = K dz + k + K_nu nu minimises the cost of the stage plus the cost from the next stage on, at  dz' = A dz + B du + c:
+        #     (R + B^T S B) du = -(H_ux dz + r + B^T (S c + s) + B^T M nu)    with    H_ux = N + B^T S A
         ahead = S @ c + s
         H_ux = N + B.T @ S @ A
         right = jnp.concatenate([H_ux, (r + B.T @ ahead)[:, None], B.T @ M], axis=1)
         gains = -jnp.linalg.solve(R + B.T @ S @ B, right)
         K, k, K_nu = gains[:, :n], gains[:, n], gains[:, n + 1 :]
+        # The coefficients before the stage follow by insertion of du.
         S_before = Q + A.T @ S @ A + H_ux.T @ K
         before = _Value(
-            (S_before + S_before.T) / 2,
+            (S_before + S_before.T) / 2,  # symmetric in spite of round-off
             q + A.T @ ahead + H_ux.T @ k,
             A.T @ M + H_ux.T @ K_nu,
             value.m + M.T @ (c + B @ k),
@@ -79,10 +87,11 @@ def solve(stages: Stages, final: Final) -> Solution:
 
     last = _Value(final.S, final.s, final.G.T, final.g, jnp.zeros((e, e)))
     first, gains = jax.lax.scan(back, last, stages, reverse=True)
+    # dz_0 = 0, and the cost is stationary by nu:  m - W nu = 0
     nu = jnp.linalg.lstsq(first.W, first.m)[0] if e else first.m
 
-    def forward(dz, at):
-        stage, (K, k, K_nu) = at
+    def forward(dz, stage_and_gains):
+        stage, (K, k, K_nu) = stage_and_gains
         du = K @ dz + k + K_nu @ nu
         dz = stage.A @ dz + stage.B @ du + stage.c
         return dz, (dz, du)

@@ -1,4 +1,4 @@
-"""One iteration of sequential quadratic programming: an update, and how far along it to go."""
+"""One iteration of sequential quadratic programming: the update, and the line search along it."""
 
 from typing import NamedTuple
 
@@ -12,14 +12,19 @@ from vmri_jax.control import bounded, riccati
 from vmri_jax.control.transcription import Transcription
 from vmri_jax.mechanics.arrays import Numbers
 
-SHORTEST = 2.0**-10
-"""Part of an update below which the search gives up."""
-ENOUGH = 1e-4
-"""Part of the predicted decrease of the merit that is asked for (Armijo)."""
+SHORTEST_PART = 2.0**-10
+"""Smallest part of an update that the line search tries, after ten halvings; a larger one gives up earlier."""
+SUFFICIENT_DECREASE = 1e-4
+"""Armijo's constant: the decrease of the merit has to be this part of the predicted one. A larger one refuses more updates."""
 
 
 class Point(NamedTuple):
-    """Nodes after the first one and controls, and what they miss: the nodes after each step, and the goal."""
+    """A point of the search.
+
+    z, u: nodes after the first one, and controls.
+    gaps: end of each step minus the next node.
+    goal: values of the goal, zero where it is reached.
+    """
 
     z: Float[Numbers, "N n"]
     u: Float[Numbers, "N parts m"]
@@ -35,11 +40,11 @@ by_sweep = jax.jit(riccati.solve)
 
 @eqx.filter_jit
 def measured(setup: Transcription, point: Point):
-    """Cost, sum of all misses, sizes of nodes and controls, and the most that a limit is passed by."""
+    """Cost, sum of all violations, largest node and control, and largest value of a limit."""
     over = setup.over(point.z, point.u)
-    missed = sum(jnp.sum(jnp.abs(x)) for x in (point.gaps, point.goal, jnp.maximum(over, 0.0)))
+    violation = sum(jnp.sum(jnp.abs(x)) for x in (point.gaps, point.goal, jnp.maximum(over, 0.0)))
     sizes = (jnp.maximum(jnp.max(jnp.abs(a)), 1e-12) for a in (point.z, point.u))
-    return setup.total(point.z, point.u), missed, *sizes, jnp.max(over, initial=0.0)
+    return setup.total(point.z, point.u), violation, *sizes, jnp.max(over, initial=0.0)
 
 
 @eqx.filter_jit
@@ -55,7 +60,11 @@ class Search:
         self.setup = setup
 
     def update(self, point: Point) -> tuple[riccati.Solution, float, riccati.Stages, riccati.Final]:
-        """The solution of the linear-quadratic problem at a point, the largest multiplier of what is asked of it, and the problem."""
+        """The linear-quadratic problem at a point.
+
+        Returns:
+            Its solution, the largest absolute multiplier, and the problem: stages and conditions on the last state.
+        """
         stages, final = linearised(self.setup, point.z, point.u)
         if self.setup.bounded:
             change, steepest = bounded.solve(stages, final, limited(self.setup, point.z, point.u))
@@ -64,53 +73,54 @@ class Search:
         return change, float(np.abs(change.nu).max(initial=0.0)), stages, final
 
     def line_search(self, point: Point, change: riccati.Solution, rho: float) -> tuple[Point, dict[str, float]]:
-        """The first point along an update whose merit ``cost + rho (sum |gaps| + sum |goal| + sum of what is above the limits)``
-        is small enough, and what there is to say of it.
+        """The first point along an update with a sufficient decrease of the merit, and its entry in the history.
 
-        Halves of the update are tried, each in two ways: nodes and controls updated alike, which unstable motions need, and the
-        motion of the updated controls, which has no gaps, and suits bodies that turn far.
+        The merit is ``cost + rho (sum |gaps| + sum |goal| + sum max(limits, 0))``. The update is halved until one of two trials is
+        accepted: nodes and controls updated alike, which unstable motions need; and the motion of the updated controls, which has
+        no gaps and suits bodies that turn far. The point stays, and ``part`` is 0, if no part of the update is accepted.
         """
         dz, du = change.dz, jnp.reshape(change.du, point.u.shape)
-        cost, missed, size_z, size_u, _ = measured(self.setup, point)
-        before, expected = float(cost + rho * missed), float(slope(self.setup, point, dz, du) - rho * missed)
-        part, found = 1.0, None
-        while found is None and part >= SHORTEST:
+        cost, violation, size_z, size_u, _ = measured(self.setup, point)
+        before = float(cost + rho * violation)
+        # The whole update fulfils the linearised conditions: along it the violation decreases at the rate of its size.
+        expected = float(slope(self.setup, point, dz, du) - rho * violation)
+        part, accepted = 1.0, None
+        while accepted is None and part >= SHORTEST_PART:
             z, u = point.z + part * dz, point.u + part * du
-            allowed = before + ENOUGH * part * min(expected, 0.0) + 1e-12 * (1 + abs(before))
+            # the last term allows for round-off: near the optimum the merit changes by less
+            allowed = before + SUFFICIENT_DECREASE * part * min(expected, 0.0) + 1e-12 * (1 + abs(before))
             trials = [self.with_gaps(z, u), self.motion(u)]
-            merits = [
-                float(cost + rho * missed) for cost, missed, *_ in (measured(self.setup, trial) for trial in trials)
-            ]
-            best = int(np.nanargmin([*merits, np.inf]))
+            measures = [measured(self.setup, trial) for trial in trials]
+            merits = [float(cost + rho * violation) for cost, violation, *_ in measures]
+            best = int(np.nanargmin([*merits, np.inf]))  # a motion that fails has the merit NaN
             if best < len(trials) and merits[best] <= allowed:
-                found = trials[best]
+                accepted = trials[best]
             else:
                 part /= 2
-        if found is None:
-            part, found = 0.0, point
-        cost, _, size_z, size_u, over = measured(self.setup, found)
-        update = max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u)
-        told = {
+        if accepted is None:
+            part, accepted = 0.0, point
+        cost, _, size_z, size_u, over = measured(self.setup, accepted)
+        record = {
             "cost": cost,
-            "gap": np.abs(found.gaps).max() / size_z,
-            "miss": np.abs(found.goal).max(initial=0.0),
+            "gap": np.abs(accepted.gaps).max() / size_z,
+            "miss": np.abs(accepted.goal).max(initial=0.0),
             "over": over,
-            "update": update,
+            "update": max(np.abs(dz).max() / size_z, np.abs(du).max() / size_u),
             "part": part,
         }
-        return found, {name: float(value) for name, value in told.items()}
+        return accepted, {name: float(value) for name, value in record.items()}
 
     def with_gaps(self, z, u) -> Point:
-        """Nodes and controls with what they miss: NaN where a step fails."""
+        """The point of nodes z and controls u; its gaps are NaN where a step fails."""
         ends, _ = steps(self.setup, z, u, jnp.asarray(False))
         return Point(z, u, ends - z, self._goal(z))
 
     def rolled(self, u):
-        """Nodes of the motion with controls u, NaN from a step on that fails, and the `Status` of the steps."""
+        """Nodes of the motion with controls u, NaN from the first failed step on, and the `Status` of the steps."""
         return steps(self.setup, jnp.zeros((len(u), self.setup.z_start.size)), u, jnp.asarray(True))
 
     def motion(self, u) -> Point:
-        """The motion of controls, without gaps."""
+        """The point of controls u and the motion that they make, without gaps."""
         z, _ = self.rolled(u)
         return Point(z, u, jnp.zeros_like(z), self._goal(z))
 

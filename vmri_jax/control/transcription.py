@@ -31,25 +31,26 @@ from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton
 
 CONTROL = "vmri_jax.control"
-"""Name among the parameters of a system of the controls of a step, with its start and the length of the parts that they are held for."""
+"""Entry of ``system.params`` with the controls: u, the time when the first one starts, and the duration of each."""
 
-BETWEEN = 1e-6
-"""Times that are nearer to the border of two parts, over the length of a part, are between them."""
+BORDER_WIDTH = 1e-6
+"""Half the width of the border between two controls, over the duration of one: within it a time counts as the border, so that round-off
+of a node's time does not choose a control. A larger one would mix controls at micro nodes beside the border."""
 
 
 class Transcription(eqx.Module):
     """An optimal control problem on a macro grid.
 
     Attributes:
-        system: without the controls; its params are a dict.
-        start: the state that the motion starts from.
+        system: the system without forces of controls; its params are a dict.
+        start: first state of the motion.
         actuate: generalised forces of the controls, ``actuate(q_s, q_f, u, params) -> (f_s, f_f)``.
-        cost: per time, ``cost(state, u) -> ()``.
-        final_cost: ``final_cost(state) -> ()``.
-        goal: ``goal(state) -> (e,)``, zero at the end.
+        cost: cost per time, ``cost(state, u) -> ()``.
+        final_cost: cost of the last state, ``final_cost(state) -> ()``.
+        goal: equations for the last state, ``goal(state) -> (e,)``.
         limits: ``limits(state, u) -> (c,)``, not above zero at the end of every part of an interval; None for none.
         bounds: least and largest controls, (m,) each.
-        parts: of a macro interval, for each of which there are own controls: 1, or num_micro.
+        parts: number of controls that follow each other in a macro interval: 1, or num_micro.
     """
 
     system: System
@@ -72,16 +73,16 @@ class Transcription(eqx.Module):
 
     @property
     def controlled(self) -> System:
-        """The system with the forces of its controls."""
+        """The system with forces of controls, which it expects in its params."""
         return self.system.replace(force=_forces(self.system.force, self.actuate))
 
     def times(self, count: int) -> np.ndarray:
-        """(count, parts) times from which on controls are held."""
+        """(count, parts) starts of the intervals over which each control is constant."""
         start = float(self.start.t) + float(self.macro_dt) * np.arange(count)
         return start[:, None] + np.arange(self.parts) * (float(self.macro_dt) / self.parts)
 
     def driven(self, u) -> System:
-        """The system with the forces of controls u (N, parts, m), from the start on."""
+        """The system with the forces of controls u (N, parts, m) over the whole motion."""
         held = jnp.reshape(u, (-1, u.shape[-1])), self.start.t, self.macro_dt / self.parts
         return self.controlled.replace(params={**self.system.params, CONTROL: held})
 
@@ -95,11 +96,11 @@ class Transcription(eqx.Module):
         return phase_vector(self.start)
 
     def before(self, z):
-        """The nodes that the steps to the nodes z (N, n) start from."""
+        """Starts of the steps that end at the nodes z (N, n)."""
         return jnp.concatenate([self.z_start[None], z[:-1]])
 
     def step(self, z, u, k):
-        """The next state, and the `Status` of the step; u (parts, m)."""
+        """The end of the step from node k at z (n,) with controls u (parts, m), and the `Status` of the step."""
         state = self.state(z, k)
         held = u, state.t, self.macro_dt / self.parts
         system = self.controlled.replace(params={**self.system.params, CONTROL: held})
@@ -107,14 +108,14 @@ class Transcription(eqx.Module):
         return phase_vector(end), info.status
 
     def steps(self, z, u, follow):
-        """The ends of all steps, (N, n), and their `Status`: from the nodes z, or where `follow` is true each from the end of the
-        one before, NaN from a failure on.
+        """Ends (N, n) of all steps, NaN where a step fails, and their `Status`.
 
-        Both by one program, since a step takes long to compile.
+        Each step starts from its node in z, or from the end of the step before if `follow` is true. One program computes both,
+        since a step takes long to compile.
         """
 
-        def step(end, at):
-            node, u, k = at
+        def step(end, stage):
+            node, u, k = stage
             end, status = self.step(jnp.where(follow, end, node), u, k)
             end = jnp.where(status.result <= Result.CONVERGED_AT_ROUNDOFF, end, jnp.nan)
             return end, (end, status)
@@ -122,7 +123,7 @@ class Transcription(eqx.Module):
         return jax.lax.scan(step, self.z_start, (self.before(z), u, jnp.arange(len(u))))[1]
 
     def stage_cost(self, z, u, z_next, k):
-        """``H`` times the mean of the cost at both ends of the interval, over the parts."""
+        """Trapezoidal rule: ``H (C(z_k, u) + C(z_{k+1}, u)) / 2``, its mean over the controls of the interval."""
         ends = self.state(z, k), self.state(z_next, k + 1)
         return self.macro_dt * sum(jnp.mean(jax.vmap(lambda u, s=s: self.cost(s, u))(u)) for s in ends) / 2
 
@@ -132,7 +133,7 @@ class Transcription(eqx.Module):
         return jnp.sum(stages) + self.final_cost(self.state(z[-1], len(u)))
 
     def over(self, z, u):
-        """Values of the limits at nodes z (N, n) after the first one, (N, parts c)."""
+        """Values (N, parts c) of the limits at nodes z (N, n) after the first one."""
 
         def stage(z, u, k):
             state, limits = self.state(z, k + 1), self.limits
@@ -151,7 +152,7 @@ class Transcription(eqx.Module):
         return Limits(C, D.reshape(*D.shape[:2], u[0].size), self.over(z, u), lower, upper)
 
     def linearised(self, z, u) -> tuple[Stages, Final]:
-        """The linear-quadratic problem at nodes z and controls u: derivatives of all steps, by `jax.vmap` over them."""
+        """The linear-quadratic problem at nodes z (N, n) and controls u (N, parts, m)."""
         count, n = len(u), z.shape[1]
         flat = u.reshape(count, -1)
 
@@ -168,7 +169,9 @@ class Transcription(eqx.Module):
             slopes, reached = jax.jacfwd(end, has_aux=True)(x)
             y = jnp.concatenate([x, z_next])
             gradient, hessian = jax.grad(cost)(y), convex(jax.hessian(cost)(y))
-            along = jnp.concatenate([jnp.eye(x.size), slopes])  # of (z, u, z_next) by (z, u)
+            # The cost depends on y = (z, u, z_next). To first order  dy = along (dz, du) + shift,  since the step gives
+            # dz_next = slopes (dz, du) + c;  this turns gradient and hessian by y into those by (z, u).
+            along = jnp.concatenate([jnp.eye(x.size), slopes])
             c = reached - z_next
             shift = jnp.concatenate([jnp.zeros(x.size), c])
             return Stages(
@@ -177,35 +180,45 @@ class Transcription(eqx.Module):
 
         stages = jax.vmap(stage)(self.before(z), flat, z, jnp.arange(count))
 
-        def last(of):
-            return lambda z: of(self.state(z, count))
+        def of_end(function):
+            return lambda z: function(self.state(z, count))
 
-        goal, final_cost = last(self.goal), last(self.final_cost)
+        goal, final_cost = of_end(self.goal), of_end(self.final_cost)
         S, s = convex(jax.hessian(final_cost)(z[-1])), jax.grad(final_cost)(z[-1])
         return stages, Final(S, s, jax.jacfwd(goal)(z[-1]), goal(z[-1]))
 
 
 @lru_cache(maxsize=32)
-def _forces(own: Callable | None, actuate: Callable) -> Callable:
-    """The forces of a system and of its controls; the same function for the same ones, so that nothing is compiled again."""
+def _forces(system_force: Callable | None, actuate: Callable) -> Callable:
+    """The sum of the forces of a system and of its controls, cached: JAX compiles again for a new function object."""
 
     def force(t, q_s, q_f, v_s, v_f, params: Mapping[str, Any]):
         f_s, f_f = actuate(q_s, q_f, held(t, *params[CONTROL]), params)
-        if own is None:
+        if system_force is None:
             return f_s, f_f
-        more_s, more_f = own(t, q_s, q_f, v_s, v_f, params)
-        return f_s + more_s, f_f + more_f
+        system_s, system_f = system_force(t, q_s, q_f, v_s, v_f, params)
+        return f_s + system_s, f_f + system_f
 
     return force
 
 
 def held(t, u, t_start, length):
-    """Controls at a time: those of its part, (parts, m), and between two parts the mean, so that each acts over its whole length."""
-    sides = (t - t_start) / length + jnp.array([-BETWEEN, BETWEEN])
+    """The control (m,) at time t.
+
+    At the border of two intervals it is the mean of both controls, so that quadrature rules with nodes at the ends of intervals
+    weight each control by its duration.
+
+    Args:
+        t: time.
+        u: (k, m) controls that follow each other.
+        t_start: start of the first one.
+        length: duration of each.
+    """
+    sides = (t - t_start) / length + jnp.array([-BORDER_WIDTH, BORDER_WIDTH])
     return jnp.mean(u[jnp.clip(jnp.floor(sides).astype(int), 0, len(u) - 1)], axis=0)
 
 
 def convex(hessian):
-    """A symmetric matrix without its negative part."""
+    """A symmetric matrix with its negative eigenvalues set to zero: the quadratic problem then has a minimum."""
     values, vectors = jnp.linalg.eigh(hessian)
     return (vectors * jnp.maximum(values, 0.0)) @ vectors.T

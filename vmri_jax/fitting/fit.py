@@ -24,16 +24,19 @@ from vmri_jax.steppers import solvers
 from vmri_jax.steppers.solvers import Newton
 
 START = ("q_s", "q_f", "v_s", "v_f")
-"""Names of unknowns that are the start of a problem."""
-TIGHTER = (1e-2, 1.0, 1e2, 1e4, 1e6)
-"""How much the parts of multiple shooting are held together, stage by stage: the weight of a gap as large as the motion itself, over the
-root of the number of values."""
+"""Unknowns of these names are the start of the problem."""
+GAP_WEIGHTS = (1e-2, 1.0, 1e2, 1e4, 1e6)
+"""Weights of the gaps between the parts of multiple shooting, for searches one after the other, each from the end of the one before. A
+gap as large as the motion counts like a miss of every value by this many standard deviations. A larger first weight makes the search as
+hard as one with a single run; a smaller last weight leaves gaps in the result."""
 TOLERANCE = 1e-6
-"""Changes of the search variables at which the search ends."""
-BAD = 1e6
-"""What a value counts as missed by, in standard deviations, where a run fails."""
-PHASES = 4
-"""Parts of a fit that are told apart where it takes long."""
+"""Absolute and relative change of the search variables at which a search ends. A larger one leaves errors of this size beside the
+standard errors of the parameters."""
+FAILED_MISS = 1e6
+"""Miss of a value, in standard deviations, that a failed run counts as: far above the misses of runs that work, so that the search turns
+back. Squares of much larger ones would drown the others in round-off."""
+NUM_PHASES = 4
+"""Number of phases that the display of a long fit tells apart."""
 
 
 def fit(
@@ -53,24 +56,24 @@ def fit(
     """Find the parameters for which the motion comes closest to what was measured.
 
         data = vm.fitting.Measured(t, values, sigma=0.01, observe=lambda state: state.q_f)
-        found = vm.fit(problem, data, {"stiffness": vm.fitting.Unknown(3000.0, lower=0)}, scheme=scheme, macro_dt=0.01)
-        print(found)
+        result = vm.fit(problem, data, {"stiffness": vm.fitting.Unknown(3000.0, lower=0)}, scheme=scheme, macro_dt=0.01)
+        print(result)
 
-    It minimises ``sum ((predicted - measured) / sigma)^2`` by the method of Levenberg and Marquardt (`optimistix`), with the
-    Jacobian in forward mode. What takes more than two seconds is said on the error stream.
+    The method of Levenberg and Marquardt (`optimistix`) minimises ``sum ((predicted - measured) / sigma)^2``, with the Jacobian in
+    forward mode. A fit that takes more than two seconds shows its phases on the error stream.
 
     Args:
-        problem: whose ``system.params`` is a dict; `parameters` then name entries of it, or "q_s", "q_f", "v_s", "v_f" for
-            the start. Or a function ``{name: value} -> Problem``, for everything else.
+        problem: a problem whose ``system.params`` is a dict; `parameters` name its entries, or "q_s", "q_f", "v_s", "v_f" for the
+            start. Or a function ``{name: value} -> Problem``, for everything else.
         data: one or several sets of measurements.
-        parameters: an `Unknown` for each name, or a number to start from.
-        scheme, macro_dt, solver: as of `simulate`. The times of measurement must be macro nodes. Runs are made without a fallback
-            where the scheme allows it.
+        parameters: an `Unknown` for each name, or the number where its search starts.
+        scheme, macro_dt, solver: as in `simulate`. The times of measurement must be macro nodes. Where the solver is not chosen,
+            runs have no fallback.
         segments: parts of multiple shooting; more than one for long or chaotic motion.
-        starts: searches side by side, the first from the start itself, the others from around it.
-        spread: standard deviation of the search variables of those, about the relative change of a parameter.
-        max_steps: most iterations of a search.
-        seed: of the starts.
+        starts: number of searches side by side, the first from the starts of `parameters`, the others from random ones around them.
+        spread: standard deviation of the search variables of the random starts, about the relative change of a parameter.
+        max_steps: largest number of iterations of a search.
+        seed: of the random starts.
 
     Returns:
         The `Fit`: parameters, their covariance, what the data does not determine, the run.
@@ -86,13 +89,15 @@ def fit(
     _check(data, segments, starts, max_steps)
     first = model(unknowns.at(np.zeros(unknowns.size)))
     check_type("fit: the model", first, Problem, "a vmri_jax.Problem from its parameters")
+    # steps[i] are the numbers of the macro nodes at which the set i of data was measured
     steps = [m.steps(float(first.t), macro_dt) for m in data]
     if max(s.max() for s in steps) < 1:
-        raise ValueError("fit: all times of measurement are that of the start; measure later ones, too.")
+        raise ValueError("fit: all measurements are at the start of the problem; measure at later times, too.")
     with Working("fit") as tell:
-        tell("a run with the parameters to start from", 0, PHASES)
+        tell("a run with the first parameters", 0, NUM_PHASES)
         run = prepare(first, scheme, macro_dt=macro_dt, num_steps=max(int(s.max()) for s in steps), solver=solver)
         run()
+        # A fallback is a branch of the compiled step; `jax.vmap` over searches and derivatives would compute both of its sides.
         if solver is None and run.plan.has_fallback:
             solver = solvers.Nested()
         shooting = Shooting(model, unknowns, data, steps, scheme, solver or solvers.Auto(), float(macro_dt), segments)
@@ -116,16 +121,16 @@ def _optimistix():
 def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     if not parameters:
         raise ValueError(
-            "fit: parameters is empty; name what is to be found, e.g. {'stiffness': Unknown(3000.0, lower=0)}."
+            "fit: parameters is empty; name the unknown parameters, e.g. {'stiffness': Unknown(3000.0, lower=0)}."
         )
     if not isinstance(problem, Problem) and callable(problem) and not hasattr(problem, "problem"):
         return cast(Callable[[Mapping], Problem], problem)
-    given = opened(problem)
-    if not isinstance(given, Problem):
+    base = opened(problem)
+    if not isinstance(base, Problem):
         raise TypeError(
-            f"fit: problem is {type(given).__name__}; give a Problem, a scene, or a function from parameters to a Problem."
+            f"fit: problem is {type(base).__name__}; give a Problem, a scene, or a function from parameters to a Problem."
         )
-    params = given.system.params
+    params = base.system.params
     known = params if isinstance(params, Mapping) else {}
     for name, unknown in parameters.items():
         if name not in known and name not in START:
@@ -133,7 +138,7 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
                 f"fit: parameters has {name!r}, which is none of system.params ({', '.join(known) or 'no dict'}) nor of "
                 f"{', '.join(START)}. Give a function from parameters to a Problem for anything else."
             )
-        expected = np.shape(known[name] if name in known else getattr(given, name))
+        expected = np.shape(known[name] if name in known else getattr(base, name))
         start = unknown.start if isinstance(unknown, Unknown) else unknown
         if np.shape(start) != expected:
             raise ValueError(
@@ -143,15 +148,15 @@ def _model(problem, parameters: Mapping) -> Callable[[Mapping], Problem]:
     def model(values: Mapping) -> Problem:
         inside = {name: value for name, value in values.items() if name in known}
         start = {name: value for name, value in values.items() if name not in known}
-        system = given.system.replace(params={**known, **inside}) if inside else given.system
-        return replace(given, system=system, **start)
+        system = base.system.replace(params={**known, **inside}) if inside else base.system
+        return replace(base, system=system, **start)
 
     return model
 
 
 def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
     if not data:
-        raise ValueError("fit: data is empty; give what was measured, vm.fitting.Measured(t, values, sigma).")
+        raise ValueError("fit: data is empty; give measurements, vm.fitting.Measured(t, values, sigma).")
     for m in data:
         check_type("fit: data", m, Measured, "vm.fitting.Measured(t, values, sigma), or several of them")
     if len({m.sigma is None for m in data}) > 1:
@@ -161,7 +166,7 @@ def _check(data: list, segments: int, starts: int, max_steps: int) -> None:
 
 
 class _Search:
-    """The search of a fit; its programs are compiled once, and run for several starts and several sets of values."""
+    """The search of a fit; its programs are compiled once and run for several starts and several sets of values."""
 
     def __init__(self, shooting: Shooting, max_steps: int):
         self.shooting, self.max_steps = shooting, max_steps
@@ -171,29 +176,36 @@ class _Search:
             raise ValueError(
                 f"fit: {self.count} values for {self.size} unknown numbers; measure more, or fix some of them."
             )
-        none = np.zeros(self.size)
-        self.others = shooting.starts(none)
-        scale = np.concatenate([self.others, np.asarray(shooting.start(none))[None]])
+        u_start = np.zeros(self.size)
+        self.part_starts = shooting.starts(u_start)
+        # The starts of the parts are scaled by the largest value of each coordinate along the first run.
+        scale = np.concatenate([self.part_starts, np.asarray(shooting.start(u_start))[None]])
         self.scale = np.maximum(np.abs(scale).max(axis=0), 1e-3 * np.abs(scale).max() + 1e-12)
 
     def residual(self, x, values, weight):
-        """Misses of all values in standard deviations, then weighted gaps. x are u and the starts of the other parts in units of `scale`."""
+        """Misses of all values in standard deviations, and weighted gaps between the parts.
+
+        Args:
+            x: (u, z), search variables of the parameters, and starts of the parts after the first one in units of `scale`.
+            values: measured values.
+            weight: of the gaps.
+        """
         u, z = x
         predicted, gaps = self.shooting.predict(u, z * self.scale)
         misses = (predicted - values) / self.shooting.sigma
         finite = jnp.isfinite(misses)
-        misses = jnp.where(finite, misses, BAD)
-        gaps = jnp.where(jnp.isfinite(gaps), gaps, BAD)
+        misses = jnp.where(finite, misses, FAILED_MISS)
+        gaps = jnp.where(jnp.isfinite(gaps), gaps, FAILED_MISS)
         return misses, weight * np.sqrt(self.count) * gaps / self.scale
 
     def solve(self, u, z, values):
-        """The search from u, z: (u, z, misses, iterations, whether it converged, largest gap)."""
+        """The search from u, z: its end (u, z), misses, iterations, whether it converged, largest gap."""
         optimistix = _optimistix()
         solver = optimistix.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE)
-        weights = jnp.asarray(TIGHTER if self.shooting.segments > 1 else (1.0,))
+        weights = jnp.asarray(GAP_WEIGHTS if self.shooting.segments > 1 else (1.0,))
 
         def stage(x, weight):
-            found = optimistix.least_squares(
+            solution = optimistix.least_squares(
                 lambda x, args: self.residual(x, *args),
                 solver,
                 x,
@@ -201,21 +213,24 @@ class _Search:
                 max_steps=self.max_steps,
                 throw=False,
             )
-            good = found.result == optimistix.RESULTS.successful
-            return found.value, (found.stats["num_steps"], good)
+            good = solution.result == optimistix.RESULTS.successful
+            return solution.value, (solution.stats["num_steps"], good)
 
         (u, z), (iterations, good) = jax.lax.scan(stage, (u, z), weights)
         misses, gaps = self.residual((u, z), values, 1.0)
         return u, z, misses, jnp.sum(iterations), good[-1], jnp.max(jnp.abs(gaps), initial=0.0)
 
     def jacobian(self, u, z, values):
-        """Of the misses and of tightly weighted gaps by the numbers of the parameters themselves and the starts."""
+        """Jacobians of misses and gaps, the gaps with their last weight: by the parameters themselves, and by the starts of the parts."""
 
         def joined(x):
             u, z = jnp.split(x, [self.size])
-            return jnp.concatenate([jnp.ravel(a) for a in self.residual((u, z.reshape(shape)), values, TIGHTER[-1])])
+            return jnp.concatenate(
+                [jnp.ravel(a) for a in self.residual((u, z.reshape(shape)), values, GAP_WEIGHTS[-1])]
+            )
 
         shape = jnp.shape(z)
+        # dr/dx = (dr/du) / (dx/du), since the number i of the parameters depends on u_i alone
         whole = jax.jacfwd(joined)(jnp.concatenate([u, jnp.ravel(z)]))
         by_parameters = jax.jacfwd(lambda u: self.shooting.unknowns.vector(self.shooting.unknowns.at(u)))(u)
         return whole[:, : self.size] / jnp.diagonal(by_parameters), whole[:, self.size :]
@@ -226,27 +241,31 @@ class _Search:
         return jax.jit(self.jacobian)
 
     def check_dependence(self, tell: Progress) -> None:
-        """Refuse parameters that change nothing that was measured."""
-        tell("compiling and running the derivatives by the parameters", 1, PHASES)
-        at = np.zeros(self.size), self.others / self.scale, self.shooting.values
-        by_parameters = np.asarray(self.compiled_jacobian(*at)[0])
+        """Refuse parameters that no measured value depends on.
+
+        Raises:
+            ValueError: with the names of these parameters.
+        """
+        tell("compiling and running the derivatives by the parameters", 1, NUM_PHASES)
+        point = np.zeros(self.size), self.part_starts / self.scale, self.shooting.values
+        by_parameters = np.asarray(self.compiled_jacobian(*point)[0])
         dead = np.flatnonzero(~by_parameters.any(axis=0))
         if dead.size:
             labels = self.shooting.unknowns.labels
             raise ValueError(
-                f"fit: nothing that was measured depends on {', '.join(labels[i] for i in dead)} at the start of the search. Leave "
-                "it out, or start elsewhere."
+                f"fit: no measured value depends on {', '.join(labels[i] for i in dead)} at the start of the search. Leave this "
+                "parameter out, or start elsewhere."
             )
 
     def result(self, u, tell: Progress) -> Fit:
-        """The best of the searches from the rows of u."""
-        tell(f"compiling the search, then at most {self.max_steps} steps of it", 2, PHASES)
-        z = np.broadcast_to(self.others / self.scale, (len(u), *self.others.shape))
+        """The `Fit` of the best search; each row of u starts one."""
+        tell(f"compiling the search, then at most {self.max_steps} iterations", 2, NUM_PHASES)
+        z = np.broadcast_to(self.part_starts / self.scale, (len(u), *self.part_starts.shape))
         solve = jax.jit(jax.vmap(self.solve, (0, 0, None)))
-        found = [np.asarray(a) for a in solve(u, z, self.shooting.values)]
-        squares = np.sum(found[2] ** 2, axis=1)
-        u, z, misses, iterations, good, gap = (a[np.argmin(squares)] for a in found)
-        tell("the derivatives at what the search came to", 3, PHASES)
+        ends = [np.asarray(a) for a in solve(u, z, self.shooting.values)]
+        squares = np.sum(ends[2] ** 2, axis=1)  # of the misses
+        u, z, misses, iterations, good, gap = (a[np.argmin(squares)] for a in ends)
+        tell("the derivatives at the end of the search", 3, NUM_PHASES)
         by_parameters, by_starts = (np.asarray(a) for a in self.compiled_jacobian(u, z, self.shooting.values))
         return Fit.of(
             self.shooting,
@@ -263,14 +282,14 @@ class _Search:
 
 
 def _again(search: _Search, u, z, values):
-    """(k, p) parameters and their covariances (k, p, p) for other values (k, m), searched for from those that were found."""
+    """Parameters (k, p) and covariances (k, p, p) of fits to other values (k, m); each search starts at the end u, z of the first fit."""
     unknowns = search.shooting.unknowns
 
     @jax.jit
-    def one(values):
-        found_u, found_z, *_ = search.solve(u, z, values)
-        jacobian = without_starts(*search.jacobian(found_u, found_z, values))
+    def refit(values):
+        u_end, found_z, *_ = search.solve(u, z, values)
+        jacobian = without_starts(*search.jacobian(u_end, found_z, values))
         covariance = jnp.linalg.pinv(jacobian.T @ jacobian, hermitian=True)
-        return unknowns.vector(unknowns.at(found_u)), covariance
+        return unknowns.vector(unknowns.at(u_end)), covariance
 
-    return jax.lax.map(one, values, batch_size=50)
+    return jax.lax.map(refit, values, batch_size=50)

@@ -1,4 +1,4 @@
-"""Measurements: values at times, how exact they are, and what of a state they are values of."""
+"""Measurements: times, values, their standard deviations, and the measured quantity as a function of the state."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,8 +10,9 @@ import numpy as np
 from vmri_jax.mechanics.arrays import real_array
 from vmri_jax.mechanics.state import State
 
-ON_THE_GRID = 1e-6
-"""Part of a macro step that a time of measurement may be off its node by."""
+NODE_TOLERANCE = 1e-6
+"""Largest distance of a time of measurement from a macro node, in macro steps: round-off of the time, no more. A larger one would take
+values between nodes for values at nodes."""
 
 
 def positions(state: State):
@@ -21,19 +22,19 @@ def positions(state: State):
 
 @dataclass(frozen=True)
 class Measured:
-    """Values that were measured along a motion.
+    """Measured values along a motion.
 
         vm.fitting.Measured(t, values, sigma=0.01, observe=lambda state: state.q_f[:2])
 
     Attributes:
         t: (k,) times, nodes of the macro grid of the fit.
-        values: (k, m) or (k,), NaN where there is none.
-        sigma: standard deviation of their errors, positive: a number, (m,) or (k, m). None if it is not known; it is then
-            estimated from what the fit leaves, and must be so for all measurements.
-        observe: what is measured, ``observe(state) -> (m,)`` or ``()``; all positions by default.
+        values: (k, m) or (k,), NaN for a missing one.
+        sigma: standard deviation of the errors of the values, positive: a number, (m,) or (k, m). None if it is not known: the fit
+            estimates it from its residuals; then sigma is None for all sets of measurements.
+        observe: the measured quantity, ``observe(state) -> (m,)`` or ``()``; all positions by default.
 
     Raises:
-        TypeError, ValueError: no real numbers, other shapes, a sigma that is not positive.
+        TypeError, ValueError: arrays that are not real, wrong shapes, a sigma that is not positive.
     """
 
     t: Any
@@ -55,7 +56,7 @@ class Measured:
             sigma = np.asarray(real_array("Measured: sigma", self.sigma))
             if not (np.isfinite(sigma).all() and np.all(sigma > 0)):
                 raise ValueError(
-                    f"Measured: sigma is {self.sigma}; it must be positive. Leave it out if it is not known: it is then estimated."
+                    f"Measured: sigma is {self.sigma}; it must be positive. Leave an unknown sigma out: the fit estimates it."
                 )
             try:
                 sigma = np.broadcast_to(sigma, values.shape)
@@ -69,14 +70,14 @@ class Measured:
         object.__setattr__(self, "values", values)
 
     def steps(self, t_start: float, macro_dt: float) -> np.ndarray:
-        """Numbers of the macro nodes that the times are at.
+        """Numbers of the macro nodes at the times of measurement.
 
         Raises:
             ValueError: a time before the start, or off the grid.
         """
         exact = (self.t - t_start) / macro_dt
         steps = np.rint(exact).astype(int)
-        off = np.flatnonzero(np.abs(exact - steps) > ON_THE_GRID)
+        off = np.flatnonzero(np.abs(exact - steps) > NODE_TOLERANCE)
         if off.size:
             t = self.t[off[0]]
             raise ValueError(

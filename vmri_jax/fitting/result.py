@@ -1,4 +1,4 @@
-"""What a fit tells: the parameters, how well they are known, and how well the motion fits."""
+"""The result of a fit: the parameters, how well they are known, and how well the motion fits."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,31 +14,35 @@ from vmri_jax.fitting.shooting import Shooting
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.running.trajectory import Trajectory
 
-UNDETERMINED = 1e-7
-"""Directions that change the predictions by less than this part of the best determined one, relative to the parameters, count as none."""
-RANK = 1e-12
-"""Directions of the starts with singular values below this part of the largest count as none."""
-UNLIKELY = 1e-6
-"""Chance of misses as large as they are, below which the report doubts the fit."""
+SINGULAR_VALUE_TOLERANCE = 1e-7
+"""Smallest singular value of the Jacobian by relative changes of the parameters, over the largest one, of a direction that the data
+determines. Below it round-off of the runs hides the change of the predictions; a larger one also drops directions that are determined badly."""
+STARTS_RANK_TOLERANCE = 1e-12
+"""Smallest singular value, over the largest one, of a direction that counts to the range of the Jacobian by the starts; below it a
+direction is round-off. A larger one leaves real effects of the starts to the parameters."""
+DOUBTED_PROBABILITY = 1e-6
+"""Probability of a chi^2 as large as that of the fit, below which the report doubts the fit. A larger one doubts good fits by chance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Parameters that were found, with what the data says about them.
+    """Fitted parameters, their covariance, and the quality of the fit.
 
     Attributes:
-        parameters: by name.
-        labels: of all p numbers among them.
-        covariance: (p, p), ``(J^T J)^-1`` with the Jacobian J of the predictions in standard deviations; infinite rows for what
-            is not determined. Without a known sigma it is that of the misses.
-        residuals: (m,) misses in standard deviations, one for each value.
-        freedom: number of values less that of the unknowns.
-        sigma: 1, or the standard deviation that was estimated where it is not known.
-        undetermined: in words, the combinations of parameters that the data says nothing about.
+        parameters: values by name.
+        labels: names of the p numbers in them.
+        covariance: (p, p), ``(J^T J)^-1`` with the Jacobian J of the predictions in standard deviations; infinite for
+            parameters that the data does not determine. Where sigma is not known, the estimated one scales it.
+        residuals: (m,) predicted minus measured values, in standard deviations.
+        freedom: degrees of freedom, m - p.
+        sigma: 1, or the estimated standard deviation of the values.
+        undetermined: in words, the combinations of parameters that the data does not determine.
         iterations: of the search.
-        converged: whether it ended by its tolerance.
-        gap: the most that a part of multiple shooting misses the next one by, over the size of the motion.
+        converged: whether the search ended by its tolerance.
+        gap: largest gap between parts of multiple shooting, relative to the size of the motion.
         squares: (starts,) sums of squares at the ends of all searches.
+        shooting: the runs of the fit.
+        again: ``again(values (k, m))``, parameters (k, p) and covariances (k, p, p) for other values.
     """
 
     parameters: dict[str, Any]
@@ -59,13 +63,14 @@ class Fit:
     def of(
         cls, shooting: Shooting, u, misses, *, by_parameters, by_starts, iterations, converged, gap, squares, again
     ) -> "Fit":
-        """From the end of a search."""
+        """The fit at the end of a search, see `vmri_jax.fitting.fit`."""
         unknowns = shooting.unknowns
         parameters = {name: np.asarray(value) for name, value in unknowns.at(u).items()}
         numbers = np.asarray(unknowns.vector(parameters))
         freedom = len(misses) - unknowns.size
         sigma = 1.0
         if not shooting.knows_sigma:
+            # s^2 = sum of squares / (m - p)
             sigma = float(np.sqrt(np.sum(misses**2) / max(freedom, 1)))
             misses = misses / sigma
         covariance, undetermined = _covariance(by_parameters, by_starts, numbers, unknowns.labels)
@@ -87,7 +92,7 @@ class Fit:
 
     @property
     def problem(self) -> Problem:
-        """The problem with the parameters that were found."""
+        """The problem with the fitted parameters."""
         return self.shooting.model(self.parameters)
 
     @property
@@ -101,7 +106,13 @@ class Fit:
         return dict(zip(self.labels, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Confidence intervals of each number by itself, ``x +- q s``, with q of Student's distribution where sigma is estimated."""
+        """Confidence intervals of each number by itself, ``x +- q s`` with its standard error s.
+
+        The quantile q is of the normal distribution, or of Student's where sigma is estimated.
+
+        Raises:
+            ValueError: a level that is not between 0 and 1.
+        """
         if not 0 < level < 1:
             raise ValueError(f"intervals: level is {level}; it must lie between 0 and 1, e.g. 0.95.")
         q = self._quantile(level)
@@ -116,45 +127,48 @@ class Fit:
 
     @property
     def probability(self) -> float:
-        """Of a sum of squares at least as large, if model and sigma are right; 1 where sigma is estimated."""
+        """Probability of a sum of squares at least as large, if model and sigma are right; 1 where sigma is estimated."""
         if not self.shooting.knows_sigma:
             return 1.0
         return float(stats.chi2.sf(np.sum(self.residuals**2), max(self.freedom, 1)))
 
     def simulate(self, **options) -> Trajectory:
-        """The run with the parameters that were found, up to the last measurement; `options` as of `vmri_jax.simulate`."""
-        given = {"macro_dt": self.shooting.macro_dt, "num_steps": self.shooting.last} | options
-        return simulate(self.problem, self.shooting.scheme, **given)
+        """The run with the fitted parameters up to the last measurement; `options` as in `vmri_jax.simulate`."""
+        settings = {"macro_dt": self.shooting.macro_dt, "num_steps": self.shooting.last} | options
+        return simulate(self.problem, self.shooting.scheme, **settings)
 
     def bootstrap(self, repeats: int, seed: int = 0) -> "Bootstrap":
-        """Fits to measurements that are made up from what was found, with errors of the given sigma: how good the intervals are.
+        """Fits to synthetic measurements: the predictions of this fit plus normal errors of its sigma. They show how good the intervals are.
 
         Args:
-            repeats: made-up sets of measurements.
+            repeats: number of synthetic sets of measurements.
             seed: of their errors.
         """
+        # residuals are (predicted - measured) / (sigma of the values, times the estimate)
         exact = self.shooting.values + self.residuals * self.sigma * self.shooting.sigma
         noise = np.random.default_rng(seed).standard_normal((repeats, len(exact)))
-        found, covariances = self.again(exact + noise * self.sigma * self.shooting.sigma)
+        estimates, covariances = self.again(exact + noise * self.sigma * self.shooting.sigma)
         errors = self.sigma * np.sqrt(np.diagonal(np.asarray(covariances), axis1=1, axis2=2))
-        return Bootstrap(self.labels, self.values, np.asarray(found), errors)
+        return Bootstrap(self.labels, self.values, np.asarray(estimates), errors)
 
     @property
     def doubts(self) -> list[str]:
-        """What speaks against the fit, in sentences; then its intervals say little, and are not printed."""
-        found = []
+        """Reasons to doubt the fit, in sentences; its intervals say little then, and are not printed."""
+        sentences = []
         if not self.converged:
-            found.append(
+            sentences.append(
                 "The search did not end by its tolerance: raise max_steps, start closer, or cut the motion into segments."
             )
-        if self.probability < UNLIKELY:
-            more = [] if len(self.squares) > 1 else ["starts=8"]
-            more += [] if self.shooting.segments > 1 else ["segments=10, which cuts the motion into parts"]
-            beside = (
-                f"the search may have ended beside the best parameters (try {' or '.join(more)}), or " if more else ""
+        if self.probability < DOUBTED_PROBABILITY:
+            remedies = [] if len(self.squares) > 1 else ["starts=8"]
+            remedies += [] if self.shooting.segments > 1 else ["segments=10, which cuts the motion into parts"]
+            other_cause = (
+                f"the search may have ended beside the best parameters (try {' or '.join(remedies)}), or "
+                if remedies
+                else ""
             )
-            found.append(f"Sigma does not explain the misses: {beside}the model or sigma is not right.")
-        return found
+            sentences.append(f"Sigma does not explain the misses: {other_cause}the model or sigma is not right.")
+        return sentences
 
     def __repr__(self) -> str:
         width = max(map(len, self.labels))
@@ -163,57 +177,64 @@ class Fit:
             known = zip(self.standard_errors.values(), self.intervals().values(), strict=True)
             intervals = [f" +- {s:.2g}   95 %: {low:.6g} .. {high:.6g}" for s, (low, high) in known]
             lines = [line + interval for line, interval in zip(lines, intervals, strict=True)]
-        how = (
+        sigma_words = (
             f"chance of worse {self.probability:.2g}"
             if self.shooting.knows_sigma
             else f"sigma estimated: {self.sigma:.3g}"
         )
         squares = float(np.sum(self.residuals**2))
-        lines.append(f"chi^2 {squares:.4g} for {self.freedom} degrees of freedom ({how}), {self.iterations} iterations")
+        lines.append(
+            f"chi^2 {squares:.4g} for {self.freedom} degrees of freedom ({sigma_words}), {self.iterations} iterations"
+        )
         lines += self.doubts
         if self.shooting.segments > 1:
             lines.append(f"{self.shooting.segments} segments, largest gap {self.gap:.1e} of the motion")
-        return "\n".join(lines + [f"The data does not determine {what}." for what in self.undetermined])
+        return "\n".join(lines + [f"The data does not determine {combination}." for combination in self.undetermined])
 
 
 @dataclass(frozen=True)
 class Bootstrap:
-    """Fits to made-up measurements.
+    """Fits to synthetic measurements.
 
     Attributes:
-        labels: of the p numbers.
-        truth: (p,) what the measurements were made up with.
-        found, errors: (repeats, p) what was found, and its standard errors.
+        labels: names of the p numbers.
+        truth: (p,) parameters that the measurements were made with.
+        estimates: (repeats, p) fitted parameters.
+        errors: (repeats, p) their standard errors.
     """
 
     labels: list[str]
     truth: Float[np.ndarray, "p"]
-    found: Float[np.ndarray, "repeats p"]
+    estimates: Float[np.ndarray, "repeats p"]
     errors: Float[np.ndarray, "repeats p"]
 
     def coverage(self, level: float = 0.95) -> dict[str, float]:
-        """The part of the intervals of this level that cover the truth, by label."""
+        """The fraction of the intervals of this level that contain the truth, by label."""
         q = stats.norm.ppf((1 + level) / 2)
-        covers = np.abs(self.found - self.truth) <= q * self.errors
+        covers = np.abs(self.estimates - self.truth) <= q * self.errors
         return dict(zip(self.labels, covers.mean(axis=0).tolist(), strict=True))
 
 
 def without_starts(by_parameters, by_starts):
-    """The Jacobian by the parameters, without what the starts of the parts can do instead."""
+    """The Jacobian (m, p) by the parameters, projected on the complement of the range of the Jacobian (m, k) by the starts of the parts.
+
+    Changes of the predictions that other starts make as well say nothing about the parameters.
+    """
     if not by_starts.size:
         return by_parameters
     q, sizes, _ = jnp.linalg.svd(by_starts, full_matrices=False)
-    q = q * (sizes > RANK * sizes[0])
+    q = q * (sizes > STARTS_RANK_TOLERANCE * sizes[0])
     return by_parameters - q @ (q.T @ by_parameters)
 
 
 def _covariance(by_parameters, by_starts, numbers, labels) -> tuple[np.ndarray, list[str]]:
-    """``(J^T J)^-1`` of the parameters, and the combinations of them that are not determined."""
+    """``(J^T J)^-1`` of the parameters, and in words their combinations that the data does not determine."""
     scale = np.where(numbers == 0, 1.0, np.abs(numbers))
     jacobian = np.asarray(without_starts(by_parameters * scale, by_starts))
     _, sizes, directions = np.linalg.svd(jacobian, full_matrices=False)
-    known = sizes > UNDETERMINED * sizes[0]
+    known = sizes > SINGULAR_VALUE_TOLERANCE * sizes[0]
     covariance = directions[known].T @ np.diag(sizes[known] ** -2.0) @ directions[known] * np.outer(scale, scale)
+    # A parameter with more than a tenth of the largest share in an undetermined direction has an infinite variance.
     words = []
     for direction in directions[~known]:
         shares = np.abs(direction) > 0.1 * np.abs(direction).max()

@@ -1,8 +1,10 @@
-"""Shooting: what a model predicts for all measurements, from the start of the motion or from the starts of parts of it.
+"""Shooting: predictions of a model for all measurements, from the start of the motion or from the starts of parts of it.
 
-With one part the start follows from the parameters. With several, each part starts where it likes, and is asked to end where the
-next one starts: *multiple shooting*. No part is long enough for errors to grow by much, so that the search is well behaved where a
-single run would be chaotic, or many periods away from the measurements (Bock 1983).
+With one part the start follows from the parameters. With several (*multiple shooting*) the start of each part is an unknown, and a
+condition of the search is that each part ends where the next one starts. Errors grow little within a part, so that the search is well
+behaved where a single run would be chaotic, or many periods away from the measurements.
+
+Source: H. G. Bock, Recent advances in parameter identification techniques for O.D.E., Birkhaeuser (1983).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,11 +31,11 @@ class Shooting:
     """The runs of a fit, cut into parts of equal length.
 
     Attributes:
-        model: the problem for parameters by name.
-        unknowns: the parameters.
-        data: what was measured.
-        steps: of each of `data`, the numbers of the macro nodes.
-        segments: parts.
+        model: ``{name: value} -> Problem``.
+        unknowns: the parameters that are searched for.
+        data: sets of measurements.
+        steps: for each set, the numbers of the macro nodes of its times.
+        segments: number of parts.
     """
 
     model: Callable[[Mapping], Problem]
@@ -63,18 +65,18 @@ class Shooting:
 
     @cached_property
     def values(self) -> np.ndarray:
-        """All values that are numbers, in a row."""
+        """(m,) all measured values, missing ones left out."""
         return np.concatenate([m.values[np.isfinite(m.values)] for m in self.data])
 
     @cached_property
     def sigma(self) -> np.ndarray:
-        """Their standard deviations; 1 where they are not known."""
+        """(m,) standard deviations of the values; 1 where they are not known."""
         sigmas = [np.ones_like(m.values) if m.sigma is None else m.sigma for m in self.data]
         return np.concatenate([s[np.isfinite(m.values)] for s, m in zip(sigmas, self.data, strict=True)])
 
     @property
     def knows_sigma(self) -> bool:
-        """Whether they are known."""
+        """Whether the standard deviations are known."""
         return self.data[0].sigma is not None
 
     def start(self, u):
@@ -83,7 +85,7 @@ class Shooting:
         return _phase(problem, problem.state())
 
     def starts(self, u) -> np.ndarray:
-        """(segments - 1, 2 n) starts of the other parts along one run."""
+        """(segments - 1, 2 n) starts of the parts after the first one, along a single run with the search variables u."""
         if self.segments == 1:
             return np.zeros((0, self.start(u).size))
         problem = self.model(self.unknowns.at(u))
@@ -99,13 +101,13 @@ class Shooting:
         return np.asarray(jax.vmap(partial(_phase, problem))(nodes))
 
     def predict(self, u, starts):
-        """Predicted values, and what the ends of the parts miss the starts of the next ones by, (segments - 1, 2 n).
+        """Predicted values (m,), and gaps (segments - 1, 2 n): the end of each part minus the start of the next one.
 
         Args:
             u: search variables of the parameters.
             starts: (segments - 1, 2 n) positions and velocities where the parts after the first one start.
         """
-        if self.segments == 1:  # JAX's own forward mode, by the parameters alone, from the start of the problem itself
+        if self.segments == 1:  # the start follows from u: JAX's own derivative needs tangents for u alone
             problem = self.model(self.unknowns.at(u))
             observed, ends = jax.tree.map(lambda a: a[None], self._run(problem, problem.state()))
         else:
@@ -118,7 +120,7 @@ class Shooting:
 
     @cached_property
     def _places(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Of each measurement, the parts that its times are in, and the numbers of the nodes there."""
+        """For each set of measurements, the part that each of its times lies in, and the number of the saved node there."""
         parts = [np.minimum(steps // self.length, self.segments - 1) for steps in self.steps]
         return [(k, (steps - k * self.length) // self.every) for k, steps in zip(parts, self.steps, strict=True)]
 
@@ -126,8 +128,8 @@ class Shooting:
     def _parts(self) -> Callable:
         """``(u, starts of all parts) -> observed quantities at the nodes of all parts, ends of all parts``.
 
-        Its derivative is that of each part by its own start and by the parameters, in forward mode: a few runs beside each run,
-        however many parts there are.
+        A part depends on its own start and on u alone. The custom derivative uses this: it takes 2 n + len(u) tangents through each
+        part, where JAX would carry the tangents of all starts through every part.
         """
 
         @jax.custom_jvp
@@ -138,21 +140,21 @@ class Shooting:
         def derivative(primals, tangents):
             u, _ = primals
 
-            def part(together, number):
-                found = self._part(together[: u.size], together[u.size :], number)
-                return found, found
+            def part(joined, number):
+                run = self._part(joined[: u.size], joined[u.size :], number)
+                return run, run  # the second one is the value beside the derivative
 
-            together, d_together = (
+            joined, d_joined = (
                 jnp.concatenate([jnp.broadcast_to(u, (self.segments, u.size)), starts], axis=1)
                 for u, starts in (primals, tangents)
             )
-            by_each, found = jax.vmap(jax.jacfwd(part, has_aux=True))(together, jnp.arange(self.segments))
-            return found, jax.tree.map(lambda a: jnp.einsum("k...i,ki->k...", a, d_together), by_each)
+            slopes, primal_out = jax.vmap(jax.jacfwd(part, has_aux=True))(joined, jnp.arange(self.segments))
+            return primal_out, jax.tree.map(lambda a: jnp.einsum("k...i,ki->k...", a, d_joined), slopes)
 
         return parts
 
     def _part(self, u, start, number):
-        """Observed quantities at the nodes of a part, and where it ends."""
+        """Observed quantities at the saved nodes of a part, and its end (2 n,), from its start (2 n,)."""
         problem = self.model(self.unknowns.at(u))
         system, n_s, n = problem.system, problem.q_s.size, problem.q_s.size + problem.q_f.size
         t = problem.t + number * (self.length * self.macro_dt)
@@ -160,7 +162,7 @@ class Shooting:
         return self._run(problem, initial_state(system, *phase, t=t, project=system.is_constrained))
 
     def _run(self, problem: Problem, state: State):
-        """Observed quantities at the nodes of a run of one part from a state, and where it ends."""
+        """Observed quantities at the saved nodes of a run of one part from a state, and its end (2 n,)."""
         run = simulate(
             problem.system,
             self.scheme,
@@ -178,5 +180,6 @@ class Shooting:
 
 
 def _phase(problem: Problem, state: State):
+    """(2 n,) positions and velocities of a state."""
     v_s, v_f = velocity(problem.system, state.q_s, state.q_f, state.p_s, state.p_f)
     return jnp.concatenate([state.q_s, state.q_f, v_s, v_f])

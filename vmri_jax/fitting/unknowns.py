@@ -1,4 +1,4 @@
-"""Unknown parameters: where the search starts, and the bounds that it keeps."""
+"""Unknown parameters: the start of the search, and bounds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,18 +13,22 @@ from vmri_jax.mechanics.arrays import real_array
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter that is to be found, a number or an array.
+    """An unknown parameter x, a number or an array.
 
-    The search goes over u with ``x = start + scale u`` if there are no bounds, ``x = lower + (start - lower) e^u`` and the like with
-    one, and ``x = lower + (upper - lower) / (1 + e^-(c + u))`` with two: what it tries is always inside.
+    The search variable u is without bounds, 0 at the start:
+
+        x = start + scale u                                  no bounds
+        x = lower + (start - lower) e^u                      a lower bound
+        x = upper - (upper - start) e^u                      an upper bound
+        x = lower + (upper - lower) / (1 + e^-(c + u))       both, with c such that u = 0 is the start
 
     Attributes:
         start: where the search starts, inside of the bounds.
-        lower, upper: bounds, None for none; ``lower=0`` for what is positive.
-        scale: size of a change, without bounds; None for the size of the start, or 1.
+        lower, upper: bounds, None for none; ``lower=0`` for a positive parameter.
+        scale: change of x for u = 1, if there are no bounds; None for the size of the start, or 1 where that is zero.
 
     Raises:
-        TypeError, ValueError: no real numbers; a start that is not between its bounds.
+        TypeError, ValueError: arrays that are not real; a start that is not between its bounds.
     """
 
     start: Any
@@ -42,9 +46,9 @@ class Unknown:
             if value is not None:
                 value = np.asarray(real_array(f"Unknown: {name}", value))
                 object.__setattr__(self, name, np.broadcast_to(value, start.shape))
-        below = self.lower is not None and not np.all(self.lower < start)
-        above = self.upper is not None and not np.all(start < self.upper)
-        if below or above:
+        too_small = self.lower is not None and not np.all(self.lower < start)
+        too_large = self.upper is not None and not np.all(start < self.upper)
+        if too_small or too_large:
             raise ValueError(
                 f"Unknown: start is {start}; it must lie between lower={self.lower} and upper={self.upper}."
             )
@@ -69,7 +73,7 @@ class Unknown:
 
 
 class Unknowns:
-    """Several of them as one vector: the search variables of all, one after the other."""
+    """Several unknowns as one vector: their search variables, one after the other."""
 
     def __init__(self, unknowns: Mapping[str, Unknown]):
         self.unknowns = dict(unknowns)
