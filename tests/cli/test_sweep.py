@@ -143,7 +143,7 @@ def test_axes_and_files_are_seen_from_the_folder(tmp_path):
         (('system = "fpu"\n', ""), "system is missing"),
         (("omega = [20.0, 50.0]", "omega = { from = 1 }"), "the axis omega: give values, or from, to and count"),
         (("omega = [20.0, 50.0]", "omega = { form = 1 }"), "no entry 'form'. Did you mean from?"),
-        (("omega", "omga"), "nothing that the column 'omga' could change. Did you mean omega?"),
+        (("omega", "omga"), "the column 'omga' is no parameter, coordinate, step or scheme. Did you mean omega?"),
         (("[axes]", "[draws]"), "no entry 'omega'"),
         (("[axes]", "[draws]\ncount = 3\n[axes]"), "give either [axes] or [draws]"),
         (("macro_dt", "macro_dt ="), "is no TOML"),

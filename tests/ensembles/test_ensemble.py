@@ -255,7 +255,7 @@ def test_a_full_disk_keeps_the_chunks_before(tmp_path, monkeypatch):
         (
             {"design": {"omga": [1.0]}},
             ValueError,
-            r"nothing that the column 'omga' could change\. Did you mean omega\?",
+            r"the column 'omga' is no parameter, coordinate, step or scheme\. Did you mean omega\?",
         ),
         ({"design": {"q_s[7]": [1.0]}}, ValueError, r"has an index that q_s, of shape \(3,\), does not have"),
         (
@@ -282,7 +282,7 @@ def test_a_full_disk_keeps_the_chunks_before(tmp_path, monkeypatch):
             ValueError,
             r"num_steps cannot be drawn",
         ),
-        ({"design": {"t": [0.0, 1.0]}}, ValueError, r"t is a column, so that t_end is no number of steps"),
+        ({"design": {"t": [0.0, 1.0]}}, ValueError, r"t is a column, so that t_end does not fix the number of steps"),
         ({"t_end": None}, ValueError, r"of the steps macro_dt is given; give two of"),
         ({"num_micro": None}, ValueError, r"num_micro is missing for the scheme 'explicit-slow'"),
         ({"scheme": vm.fully_implicit(2)}, ValueError, r"has its num_micro already"),

@@ -139,7 +139,7 @@ GOOD = measured(5)
         ),
         (
             ValueError,
-            "all times of measurement are that of the start",
+            "all measurements are at the start of the problem",
             lambda: fit(Measured([0.0], [[0.0, 0.0]], sigma=1.0)),
         ),
         (TypeError, "the model", lambda: vm.fit(cast(Any, lambda p: 3), GOOD, {"a": 1.0}, scheme=SCHEME, macro_dt=DT)),

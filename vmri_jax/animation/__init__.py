@@ -2,10 +2,11 @@
 
 from vmri_jax.animation.bars import bars
 from vmri_jax.animation.defaults import built_in
-from vmri_jax.animation.drawing import Block, Body, Drawing, Joint, Plane, Sphere
+from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.frames import plot_strip, write_gif
 from vmri_jax.animation.html import write_html
 from vmri_jax.animation.motion import Motion, motion
+from vmri_jax.animation.parts import Block, Body, Joint, Plane, Sphere
 from vmri_jax.animation.vtk import write_vtk
 
 __all__ = [

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from vmri_jax.animation.drawing import Body, Drawing, Joint, check_index, frame
+from vmri_jax.animation.drawing import Drawing, check_index, frame
+from vmri_jax.animation.parts import Body, Joint
 from vmri_jax.running.trajectory import Trajectory
 
 RADIUS = 0.24

@@ -7,10 +7,11 @@ import jinja2
 import numpy as np
 
 from vmri_jax import plots
-from vmri_jax.animation.drawing import Drawing, Solid
+from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.geometry import LAMP, SPAN, helix
 from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
+from vmri_jax.animation.parts import Solid
 from vmri_jax.running.files import check_place
 
 MOST_NUMBERS = 600_000

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vmri_jax.animation.drawing import Body, Drawing
+from vmri_jax.animation.drawing import Drawing
 from vmri_jax.animation.geometry import grid
 from vmri_jax.animation.motion import Motion
+from vmri_jax.animation.parts import Body
 
 TURNS = (4, 14)
 """Fewest and most turns of a spring."""

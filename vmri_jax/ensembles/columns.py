@@ -1,8 +1,8 @@
-"""What the columns of a design stand for: parameters, the start, steps and schemes of a run.
+"""Columns of a design by name: each sets a parameter, a part of the start, a step or the scheme of a run.
 
-omega, springs.stiffness, masses[2]     numbers in the parameters of the system
-q_s, v_f, ...                           the whole start, vectors
-q_s[0], v_f[3], "hub x", "v hub x"      one coordinate of it, or its velocity, by number or by name
+omega, springs.stiffness, masses[2]     a parameter of the system, or one number of it
+q_s, v_f, ...                           a whole vector of the start
+q_s[0], v_f[3], "hub x", "v hub x"      one coordinate of the start, or its velocity, by number or by name
 t                                       the time of the start
 macro_dt, micro_dt, num_steps           steps
 num_micro, scheme                       schemes
@@ -25,7 +25,12 @@ START = ("t", "q_s", "q_f", "v_s", "v_f")
 
 
 class Place(NamedTuple):
-    """Numbers that a column replaces: those of `leaf` of the parameters, or of a part of the start, at `index`."""
+    """The numbers that a column replaces.
+
+    part: "params", or the part of the start: t, q_s, q_f, v_s, v_f.
+    leaf: number of the array among the parameters; 0 for a part of the start.
+    index: of one number in the array, () for the whole array.
+    """
 
     part: str
     leaf: int
@@ -35,8 +40,8 @@ class Place(NamedTuple):
 class Lanes(NamedTuple):
     """Runs side by side, the first axis of every array.
 
-    params: like the parameters of the system, None if no column changes them.
-    start: t, q_s, q_f, v_s, v_f.
+    params: of the structure of the system's parameters; None if no column changes a parameter.
+    start: t, q_s, q_f, v_s, v_f by name.
     """
 
     params: Any
@@ -44,36 +49,36 @@ class Lanes(NamedTuple):
 
 
 def places(problem: Problem, columns: Collection[str]) -> dict[str, Place]:
-    """Where the columns belong that are neither steps nor schemes.
+    """The place of each column that sets a parameter or a part of the start.
 
     Raises:
-        ValueError: a name that is nothing of this problem, an index that does not exist, or two columns for one number.
+        ValueError: a name that the problem does not have, an index that does not exist, or two columns for one number.
     """
     known = _known(problem)
-    found: dict[str, Place] = {}
+    by_column: dict[str, Place] = {}
     for name in columns:
         if name not in (*STEPS, *SCHEMES):
-            found[name] = _place(name, problem, known)
+            by_column[name] = _place(name, problem, known)
     numbers: dict[tuple, str] = {}
-    for name, place in found.items():
+    for name, place in by_column.items():
         for number in np.ndindex(*_target(problem, place).shape) if not place.index else [place.index]:
-            other = numbers.setdefault((*place[:2], *number), name)
-            if other != name:
-                raise ValueError(f"ensemble: the columns {other!r} and {name!r} both give {_shown(place, number)}.")
-    return found
+            first = numbers.setdefault((*place[:2], *number), name)
+            if first != name:
+                raise ValueError(f"ensemble: the columns {first!r} and {name!r} both give {_shown(place, number)}.")
+    return by_column
 
 
 def lanes_of(problem: Problem, where: Mapping[str, Place], rows: Rows, count: int) -> Lanes:
     """Parameters and starts of some runs.
 
     Args:
-        problem: what is the same for all of them.
-        where: the columns, see `places`.
-        rows: their values.
+        problem: has the values that no column changes.
+        where: the place of each column, see `places`.
+        rows: the values of the columns.
         count: number of runs.
 
     Raises:
-        ValueError: values of another shape than what they replace.
+        ValueError: values of another shape than the numbers that they replace.
     """
     leaves, structure = jax.tree.flatten(problem.system.params)
     start = {name: _repeated(getattr(problem, name), count) for name in START}
@@ -92,25 +97,26 @@ def lanes_of(problem: Problem, where: Mapping[str, Place], rows: Rows, count: in
 
 
 def _repeated(value, count: int) -> np.ndarray:
+    """(count, ...) copies of an array."""
     value = np.asarray(value, dtype=float)
     return np.repeat(value[None], count, axis=0)
 
 
 def _known(problem: Problem) -> dict[str, Callable[[tuple[int, ...]], Place]]:
-    """Names of columns, and the place of each for an index."""
-    found: dict[str, Callable] = {}
+    """For each name of a column, a function that gives its place from an index."""
+    known: dict[str, Callable] = {}
     paths, _ = jax.tree_util.tree_flatten_with_path(problem.system.params)
     for leaf, (path, _) in enumerate(paths):
         name = jax.tree_util.keystr(path, simple=True, separator=".")
-        found[name or "params"] = lambda index, leaf=leaf: Place("params", leaf, index)
+        known[name or "params"] = lambda index, leaf=leaf: Place("params", leaf, index)
     names = (problem.names or Names()).of_coordinates(problem.q_s.size, problem.q_f.size)
     for part, labels in (("s", names.slow_coordinates), ("f", names.fast_coordinates)):
         for i, label in enumerate(labels):
-            found.setdefault(label, lambda _, part=part, i=i: Place(f"q_{part}", 0, (i,)))
-            found.setdefault(f"v {label}", lambda _, part=part, i=i: Place(f"v_{part}", 0, (i,)))
+            known.setdefault(label, lambda _, part=part, i=i: Place(f"q_{part}", 0, (i,)))
+            known.setdefault(f"v {label}", lambda _, part=part, i=i: Place(f"v_{part}", 0, (i,)))
     for part in START:
-        found.setdefault(part, lambda index, part=part: Place(part, 0, index))
-    return found
+        known.setdefault(part, lambda index, part=part: Place(part, 0, index))
+    return known
 
 
 def _place(name: str, problem: Problem, known: Mapping[str, Callable]) -> Place:
@@ -120,8 +126,8 @@ def _place(name: str, problem: Problem, known: Mapping[str, Callable]) -> Place:
     if match is None or match[1] not in known:
         listed = [n for n in known if n not in START and not re.fullmatch(r"(v )?q_[sf]\[\d+\]", n)]
         raise ValueError(
-            f"ensemble: there is nothing that the column {name!r} could change.{near(name, [*known, *STEPS, *SCHEMES])} There are "
-            f"{', '.join([*listed, *START[1:], *STEPS, *SCHEMES])}; of arrays one number, {START[1]}[0]."
+            f"ensemble: the column {name!r} is no parameter, coordinate, step or scheme.{near(name, [*known, *STEPS, *SCHEMES])} There are "
+            f"{', '.join([*listed, *START[1:], *STEPS, *SCHEMES])}. One number of an array is {START[1]}[0], for example."
         )
     place = known[match[1]](tuple(int(i) for i in match[2].split(",")))
     shape = _target(problem, place).shape
@@ -133,12 +139,12 @@ def _place(name: str, problem: Problem, known: Mapping[str, Callable]) -> Place:
 
 
 def _target(problem: Problem, place: Place) -> np.ndarray:
-    """The numbers of the problem, some of which the column replaces."""
+    """The array of the problem that the place is in."""
     if place.part != "params":
         return np.asarray(getattr(problem, place.part))
     return np.asarray(jax.tree.leaves(problem.system.params)[place.leaf])
 
 
 def _shown(place: Place, number) -> str:
-    what = "a parameter" if place.part == "params" else place.part
-    return f"{what}{list(number) if len(number) else ''}"
+    target = "a parameter" if place.part == "params" else place.part
+    return f"{target}{list(number) if len(number) else ''}"

@@ -1,10 +1,10 @@
-"""Designs: which runs an ensemble has. A design is a table with a row for each run, of which only parts are ever made.
+"""Designs: the runs of an ensemble. A design is a table with a row for each run; only the rows of a chunk are made at a time.
 
     Product({"omega": [10, 50], "num_micro": [1, 5]})          all combinations, the last axis varies first
     Table({"omega": [10, 50], "v_s[0]": [0.1, 0.2]})           a run for each row: 10 with 0.1, 50 with 0.2
     Draws(1000, {"omega": ("uniform", 10, 50)}, seed=1)        1000 runs with random values
 
-Rows are numbered from 0, and every row can be made alone: random ones depend on the seed and on their number only.
+Rows are numbered from 0. Any row can be made without the others: a random row depends on the seed and on its number alone.
 """
 
 import warnings
@@ -19,23 +19,23 @@ from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.mechanics.names import near
 
 Rows = dict[str, np.ndarray]
-"""Some rows of a design, by column; the first axis of every array is the rows."""
+"""Some rows of a design: an array for each column, its first axis the rows."""
 
-MOST_SOBOL = 2**30
-"""Points of a sequence of Sobol with numbers of 30 bits."""
-MOST_LATIN = 2**22
-"""Points of a Latin hypercube, which is made as a whole."""
+MOST_SOBOL_POINTS = 2**30
+"""Largest number of rows by a sequence of Sobol: its numbers have 30 bits, after which the sequence ends."""
+MOST_LATIN_POINTS = 2**22
+"""Largest number of rows of a Latin hypercube. Every worker makes the whole table: 32 MiB for each column, more with a larger number."""
 METHODS = ("sobol", "latin-hypercube", "random")
 ALIASES = {"normal": "norm", "exponential": "expon"}
-"""Names of distributions besides those of `scipy.stats`."""
+"""Further names of distributions, and the names that `scipy.stats` has for them."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Values of a column, with what readers of the results will want to know.
+    """Values of a column, with its unit and meaning.
 
     values: numbers, or labels of schemes.
-    unit, description: kept with the results.
+    unit, description: stored with the results.
     """
 
     values: Any
@@ -49,7 +49,7 @@ class Draw:
 
     name: "uniform" (lowest, highest), "loguniform" (lowest, highest), "normal" (mean, standard deviation), or any continuous
         distribution of `scipy.stats` with its arguments.
-    unit, description: kept with the results.
+    unit, description: stored with the results.
     """
 
     name: str
@@ -58,12 +58,12 @@ class Draw:
     description: str = ""
 
     def quantiles(self, at: np.ndarray) -> np.ndarray:
-        """Values that parts `at` of all draws stay below.
+        """Quantiles of the distribution at the probabilities `at`, between 0 and 1.
 
         Raises:
-            ValueError: an unknown distribution, or arguments that are none of it.
+            ValueError: an unknown distribution, or arguments that it does not take.
         """
-        from scipy import stats  # it takes a third of a second
+        from scipy import stats  # the import takes a third of a second
 
         name = ALIASES.get(self.name, self.name)
         distribution = getattr(stats, name, None)
@@ -71,11 +71,11 @@ class Draw:
             known = [*ALIASES, *(n for n, d in vars(stats).items() if isinstance(d, stats.rv_continuous))]
             raise ValueError(
                 f"Draws: there is no distribution {self.name!r}.{near(self.name, known)} Give uniform, loguniform, normal, or "
-                "another continuous one of scipy.stats."
+                "another continuous distribution of scipy.stats."
             )
         arguments = self.arguments
         try:
-            if name == "uniform" and arguments:
+            if name == "uniform" and arguments:  # scipy takes the lowest value and the width
                 low, high = arguments
                 arguments = low, high - low if high > low else np.nan
             values = np.asarray(distribution.ppf(at, *arguments), dtype=float)
@@ -93,10 +93,10 @@ class Draw:
 class Product:
     """All combinations of the values of some axes. The last axis varies first.
 
-    axes: by the name of the column, values or an `Axis`. None of them: a single run.
+    axes: for each column, values or an `Axis`. Without any axis there is a single run.
 
     Raises:
-        ValueError: an axis without values, with values twice or that are not finite.
+        ValueError: an axis without values, with a value twice, or with values that are not finite.
     """
 
     axes: Mapping[str, Any]
@@ -123,7 +123,7 @@ class Product:
         return int(np.prod(self.shape, dtype=np.int64))
 
     def rows(self, first: int, last: int) -> Rows:
-        """Rows number `first` to `last`, that one excluded."""
+        """Rows number `first` to `last - 1`."""
         places = np.unravel_index(np.arange(first, last), self.shape) if self.axes else ()
         return {name: axis.values[place] for (name, axis), place in zip(self.axes.items(), places, strict=True)}
 
@@ -132,15 +132,15 @@ class Product:
         return (part := Product({name: self.axes[name] for name in names})).rows(0, len(part))
 
     def described(self) -> dict[str, dict]:
-        """The columns as plain data."""
+        """The columns as plain data, for the store."""
         return {name: {**_words(axis), "values": axis.values.tolist()} for name, axis in self.axes.items()}
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows as they are given.
+    """Given rows.
 
-    columns: by name, values or an `Axis`; arrays whose first axis is the runs. Values may be vectors, of whole q_s or v_f, say.
+    columns: for each column, values or an `Axis`; the first axis of the array is the runs. A value may be a vector, for a whole q_s or v_f.
 
     Raises:
         ValueError: no column, columns of different length, or values that are not finite.
@@ -156,9 +156,11 @@ class Table:
         }
         lengths = {name: axis.values.shape[:1] for name, axis in columns.items()}
         if len(set(lengths.values())) != 1 or () in lengths.values() or (0,) in lengths.values():
-            found = ", ".join(f"{name} {shape[0] if shape else 'a single value'}" for name, shape in lengths.items())
+            lengths_text = ", ".join(
+                f"{name} {shape[0] if shape else 'a single value'}" for name, shape in lengths.items()
+            )
             raise ValueError(
-                f"Table: columns must have one value for each run, but their lengths are: {found or 'no columns'}. For all "
+                f"Table: columns must have one value for each run, but their lengths are: {lengths_text or 'no columns'}. For all "
                 "combinations of values take Product."
             )
         object.__setattr__(self, "columns", columns)
@@ -167,7 +169,7 @@ class Table:
         return len(next(iter(self.columns.values())).values)
 
     def rows(self, first: int, last: int) -> Rows:
-        """Rows number `first` to `last`, that one excluded."""
+        """Rows number `first` to `last - 1`."""
         return {name: axis.values[first:last] for name, axis in self.columns.items()}
 
     def combinations(self, names: Sequence[str]) -> Rows:
@@ -175,7 +177,7 @@ class Table:
         return unique_rows({name: self.columns[name].values for name in names})[0]
 
     def described(self) -> dict[str, dict]:
-        """The columns as plain data, without their values."""
+        """The columns as plain data, without their values, which the store has in arrays."""
         return {name: _words(axis) for name, axis in self.columns.items()}
 
 
@@ -184,9 +186,9 @@ class Draws:
     """Random rows.
 
     count: number of runs.
-    columns: by name a `Draw`, or a tuple of the name of a distribution and its arguments, ``("uniform", 10, 50)``.
+    columns: for each column a `Draw`, or a tuple of the name of a distribution and its arguments, ``("uniform", 10, 50)``.
     method: "sobol" (a scrambled sequence: averages converge faster), "latin-hypercube", or "random" (independent).
-    seed: of the generator; the same seed gives the same rows.
+    seed: of the generator of random numbers; the same seed gives the same rows.
 
     Raises:
         ValueError: bad arguments; more rows than a method can make.
@@ -204,7 +206,7 @@ class Draws:
             raise ValueError(
                 f"Draws: method is {self.method!r}.{near(str(self.method), METHODS)} Give one of {', '.join(METHODS)}."
             )
-        most = {"sobol": MOST_SOBOL, "latin-hypercube": MOST_LATIN}.get(self.method, self.count)
+        most = {"sobol": MOST_SOBOL_POINTS, "latin-hypercube": MOST_LATIN_POINTS}.get(self.method, self.count)
         if self.count > most:
             raise ValueError(
                 f"Draws: count is {self.count}, more than the {most} of the method {self.method}; take method='random'."
@@ -220,25 +222,24 @@ class Draws:
         return self.count
 
     def rows(self, first: int, last: int) -> Rows:
-        """Rows number `first` to `last`, that one excluded."""
+        """Rows number `first` to `last - 1`."""
         points = np.clip(self._points(first, last), 2.0**-53, 1 - 2.0**-53)  # quantiles of 0 and 1 may be infinite
         return {name: draw.quantiles(points[:, i]) for i, (name, draw) in enumerate(self.columns.items())}
 
     def combinations(self, names: Sequence[str]) -> Rows:
-        """Refused: drawn values are all different.
+        """No rows for no names; drawn values are all different, so that columns with few values cannot be drawn.
 
         Raises:
-            ValueError: always, but for no names.
+            ValueError: there are names.
         """
         if names:
             raise ValueError(
-                f"Draws: {', '.join(names)} cannot be drawn, since runs with different values of it are computed by different "
-                "programs; give a Table of these runs."
+                f"Draws: {', '.join(names)} cannot be drawn: each value needs a program of its own. Give the runs as a Table."
             )
         return {}
 
     def described(self) -> dict[str, dict]:
-        """The columns as plain data."""
+        """The columns as plain data, for the store."""
         return {
             name: {**_words(draw), "distribution": [draw.name, *draw.arguments]} for name, draw in self.columns.items()
         }
@@ -256,7 +257,7 @@ class Draws:
 
         sequence = qmc.Sobol(size, rng=np.random.default_rng(self.seed))
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "The balance properties")  # of parts of it
+            warnings.filterwarnings("ignore", "The balance properties")  # a chunk is no power of two
             return sequence.fast_forward(first).random(last - first) if first else sequence.random(last)
 
 
@@ -264,7 +265,7 @@ Design = Product | Table | Draws
 
 
 def unique_rows(rows: Rows) -> tuple[Rows, np.ndarray]:
-    """The different rows, and for each row the number of its like among them."""
+    """The distinct rows, and for each row the number of the distinct row that it equals."""
     if not rows:
         return {}, np.zeros(0, dtype=int)
     codes = [np.unique(values, return_inverse=True)[1] for values in rows.values()]
@@ -279,27 +280,27 @@ def _latin_hypercube(count: int, size: int, seed: int) -> np.ndarray:
     return qmc.LatinHypercube(size, rng=np.random.default_rng(seed)).random(count)
 
 
-def _draw(name: str, given) -> Draw:
-    if isinstance(given, Draw):
-        return given
-    if not (isinstance(given, Sequence) and len(given) and isinstance(given[0], str)) or isinstance(given, str):
+def _draw(name: str, entry) -> Draw:
+    if isinstance(entry, Draw):
+        return entry
+    if not (isinstance(entry, Sequence) and len(entry) and isinstance(entry[0], str)) or isinstance(entry, str):
         raise ValueError(
-            f"Draws: the column {name!r} is {given!r}; give the name of a distribution and its arguments, "
+            f"Draws: the column {name!r} is {entry!r}; give the name of a distribution and its arguments, "
             "('uniform', 10, 50) or ('normal', 0, 0.1)."
         )
-    return Draw(given[0], tuple(float(x) for x in given[1:]))
+    return Draw(entry[0], tuple(float(x) for x in entry[1:]))
 
 
-def _values(what: str, values) -> np.ndarray:
+def _values(subject: str, values) -> np.ndarray:
     """Numbers as float64, whole numbers as int64, labels as strings."""
     array = np.asarray(values)
     if array.dtype.kind in "US":
         return array.astype(str)
     if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
-        raise ValueError(f"{what} has the values {values!r}; give finite numbers, or labels of schemes.")
+        raise ValueError(f"{subject} has the values {values!r}; give finite numbers, or labels of schemes.")
     return array.astype(np.int64 if array.dtype.kind in "iu" else np.float64)
 
 
 def _words(axis: Axis | Draw) -> dict[str, str]:
-    given = {"units": axis.unit, "description": axis.description}
-    return {name: text for name, text in given.items() if text}
+    texts = {"units": axis.unit, "description": axis.description}
+    return {name: text for name, text in texts.items() if text}

@@ -1,4 +1,4 @@
-"""Where tasks run: in this process, in workers of this machine, or wherever an executor has them run."""
+"""Executors of tasks: this process, workers on this machine, or an executor that the user gives."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -10,19 +10,19 @@ from vmri_jax.ensembles.worker import call_in_worker, call_packed, known_version
 from vmri_jax.mechanics.arrays import whole_number
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 
-RETRIES = 2
-"""Times that Dask tries a task again that raised an error. How often it does where workers died is its own setting."""
-AHEAD = 4
-"""Tasks per thread of the workers that are handed over before their time."""
-
-
-LOOK = 1.0
-"""Seconds after which workers are counted anew, and futures looked at: `wait` does not see those that Dask cancels when its
-scheduler is gone."""
+DASK_RETRIES = 2
+"""Number of times that Dask repeats a task that raised an error; a larger one delays the report of an error that is no accident. A
+setting of Dask tells how often it repeats a task whose worker died."""
+TASKS_PER_THREAD = 4
+"""Tasks under way for each thread of the workers, so that no thread waits for the next task. With more of them more work is lost when the
+program is stopped."""
+POLL_SECONDS = 1.0
+"""Seconds between two looks at the workers and at all futures: `wait` does not return for futures that Dask cancels when its scheduler
+ends. With a larger value the program notices later that the scheduler is gone."""
 
 
 class Here(Executor):
-    """Runs every task in this process, when it is submitted."""
+    """Runs every task in this process, within `submit`."""
 
     def submit(self, fn: Callable, /, *args, **kwargs) -> Future:
         future: Future = Future()
@@ -34,60 +34,63 @@ class Here(Executor):
 
 
 @contextmanager
-def executor_of(what: str, executor: Any, processes: int | None) -> Iterator[tuple[Executor, Callable[[], int]]]:
-    """An executor, and a function that says how many tasks it should have at a time.
+def executor_of(caller: str, executor: Any, processes: int | None) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """An executor, and a function that returns the number of tasks that it should have under way.
 
     Args:
-        what: the function that was called, for messages.
-        executor: None, a `concurrent.futures.Executor`, or a `dask.distributed.Client`.
-        processes: workers of this machine to start, None for none.
+        caller: name of the calling function, for messages.
+        executor: None for this process, a `concurrent.futures.Executor`, or a `dask.distributed.Client`.
+        processes: number of workers to start on this machine, or None.
 
     Raises:
-        TypeError, ValueError: something else, or both.
+        TypeError, ValueError: another executor, or both `executor` and `processes`.
         ImportError: `processes` without Dask.
     """
     if executor is not None and processes is not None:
-        raise ValueError(f"{what}: executor and processes are given; choose one of them.")
-    with ExitStack() as open_ones:
+        raise ValueError(f"{caller}: executor and processes are given; choose one of them.")
+    with ExitStack() as resources:
         if processes is not None:
-            executor = open_ones.enter_context(local_workers(whole_number(f"{what}: processes", processes)))
+            executor = resources.enter_context(local_workers(whole_number(f"{caller}: processes", processes)))
         if executor is None:
             yield Here(), lambda: 1
         elif isinstance(executor, Executor):
             size = getattr(executor, "_max_workers", 1)
-            yield executor, lambda: AHEAD * size
+            yield executor, lambda: TASKS_PER_THREAD * size
         elif hasattr(executor, "get_executor"):
-            tasks = executor.get_executor(retries=RETRIES, pure=False)
+            tasks = executor.get_executor(retries=DASK_RETRIES, pure=False)
             try:
                 yield tasks, _room(executor)
             finally:
                 if executor.status == "running":
-                    tasks.shutdown(wait=False)  # what is not done is not wanted any more
+                    tasks.shutdown(wait=False)  # nobody needs the results of tasks that still run
         else:
             raise TypeError(
-                f"{what}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
+                f"{caller}: executor is {type(executor).__name__}; give a dask.distributed.Client or a concurrent.futures.Executor, "
                 "or the number of processes on this machine."
             )
 
 
 def _room(client: Any) -> Callable[[], int]:
-    """How many tasks its workers should have; as many as before while the scheduler does not answer, none once it is given up."""
-    known, asked = AHEAD, -LOOK
+    """A function that returns the number of tasks for all workers of a client.
+
+    While the scheduler does not answer the number stays; once the client has closed it is 0.
+    """
+    tasks, counted_at = TASKS_PER_THREAD, -POLL_SECONDS
 
     def room() -> int:
-        nonlocal known, asked
-        if time.monotonic() - asked > LOOK:
-            asked = time.monotonic()
+        nonlocal tasks, counted_at
+        if time.monotonic() - counted_at > POLL_SECONDS:
+            counted_at = time.monotonic()
             with suppress(OSError, RuntimeError, AttributeError):
-                known = AHEAD * max(1, sum(client.nthreads().values()))
-        return 0 if client.status == "closed" else known
+                tasks = TASKS_PER_THREAD * max(1, sum(client.nthreads().values()))
+        return 0 if client.status == "closed" else tasks
 
     return room
 
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Any]:
-    """A client of so many workers on this machine, each a process with one thread.
+    """A client of `count` workers on this machine, each a process with one thread.
 
     Raises:
         ImportError: Dask is not installed.
@@ -107,18 +110,18 @@ def as_done(
     arguments: Iterable[tuple],
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Iterator[tuple[tuple, Future]]:
-    """Submit all of these, not too many ahead, and yield them with their futures as they are done.
+    """Submit a task for each tuple of arguments, not too many ahead, and yield the arguments with the future as tasks end.
 
     Args:
         submit: starts one task.
-        room: how many tasks may be under way.
-        arguments: of every task.
-        interrupted: whether Ctrl-C was pressed. Python loses a `KeyboardInterrupt` that falls into the finaliser of a future of
-            Dask, so that Ctrl-C is noted and asked for here.
+        room: returns the largest number of tasks under way.
+        arguments: a tuple for each task.
+        interrupted: returns whether Ctrl-C was pressed. Python loses a `KeyboardInterrupt` that is raised in the finaliser of a future
+            of Dask; therefore a handler notes Ctrl-C, and this function polls it.
 
     Raises:
-        CancelledError: there is no room any more: the workers are gone.
-        KeyboardInterrupt: Ctrl-C was noted.
+        CancelledError: `room` returned 0: the workers are gone.
+        KeyboardInterrupt: Ctrl-C was pressed.
     """
     waiting: dict[Future, tuple] = {}
     left = iter(arguments)
@@ -128,11 +131,11 @@ def as_done(
                 raise KeyboardInterrupt
             if not room():
                 raise CancelledError
-            while len(waiting) < room() and (one := next(left, None)) is not None:
-                waiting[submit(*one)] = one
+            while len(waiting) < room() and (call := next(left, None)) is not None:
+                waiting[submit(*call)] = call
             if not waiting:
                 return
-            wait(waiting, LOOK, FIRST_COMPLETED)
+            wait(waiting, POLL_SECONDS, FIRST_COMPLETED)
             for future in [future for future in waiting if future.done()]:
                 yield waiting.pop(future), future
     finally:
@@ -141,43 +144,43 @@ def as_done(
 
 
 def mapped(
-    what: str,
+    caller: str,
     task: Callable,
     arguments: Iterable[tuple],
     executor: Any = None,
-    told: Callable[[int, int], None] = lambda done, number: None,
+    report: Callable[[int, int], None] = lambda done, number: None,
 ) -> list:
-    """``[task(*one) for one in arguments]``, computed by an executor; the first error is raised.
+    """``[task(*call) for call in arguments]``, computed by an executor; the first error is raised.
 
     Args:
-        what: the function that was called, for messages.
-        task: a function of a module.
-        arguments: of every call; they can be pickled if workers are to have them.
-        executor: as of `ensemble`.
-        told: ``told(done, number)``, how many are done when number `number` is handed over.
+        caller: name of the calling function, for messages.
+        task: a function that is defined in a module.
+        arguments: a tuple for each call, which pickle can send if workers compute.
+        executor: as in `ensemble`.
+        report: ``report(done, number)``, the number of calls that are done when call `number` is submitted.
 
     Raises:
-        Interrupted: Ctrl-C; carries the results until then.
+        Interrupted: Ctrl-C; carries the results up to then.
     """
-    given = list(arguments)
-    found: list = [None] * len(given)
+    calls = list(arguments)
+    results: list = [None] * len(calls)
     with ExitStack() as opened:
-        tasks, room = opened.enter_context(executor_of(what, executor, None))
+        tasks, room = opened.enter_context(executor_of(caller, executor, None))
         here, versions = isinstance(tasks, Here), known_versions()
-        # A task of this process is stopped at once.
+        # In this process Ctrl-C stops the task itself, so that nothing has to poll.
         interrupted = (lambda: False) if here else opened.enter_context(interrupts_noted())
-        calls = ((i,) for i in range(len(given)))
+        numbers = ((i,) for i in range(len(calls)))
 
         def submit(i: int) -> Future:
-            told(sum(part is not None for part in found), i)
+            report(sum(part is not None for part in results), i)
             if here:
-                return tasks.submit(task, *given[i])
-            return tasks.submit(*call_in_worker(versions, call_packed, packed(what, (task, given[i]))))
+                return tasks.submit(task, *calls[i])
+            return tasks.submit(*call_in_worker(versions, call_packed, packed(caller, (task, calls[i]))))
 
         try:
-            for (i,), future in as_done(submit, room, calls, interrupted):
-                found[i] = future.result()
+            for (i,), future in as_done(submit, room, numbers, interrupted):
+                results[i] = future.result()
         except KeyboardInterrupt:
-            done = sum(result is not None for result in found)
-            raise Interrupted(found, done, len(found), "calls") from None
-    return found
+            done = sum(result is not None for result in results)
+            raise Interrupted(results, done, len(results), "calls") from None
+    return results

@@ -1,4 +1,4 @@
-"""What is known of an ensemble before it is computed: its chunks, the arrays of its store, and all that tells it from others."""
+"""Preparation of an ensemble: checks of all arguments, its chunks, the arrays of its store, and the record that identifies it."""
 
 import warnings
 from pathlib import Path
@@ -17,23 +17,27 @@ from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.store.identity import changed_conditions, describe, differences, environment, identity
 from vmri_jax.steppers.results import Result
 
-SECONDS = 1.0
-"""Seconds that a chunk of runs takes, about. With a larger value an interrupted ensemble loses more, with a smaller one workers wait for files."""
+CHUNK_SECONDS = 1.0
+"""Target seconds of computation of a chunk. A larger one loses more work at an interrupt; with a smaller one workers wait for files."""
 MOST_CHUNKS = 20_000
-"""Most chunks of an ensemble. Schedulers hand out some hundreds of tasks a second, and every chunk has its files: more chunks cost more than they compute."""
-MOST_BYTES = 2**26
-"""Most bytes of the results of a chunk; with larger ones a worker needs more memory."""
-PARTS = 64
-"""and is at most such a part of all runs, so that workers share them evenly."""
-NANOSECONDS = {"explicit": 1.0, "implicit": 25.0, "constrained": 25.0}
-"""Rough times of a micro step for each coordinate of each run, in a batch."""
+"""Largest number of chunks of an ensemble, unless the next two limits need more. A scheduler hands out some hundreds of tasks a second,
+and every chunk has its files: a larger number costs more time than the runs."""
+MOST_CHUNK_BYTES = 2**26
+"""Largest size of the saved nodes and results of a chunk, in bytes: 64 MiB. A larger one needs more memory in every worker."""
+FEWEST_CHUNKS = 64
+"""Target for the smallest number of chunks, so that workers share the runs evenly; batches that are computed side by side are not cut for
+it. A larger one makes chunks so small that writing their files takes most of the time."""
+MICRO_STEP_NANOSECONDS = {"explicit": 1.0, "implicit": 25.0, "constrained": 25.0}
+"""Rough nanoseconds of a micro step, for each coordinate of each run in a batch, by kind of step. They only choose the size of chunks: with
+larger ones chunks have fewer runs."""
 
 
 class Prepared(NamedTuple):
-    """What is known of an ensemble before it is computed.
+    """An ensemble before any run is computed.
 
-    arrays: what the store has of each run, by name: shape, dtype, dimensions and attributes.
-    run: the longest one.
+    arrays: for each array of the store, by name, its shape for one run, dtype, dimensions and attributes.
+    chunks: the division of the runs.
+    run: the longest run.
     """
 
     arrays: dict[str, dict]
@@ -42,7 +46,12 @@ class Prepared(NamedTuple):
 
 
 def prepared(work: Work, design: Design, chunk: int | None = None) -> Prepared:
-    """What is known before anything is computed; all that can be wrong with the arguments is refused.
+    """Check all arguments, and choose arrays and chunks, before anything is computed.
+
+    Args:
+        work: of the ensemble.
+        design: its rows.
+        chunk: number of runs of a chunk; None to choose it.
 
     Raises:
         ValueError, TypeError: bad arguments.
@@ -53,15 +62,15 @@ def prepared(work: Work, design: Design, chunk: int | None = None) -> Prepared:
 
 
 def _checked(work: Work, design: Design) -> list[Simulation]:
-    """A run of each group, the longest first; all that can be wrong with the arguments is refused."""
+    """One run of each group, the longest first, after a check of all arguments."""
     work.check_values(design.rows(0, 1))
     runs = [work.simulation(group) for group in all_groups(work, design)]
     runs[0].check("ensemble: the start", constraints=False)
-    over_nodes = [name for name, one in zip(work.save, work.quantities, strict=True) if one.over_nodes]
+    over_nodes = [name for name, quantity in zip(work.save, work.quantities, strict=True) if quantity.over_nodes]
     if over_nodes and work.num_saves == 1:
         raise ValueError(
             f"ensemble: {', '.join(over_nodes)} looks at the saved nodes of a run, and only its end is saved; give num_saves, "
-            "say 50."
+            "for example 50."
         )
     return sorted(runs, key=_micro_steps, reverse=True)
 
@@ -71,7 +80,7 @@ def _micro_steps(run: Simulation) -> int:
 
 
 def _arrays(work: Work, run: Simulation) -> dict[str, dict]:
-    """What the store has of each run: shape, dtype, dimensions and attributes."""
+    """The arrays of the store by name: shape for one run, dtype, dimensions and attributes."""
     meanings = " ".join(result.name.lower() for result in Result)
     values = [int(result) for result in Result]
     status = {
@@ -79,47 +88,50 @@ def _arrays(work: Work, run: Simulation) -> dict[str, dict]:
         "failed_at": Kept(np.empty((), np.int32), (), "macro step that failed, -1 if none did"),
     }
     arrays = {}
-    for name, one in (status | what_is_kept(work.quantities, run)).items():
-        about = {"description": one.description} if one.description else {}
+    for name, kept in (status | what_is_kept(work.quantities, run)).items():
+        attributes = {"description": kept.description} if kept.description else {}
         flags = {"flag_values": values, "flag_meanings": meanings} if name == "result" else {}
         arrays[name] = {
-            "shape": one.value.shape,
-            "dtype": one.value.dtype,
-            "dimensions": one.dimensions,
-            "attributes": about | flags,
+            "shape": kept.value.shape,
+            "dtype": kept.value.dtype,
+            "dimensions": kept.dimensions,
+            "attributes": attributes | flags,
         }
     return arrays
 
 
 def _chunks(runs: list[Simulation], lanes: int, arrays: dict[str, dict], chunk: int | None) -> Chunks:
-    """About a second's work, a power of two times the lanes that are computed side by side."""
+    """Chunks of about `CHUNK_SECONDS`, of a power of two times `width` runs; `width` runs are computed side by side."""
     run = runs[0]
+    # A chunk has runs of every group: a batch wider than the share of one group would be filled with copies.
     width = min(lanes_at_once(run), 2 ** (-(-lanes // len(runs)) - 1).bit_length(), lanes)
     if chunk is not None:
         size = min(whole_number("ensemble: chunk", chunk, otherwise=", or None"), lanes)
         return Chunks(lanes, size, min(width, size))
     kind = "constrained" if run.system.is_constrained else "implicit" if run.plan.has_fallback else "explicit"
     size_q = run.state.q_s.size + run.state.q_f.size
-    seconds = 1e-9 * NANOSECONDS[kind] * _micro_steps(run) * run.scheme.degree**2 * size_q
-    kept = sum(np.dtype(one["dtype"]).itemsize * int(np.prod(one["shape"])) for one in arrays.values())
-    bytes_of_run = kept + 8 * (2 * size_q + 8) * (run.num_saves + 1)
-    most = min(max(SECONDS / seconds, lanes / MOST_CHUNKS), MOST_BYTES / bytes_of_run, lanes / PARTS)
-    size = width * 2 ** max(0, int(np.log2(max(most / width, 1.0))))
+    seconds = 1e-9 * MICRO_STEP_NANOSECONDS[kind] * _micro_steps(run) * run.scheme.degree**2 * size_q
+    array_bytes = sum(np.dtype(array["dtype"]).itemsize * int(np.prod(array["shape"])) for array in arrays.values())
+    bytes_of_run = array_bytes + 8 * (2 * size_q + 8) * (run.num_saves + 1)
+    most_lanes = min(
+        max(CHUNK_SECONDS / seconds, lanes / MOST_CHUNKS), MOST_CHUNK_BYTES / bytes_of_run, lanes / FEWEST_CHUNKS
+    )
+    size = width * 2 ** max(0, int(np.log2(max(most_lanes / width, 1.0))))
     return Chunks(lanes, min(size, lanes), width)
 
 
 def attributes_of(work: Work, design: Design, run: Simulation, chunks: Chunks) -> dict[str, Any]:
-    """Attributes of its store."""
+    """Attributes of the store of an ensemble: the design, names of coordinates, the record that identifies it, versions."""
     names = (run.names or Names()).of_coordinates(run.state.q_s.size, run.state.q_f.size)
-    about = {"kind": type(design).__name__, "columns": design.described()}
+    design_record = {"kind": type(design).__name__, "columns": design.described()}
     if isinstance(design, Draws):
-        about |= {"method": design.method, "seed": design.seed}
+        design_record |= {"method": design.method, "seed": design.seed}
     settings = {name: value for name, value in work.steps._asdict().items() if value is not None}
     return {
         "lanes": chunks.lanes,
         "chunk": chunks.size,
         "width": chunks.width,
-        "design": about,
+        "design": design_record,
         "system": work.system if isinstance(work.system, str) else "a problem",
         "slow": names.slow_coordinates,
         "fast": names.fast_coordinates,
@@ -129,59 +141,60 @@ def attributes_of(work: Work, design: Design, run: Simulation, chunks: Chunks) -
 
 
 def _identity(work: Work, design: Design, run: Simulation, settings: dict) -> dict[str, str]:
-    """All that decides the results, by name."""
+    """In words and digests, by name, everything that the results depend on."""
     schemes = {}
     for label, scheme in work.schemes.items():
-        made = scheme if isinstance(scheme, str) else getattr(scheme, "__qualname__", None)
-        schemes |= {f"scheme {label}": made} if made else describe(f"scheme {label}", scheme)
-    found = {
+        name = scheme if isinstance(scheme, str) else getattr(scheme, "__qualname__", None)
+        schemes |= {f"scheme {label}": name} if name else describe(f"scheme {label}", scheme)
+    identity_record = {
         name: text for name, text in identity(run, run.state).items() if not name.startswith(("scheme", "macro_dt"))
     }
-    found |= schemes | {name: str(value) for name, value in settings.items()}
-    found |= {"num_micro": str(work.num_micro), "save": ", ".join(Path(name).name for name in work.save)}
-    found |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
-    found |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
-    return found | _describe_design(design)
+    identity_record |= schemes | {name: str(value) for name, value in settings.items()}
+    identity_record |= {"num_micro": str(work.num_micro), "save": ", ".join(Path(name).name for name in work.save)}
+    identity_record |= {"num_saves": str(work.num_saves), "project": str(work.project), "runs": str(len(design))}
+    identity_record |= {f"file {Path(file).name}": digest for file, digest in work.sources.items()}
+    return identity_record | _describe_design(design)
 
 
 def _describe_design(design: Design) -> dict[str, str]:
-    """A design in words, by column."""
-    found = {"design": type(design).__name__}
+    """The design in words and digests, by column."""
+    description = {"design": type(design).__name__}
     if isinstance(design, Draws):
         return (
-            found
+            description
             | {"method": design.method, "seed": str(design.seed)}
             | {f"column {name}": f"{draw.name} {draw.arguments}" for name, draw in design.columns.items()}
         )
     columns = design.axes if isinstance(design, Product) else design.columns
     for name, axis in columns.items():
-        found |= describe(
+        description |= describe(
             f"column {name}", axis.values if axis.values.dtype.kind != "U" else ", ".join(axis.values.ravel())
         )
-    return found
+    return description
 
 
-def check_same(path: Path, attributes: dict, there: dict, chunk: int | None) -> None:
-    """Refuse to go on with another ensemble; warn where versions have changed.
+def check_same(path: Path, attributes: dict, stored: dict, chunk: int | None) -> None:
+    """Refuse to continue the store of another ensemble; warn if versions have changed.
 
     Args:
         path: of the store.
-        attributes, there: those of the ensemble that is asked for, and those of the store.
-        chunk: that was asked for.
+        attributes: of the ensemble that the user wants.
+        stored: attributes of the store.
+        chunk: number of runs of a chunk that the user wants, or None.
 
     Raises:
-        ValueError: with all that differs.
+        ValueError: with all differences.
     """
-    made, now = there["made_with"], attributes["made_with"]
-    found = differences(attributes["identity"], there["identity"], made["jax"] == now["jax"])
-    if chunk not in (None, there["chunk"]):
-        found.append(f"chunk: {chunk} here, {there['chunk']} in the store")
-    if found:
+    old_conditions, conditions = stored["made_with"], attributes["made_with"]
+    changes = differences(attributes["identity"], stored["identity"], old_conditions["jax"] == conditions["jax"])
+    if chunk not in (None, stored["chunk"]):
+        changes.append(f"chunk: {chunk} here, {stored['chunk']} in the store")
+    if changes:
         raise ValueError(
-            f"{path} holds another ensemble and cannot go on with this one. What differs: {'; '.join(found)}. Give the arguments it "
-            "was started with, or another name."
+            f"{path} holds another ensemble and cannot go on with this one. Differences: {'; '.join(changes)}. Give the arguments of the "
+            "first call, or another name."
         )
-    changed = changed_conditions(now, made)
+    changed = changed_conditions(conditions, old_conditions)
     if changed:
         warnings.warn(
             f"{path} was started under other conditions; the last digits of its runs may differ. Now: {', '.join(changed)}.",

@@ -1,4 +1,4 @@
-"""What is kept of a run: arrays by name, made from its saved nodes where it was computed."""
+"""Quantities of a run that the store keeps: arrays by name, which a worker computes from the saved nodes of the run."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -14,13 +14,15 @@ from vmri_jax.running.simulation import Simulation
 from vmri_jax.running.trajectory import RunInfo, Trajectory
 
 LEVELS = (0.05, 0.5, 0.95)
-"""Parts of the saved nodes that lie below the quantiles."""
+"""Probabilities of the quantiles over the saved nodes: the median, and an interval with 90 % of them."""
 
 
 class Kept(NamedTuple):
-    """An array that is kept of each run.
+    """An array of the store, for one run.
 
+    value: the array.
     dimensions: names of its axes.
+    description: of its meaning.
     """
 
     value: Any
@@ -29,9 +31,10 @@ class Kept(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """``function(trajectory)`` of a single run gives what is kept, by name.
+    """A quantity that users choose by name.
 
-    over_nodes: whether it says little if only the end is saved.
+    function: ``function(trajectory)`` of a single run returns arrays by name.
+    over_nodes: whether the quantity needs more saved nodes than the end.
     """
 
     function: Callable[[Trajectory], dict[str, Kept]]
@@ -76,12 +79,12 @@ def _iterations(run: Trajectory) -> dict[str, Kept]:
 
 
 def _extremes(run: Trajectory) -> dict[str, Kept]:
-    found = {}
+    extremes = {}
     for part, dimension in (("s", "slow"), ("f", "fast")):
         q = getattr(run, f"q_{part}")
-        found[f"min_q_{part}"] = Kept(jnp.min(q, axis=0), (dimension,), "smallest positions")
-        found[f"max_q_{part}"] = Kept(jnp.max(q, axis=0), (dimension,), "largest positions")
-    return found
+        extremes[f"min_q_{part}"] = Kept(jnp.min(q, axis=0), (dimension,), "smallest positions")
+        extremes[f"max_q_{part}"] = Kept(jnp.max(q, axis=0), (dimension,), "largest positions")
+    return extremes
 
 
 def _quantiles(run: Trajectory) -> dict[str, Kept]:
@@ -109,12 +112,12 @@ QUANTITIES = {
 
 
 def quantity(name: str) -> Quantity:
-    """One of `QUANTITIES`, or a function of your own, ``my_file.py:function`` or ``my_package.my_module:function``.
+    """One of `QUANTITIES`, or a function of the user, ``my_file.py:function`` or ``my_package.my_module:function``.
 
-    An own function takes the `Trajectory` of a single run and returns an array, or arrays by name, with operations of JAX.
+    A user's function takes the `Trajectory` of a single run and returns an array, or arrays by name, by operations of JAX.
 
     Raises:
-        ValueError: an unknown name, or no such function.
+        ValueError: an unknown name, or a name without a function.
     """
     if name in QUANTITIES:
         return QUANTITIES[name]
@@ -123,65 +126,65 @@ def quantity(name: str) -> Quantity:
             f"ensemble: save has {name!r}.{near(name, QUANTITIES)} There are {', '.join(QUANTITIES)}; your own functions are "
             "my_file.py:function, or my_package.my_module:function."
         )
-    own = imported(name)
-    if not callable(own):
+    user_function = imported(name)
+    if not callable(user_function):
         raise ValueError(
-            f"ensemble: save has {name!r}, which is {type(own).__name__}; give a function of a trajectory."
+            f"ensemble: save has {name!r}, which is {type(user_function).__name__}; give a function of a trajectory."
         )
     label = name.partition(":")[2]
 
     def function(run: Trajectory) -> dict[str, Kept]:
-        found = own(run)
-        arrays = found if isinstance(found, dict) else {label: found}
-        about = (getattr(own, "__doc__", None) or "").strip().partition("\n")[0]
-        return {key: _own(key, jnp.asarray(value), about) for key, value in arrays.items()}
+        result = user_function(run)
+        arrays = result if isinstance(result, dict) else {label: result}
+        description = (getattr(user_function, "__doc__", None) or "").strip().partition("\n")[0]
+        return {key: _of_user(key, jnp.asarray(value), description) for key, value in arrays.items()}
 
     return Quantity(function, False)
 
 
-def _own(name: str, value, about: str) -> Kept:
-    return Kept(value, tuple(f"{name}_{i}" for i in range(value.ndim)), about)
+def _of_user(name: str, value, description: str) -> Kept:
+    return Kept(value, tuple(f"{name}_{i}" for i in range(value.ndim)), description)
 
 
 def kept(quantities: Sequence[Quantity], run: Trajectory) -> dict[str, Kept]:
-    """All that is kept of a run.
+    """All arrays that the store keeps of a run.
 
     Raises:
         ValueError: two quantities with an array of one name.
     """
-    found: dict[str, Kept] = {}
-    for one in quantities:
-        part = one.function(run)
-        both = sorted(set(found) & set(part))
+    arrays: dict[str, Kept] = {}
+    for item in quantities:
+        part = item.function(run)
+        both = sorted(set(arrays) & set(part))
         if both:
             raise ValueError(f"ensemble: save has two arrays called {', '.join(both)}; give one of them another name.")
-        found |= part
-    return found
+        arrays |= part
+    return arrays
 
 
 def what_is_kept(quantities: Sequence[Quantity], run: Simulation) -> dict[str, Kept]:
-    """All that is kept of such a run, with shapes in place of values; nothing is computed.
+    """The arrays that the store keeps of a run, with shapes in place of values; nothing is computed.
 
     Raises:
         ValueError: two quantities with an array of one name, or a function of the user that cannot be traced.
     """
-    found: dict[str, Kept] = {}
+    arrays: dict[str, Kept] = {}
 
     def shapes():
         trajectory = run.engine.trajectory(run.arrays, run.save_every)
-        found.update(kept(quantities, trajectory))
-        return {name: one.value for name, one in found.items()}
+        arrays.update(kept(quantities, trajectory))
+        return {name: array.value for name, array in arrays.items()}
 
     values = jax.eval_shape(shapes)
-    return {name: one._replace(value=values[name]) for name, one in found.items()}
+    return {name: array._replace(value=values[name]) for name, array in arrays.items()}
 
 
 def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
-    """Arrays that `vmri_jax.plots.plot_ensemble` draws where none is chosen: one number per run, or one per saved node.
+    """Arrays that `vmri_jax.plots.plot_ensemble` draws by default: one number per run, or one per saved node.
 
     Args:
-        names: of what is kept, as of `quantity`.
-        problem: what runs; nothing is computed of it.
+        names: of quantities, as in `quantity`.
+        problem: of the ensemble, for the numbers of its coordinates; nothing is computed.
 
     Raises:
         ValueError: an unknown name.
@@ -195,16 +198,16 @@ def drawn_by_default(names: Sequence[str], problem: Problem) -> list[str]:
         status = jnp.zeros((), dtype=int)
         nodes = State(t, q_s, q_f, q_s, q_f)
         run = Trajectory(nodes, t, jnp.zeros((2, 2)), info, status, status).of(problem)
-        dimensions.update({name: one.dimensions for name, one in kept(quantities, run).items()})
+        dimensions.update({name: array.dimensions for name, array in kept(quantities, run).items()})
 
     jax.eval_shape(shapes)
     return [name for name, axes in dimensions.items() if axes in ((), ("node",)) and name != "node_t"]
 
 
 def of_lanes(quantities: Sequence[Quantity]) -> Callable[[Trajectory], dict[str, Any]]:
-    """A compiled function that gives what is kept of every run of a batch."""
+    """A compiled function from the trajectory of a batch to the arrays that the store keeps, a row for each run."""
 
-    def of_one(run: Trajectory):
-        return {name: one.value for name, one in kept(quantities, run).items()}
+    def of_lane(run: Trajectory):
+        return {name: array.value for name, array in kept(quantities, run).items()}
 
-    return jax.jit(jax.vmap(of_one))
+    return jax.jit(jax.vmap(of_lane))

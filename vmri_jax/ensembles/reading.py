@@ -1,4 +1,4 @@
-"""Reading an ensemble: its results as an `xarray.Dataset`, with the design as coordinates, loaded when they are asked for."""
+"""Reading an ensemble: its results as an `xarray.Dataset` with the design as coordinates, loaded when they are used."""
 
 import os
 from pathlib import Path
@@ -19,20 +19,20 @@ LEVEL_NAMES = ["position", "velocity"]
 
 
 def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
-    """The results of `ensemble`, as an `xarray.Dataset` whose arrays are loaded by Dask when they are needed.
+    """The results of `ensemble`, as an `xarray.Dataset` whose arrays Dask loads when they are used.
 
         data = vm.open_ensemble("runs.zarr")
         data.energy_error.sel(num_micro=5, omega=50, method="nearest")
 
     A product of axes has a dimension for each of them. Other designs have the dimension "lane", with the columns of the design
-    as coordinates. Runs that are not in the store yet are NaN, their result is -1. Runs that failed are NaN from there on, with
-    their status in "result", an integer with the meanings in its attributes.
+    as coordinates. Runs that are not in the store yet are NaN, with the result -1. A failed run is NaN from its failure on. "result" has
+    the status of each run, an integer whose meanings are in the attributes of the array.
 
     Args:
         path: folder of the store.
 
     Raises:
-        FileNotFoundError, ValueError: there is nothing, or something else.
+        FileNotFoundError, ValueError: the folder does not exist, or is not the store of an ensemble.
         ImportError: xarray or Dask are not installed.
     """
     xarray = extra("xarray", "open_ensemble", "ensemble")
@@ -41,16 +41,16 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
     attributes = store.read_attributes(path)
     data = xarray.open_zarr(path, chunks={}, consolidated=True, mask_and_scale=False)
     data = _without_missing(data, path, attributes, xarray)
-    about = attributes["design"]["columns"]
+    columns_record = attributes["design"]["columns"]
     if attributes["design"]["kind"] == "Product":
-        data = _on_axes(data, about, xarray)
+        data = _on_axes(data, columns_record, xarray)
     else:
         columns = _drawn(attributes) if attributes["design"]["kind"] == "Draws" else _table(path, xarray)
         data = data.assign_coords(
             {name: ((LANE, *(f"{name}_{i}" for i in range(array.ndim - 1))), array) for name, array in columns.items()}
         )
-    for name, one in about.items():
-        data[name].attrs |= {key: one[key] for key in ("units", "description") if key in one}
+    for name, column in columns_record.items():
+        data[name].attrs |= {key: column[key] for key in ("units", "description") if key in column}
     labels = {"slow": attributes["slow"], "fast": attributes["fast"], "level": LEVEL_NAMES, "quantile": list(LEVELS)}
     data = data.assign_coords({name: values for name, values in labels.items() if name in data.dims})
     kept = ("system", "lanes", "made_with")
@@ -59,21 +59,21 @@ def open_ensemble(path: str | os.PathLike) -> "xarray.Dataset":
 
 
 def _without_missing(data, path: Path, attributes: dict[str, Any], xarray):
-    """Rows of chunks that do not count are taken out: perhaps only some of their arrays have been written."""
+    """The data with rows of uncommitted chunks set to missing: a killed worker may have written some of their arrays."""
     lanes, chunk = attributes["lanes"], attributes["chunk"]
-    there = np.zeros(-(-lanes // chunk), dtype=bool)
-    there[list(store.committed(path))] = True
-    if there.all():
+    is_committed = np.zeros(-(-lanes // chunk), dtype=bool)
+    is_committed[list(store.committed(path))] = True
+    if is_committed.all():
         return data
-    counts = xarray.DataArray(np.repeat(there, chunk)[:lanes], dims=LANE)
+    in_store = xarray.DataArray(np.repeat(is_committed, chunk)[:lanes], dims=LANE)
     return xarray.Dataset(
-        {name: array.where(counts, FILL.get(array.dtype.kind, 0)) for name, array in data.items()}, attrs=data.attrs
+        {name: array.where(in_store, FILL.get(array.dtype.kind, 0)) for name, array in data.items()}, attrs=data.attrs
     )
 
 
-def _on_axes(data, about: dict[str, dict], xarray):
-    """A dimension for each axis in place of the lanes."""
-    axes = {name: one["values"] for name, one in about.items()}
+def _on_axes(data, columns_record: dict[str, dict], xarray):
+    """The data with a dimension for each axis of the product in place of the lanes."""
+    axes = {name: axis["values"] for name, axis in columns_record.items()}
     shape = tuple(map(len, axes.values()))
     arrays = {}
     for name, array in data.items():
@@ -83,37 +83,37 @@ def _on_axes(data, about: dict[str, dict], xarray):
 
 
 def _drawn(attributes: dict[str, Any]):
-    """Columns of random rows, each made when it is needed."""
+    """Columns of random rows, as arrays of Dask whose values are drawn when they are used."""
     import dask.array
 
     design = _design_of(attributes)
     chunk, lanes = attributes["chunk"], attributes["lanes"]
     sizes = (*[chunk] * (lanes // chunk), *([lanes % chunk] if lanes % chunk else []))
 
-    def of(name: str):
+    def column(name: str):
         def block(block_info: Any = None):
             ((first, last),) = block_info[None]["array-location"]
             return design.rows(first, last)[name]
 
         return dask.array.map_blocks(block, dtype=float, chunks=(sizes,), meta=np.zeros(0))
 
-    return {name: of(name) for name in design.columns}
+    return {name: column(name) for name in design.columns}
 
 
 def _design_of(attributes: dict[str, Any]) -> Draws:
     """The random design of a store."""
-    about = attributes["design"]
+    design = attributes["design"]
     columns = {}
-    for name, one in about["columns"].items():
-        kind, *arguments = one["distribution"]
+    for name, column in design["columns"].items():
+        kind, *arguments = column["distribution"]
         columns[name] = Draw(kind, tuple(arguments))
-    return Draws(attributes["lanes"], columns, about["method"], about["seed"])
+    return Draws(attributes["lanes"], columns, design["method"], design["seed"])
 
 
 def _table(path: Path, xarray) -> dict[str, Any]:
     """Columns of a design that is a table."""
-    found = xarray.open_zarr(path, group=store.DESIGN, chunks={}, consolidated=False, mask_and_scale=False)
+    columns = xarray.open_zarr(path, group=store.DESIGN, chunks={}, consolidated=False, mask_and_scale=False)
     return {
         name: store.labelled(array.values, array.attrs) if store.LABELS in array.attrs else array.data
-        for name, array in found.items()
+        for name, array in columns.items()
     }

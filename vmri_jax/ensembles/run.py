@@ -1,4 +1,4 @@
-"""`ensemble`: many runs of a system, in chunks, on one core or on a cluster, into a store that nothing makes lose them."""
+"""`ensemble`: many runs of a system, in chunks, on one core or on a cluster, into a store that keeps them whatever stops the program."""
 
 import os
 import time
@@ -26,41 +26,45 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
 
-GIVE_UP = 10
-"""So many chunks that cannot be computed, and none that can: then others are not tried."""
+FAILURES_TO_STOP = 10
+"""Number of failed chunks, before any chunk succeeds, at which the ensemble stops. A larger one spends more time on an error that all chunks
+have."""
 
 
 class EnsembleError(RuntimeError):
-    """Chunks of an ensemble could not be computed, all others are in its store.
+    """Some chunks of an ensemble could not be computed; the computed ones are in its store.
 
     Attributes:
         ensemble: the `Ensemble`.
-        failures: by number of the chunk, why.
+        failures: error of each failed chunk, by its number.
     """
 
     def __init__(self, ensemble: "Ensemble"):
         self.ensemble, self.failures = ensemble, ensemble.failures
-        first, why = next(iter(self.failures.items()))
+        first, reason = next(iter(self.failures.items()))
         lanes = ", ".join(_runs(ensemble.chunks, number) for number in list(self.failures)[:5])
-        more = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
-        whole = len(ensemble.done) + len(self.failures) == ensemble.chunks.count
-        rest = "All others are" if whole else f"No chunk could; others were not tried. {len(ensemble.done)} chunks are"
+        ellipsis = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
+        all_tried = len(ensemble.done) + len(self.failures) == ensemble.chunks.count
+        remainder = (
+            "All others are" if all_tried else f"No chunk could; others were not tried. {len(ensemble.done)} chunks are"
+        )
         super().__init__(
-            f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{more}. Chunk {first}: "
-            f"{why.splitlines()[-1]} "
-            f"{rest} in {ensemble.path}; with resume=True only those that are missing are tried again."
+            f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {first}: "
+            f"{reason.splitlines()[-1]} "
+            f"{remainder} in {ensemble.path}; with resume=True only the missing chunks are tried again."
         )
 
 
 @dataclass
 class Ensemble:
-    """An ensemble and how far it is.
+    """An ensemble and its progress.
 
     path: folder of its store.
-    chunks: how its runs are divided.
-    done: chunks that are in the store, each with the number of its runs that failed.
-    failures: chunks that could not be computed, and why.
-    seconds, computed: wall time of this call, and the runs that it computed.
+    chunks: the division of its runs.
+    done: number of failed runs of each chunk in the store.
+    failures: error of each chunk that could not be computed.
+    seconds: wall time of this call.
+    computed: number of runs that this call computed.
     """
 
     path: Path
@@ -81,12 +85,12 @@ class Ensemble:
 
     @property
     def failed_runs(self) -> int:
-        """Runs in the store that did not come to their end, see their result there."""
+        """Number of runs in the store that failed before their end; "result" in the store has the status of each."""
         return sum(self.done.values())
 
     @property
     def runs_per_second(self) -> float:
-        """Of this call."""
+        """Computed runs over wall time of this call."""
         return self.computed / self.seconds if self.seconds else float("nan")
 
     def open(self):
@@ -119,52 +123,53 @@ def ensemble(
     throw: bool = True,
     progress: ShowsProgress = False,
 ) -> Ensemble:
-    """Simulate a system many times, for all rows of a design, and keep what is asked for in a store on disk.
+    """Simulate a system once for each row of a design, and keep the quantities `save` of each run in a store on disk.
 
         runs = vm.ensemble("fpu", "explicit-slow", {"omega": np.linspace(10, 100, 91), "num_micro": [1, 5, 10]},
                            t_end=1.0, macro_dt=0.01, out="runs.zarr", processes=4)
         data = vm.open_ensemble("runs.zarr")
 
-    Runs are computed chunk by chunk. A chunk counts when all of it is on disk, so that whatever dies (a worker, this process,
-    the scheduler), all chunks before stay, and `resume` computes the missing ones only. A chunk is the same to the last bit
-    wherever it is computed, on processors of the same kind with the same versions. A run that fails is NaN and has its status
-    in the results; others do not notice.
+    Runs are computed chunk by chunk. A chunk is committed when all its files are on disk: whatever ends early (a worker, this
+    process, the scheduler), committed chunks stay, and `resume` computes the missing ones only. Processors of the same kind with the
+    same versions compute a chunk to the same last bit. A run that fails is NaN from there on and has its status in the results; it
+    does not change other runs.
 
     Args:
-        system: a problem or scene; or its name: a built-in one, ``my_file.py:my_problem``, ``my_package.my_module:my_problem``.
+        system: a problem, a scene, or a name: of a built-in system, ``my_file.py:my_problem``, ``my_package.my_module:my_problem``.
             Problems whose functions belong to the running program, or to no module, can only be computed in this process.
-        scheme: how; a `Scheme`, the name of one, or a function that makes one for a num_micro, such as `vmri_jax.fully_implicit`.
-            Several by label are an axis "scheme" of the design.
+        scheme: a `Scheme`, the name of one, or a function that makes a scheme from num_micro, such as `vmri_jax.fully_implicit`.
+            A mapping from labels to schemes is an axis "scheme" of the design.
         design: `Product`, `Table` or `Draws` of `vmri_jax.ensembles`; a mapping is a `Product`. Columns are parameters of the
             system ("omega", "spring.stiffness", "masses[2]"), parts of the start ("q_s[0]", "v hub x", "q_f"), steps
-            ("macro_dt", "micro_dt", "num_steps") and schemes ("num_micro", "scheme"). All else stays: a parameter changes the
-            system, and not the positions and velocities that the problem starts from.
+            ("macro_dt", "micro_dt", "num_steps") and schemes ("num_micro", "scheme"). A parameter changes
+            the system alone; the positions and velocities at the start stay.
         out: folder of the store, a zarr group; conventionally named .zarr. All workers must see it.
         t_end, num_steps, macro_dt, micro_dt: two of them: the time at the end, the number of macro steps, and a step size.
-        num_micro: for schemes given by name or by what makes them.
-        save: what is kept of each run, names from `vmri_jax.ensembles.QUANTITIES` or own functions of a trajectory, given like
-            systems in a file.
-        num_saves: nodes of a run, equally spaced after the start, that `save` sees: all k-th macro steps for num_steps / k.
+        num_micro: number of micro steps, for schemes given by name or by a function.
+        save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory,
+            ``my_file.py:function``.
+        num_saves: number of saved nodes of a run after the start, equally spaced, from which the quantities are computed.
         solver, project: as in `simulate` and `initial_state`.
-        chunk: runs of a chunk; None for about a second's work. The store keeps it.
-        executor: where chunks are computed: None for this process; a `dask.distributed.Client`, of a cluster of any kind; or a
+        chunk: number of runs of a chunk; None for about a second of computation. The store keeps this number.
+        executor: computes the chunks: None for this process; a `dask.distributed.Client`, of a cluster of any kind; or a
             `concurrent.futures.Executor` that spawns processes.
-        processes: or so many workers on this machine, started by Dask (needs the extra ``vmri_jax[ensemble]``). They import the
-            program that starts them, which therefore begins with ``if __name__ == "__main__":``.
-        resume: go on with the ensemble that is in `out`, which must be the same; start it if there is none.
-        overwrite: replace an ensemble that is in `out`.
+        processes: in place of an executor, the number of workers that Dask starts on this machine (needs the extra ``vmri_jax[ensemble]``). They import the
+            program that starts them, which therefore needs ``if __name__ == "__main__":``.
+        resume: compute the missing chunks of the store in `out`, which must be of this ensemble; start a store if there is none.
+        overwrite: replace the store in `out`.
         throw: raise `EnsembleError` at the end if chunks could not be computed.
-        progress: True for a bar that shows how many runs are done, how fast, and how many failed, or a function that is told.
+        progress: True for a bar with the number of runs done, their speed and the number of failed runs; or a function that is called
+            with this text and the numbers of runs.
 
     Returns:
         The `Ensemble`; ``.open()`` gives its results.
 
     Raises:
-        ValueError, TypeError: bad arguments, a store of another ensemble, before anything is computed.
-        FileExistsError: there is something in `out`, and neither `resume` nor `overwrite` is asked for.
-        OSError: `out` cannot be written; of a full disk what was there before is kept.
-        EnsembleError: chunks could not be computed, the others are in the store.
-        Interrupted: Ctrl-C; the chunks that were done are in the store.
+        ValueError, TypeError: bad arguments, or the store of another ensemble; raised before anything is computed.
+        FileExistsError: `out` has a store, and neither `resume` nor `overwrite` is true.
+        OSError: `out` cannot be written; committed chunks stay if the disk is full.
+        EnsembleError: some chunks could not be computed; the others are in the store.
+        Interrupted: Ctrl-C; committed chunks are in the store.
     """
     require_x64()
     path = Path(out)
@@ -175,7 +180,7 @@ def ensemble(
     if len(schemes) > 1 and "scheme" not in design.described():
         if not isinstance(design, Product):
             raise ValueError(
-                "ensemble: there are several schemes, but the design has no column 'scheme' that says which."
+                "ensemble: there are several schemes, but the design has no column 'scheme' that chooses one for each run."
             )
         design = Product({"scheme": list(schemes), **design.axes})
     work = Work(
@@ -192,9 +197,10 @@ def ensemble(
     arrays, chunks, run = prepared(work, design, chunk)
     attributes = attributes_of(work, design, run, chunks)
     if resume and path.exists():
-        there = store.read_attributes(path)
-        chunks = chunks._replace(size=there["chunk"], width=there["width"])
-        check_same(path, attributes, there, chunk)
+        stored = store.read_attributes(path)
+        # On another machine the default division may differ; files in the store have the old one.
+        chunks = chunks._replace(size=stored["chunk"], width=stored["width"])
+        check_same(path, attributes, stored, chunk)
     with ExitStack() as opened:
         tasks, room = opened.enter_context(executor_of("ensemble", executor, processes))
         if not isinstance(tasks, Here):
@@ -209,45 +215,45 @@ def ensemble(
         clear_partial(path)
         tell = opened.enter_context(progress_to("ensemble", progress))
         interrupted = opened.enter_context(interrupts_noted())
-        found = Ensemble(path, chunks, store.committed(path))
-        _compute(found, job_of(path, chunks, work, design), tasks, room, tell, interrupted)
-    if found.failures and throw:
-        raise EnsembleError(found)
-    return found
+        runs = Ensemble(path, chunks, store.committed(path))
+        _compute(runs, job_of(path, chunks, work, design), tasks, room, tell, interrupted)
+    if runs.failures and throw:
+        raise EnsembleError(runs)
+    return runs
 
 
-def _compute(found: Ensemble, job: Job, tasks, room, tell: Progress, interrupted) -> None:
-    """Compute the chunks that are missing."""
+def _compute(runs: Ensemble, job: Job, tasks, room, tell: Progress, interrupted) -> None:
+    """Compute the missing chunks and record them in `runs`."""
     begin = time.perf_counter()
-    missing = ((number,) for number in range(job.chunks.count) if number not in found.done)
+    missing = ((number,) for number in range(job.chunks.count) if number not in runs.done)
     if isinstance(tasks, Here):
         submit = lambda number: tasks.submit(run_chunk, job, number)  # noqa: E731
     else:
         data, versions = packed("ensemble", job), known_versions()
         submit = lambda number: tasks.submit(*call_in_worker(versions, run_packed_chunk, data, number))  # noqa: E731
-    tell(_progress(found), _lanes_done(found), job.chunks.lanes)
+    tell(_progress(runs), _lanes_done(runs), job.chunks.lanes)
     try:
         for (number,), future in as_done(submit, room, missing, interrupted):
             try:
                 done: Done = future.result()
             except Exception as error:
-                found.failures[number] = _why(error, found)
+                runs.failures[number] = _why(error, runs)
             else:
-                found.done[number] = done.failed
-                found.computed += done.lanes
-            if not found.computed and len(found.failures) >= GIVE_UP:
+                runs.done[number] = done.failed
+                runs.computed += done.lanes
+            if not runs.computed and len(runs.failures) >= FAILURES_TO_STOP:
                 return
-            found.seconds = time.perf_counter() - begin
-            tell(_progress(found), _lanes_done(found), job.chunks.lanes)
+            runs.seconds = time.perf_counter() - begin
+            tell(_progress(runs), _lanes_done(runs), job.chunks.lanes)
     except KeyboardInterrupt:
-        again = f"go on with resume=True, {found.path}"
-        raise Interrupted(found, len(found.done), found.chunks.count, "chunks", again) from None
+        again = f"go on with resume=True, {runs.path}"
+        raise Interrupted(runs, len(runs.done), runs.chunks.count, "chunks", again) from None
     except CancelledError as gone:
-        raise _gone(found) from gone
+        raise _gone(runs) from gone
 
 
-def _why(error: Exception, found: Ensemble) -> str:
-    """Why a chunk failed, in words; errors that all chunks would have are raised.
+def _why(error: Exception, runs: Ensemble) -> str:
+    """The error of a chunk in words; errors that all chunks would have are raised.
 
     Raises:
         OSError: the store cannot be written.
@@ -258,8 +264,8 @@ def _why(error: Exception, found: Ensemble) -> str:
         and error.errno is not None
         and not isinstance(error, FileNotFoundError | ConnectionError)
     ):
-        kept = f"{len(found.done)} of {found.chunks.count} chunks are kept; go on with resume=True when there is room."
-        raise _unwritable(found.path, error, kept) from error
+        kept = f"{len(runs.done)} of {runs.chunks.count} chunks are kept; go on with resume=True when there is room."
+        raise _unwritable(runs.path, error, kept) from error
     if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == "vmri_jax":
         raise RuntimeError(
             "ensemble: a worker does not have vmri_jax. Install it in the environment of the workers, the version of this process."
@@ -267,13 +273,13 @@ def _why(error: Exception, found: Ensemble) -> str:
     if isinstance(error, NotAWorker):
         raise error
     if isinstance(error, BrokenExecutor | CancelledError):
-        raise _gone(found) from error
+        raise _gone(runs) from error
     return f"{type(error).__name__}: {error}".rstrip(".") + "."
 
 
-def _gone(found: Ensemble) -> RuntimeError:
+def _gone(runs: Ensemble) -> RuntimeError:
     return RuntimeError(
-        f"ensemble: the workers, or their scheduler, are gone. {len(store.committed(found.path))} of {found.chunks.count} chunks are in {found.path}; "
+        f"ensemble: the workers, or their scheduler, are gone. {len(store.committed(runs.path))} of {runs.chunks.count} chunks are in {runs.path}; "
         "go on with resume=True."
     )
 
@@ -282,22 +288,23 @@ def _unwritable(path: Path, error: OSError, kept: str) -> OSError:
     return OSError(error.errno, f"{path} cannot be written: {error.strerror or error}. {kept}")
 
 
-def _progress(found: Ensemble) -> str:
-    parts = [f"{_lanes_done(found):,} of {len(found):,} runs"]
-    if found.computed:
-        left = (len(found) - _lanes_done(found)) / found.runs_per_second
-        parts += [f"{found.runs_per_second:,.0f} a second", f"{left:,.0f} s left"]
-    if found.failed_runs:
-        parts.append(f"{found.failed_runs:,} failed")
-    if found.failures:
-        parts.append(f"{len(found.failures)} chunks not computed")
+def _progress(runs: Ensemble) -> str:
+    parts = [f"{_lanes_done(runs):,} of {len(runs):,} runs"]
+    if runs.computed:
+        left = (len(runs) - _lanes_done(runs)) / runs.runs_per_second
+        parts += [f"{runs.runs_per_second:,.0f} a second", f"{left:,.0f} s left"]
+    if runs.failed_runs:
+        parts.append(f"{runs.failed_runs:,} failed")
+    if runs.failures:
+        parts.append(f"{len(runs.failures)} chunks not computed")
     return ", ".join(parts)
 
 
-def _lanes_done(found: Ensemble) -> int:
-    count = len(found.done) * found.chunks.size
-    last = found.chunks.count - 1
-    return count - (found.chunks.count * found.chunks.size - len(found) if last in found.done else 0)
+def _lanes_done(runs: Ensemble) -> int:
+    """Number of runs in the committed chunks; the last chunk may have fewer runs than the others."""
+    count = len(runs.done) * runs.chunks.size
+    last = runs.chunks.count - 1
+    return count - (runs.chunks.count * runs.chunks.size - len(runs) if last in runs.done else 0)
 
 
 def _runs(chunks: Chunks, number: int) -> str:
@@ -309,8 +316,8 @@ def _schemes(scheme) -> dict[str, AnyScheme]:
     if not isinstance(scheme, Mapping):
         scheme = {scheme if isinstance(scheme, str) else "scheme": scheme}
     if not scheme or not all(
-        isinstance(label, str) and (isinstance(one, str | Scheme | Composition) or callable(one))
-        for label, one in scheme.items()
+        isinstance(label, str) and (isinstance(entry, str | Scheme | Composition) or callable(entry))
+        for label, entry in scheme.items()
     ):
         raise TypeError(
             f"ensemble: scheme is {scheme!r}; give a Scheme, the name of one, a function that makes one for a num_micro, or several "
@@ -331,18 +338,18 @@ def _design(design) -> Design:
 
 
 def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
-    """Refuse what is in the way, and a place that does not exist."""
+    """Refuse a folder that does not exist, a file that is in the way, and a store without `resume` or `overwrite`."""
     if resume and overwrite:
-        raise ValueError("ensemble: both resume and overwrite are asked for; choose one of them.")
+        raise ValueError("ensemble: both resume and overwrite are true; choose one of them.")
     if not path.resolve().parent.is_dir():
         raise FileNotFoundError(f"ensemble: out is {path}, but the folder {path.parent} does not exist; make it first.")
     if not path.exists():
         check_writable(path)
         return
-    there = store.read_attributes(path)  # or it is something else
+    stored = store.read_attributes(path)  # raises if this is no store
     if not (resume or overwrite):
-        done, count = len(store.committed(path)), -(-there["lanes"] // there["chunk"])
+        done, count = len(store.committed(path)), -(-stored["lanes"] // stored["chunk"])
         raise FileExistsError(
-            f"{path} holds an ensemble of {there['lanes']} runs, {done} of {count} chunks done. Go on with it (resume=True), replace it "
+            f"{path} holds an ensemble of {stored['lanes']} runs, {done} of {count} chunks done. Go on with it (resume=True), replace it "
             "(overwrite=True), or give another name."
         )

@@ -1,15 +1,15 @@
-"""The store of an ensemble on disk, and what is written in which order.
+"""The store of an ensemble on disk, and the order in which its files are written.
 
 A store is a folder, a zarr group of format 3, that `xarray.open_zarr` reads as a dataset:
 
-    q_s, energy_error, ...   one array for everything that is kept, a row for each run, one file per chunk of runs
+    q_s, energy_error, ...   one array for each kept quantity, a row for each run, one file per chunk of runs
     result, failed_at        the status of every run
     design/...               columns of a design that is a table
-    resume/chunks            one file per chunk: the number of its runs that failed, once the chunk counts
-    attributes               format, design, settings, identity of the ensemble, what it was made with
+    resume/chunks            one file per committed chunk: the number of its runs that failed
+    attributes               format, design, settings, identity of the ensemble, versions that made it
 
-The last file of a chunk commits it: it is written when all others of the chunk are on disk. What is there of a chunk without it
-does not count and is written again. So any number of workers can write at once, and be killed at any moment.
+The last file of a chunk commits the chunk: a worker writes it when all other files of the chunk are on disk. Readers ignore a chunk
+without this file, and the ensemble computes it again. So any number of workers can write at once, and be killed at any moment.
 """
 
 import json
@@ -30,18 +30,18 @@ COMMITTED = Path("resume", "chunks")
 DESIGN = "design"
 LANE = "lane"
 LABELS = "labels"
-"""Attribute of a column of labels, which are stored as their numbers in it."""
+"""Attribute of a column of labels: the list of labels, whose numbers in the list are the values of the column."""
 
 
 def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, dict], columns: Rows, chunk: int) -> None:
-    """Make a store without runs; what is at this place gives way when it is complete.
+    """Make a store without runs. When it is complete it replaces a store at this place.
 
     Args:
-        path: its folder.
+        path: folder of the store.
         attributes: of the store.
-        arrays: by name the shape, dtype, dimensions and attributes of what is kept of all runs.
+        arrays: for each array by name the shape for one run, dtype, dimensions and attributes.
         columns: of a design that is a table.
-        chunk: runs of a chunk.
+        chunk: number of runs of a chunk.
     """
     import zarr
 
@@ -62,20 +62,20 @@ def create(path: Path, attributes: Mapping[str, Any], arrays: Mapping[str, dict]
 
 
 def _store_column(group, name: str, values: np.ndarray, chunk: int) -> None:
-    """A column of a table; labels as numbers of a list of them, since zarr has no text of its own yet."""
-    about = {}
+    """Write a column of a table; labels as their numbers in a list, since zarr has no standard type for text."""
+    attributes = {}
     if values.dtype.kind == "U":
         labels, values = np.unique(values, return_inverse=True)
-        about = {LABELS: labels.tolist()}
+        attributes = {LABELS: labels.tolist()}
     dimensions = [f"{name}_{i}" for i in range(values.ndim - 1)]
-    one = {"dtype": values.dtype, "dimensions": dimensions, "attributes": about}
-    _create(group, name, values.shape, chunk, one)[:] = values
+    array = {"dtype": values.dtype, "dimensions": dimensions, "attributes": attributes}
+    _create(group, name, values.shape, chunk, array)[:] = values
 
 
-def _create(group, name: str, shape: tuple[int, ...], chunk: int, like: dict):
+def _create(group, name: str, shape: tuple[int, ...], chunk: int, array: dict):
     from zarr.codecs import Crc32cCodec
 
-    dtype = np.dtype(like["dtype"])
+    dtype = np.dtype(array["dtype"])
     return group.create_array(
         name,
         shape=shape,
@@ -83,8 +83,8 @@ def _create(group, name: str, shape: tuple[int, ...], chunk: int, like: dict):
         dtype=dtype,
         fill_value=FILL.get(dtype.kind, 0),
         compressors=Crc32cCodec(),
-        dimension_names=(LANE, *like["dimensions"]),
-        attributes=like.get("attributes", {}),
+        dimension_names=(LANE, *array["dimensions"]),
+        attributes=array.get("attributes", {}),
         config=CONFIG,
         **_KEYS,
     )
@@ -105,7 +105,7 @@ class Writer:
         self._columns = dict(group[DESIGN].arrays()) if DESIGN in group else {}  # pyright: ignore[reportAttributeAccessIssue]
 
     def columns(self, first: int, last: int) -> Rows:
-        """Rows of a design that is a table."""
+        """Rows `first` to `last - 1` of a design that is a table."""
         return {name: labelled(np.asarray(array[first:last]), array.attrs) for name, array in self._columns.items()}
 
     def write(self, number: int, values: Rows) -> int:
@@ -114,11 +114,11 @@ class Writer:
         files = []
         for name, value in values.items():
             array = self._arrays[name]
-            if first + len(value) > array.shape[0]:  # zarr would write nothing, and say nothing
+            if first + len(value) > array.shape[0]:  # zarr would write nothing, without an error
                 raise ValueError(f"{self._path}: {name} has {array.shape[0]} rows, none for chunk {number}.")
             array[first : first + len(value)] = value
             files.append(self._path / name / ".".join(["c", str(number)] + ["0"] * (array.ndim - 1)))
-        synchronize_files(files)  # after all have been written: the first wait is one for most of the others
+        synchronize_files(files)  # after all writes: the system writes them together
         failed = int(np.count_nonzero(values["failed_at"] >= 0))
         with replaced(self._path / COMMITTED / f"c.{number}") as file:
             file.write(np.array([failed], "<i4").tobytes())
@@ -126,39 +126,39 @@ class Writer:
 
 
 def labelled(values, attributes: Mapping[str, Any]):
-    """Values of a column of a table, labels in place of their numbers."""
+    """Values of a column of a table, with labels in place of their numbers."""
     return np.asarray(attributes[LABELS])[values] if LABELS in attributes else values
 
 
 def made(path: Path) -> tuple[int, int]:
-    """What tells a store from others at the same place."""
-    found = (path / METADATA).stat()
-    return found.st_ino, found.st_mtime_ns
+    """Inode and time of the metadata file, which differ between stores that follow each other at one place."""
+    file = (path / METADATA).stat()
+    return file.st_ino, file.st_mtime_ns
 
 
 def committed(path: Path) -> dict[int, int]:
-    """The chunks that count, each with the number of its runs that failed."""
-    found = {}
+    """Committed chunks, each with the number of its runs that failed."""
+    failed_runs = {}
     with os.scandir(path / COMMITTED) as entries:
         for entry in entries:
             if entry.name.startswith("c."):
-                found[int(entry.name[2:])] = int(np.frombuffer(Path(entry.path).read_bytes(), "<i4")[0])
-    return found
+                failed_runs[int(entry.name[2:])] = int(np.frombuffer(Path(entry.path).read_bytes(), "<i4")[0])
+    return failed_runs
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
     """Attributes of a store.
 
     Raises:
-        FileNotFoundError: nothing there.
-        ValueError: something else than the store of an ensemble.
+        FileNotFoundError: the folder does not exist.
+        ValueError: it is not the store of an ensemble.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give the folder of an ensemble.")
     try:
         attributes = json.loads((path / METADATA).read_text())["attributes"]
         if attributes["format"] != FORMAT:
-            raise ValueError(f"its format is {attributes['format']!r}, that of ensembles is {FORMAT!r}")
+            raise ValueError(f"its format is {attributes['format']!r}, an ensemble has the format {FORMAT!r}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not the store of an ensemble ({type(error).__name__}: {error}).") from error
     return attributes

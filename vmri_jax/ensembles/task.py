@@ -1,4 +1,4 @@
-"""A task: one chunk of runs, computed and written to its part of the store. It needs the store and some bytes, nothing else."""
+"""A task: one chunk of runs, computed and written to its part of the store. A task needs the store and the pickled `Job`, nothing else."""
 
 import pickle
 from functools import lru_cache
@@ -11,11 +11,11 @@ from vmri_jax.ensembles.work import Work
 
 
 class Chunks(NamedTuple):
-    """How the runs of an ensemble are divided.
+    """The division of the runs of an ensemble.
 
-    lanes: their number.
-    size: runs of a chunk.
-    width: runs that are computed side by side.
+    lanes: number of runs.
+    size: number of runs of a chunk; the last chunk may have fewer.
+    width: number of runs that are computed side by side.
     """
 
     lanes: int
@@ -28,15 +28,17 @@ class Chunks(NamedTuple):
         return -(-self.lanes // self.size)
 
     def ends(self, number: int) -> tuple[int, int]:
-        """First run of a chunk, and the first one after it."""
+        """Number of the first run of a chunk, and of the first run after it."""
         return number * self.size, min((number + 1) * self.size, self.lanes)
 
 
 class Job(NamedTuple):
-    """All that tasks of an ensemble share.
+    """Arguments that all tasks of an ensemble share.
 
-    work: what is computed.
-    design: its rows; None of a table, whose rows are in the store.
+    path: folder of the store.
+    chunks: the division of the runs.
+    work: computes them.
+    design: makes the rows; None for a table, whose rows are in the store.
     """
 
     path: str
@@ -46,19 +48,19 @@ class Job(NamedTuple):
 
 
 class Done(NamedTuple):
-    """What a task says when its chunk is written: its runs, and those of them that failed."""
+    """The result of a task: the number of runs of its chunk, and how many of them failed."""
 
     lanes: int
     failed: int
 
 
 def job_of(path: Path, chunks: Chunks, work: Work, design: Design) -> Job:
-    """The job of an ensemble whose store is there."""
+    """The job of an ensemble whose store exists."""
     return Job(str(path.resolve()), chunks, work, None if isinstance(design, Table) else design)
 
 
 def run_chunk(job: Job, number: int) -> Done:
-    """Compute a chunk and write it."""
+    """Compute a chunk of runs, write it and commit it."""
     first, last = job.chunks.ends(number)
     writer = _writer(job.path, job.chunks.size, made(Path(job.path)))
     rows = writer.columns(first, last) if job.design is None else job.design.rows(first, last)
@@ -67,7 +69,7 @@ def run_chunk(job: Job, number: int) -> Done:
 
 
 def run_packed_chunk(packed: bytes, number: int) -> Done:
-    """`run_chunk` of a job that was pickled."""
+    """`run_chunk` of a pickled job."""
     return run_chunk(_job(packed), number)
 
 
@@ -80,5 +82,5 @@ def _job(packed: bytes) -> Job:
 
 @lru_cache(maxsize=4)
 def _writer(path: str, chunk: int, made: tuple[int, int]) -> Writer:
-    """Of a store, told apart from others that were at its place before by when it was made."""
+    """The writer of a store, cached; `made` makes a new writer for a store that replaces another one at its place."""
     return Writer(Path(path), chunk)

@@ -1,4 +1,4 @@
-"""The work of an ensemble: everything that a worker has to know to compute some of its runs. It is small, and can be sent."""
+"""The work of an ensemble: a small object that pickle can send, with which a worker computes some of the runs."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
@@ -28,11 +28,11 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
 
 AnyScheme = str | Scheme | Composition | Callable[[int], Scheme | Composition]
-"""A scheme, by name or itself, or what makes one for a number of micro steps."""
+"""A scheme, the name of one, or a function from the number of micro steps to a scheme."""
 
 
 class Steps(NamedTuple):
-    """Steps of runs, as far as they are the same for all of them."""
+    """Arguments of `ensemble` about steps; None for columns, and for values that follow from the others."""
 
     t_end: float | None = None
     num_steps: int | None = None
@@ -41,10 +41,11 @@ class Steps(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Runs that one program computes side by side.
+    """Runs that one compiled program computes.
 
-    lanes: which rows they are.
-    macro_dt: a number, or one for each of them.
+    lanes: numbers of their rows.
+    scheme, num_steps: the same for all of them.
+    macro_dt: a number, or an array with one for each run.
     """
 
     lanes: np.ndarray
@@ -55,14 +56,15 @@ class Group(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """What is the same for all runs of an ensemble, and how columns of its design change it.
+    """The arguments that all runs of an ensemble share, and the columns that change some of them for each run.
 
     system: name of a system, or a problem that can be pickled.
     schemes: by label.
     columns: names of the columns of the design.
-    steps, num_micro, solver, project: as of `ensemble`.
-    save: names of what is kept; num_saves: saved nodes after the start.
-    sources: digests of the user's files that are named here.
+    steps, num_micro, solver, project: as in `ensemble`.
+    save: names of the quantities that are kept.
+    num_saves: number of saved nodes after the start.
+    sources: digests of the user's files, by path.
     """
 
     system: str | Problem
@@ -77,23 +79,23 @@ class Work:
     sources: Mapping[str, str] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {one.name: getattr(self, one.name) for one in fields(self)}  # without what was made of them here
+        return {part.name: getattr(self, part.name) for part in fields(self)}  # without cached properties
 
     def with_sources(self) -> "Work":
-        """The same that knows what is in the user's files, which get their whole path."""
+        """This work with absolute paths of the user's files, and with digests of them."""
         names = [name for name in (self.system, *self.save) if isinstance(name, str)]
         files = {name.partition(":")[0] for name in names}
-        whole = {file: str(Path(file).resolve()) for file in files if Path(file).suffix and Path(file).is_file()}
+        resolved = {file: str(Path(file).resolve()) for file in files if Path(file).suffix and Path(file).is_file()}
 
         def located(name):
-            file, colon, rest = name.partition(":") if isinstance(name, str) else ("", "", "")
-            return f"{whole[file]}{colon}{rest}" if file in whole else name
+            file, colon, attribute = name.partition(":") if isinstance(name, str) else ("", "", "")
+            return f"{resolved[file]}{colon}{attribute}" if file in resolved else name
 
-        sources = {file: _digest(file) for file in whole.values()}
+        sources = {file: _digest(file) for file in resolved.values()}
         return replace(self, system=located(self.system), save=tuple(map(located, self.save)), sources=sources)
 
     def check_sources(self) -> None:
-        """Refuse files of the user that are missing or others than those the ensemble was started with.
+        """Refuse a worker on which a file of the user is missing, or differs from the file where the ensemble was started.
 
         Raises:
             FileNotFoundError, ValueError: with the file.
@@ -105,34 +107,36 @@ class Work:
                     "my_package.my_module:name."
                 )
             if _digest(file) != digest:
-                raise ValueError(f"{file} is another file on this worker than where the ensemble was started.")
+                raise ValueError(
+                    f"{file} differs from the file where the ensemble was started; give all workers the same file."
+                )
 
     @cached_property
     def problem(self) -> Problem:
-        """The problem that columns change."""
+        """The problem whose parameters and start the columns change."""
         return find_problem(self.system) if isinstance(self.system, str) else self.system
 
     @cached_property
     def places(self) -> dict[str, Place]:
-        """Where columns belong."""
+        """The place of each column in the problem."""
         return places(self.problem, self.columns)
 
     @cached_property
     def quantities(self) -> list[Quantity]:
-        """What is kept."""
+        """The quantities that are kept."""
         return [quantity(name) for name in self.save]
 
     @cached_property
     def told_apart(self) -> list[str]:
-        """Columns whose different values need programs, or calls, of their own."""
+        """Columns of which every value needs a group of its own: schemes, number of steps, and step sizes that the number follows from."""
         steps = STEPS if self.steps.t_end is not None and not self._has("num_steps") else ("num_steps",)
         return [name for name in self.columns if name in (*SCHEMES, *steps)]
 
     def groups(self, rows: Rows, count: int) -> Iterator[Group]:
-        """Rows by what one program computes.
+        """Divide rows into groups, one for each compiled program.
 
         Raises:
-            ValueError, TypeError: values that make no run.
+            ValueError, TypeError: values from which no run can be made.
         """
         different, number = unique_rows({name: rows[name] for name in self.told_apart})
         if not self.told_apart:
@@ -145,7 +149,7 @@ class Work:
             yield Group(lanes, scheme, *self._steps(values | dt, scheme))
 
     def simulation(self, group: Group) -> Simulation:
-        """One run of a group, whose arguments are checked.
+        """The first run of a group, after a check of its arguments.
 
         Raises:
             ValueError, TypeError: bad arguments.
@@ -162,7 +166,7 @@ class Work:
         return simulation(self.problem, group.scheme, state, self.solver, steps)
 
     def check_values(self, rows: Rows) -> None:
-        """Refuse values of columns that do not fit what they replace.
+        """Refuse values of other shapes than the numbers that they replace.
 
         Raises:
             ValueError: with the column.
@@ -170,24 +174,26 @@ class Work:
         lanes_of(self.problem, self.places, rows, len(next(iter(rows.values()))) if rows else 1)
 
     def compute(self, rows: Rows, count: int, width: int) -> dict[str, np.ndarray]:
-        """What is kept of some runs, and their status.
+        """Kept quantities and status of some runs, arrays by name with a row for each run.
 
         Args:
             rows: of the design.
             count: number of rows.
-            width: lanes that are computed side by side.
+            width: number of runs that are computed side by side.
         """
-        found: dict[str, np.ndarray] = {}
+        arrays: dict[str, np.ndarray] = {}
         for group in self.groups(rows, count):
             part = self._compute(group, {name: values[group.lanes] for name, values in rows.items()}, width)
             for name, values in part.items():
-                whole = found.setdefault(name, np.empty((count, *values.shape[1:]), values.dtype))
-                whole[group.lanes] = values
-        return found
+                array = arrays.setdefault(name, np.empty((count, *values.shape[1:]), values.dtype))
+                array[group.lanes] = values
+        return arrays
 
     def _compute(self, group: Group, rows: Rows, width: int) -> dict[str, np.ndarray]:
         count = len(group.lanes)
-        filled = np.minimum(np.arange(max(count, width)), count - 1)  # copies of the last run: one program for all
+        filled = np.minimum(
+            np.arange(max(count, width)), count - 1
+        )  # copies of the last run: all batches are `width` wide, for one program
         rows = {name: values[filled] for name, values in rows.items()}
         macro_dt = group.macro_dt[filled] if np.ndim(group.macro_dt) else group.macro_dt
         lanes = lanes_of(self.problem, self.places, rows, len(filled))
@@ -217,19 +223,21 @@ class Work:
         label = str(values.get("scheme", next(iter(self.schemes))))
         if label not in self.schemes:
             raise ValueError(
-                f"ensemble: there is no scheme {label!r}.{near(label, self.schemes)} Those given are {', '.join(self.schemes)}."
+                f"ensemble: there is no scheme {label!r}.{near(label, self.schemes)} There are {', '.join(self.schemes)}."
             )
         scheme = self.schemes[label]
         num_micro = _whole("num_micro", values["num_micro"]) if "num_micro" in values else self.num_micro
         if isinstance(scheme, Scheme | Composition):
             if num_micro is not None:
                 raise ValueError(
-                    f"ensemble: the scheme {label!r} has its num_micro already; give what makes one, vmri_jax.fully_implicit "
-                    "say, or the name of a scheme."
+                    f"ensemble: the scheme {label!r} has its num_micro already; give a function of num_micro, for example "
+                    "vmri_jax.fully_implicit, or the name of a scheme."
                 )
             return scheme
         if num_micro is None:
-            raise ValueError(f"ensemble: num_micro is missing for the scheme {label!r}; give it, or a column of it.")
+            raise ValueError(
+                f"ensemble: num_micro is missing for the scheme {label!r}; give num_micro, or a column of this name."
+            )
         made = find_scheme(scheme, num_micro) if isinstance(scheme, str) else scheme(num_micro)
         if not isinstance(made, Scheme | Composition):
             raise TypeError(f"ensemble: the scheme {label!r} makes {type(made).__name__}; it must make a Scheme.")
@@ -239,57 +247,70 @@ class Work:
         return name in self.columns or getattr(self.steps, name) is not None
 
     def _steps(self, values: Mapping[str, Any], scheme) -> tuple[Any, int]:
-        """Macro step and number of steps."""
-        given = {name: value for name, value in self.steps._asdict().items() if value is not None}
-        both = sorted(set(given) & set(values))
-        if both:
-            raise ValueError(f"ensemble: {', '.join(both)} is a column and an argument; give it once.")
-        given |= {name: values[name] for name in STEPS if name in values}
-        known = set(given)
-        if len(known) != 2 or known == {"macro_dt", "micro_dt"}:
+        """Macro step, a number or one for each run, and number of macro steps.
+
+        Raises:
+            ValueError: not two of t_end, num_steps and a step; a step that is not positive.
+        """
+        values_by_name = {name: value for name, value in self.steps._asdict().items() if value is not None}
+        twice = sorted(set(values_by_name) & set(values))
+        if twice:
+            raise ValueError(f"ensemble: {', '.join(twice)} is a column and an argument; leave one of them out.")
+        values_by_name |= {name: values[name] for name in STEPS if name in values}
+        names = set(values_by_name)
+        if len(names) != 2 or names == {"macro_dt", "micro_dt"}:
             raise ValueError(
-                f"ensemble: of the steps {', '.join(sorted(known)) or 'nothing'} is given; give two of t_end, num_steps and one of "
+                f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of t_end, num_steps and one of "
                 "macro_dt and micro_dt, as arguments or columns."
             )
-        if "t" in self.columns and "t_end" in known:
-            raise ValueError("ensemble: t is a column, so that t_end is no number of steps; give num_steps and a step.")
-        if "num_steps" in given:
-            given["num_steps"] = _whole("num_steps", given["num_steps"])
+        if "t" in self.columns and "t_end" in names:
+            raise ValueError(
+                "ensemble: t is a column, so that t_end does not fix the number of steps; give num_steps and a step."
+            )
+        if "num_steps" in values_by_name:
+            values_by_name["num_steps"] = _whole("num_steps", values_by_name["num_steps"])
         start = float(self.problem.t)
-        if known == {"t_end", "num_steps"}:
-            return (float(given["t_end"]) - start) / given["num_steps"], given["num_steps"]
-        factor = scheme.num_micro if "micro_dt" in given else 1
-        macro_dt = factor * np.asarray(given["micro_dt" if "micro_dt" in given else "macro_dt"], dtype=float)
+        if names == {"t_end", "num_steps"}:
+            return (float(values_by_name["t_end"]) - start) / values_by_name["num_steps"], values_by_name["num_steps"]
+        factor = scheme.num_micro if "micro_dt" in values_by_name else 1
+        macro_dt = factor * np.asarray(
+            values_by_name["micro_dt" if "micro_dt" in values_by_name else "macro_dt"], dtype=float
+        )
         if not np.all(macro_dt > 0):
             raise ValueError(f"ensemble: a step is {np.min(macro_dt)}; steps must be positive.")
         macro_dt = float(macro_dt) if macro_dt.ndim == 0 else macro_dt
-        return macro_dt, given.get("num_steps") or steps_until(given["t_end"], start, macro_dt)
+        return macro_dt, values_by_name.get("num_steps") or steps_until(values_by_name["t_end"], start, macro_dt)
 
 
 def all_groups(work: Work, design: Design) -> Iterator[Group]:
-    """Every kind of group that there may be in a design, of a single row each."""
+    """All groups that the rows of a design can form, each with a single row."""
     rows = design.combinations(work.told_apart)
-    others = [name for name in ("macro_dt", "micro_dt") if name in work.columns and name not in rows]
-    first = design.rows(0, 1) if others else {}
+    step_columns = [name for name in ("macro_dt", "micro_dt") if name in work.columns and name not in rows]
+    first = design.rows(0, 1) if step_columns else {}
     count = max((len(values) for values in rows.values()), default=1)
-    yield from work.groups(rows | {name: np.repeat(first[name], count) for name in others}, count)
+    yield from work.groups(rows | {name: np.repeat(first[name], count) for name in step_columns}, count)
 
 
 @eqx.filter_jit
 def _states(system: System, params, start: tuple, project: bool) -> State:
-    """Consistent states with these starts, (t, q_s, q_f, v_s, v_f), and parameters, a lane each."""
+    """Consistent states, one for each row of the starts (t, q_s, q_f, v_s, v_f) and parameters."""
 
-    def of_one(own, one):
-        t, q_s, q_f, v_s, v_f = one
-        lane = system if own is None else system.replace(params=own)
-        return initial_state(lane, q_s, q_f, v_s, v_f, t, project=project)
+    def of_lane(lane_params, lane_start):
+        t, q_s, q_f, v_s, v_f = lane_start
+        lane_system = system if lane_params is None else system.replace(params=lane_params)
+        return initial_state(lane_system, q_s, q_f, v_s, v_f, t, project=project)
 
-    return jax.vmap(of_one, (None if params is None else 0, 0))(params, start)
+    return jax.vmap(of_lane, (None if params is None else 0, 0))(params, start)
 
 
 @lru_cache(maxsize=8)
 def _kept_of(save: tuple[str, ...], sources: tuple) -> Callable[[Trajectory], dict[str, Any]]:
-    """What is kept, compiled once for all ensembles of a process that keep the same, by functions of the same files."""
+    """The compiled function that computes the kept quantities, cached for the ensembles of a process.
+
+    Args:
+        save: names of quantities.
+        sources: digests of the user's files, so that a changed file is read again.
+    """
     return of_lanes([quantity(name) for name in save])
 
 

@@ -1,6 +1,6 @@
-"""Other processes: what they are told, and what they do before JAX starts in them.
+"""Calls in worker processes: how the arguments are sent, and how JAX is set up before a worker uses it.
 
-They get bytes, and unpack them when JAX has its settings: arrays of JAX that are unpacked would start it.
+A worker gets bytes and unpacks them after it has set up JAX: to unpack an array of JAX starts JAX, with default settings.
 """
 
 import os
@@ -17,33 +17,34 @@ VERSIONS = ("vmri_jax", "jax", "jaxlib")
 
 
 class NotAWorker(RuntimeError):
-    """A process cannot be a worker: it has other versions, or JAX runs there with other settings."""
+    """A process cannot be a worker: it has other versions of packages, or JAX runs in it with other settings."""
 
 
 @lru_cache
 def known_versions() -> dict[str, str]:
-    """Versions that decide the last digits of a run."""
-    found = environment()
-    return {name: found[name] for name in VERSIONS}
+    """Versions of the packages that the last digits of a run depend on."""
+    versions = environment()
+    return {name: versions[name] for name in VERSIONS}
 
 
-def packed(what: str, value: Any) -> bytes:
+def packed(caller: str, value: Any) -> bytes:
     """A value as bytes that another process can read.
 
     Args:
-        what: the function that was called, for messages.
+        caller: name of the calling function, for messages.
+        value: its functions have to be importable.
 
     Raises:
-        ValueError: it has functions that workers cannot import, with what to do.
+        ValueError: the value has functions that workers cannot import.
     """
     try:
         data = pickle.dumps(value)
         if b"__main__" in data:
-            raise pickle.PicklingError("it has functions of the program that is running")
+            raise pickle.PicklingError("it has functions of the running program")
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ValueError(
-            f"{what}: workers cannot import this system or scheme ({error}). Functions of the program that is running, of an "
-            "interactive session, made within another function or by lambda have no name that other processes find. Put the "
+            f"{caller}: workers cannot import this system or scheme ({error}). Workers cannot find functions of the running program or of an "
+            "interactive session, nor lambdas and functions within functions. Put the "
             "problem into a file and give its name, 'my_file.py:my_problem', or into a package that workers have, "
             "'my_package.my_module:my_problem'."
         ) from error
@@ -51,7 +52,7 @@ def packed(what: str, value: Any) -> bytes:
 
 
 class _Call:
-    """A call whose pickle, when it is loaded, gives its result."""
+    """A call whose pickle makes the call when it is loaded: `pickle.loads` returns the result."""
 
     def __init__(self, function: Callable, *arguments):
         self.call = function, arguments
@@ -61,21 +62,24 @@ class _Call:
 
 
 def call_in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain) -> tuple[Callable, bytes]:
-    """A function and its argument for an executor, which make the call of `in_worker`.
+    """A function and its argument for an executor, ``(pickle.loads, bytes)``, that make the call of `in_worker`.
 
-    Both are none of this package, so that a worker without it can say so: Dask's end when they get a task that they cannot read.
+    A worker without this package can read both, and reports the missing package. Workers of Dask end at a task that they cannot read.
     """
     return pickle.loads, pickle.dumps(_Call(in_worker, versions, task, packed, *plain))
 
 
 def in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain):
-    """``task(packed, *plain)`` in another process, where JAX has its settings.
+    """Set up JAX in this process and return ``task(packed, *plain)``.
 
     Args:
-        versions: of the process that started the work.
+        versions: versions of packages of the process that started the work.
+        task: unpacks its first argument.
+        packed: bytes for it.
+        plain: further arguments.
 
     Raises:
-        NotAWorker: this process has others, or JAX has started here without these settings.
+        NotAWorker: this process has other versions, or JAX has started in it with other settings.
     """
     here = known_versions()
     differ = [
@@ -91,20 +95,24 @@ def in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain):
 
 
 def call_packed(packed: bytes):
-    """``task(*arguments)`` of these, pickled."""
+    """``task(*arguments)`` from the pickled ``(task, arguments)``."""
     task, arguments = pickle.loads(packed)
     return task(*arguments)
 
 
 @lru_cache(maxsize=1)
 def _prepare(process: int) -> None:
-    """One thread, 64-bit floats, fast loops, and compiled programs kept on disk, by kind of processor."""
+    """Settings of JAX: one thread, 64-bit floats, fast loops, and compiled programs on disk in a folder for this kind of processor.
+
+    Args:
+        process: number of this process; a forked process has another one, and prepares itself again.
+    """
     os.environ.setdefault("PJRT_NPROC", "1")
     try:
         configure(cache=cache_folder() / "workers" / processor())
     except RuntimeError as error:
         raise NotAWorker(
-            f"process {process} on {socket.gethostname()} runs JAX already, without the settings of vmri_jax, perhaps since it was "
-            "forked. Give an executor that starts processes anew, ProcessPoolExecutor(n, "
-            "mp_context=multiprocessing.get_context('spawn')), and workers that have done nothing else with JAX."
+            f"process {process} on {socket.gethostname()} runs JAX already, without the settings of vmri_jax; perhaps it was forked. "
+            "Give an executor that starts new processes, ProcessPoolExecutor(n, "
+            "mp_context=multiprocessing.get_context('spawn')), and workers that do nothing else with JAX."
         ) from error

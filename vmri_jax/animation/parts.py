@@ -1,0 +1,94 @@
+"""Parts of a drawing: bodies, solids, blocks of general coordinates, joints, and fixed planes and spheres."""
+
+from dataclasses import dataclass
+
+KINDS = ("link", "spring")
+PACES = ("slow", "fast")
+
+
+@dataclass(frozen=True)
+class Body:
+    """A point of 1 to 3 coordinates, each a linear form ``sum_k weight_k q[index_k]`` over q_s and q_f; none is zero.
+
+    Attributes:
+        name: unique in a drawing.
+        forms: per coordinate its terms (weight, "s" or "f", index).
+        offset: added to the coordinates: where the body is at q = 0.
+        radius: in the unit of the coordinates; None for one that suits the picture.
+        color: as in CSS, ``#rrggbb``; None for that of its pace.
+        shown: "ball", "name" (of a solid, whose centre it is), or "" for a point of which nothing is shown.
+    """
+
+    name: str
+    forms: tuple[tuple[tuple[float, str, int], ...], ...]
+    offset: tuple[float, ...]
+    radius: float | None = None
+    color: str | None = None
+    shown: str = "ball"
+
+    @property
+    def pace(self) -> str:
+        """ "slow" if all its coordinates are, else "fast"."""
+        return "slow" if all(part == "s" for form in self.forms for _, part, _ in form) else "fast"
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A convex solid that moves with four points: a corner with the weights c is at ``x_0 + sum_i c_i (x_i - x_0)``.
+
+    Attributes:
+        points: names of the four bodies, the centre first.
+        corners: the weights (c_1, c_2, c_3) of each corner.
+        faces: numbers of their corners, anticlockwise from outside.
+        color: None for that of the pace of its centre.
+    """
+
+    points: tuple[str, ...]
+    corners: tuple[tuple[float, ...], ...]
+    faces: tuple[tuple[int, ...], ...]
+    color: str | None = None
+
+
+@dataclass(frozen=True)
+class Block:
+    """General coordinates, ("s" or "f", index) each, that are not those of a point: each is shown as a bar.
+
+    labels: names of the coordinates, ``name[i]`` if they have none.
+    """
+
+    name: str
+    coordinates: tuple[tuple[str, int], ...]
+    labels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A link or spring between two bodies, or from a body to a fixed point.
+
+    Attributes:
+        kind: "link" or "spring".
+        bodies: one name or two.
+        point: the fixed point, if there is one body.
+        pace: "slow" or "fast", colours a spring; None for that of the bodies.
+    """
+
+    kind: str
+    bodies: tuple[str, ...]
+    point: tuple[float, ...] | None = None
+    pace: str | None = None
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A wall or ground through `point`; bodies stay on the side of `normal`."""
+
+    point: tuple[float, ...]
+    normal: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A fixed sphere."""
+
+    center: tuple[float, ...]
+    radius: float

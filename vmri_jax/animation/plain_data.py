@@ -1,0 +1,136 @@
+"""Parts of a drawing from plain data, with checks: every refusal names the entry that is wrong."""
+
+import operator
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from vmri_jax.animation.checks import check_keys, entries, numbers, positive
+from vmri_jax.animation.parts import KINDS, PACES, Block, Body, Joint, Solid
+from vmri_jax.mechanics.kinematics import Kinematics
+from vmri_jax.mechanics.names import near
+
+BLOCK_KEYS = ("name", "coordinates", "labels")
+BODY_KEYS = ("name", "coordinates", "offset", "radius", "color", "shown")
+SOLID_KEYS = ("name", "coordinates", "corners", "faces", "color")
+FORMS_OF_CENTRES = ("ball", "name", "")
+
+
+def read_body(data: Any, where: str) -> Body:
+    check_keys(data, BODY_KEYS, ("name", "coordinates"), where)
+    coordinates = data["coordinates"]
+    if not isinstance(coordinates, list | tuple) or not 1 <= len(coordinates) <= 3:
+        raise ValueError(f"{where}: coordinates is {coordinates!r}; it must be a list of 1 to 3 entries.")
+    radius = None if data.get("radius") is None else positive(data["radius"], f"{where}: radius")
+    color = data.get("color")
+    if color is not None and not (isinstance(color, str) and re.fullmatch("#[0-9a-fA-F]{6}", color)):
+        raise ValueError(f"{where}: color is {color!r}; it must be like '#0072b2'.")
+    forms = tuple(_form(entry, where) for entry in coordinates)
+    offset = numbers(data.get("offset") or [0.0] * len(forms), f"{where}: offset")
+    shown = data.get("shown", "ball")
+    if shown not in FORMS_OF_CENTRES:
+        raise ValueError(f"{where}: shown is {shown!r}; it must be 'ball', 'name' or ''.")
+    return Body(str(data["name"]), forms, offset, radius, color, shown)
+
+
+def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
+    """The solid, and the four points that it moves with: its centre, and one along each director."""
+    check_keys(data, SOLID_KEYS, SOLID_KEYS[:4], where)
+    name = str(data["name"])
+    forms = [_form(coordinate, where) for coordinate in entries(data, "coordinates", where)]
+    corners = np.array([numbers(corner, f"{where}: corners") for corner in entries(data, "corners", where)])
+    faces = tuple(tuple(operator.index(i) for i in face) for face in entries(data, "faces", where))
+    count = len(forms) // 3 - 1
+    if len(forms) != 3 * (count + 1) or not 1 <= count <= 3 or corners.ndim != 2 or corners.shape[1] != count:
+        raise ValueError(
+            f"{where}: {len(forms)} coordinates and corners of shape {corners.shape}; give the 12 coordinates of a rigid body (or "
+            "fewer, of one with fewer directors) and a number along each director for every corner."
+        )
+    if any(not 0 <= i < len(corners) for face in faces for i in face):
+        raise ValueError(f"{where}: a face has corners that there are not; there are {len(corners)}.")
+    size = float(np.abs(corners).max()) or 1.0
+    centre = tuple(forms[:3])
+    bodies = [Body(name, centre, (0.0,) * 3, None, data.get("color"), "name")]
+    for k in range(3):
+        directors = forms[3 * (k + 1) : 3 * (k + 2)] or [()] * 3
+        along = [(*a, *((size * w, part, i) for w, part, i in b)) for a, b in zip(centre, directors, strict=True)]
+        bodies.append(Body(f"{name} axis {k + 1}", tuple(along), (0.0,) * 3, shown=""))
+    weights = np.pad(corners / size, [(0, 0), (0, 3 - count)])
+    named = tuple(body.name for body in bodies)
+    return Solid(named, tuple(map(tuple, weights.tolist())), faces, data.get("color")), bodies
+
+
+def read_block(data: Any, where: str) -> Block:
+    check_keys(data, BLOCK_KEYS, BLOCK_KEYS[:2], where)
+    forms = [_form(entry, where) for entry in entries(data, "coordinates", where)]
+    if not forms or any(len(form) != 1 or form[0][0] != 1.0 for form in forms):
+        raise ValueError(f"{where}: coordinates is {data['coordinates']!r}; it must be a list of ['s' or 'f', index].")
+    labels = [str(label) for label in entries(data, "labels", where)] or [
+        f"{data['name']}[{i}]" for i in range(len(forms))
+    ]
+    if len(labels) != len(forms):
+        raise ValueError(f"{where}: there are {len(labels)} labels for {len(forms)} coordinates; give one for each.")
+    return Block(str(data["name"]), tuple((part, index) for ((_, part, index),) in forms), tuple(labels))
+
+
+def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
+    """The terms of ``["s", 0]`` or ``[[weight, "s", 0], ...]``."""
+    single = isinstance(entry, list | tuple) and len(entry) == 2 and isinstance(entry[0], str)
+    try:
+        terms = [(float(weight), part, operator.index(i)) for weight, part, i in ([(1.0, *entry)] if single else entry)]
+    except (TypeError, ValueError):
+        terms = [(np.nan, "", 0)]
+    if not all(part in ("s", "f") and i >= 0 and np.isfinite(weight) for weight, part, i in terms):
+        raise ValueError(
+            f"{where}: the coordinate {entry!r} must be ['s' or 'f', index] or a list of [weight, 's' or 'f', index]."
+        )
+    return tuple(terms)
+
+
+def read_joint(kind: str, names: Sequence[str], entry: Any, where: str) -> Joint:
+    if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
+        raise ValueError(f"{where} is {entry!r}; it must be a pair of names, or one and 'slow' or 'fast'.")
+    a, b = (_body_name(name, names, where) for name in entry[:2])
+    if a == b:
+        raise ValueError(f"{where} joins {a!r} with itself.")
+    return Joint(kind, (a, b), pace=_pace(entry[2] if len(entry) == 3 else None, where))
+
+
+def read_anchor(names: Sequence[str], data: Any, where: str) -> Joint:
+    check_keys(data, ("body", "point", "kind", "pace"), ("body", "point", "kind"), where)
+    if data["kind"] not in KINDS:
+        raise ValueError(f"{where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")
+    point = numbers(data["point"], f"{where}: point")
+    body = _body_name(data["body"], names, where)
+    return Joint(data["kind"], (body,), point, _pace(data.get("pace"), where))
+
+
+def read_record(kind: type, readers: dict[str, Callable], data: Any, where: str) -> Any:
+    """What has just these entries, each read and checked by a function of its own."""
+    check_keys(data, list(readers), list(readers), where)
+    return kind(**{key: read(data[key], f"{where}: {key}") for key, read in readers.items()})
+
+
+def _body_name(name: Any, names: Sequence[str], where: str) -> str:
+    if name not in names:
+        listed = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise ValueError(
+            f"{where} names the body {name!r}, which does not exist.{near(str(name), names)} There are {listed}."
+        )
+    return name
+
+
+def _pace(pace: Any, where: str) -> str | None:
+    if pace is not None and pace not in PACES:
+        raise ValueError(f"{where}: the pace is {pace!r}; it must be {' or '.join(PACES)}.")
+    return pace
+
+
+def read_carried(data: Any) -> tuple[Kinematics, dict[str, np.ndarray]] | None:
+    """The map of bodies on joints, of its plain data."""
+    if data is None:
+        return None
+    check_keys(data, ("map", "joints"), ("map", "joints"), "drawing: kinematics")
+    return Kinematics.from_dict(data["map"]), {name: np.asarray(values) for name, values in data["joints"].items()}
