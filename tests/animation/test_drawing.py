@@ -138,7 +138,7 @@ def test_links_of_built_in_drawings_keep_their_length_along_a_run(name, macro_dt
 
 
 def test_the_drawn_chain_stretches_as_its_potentials_say(fpu, monkeypatch):
-    monkeypatch.setattr(defaults_module, "MAGNIFIED", 1.0)
+    monkeypatch.setattr(defaults_module, "MAGNIFICATION", 1.0)
     run = reference_run("fpu3_fully_implicit_p1", 0.05)
     drawing = Drawing.from_dict(built_in("fpu", 3))
     x = motion(run, drawing).points[..., 0]

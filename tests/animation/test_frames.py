@@ -12,7 +12,7 @@ from PIL import Image
 from tests.animation.support import PENDULUM, swinging
 from vmri_jax import plots
 from vmri_jax.animation import Drawing, motion, plot_strip, write_gif
-from vmri_jax.animation.camera import FILLED, Camera
+from vmri_jax.animation.camera import FILLED_PART, Camera
 from vmri_jax.animation.frames import rows_of
 from vmri_jax.animation.layout import layout, nice
 from vmri_jax.animation.shapes import Stage
@@ -35,7 +35,7 @@ def test_a_fitted_view_holds_everything_and_is_filled(aspect):
     points = np.random.default_rng(1).normal(size=(50, 3)) * [3.0, 1.0, 2.0]
     low, high = Camera(-1.0, 0.3, np.zeros(3), 1.0).fitted(points, 0.1, aspect).bounds(points, 0.1)
     np.testing.assert_allclose(low, -high, atol=1e-3)
-    assert max(high[0] / aspect, high[1]) == pytest.approx(FILLED, abs=2e-3)
+    assert max(high[0] / aspect, high[1]) == pytest.approx(FILLED_PART, abs=2e-3)
 
 
 def test_sizes_suit_the_picture(pendulum):

@@ -15,7 +15,7 @@ import pytest
 from tests.animation.support import PENDULUM, swinging
 from vmri_jax.animation import Drawing, motion, write_html
 from vmri_jax.animation.geometry import joint, spring
-from vmri_jax.animation.html import MOST_NUMBERS
+from vmri_jax.animation.html import MOST_COORDINATES
 from vmri_jax.animation.layout import layout
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -77,10 +77,10 @@ def test_text_from_the_user_cannot_become_code(tmp_path):
 
 
 def test_long_runs_are_thinned_and_the_page_says_so(tmp_path):
-    count = MOST_NUMBERS // 6 + 10
+    count = MOST_COORDINATES // 6 + 10
     moved = motion(swinging(count, end=300.0), Drawing.from_dict(PENDULUM))
     data = data_of(page_of(moved, tmp_path / "run.html"))
-    assert len(unpacked(data["points"])) <= MOST_NUMBERS
+    assert len(unpacked(data["points"])) <= MOST_COORDINATES
     assert data["caption"] == "Drawn from every 2nd node."
     assert data["speed"] == 20.0
 

@@ -83,7 +83,7 @@ def test_springs_end_at_points_of_bodies_and_arms_reach_to_joints():
     [
         ({"coordinates": [["s", i] for i in range(11)]}, r"solids\[0\]: 11 coordinates and corners of shape \(4, 3\)"),
         ({"corners": [[0.5, 0.0]] * 4}, r"corners of shape \(4, 2\)"),
-        ({"faces": [[0, 1, 7]]}, "a face has corners that there are not; there are 4"),
+        ({"faces": [[0, 1, 7]]}, "a face has the number of a corner that does not exist; there are 4"),
         ({"shown": "ball"}, "shown"),
     ],
 )

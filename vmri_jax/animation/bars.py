@@ -9,8 +9,8 @@ from vmri_jax.animation.drawing import Drawing, check_index, frame
 from vmri_jax.animation.parts import Body, Joint
 from vmri_jax.running.trajectory import Trajectory
 
-RADIUS = 0.24
-"""Of a ball, in the distance between bars."""
+BALL_RADIUS = 0.24
+"""Radius of the ball on a bar, over the distance between bars: below a half, else neighbours touch."""
 
 
 def bars(trajectory: Trajectory) -> dict:
@@ -33,12 +33,13 @@ def bars(trajectory: Trajectory) -> dict:
 
 
 def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
-    """The drawing with a body for each coordinate of its blocks, to the right of all others.
+    """The drawing with a body for each coordinate of its blocks, to the right of all other bodies.
 
-    Every block has its own scale, 1, 2 or 5 times a power of ten, by which its largest coordinate in the run is as high as
-    there is room; the caption says it.
+    Each block has a scale, 1, 2 or 5 times a power of ten, with which its largest coordinate in the run just fits the height of
+    the bars; the caption tells the scales.
 
     Args:
+        drawing: with or without blocks.
         q_s, q_f: (k, n_s) and (k, n_f) positions along the run.
 
     Raises:
@@ -61,7 +62,7 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
         for label, coordinate in zip(block.labels, block.coordinates, strict=True):
             foot = tuple(((corner + np.array([x, 0.0, 0.0])) @ axes).tolist())
             forms = tuple(((scale * float(weight), *coordinate),) if weight else () for weight in axes[2])
-            bodies.append(Body(label, forms, foot, RADIUS * unit))
+            bodies.append(Body(label, forms, foot, BALL_RADIUS * unit))
             posts.append(Joint("link", (bodies[-1].name,), foot))
             x += unit
         x += unit
@@ -76,7 +77,7 @@ def with_bars(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> Drawing:
 
 
 def _room(drawing: Drawing, q_s: np.ndarray, q_f: np.ndarray) -> tuple[np.ndarray, float]:
-    """Foot (3,) of the first bar in the picture, and how far up and down bars may reach."""
+    """Foot (3,) of the first bar in the picture, and the largest height of bars, up and down."""
     if not drawing.bodies:
         return np.zeros(3), 2.0
     offset, matrix = drawing.maps(q_s.shape[1], q_f.shape[1])

@@ -1,4 +1,4 @@
-"""Checks of plain data that a user wrote: what came, what was expected, and where."""
+"""Checks of plain data that a user wrote. Messages tell the place, the value, and the expected form."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from vmri_jax.mechanics.names import near
 
 
 def check_keys(data: Any, known: Sequence[str], needed: Sequence[str], where: str) -> None:
-    """Refuse what is no dict, entries that do not exist, and missing ones."""
+    """Refuse data that is no dict, unknown entries, and missing ones."""
     if not isinstance(data, dict):
         raise ValueError(f"{where} is {type(data).__name__}; it must be a dict with {', '.join(known)}.")
     for key in data:
@@ -21,11 +21,11 @@ def check_keys(data: Any, known: Sequence[str], needed: Sequence[str], where: st
 
 
 def entries(data: dict, key: str, where: str) -> list:
-    """The list at a key, empty if there is none."""
-    found = data.get(key, [])
-    if not isinstance(found, list | tuple):
-        raise ValueError(f"{where}: {key} is {type(found).__name__}; it must be a list.")
-    return list(found)
+    """The list at a key, empty if the key is missing."""
+    items = data.get(key, [])
+    if not isinstance(items, list | tuple):
+        raise ValueError(f"{where}: {key} is {type(items).__name__}; it must be a list.")
+    return list(items)
 
 
 def numbers(value: Any, where: str) -> tuple[float, ...]:
@@ -41,20 +41,20 @@ def numbers(value: Any, where: str) -> tuple[float, ...]:
 
 def direction(value: Any, where: str) -> tuple[float, ...]:
     """1 to 3 finite numbers that are not all zero."""
-    found = numbers(value, where)
-    if not any(found):
-        raise ValueError(f"{where} is {list(found)}; it must not be zero.")
-    return found
+    vector = numbers(value, where)
+    if not any(vector):
+        raise ValueError(f"{where} is {list(vector)}; it must not be zero.")
+    return vector
 
 
 def angles(value: Any, where: str) -> tuple[float, ...]:
     """Azimuth and elevation in degrees."""
-    found = numbers(value, where)
-    if len(found) != 2 or abs(found[1]) > 90:
+    degrees = numbers(value, where)
+    if len(degrees) != 2 or abs(degrees[1]) > 90:
         raise ValueError(
-            f"{where} is {list(found)}; it must be azimuth and elevation in degrees, the latter from -90 to 90."
+            f"{where} is {list(degrees)}; it must be azimuth and elevation in degrees, the latter from -90 to 90."
         )
-    return found
+    return degrees
 
 
 def positive(value: Any, where: str) -> float:

@@ -12,15 +12,15 @@ from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.signals import Signal, fast_signal, slow_signal, window
 
 HEIGHT = 1.65
-"""Of the curves, in inches."""
-POINTS = 2000
-"""Of a curve."""
+"""Height of the panels with their labels, in inches."""
+FEWEST_POINTS = 2000
+"""Smallest number of points of a curve: about one per pixel of a figure, so that the interpolation between nodes is seen as a curve."""
 LEFT, RIGHT, BELOW, ABOVE = 0.62, 0.12, 0.42, 0.3
-"""Room around a panel for its labels, in inches."""
+"""Margins of a panel for its labels, in inches."""
 
 
 class Curves:
-    """The curves of a motion: two panels side by side, one or none where there is nothing to see.
+    """The curves of a motion: two panels side by side; a panel is left out if its signal does not move.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
@@ -33,15 +33,15 @@ class Curves:
 
     @property
     def height(self) -> float:
-        """In inches."""
+        """Height of all curves, in inches."""
         return HEIGHT if self.slow or self.fast else 0.0
 
     def draw(self, figure: Figure, moments: Sequence[float] | np.ndarray) -> None:
-        """Draw them at the lower end of a figure.
+        """Draw the curves at the lower end of a figure.
 
         Args:
             figure: in the style of the theme.
-            moments: times of the pictures, which are marked.
+            moments: times of the pictures; dots mark them on the slow curve.
         """
         span = float(self.motion.t[0]), float(self.motion.t[-1])
         panels = [] if self.slow is None else [(self.slow, span, "t")]
@@ -68,7 +68,7 @@ class Curves:
 
     def _curve(self, axes: Axes, signal: Signal, part: tuple[float, float]) -> None:
         nodes = self.motion.between(*part)
-        times = np.linspace(*part, POINTS) if len(nodes.t) < POINTS else nodes.t
+        times = np.linspace(*part, FEWEST_POINTS) if len(nodes.t) < FEWEST_POINTS else nodes.t
         color = self.theme.curves[0 if signal.pace == "slow" else 1]
         axes.plot(times, signal.of(self.motion.at(times)), color=color, linewidth=1.1)
         axes.margins(x=0)

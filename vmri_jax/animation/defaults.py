@@ -3,18 +3,19 @@
 import math
 from itertools import pairwise
 
-MAGNIFIED = 10.0
-"""The stiff springs of the Fermi-Pasta-Ulam chain stretch by a few percent: their elongations are drawn so much larger."""
+MAGNIFICATION = 10.0
+"""Drawn over real elongation of the stiff springs of the Fermi-Pasta-Ulam chain, which stretch by a few percent. With 1 the
+stretching could not be seen."""
 STEEL_BALL = {"radius": 0.3, "color": "#8a97a1"}
 
 
 def fermi_pasta_ulam(num_springs: int) -> dict:
-    """The chain between two walls: masses at ``(s_i - f_i) / sqrt 2`` and ``(s_i + f_i) / sqrt 2`` from their rest."""
+    """The chain between two walls: masses displaced by ``(s_i - f_i) / sqrt 2`` and ``(s_i + f_i) / sqrt 2`` from their places at rest."""
     bodies, w = [], 1 / math.sqrt(2)
     for i in range(num_springs):
-        for sign, rest in ((-1.0, 4.5 * i + 3.0), (1.0, 4.5 * i + 4.5)):
-            form = [[w, "s", i], [sign * MAGNIFIED * w, "f", i]]
-            bodies.append({"name": f"mass {len(bodies) + 1}", "coordinates": [form], "offset": [rest], **STEEL_BALL})
+        for sign, place in ((-1.0, 4.5 * i + 3.0), (1.0, 4.5 * i + 4.5)):
+            form = [[w, "s", i], [sign * MAGNIFICATION * w, "f", i]]
+            bodies.append({"name": f"mass {len(bodies) + 1}", "coordinates": [form], "offset": [place], **STEEL_BALL})
     names = [body["name"] for body in bodies]
     springs = [[a, b, "slow" if i % 2 else "fast"] for i, (a, b) in enumerate(pairwise(names))]
     walls = [(names[0], 0.0), (names[-1], 4.5 * num_springs + 3.0)]
@@ -23,12 +24,12 @@ def fermi_pasta_ulam(num_springs: int) -> dict:
         "springs": springs,
         "anchors": [{"body": name, "point": [x], "kind": "spring", "pace": "slow"} for name, x in walls],
         "planes": [{"point": [x], "normal": [normal]} for (_, x), normal in zip(walls, (1.0, -1.0), strict=True)],
-        "caption": f"Elongations of the stiff springs are drawn {MAGNIFIED:g} times as large as they are.",
+        "caption": f"Elongations of the stiff springs are drawn {MAGNIFICATION:g} times as large as they are.",
     }
 
 
 def triple_spherical_pendulum() -> dict:
-    """The heavy bob on a rod, two light ones on a rod and a stiff spring."""
+    """A heavy bob on a rod, a light bob on a second rod, and the last bob on a stiff spring."""
     light = [_point(name, "f", i, 0.4) for i, name in enumerate(("light bob", "last bob"))]
     return {
         "bodies": [_point("heavy bob", "s", 0, 0.9), *light],
@@ -57,7 +58,7 @@ def _point(name: str, part: str, number: int, radius: float) -> dict:
 
 
 def built_in(name: str, n_s: int) -> dict | None:
-    """The drawing of a built-in system as plain data for `Drawing.from_dict`; None if it is not one.
+    """The drawing of a built-in system as plain data for `Drawing.from_dict`; None for other systems.
 
     Args:
         name: "fpu", "tsp" or "sam".

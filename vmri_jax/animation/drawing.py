@@ -1,4 +1,4 @@
-"""What a picture of a system is made of: bodies and what joins them, as plain data that can be stored next to a run."""
+"""The drawing of a system: its parts, where they are for given coordinates, and plain data that is stored next to a run."""
 
 import json
 from collections import Counter
@@ -32,16 +32,16 @@ KEYS = (
 
 @dataclass(frozen=True)
 class Drawing:
-    """Bodies, solids, blocks of general coordinates, what joins bodies, fixed things around them.
+    """The picture of a system: bodies, solids, blocks of general coordinates, joints between bodies, fixed planes and spheres.
 
     Attributes:
-        up: the direction that is shown upwards, in coordinates of the bodies; None for the last coordinate (bodies of one
+        up: the direction that points upwards in the picture, in coordinates of the bodies; None for the last coordinate (bodies of one
             coordinate move sideways).
-        view: azimuth and elevation from which one looks, in degrees; None for one that suits. (-90, 0) is from the front, with
+        view: azimuth and elevation of the camera, in degrees; None for a view that depends on the dimension. (-90, 0) is from the front, with
             x to the right; (-90, 90) from above.
-        caption: a line that is shown with the picture.
-        carried: the map from the coordinates of a run to those that bodies name, and the numbers of its joints, see
-            `vmri_jax.mechanics.kinematics`; None where they are the same.
+        caption: a line of text for the picture.
+        carried: for runs in joint coordinates, the map from the coordinates of the run to those of the bodies, and the arrays of
+            its joints, see `vmri_jax.mechanics.kinematics`; else None.
     """
 
     bodies: tuple[Body, ...]
@@ -63,18 +63,18 @@ class Drawing:
             data: a dict (or its JSON text) of
 
                 - ``bodies``: dicts of ``name``; ``coordinates``, 1 to 3 entries ``["s" or "f", index]``, or linear forms
-                  ``[[weight, "s" or "f", index], ...]``; and if wanted ``offset``, ``radius``, ``color``, ``shown``.
+                  ``[[weight, "s" or "f", index], ...]``; optionally ``offset``, ``radius``, ``color``, ``shown``.
                 - ``solids``: dicts of ``name``; ``coordinates`` of a rigid body, its centre and its directors; ``corners``, along
-                  the directors; ``faces``; and if wanted ``color``.
-                - ``blocks``: dicts of ``name``; ``coordinates``, any number of entries ``["s" or "f", index]``; and if wanted
-                  ``labels``, a name for each of them.
-                - ``links``, ``springs``: pairs of names, and a third entry "slow" or "fast" if wanted.
-                - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), and if wanted ``pace``.
+                  the directors; ``faces``; optionally ``color``.
+                - ``blocks``: dicts of ``name``; ``coordinates``, any number of entries ``["s" or "f", index]``; optionally
+                  ``labels``, a name for each coordinate.
+                - ``links``, ``springs``: pairs of names, with an optional third entry "slow" or "fast".
+                - ``anchors``: dicts of ``body``, ``point``, ``kind`` ("link" or "spring"), optionally ``pace``.
                 - ``planes``: dicts of ``point``, ``normal``; ``spheres``: dicts of ``center``, ``radius``.
                 - ``up``, ``view``, ``caption``: see above; ``kinematics``: "map" and "joints" of `carried`, which a scene writes.
 
         Raises:
-            ValueError: anything else, with the entry that is wrong.
+            ValueError: other data; the message names the wrong entry.
         """
         if isinstance(data, str):
             try:
@@ -109,37 +109,39 @@ class Drawing:
         )
 
     def extended(self, q_s, q_f, v_s, v_f) -> tuple[np.ndarray, ...]:
-        """Coordinates that bodies name, and their rates, (k, n) each.
+        """Coordinates of the bodies and their rates, slow and fast, (k, n) each.
 
         Args:
-            q_s, q_f, v_s, v_f: (k, n_s), (k, n_f) those of a run.
+            q_s, q_f: (k, n_s), (k, n_f) coordinates of a run.
+            v_s, v_f: their rates.
         """
         if self.carried is None:
             return q_s, q_f, v_s, v_f
         kinematics, joints = self.carried
 
-        def at(q_s, q_f, v_s, v_f):
+        def bodies_and_rates(q_s, q_f, v_s, v_f):
             bodies, rates = jax.jvp(lambda q_s, q_f: kinematics(q_s, q_f, joints), (q_s, q_f), (v_s, v_f))
             return *bodies, *rates
 
-        return tuple(map(np.asarray, jax.jit(jax.vmap(at))(q_s, q_f, v_s, v_f)))
+        return tuple(map(np.asarray, jax.jit(jax.vmap(bodies_and_rates))(q_s, q_f, v_s, v_f)))
 
     def corners(self, points: np.ndarray) -> list[np.ndarray]:
-        """(..., n, 3) corners of every solid.
+        """Corners (..., n, 3) of each solid.
 
         Args:
             points: (..., n_bodies, 3) positions of the bodies.
         """
         index = {body.name: i for i, body in enumerate(self.bodies)}
-        found = []
+        solids = []
         for solid in self.solids:
-            centre, *others = (points[..., index[name], :] for name in solid.points)
-            axes = np.stack([other - centre for other in others], axis=-2)
-            found.append(centre[..., None, :] + np.array(solid.corners) @ axes)
-        return found
+            # x_0 + sum_i c_i (x_i - x_0)
+            centre, *ends = (points[..., index[name], :] for name in solid.points)
+            axes = np.stack([end - centre for end in ends], axis=-2)
+            solids.append(centre[..., None, :] + np.array(solid.corners) @ axes)
+        return solids
 
     def pace(self, joint: Joint) -> str:
-        """ "slow" or "fast": as it says, else "fast" if all its bodies are.
+        """ "slow" or "fast": the pace of the joint if it has one, else "fast" if all its bodies are fast.
 
         Args:
             joint: between bodies of this drawing.
@@ -149,25 +151,25 @@ class Drawing:
 
     @property
     def paces(self) -> list[str]:
-        """Those of its bodies and springs."""
-        found = {body.pace for body in self.bodies}
-        found |= {self.pace(joint) for joint in self.joints if joint.kind == "spring"}
-        return [pace for pace in PACES if pace in found]
+        """Paces of the bodies and springs, "slow" before "fast"."""
+        paces = {body.pace for body in self.bodies}
+        paces |= {self.pace(joint) for joint in self.joints if joint.kind == "spring"}
+        return [pace for pace in PACES if pace in paces]
 
     @property
     def dimension(self) -> int:
-        """Coordinates of a point: 1, 2 or 3, the most of any body or given point."""
+        """Number of coordinates of a point: 1, 2 or 3, the largest number of any body, point or direction of the drawing."""
         points = [joint.point or () for joint in self.joints] + [sphere.center for sphere in self.spheres]
         points += [vector for plane in self.planes for vector in (plane.point, plane.normal)]
         points += [vector for body in self.bodies for vector in (body.forms, body.offset)] + [self.up or ()]
         return max((len(point) for point in points), default=1)
 
     def frame(self) -> np.ndarray:
-        """(3, dimension) matrix from coordinates of the bodies to those of the picture, where z points upwards."""
+        """(3, dimension) matrix from coordinates of the bodies to coordinates of the picture, where z points upwards."""
         return frame(self.up, self.dimension)
 
     def place(self, points: Sequence[tuple[float, ...]]) -> np.ndarray:
-        """(n, 3) points of the picture.
+        """(n, 3) points in coordinates of the picture.
 
         Args:
             points: points or directions in coordinates of the bodies; missing coordinates are zero.
@@ -177,10 +179,10 @@ class Drawing:
         return padded @ self.frame().T
 
     def maps(self, n_s: int, n_f: int) -> tuple[np.ndarray, np.ndarray]:
-        """Offset (n, 3) and matrix (n, 3, n_s + n_f): where the bodies are in the picture, ``offset + matrix @ q``.
+        """Offset (n, 3) and matrix (n, 3, n_s + n_f) of the positions of the bodies in the picture, ``offset + matrix @ q``.
 
         Args:
-            n_s, n_f: lengths of the slow and of the fast coordinates that `extended` gives.
+            n_s, n_f: numbers of slow and of fast coordinates that `extended` returns.
 
         Raises:
             ValueError: a body uses a coordinate that q does not have.
@@ -196,7 +198,7 @@ class Drawing:
 
 
 def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:
-    """(3, dimension) matrix of orthonormal columns from coordinates to those of the picture, see `Drawing.up`."""
+    """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to those of the picture, see `Drawing.up`."""
     if up is None:
         return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
     padded = np.pad(up, (0, dimension - len(up)))
@@ -204,7 +206,11 @@ def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:
 
 
 def check_index(name: str, part: str, index: int, n_s: int, n_f: int) -> None:
-    """Refuse a coordinate of a body or block that a run does not have."""
+    """Refuse a coordinate of a body or block that the run does not have.
+
+    Raises:
+        ValueError: with the body and the coordinate.
+    """
     size, pace = (n_s, "slow") if part == "s" else (n_f, "fast")
     if index >= size:
         raise ValueError(
@@ -214,11 +220,12 @@ def check_index(name: str, part: str, index: int, n_s: int, n_f: int) -> None:
 
 
 def _upright(up: np.ndarray) -> np.ndarray:
-    """Matrix of a rotation that takes the unit vector `up` to z, and keeps x where it can."""
+    """Matrix of a rotation that takes the unit vector `up` to z, and leaves the x axis in place if it is at a right angle to `up`."""
     if up.size == 1:
         return np.array([[0.0], [0.0], [up[0]]])
     if up.size == 2:
         return np.array([[up[1], -up[0]], [0.0, 0.0], up])
+    # Gram-Schmidt from the x axis, or from the y axis if `up` is nearly along x
     x = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
     x = x - (x @ up) * up
     x /= np.linalg.norm(x)

@@ -15,35 +15,37 @@ from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.shapes import Stage
 
 FRAMES_PER_SECOND = 20
+"""Pictures of a GIF in a second; more make a larger file."""
 MOST_COLUMNS = 6
-"""Pictures side by side; with more, names and times are too small to read."""
+"""Largest number of pictures side by side; with more, names and times are too small to read."""
 WIDTH = 9.0
-"""Of a strip, in inches."""
-TITLE = 0.3
+"""Width of a strip, in inches."""
+TITLE_HEIGHT = 0.3
+"""Height of a line of title or caption, in inches."""
 GIF_WIDTH = 640
+"""Width of a GIF, in pixels; the file grows with its square."""
 
 
 def plot_strip(
     motion: Motion, times: int | Sequence[float] = 5, title: str = "", theme: plots.Theme = plots.LIGHT
 ) -> plots.NotebookFigure:
-    """Several moments side by side, from one point of view; wide scenes one below the other.
+    """Pictures of several moments side by side, from one point of view; wide scenes one below the other.
 
-    Rows have equal numbers of pictures, or differ by one; the shorter rows are centred.
-
-    Below them are curves: the slow motion along the whole run, with the moments as dots, and a close-up of the fast one.
+    Rows have equal numbers of pictures, or differ by one; the shorter rows are centred. Below the pictures are two curves: the slow
+    motion along the whole run, with the moments as dots, and some periods of the fast motion.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
-        times: the moments, or how many of them, spread evenly.
+        times: the moments, or the number of moments, which are then spread evenly.
         title: over the figure.
         theme: colours.
 
     Raises:
-        ValueError: no moment.
+        ValueError: no moments.
     """
     moments = np.linspace(motion.t[0], motion.t[-1], times) if isinstance(times, int) else np.asarray(times, float)
     if moments.ndim != 1 or not moments.size:
-        raise ValueError(f"plot_strip: times is {times!r}; give at least one.")
+        raise ValueError(f"plot_strip: times is {times!r}; give at least one moment.")
     stage = Stage.of(motion, theme)
     aspect = stage.aspect
     sizes = rows_of(len(moments), MOST_COLUMNS if aspect < 1.3 else 3 if aspect < 3.5 else 1)
@@ -52,7 +54,7 @@ def plot_strip(
     curves = Curves(motion, theme)
     with plots.style(theme):
         width = WIDTH / columns
-        head = TITLE * (1 + bool(motion.drawing.caption))
+        head = TITLE_HEIGHT * (1 + bool(motion.drawing.caption))
         height = rows * width / aspect + head + curves.height
         figure = plots.NotebookFigure(figsize=(WIDTH, height))
         figure.set_layout_engine("none")
@@ -67,11 +69,11 @@ def plot_strip(
 
 
 def rows_of(count: int, columns: int) -> list[int]:
-    """How many pictures each row has, of at most so many columns: as equal as can be, the longer rows first.
+    """The number of pictures in each row, as equal as possible, the longer rows first.
 
     Args:
-        count: number of pictures.
-        columns: most pictures in a row.
+        count: number of all pictures.
+        columns: largest number of pictures in a row.
     """
     rows = -(-count // columns)
     return [count // rows + (row < count % rows) for row in range(rows)]
@@ -80,7 +82,7 @@ def rows_of(count: int, columns: int) -> list[int]:
 def _write_head(figure: Figure, title: str, stage: Stage) -> None:
     """Title, legend of the colours and caption."""
     width, height = figure.get_size_inches()
-    for text, top, size in ((title, 0.1, 11), (stage.motion.drawing.caption, 0.1 + TITLE, 9)):
+    for text, top, size in ((title, 0.1, 11), (stage.motion.drawing.caption, 0.1 + TITLE_HEIGHT, 9)):
         if text:
             figure.text(0.1 / width, 1 - top / height, text, va="top", color=stage.theme.ink, fontsize=size)
     handles = [
@@ -99,14 +101,14 @@ def write_gif(
     theme: plots.Theme = plots.LIGHT,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Write a GIF that shows the whole motion in so many seconds, again and again.
+    """Write a GIF that shows the whole motion in `seconds`, again and again.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
         path: of the file.
-        seconds: how long it takes.
+        seconds: duration of the GIF.
         theme: colours.
-        progress: told (pictures done, of how many).
+        progress: ``progress(done, total)``, called after each picture.
 
     Raises:
         ValueError: seconds that are not positive.
@@ -128,6 +130,8 @@ def write_gif(
             canvas.draw()
             images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
             progress(i + 1, count)
-    palette = images[count // 2].quantize(255)  # one for all: colours must not flicker
-    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
-    first.save(path, save_all=True, append_images=others, duration=1000 // FRAMES_PER_SECOND, loop=0, optimize=True)
+    palette = images[count // 2].quantize(255)  # one palette for all pictures, else colours flicker
+    first, *later_images = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    first.save(
+        path, save_all=True, append_images=later_images, duration=1000 // FRAMES_PER_SECOND, loop=0, optimize=True
+    )

@@ -1,34 +1,34 @@
-"""Shapes at rest, as points: what strips, GIFs and the page have in common.
+"""Shapes at rest, as points, for strips, GIFs and the page.
 
-Grids and helices are computed here once; the page gets them as numbers. What depends on time (where a joint ends, a helix
-between two bodies) is computed by the script of the page at play time, from the same numbers: every node of a long run
-with every turn of its springs would make a page of many megabytes.
+Grids and helices are computed here once; the page gets them as numbers. Shapes that depend on time (the ends of a joint, a helix
+between two bodies) are computed by the script of the page at play time, from the same numbers: every node of a long run with
+every turn of its springs would make a page of many megabytes.
 """
 
 import numpy as np
 
 LAMP = (-0.45, 0.7, 0.55)
-"""Where light comes from: right, up, back of the view."""
-SPAN = 0.8
-"""Joints end this far into a ball, in its radius."""
-LEAD = 0.1
-"""Part of a spring that is straight, at each end."""
-PIECES = 16
-"""Of a line of a grid, each with its own strength."""
+"""Direction to the lamp: right, up, back of the view."""
+JOINT_END = 0.8
+"""Distance of the end of a joint from the centre of its ball, over the radius of the ball; below 1 the ball hides the end."""
+STRAIGHT_PART = 0.1
+"""Length of the straight piece at each end of a spring, over the length of the spring."""
+PIECES_PER_LINE = 16
+"""Number of pieces of a line of a grid, each with its own strength; more make the fading smoother and the page larger."""
 
 
 def helix(turns: int, per_turn: int = 16) -> np.ndarray:
-    """A spring that keeps its turns when it stretches: one row (share, radius, cos, sin) per point.
+    """A spring whose number of turns stays when it stretches: one row (share, radius, cos, sin) per point.
 
-    The point of a row is ``start + share (end - start) + radius coil (cos n + sin m)``, n and m unit vectors across.
+    The point of a row is ``start + share (end - start) + radius coil (cos n + sin m)``, with unit vectors n and m across the axis.
 
     Args:
-        turns: how many.
-        per_turn: points in each.
+        turns: number of turns.
+        per_turn: number of points of a turn.
     """
     turn = np.arange(turns * per_turn + 1) / per_turn
     radius = np.minimum(1, np.minimum(turn, turns - turn))
-    share = LEAD + (1 - 2 * LEAD) * turn / turns
+    share = STRAIGHT_PART + (1 - 2 * STRAIGHT_PART) * turn / turns
     return np.stack([share, radius, np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)], axis=1)
 
 
@@ -38,26 +38,26 @@ def grid(center, sides, halves: tuple[float, float], step: float, fades: bool) -
     Args:
         center, sides: (3,) and (2, 3), middle and unit vectors along the sides.
         halves: half lengths of the sides.
-        step: between two lines.
-        fades: strengths fall to zero outwards, from 1 in the middle; else all are 1.
+        step: distance of two lines.
+        fades: whether strengths fall from 1 in the middle to 0 outwards; else all are 1.
     """
     rows = []
     for across in (0, 1):
         along, beside = halves[1 - across], halves[across]
         count = int(beside / step)
         for k in range(-count, count + 1):
-            w = np.linspace(-along, along, PIECES + 1)
-            uv = np.stack([np.full(PIECES + 1, k * step), w], axis=1)[:, :: -1 if across else 1]
+            w = np.linspace(-along, along, PIECES_PER_LINE + 1)
+            uv = np.stack([np.full(PIECES_PER_LINE + 1, k * step), w], axis=1)[:, :: -1 if across else 1]
             line = center + uv @ sides
             outwards = np.linalg.norm((uv[:-1] + uv[1:]) / 2 / halves, axis=1)
-            strength = np.clip(1 - outwards, 0, 1) if fades else np.ones(PIECES)
+            strength = np.clip(1 - outwards, 0, 1) if fades else np.ones(PIECES_PER_LINE)
             rows.append(np.concatenate([line[:-1], line[1:], strength[:, None]], axis=1))
-    found = np.concatenate(rows)
-    return found[found[:, 6] > 0]
+    pieces = np.concatenate(rows)
+    return pieces[pieces[:, 6] > 0]
 
 
 def joint(a, b, reach: tuple[float, float]):
-    """Where a joint of two balls starts and ends; None if they touch or an end lies within the other ball.
+    """Start and end of a joint between two balls; None if the balls touch or an end lies within the other ball.
 
     Args:
         a, b: (3,) centres.
@@ -65,21 +65,21 @@ def joint(a, b, reach: tuple[float, float]):
     """
     gap = b - a
     length = float(np.linalg.norm(gap))
-    if length <= max(SPAN * sum(reach), *reach):
+    if length <= max(JOINT_END * sum(reach), *reach):
         return None
-    return a + SPAN * reach[0] / length * gap, b - SPAN * reach[1] / length * gap
+    return a + JOINT_END * reach[0] / length * gap, b - JOINT_END * reach[1] / length * gap
 
 
 def spring(start, end, coil: float, turns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of a helix with straight ends, and how they lie off its axis, in radii.
+    """Points (n, 3) of a helix with straight ends, and the unit vectors from the axis to the points of its turns.
 
     Args:
         start, end: (3,).
         coil: radius of the helix.
-        turns: how many.
+        turns: number of turns.
     """
     along = (end - start) / np.linalg.norm(end - start)
-    sideways = np.cross(along, [0.36, 0.48, 0.8])
+    sideways = np.cross(along, [0.36, 0.48, 0.8])  # a direction in which few springs lie
     sideways /= np.linalg.norm(sideways)
     share, radius, cos, sin = helix(turns).T[:, :, None]
     radial = cos * sideways + sin * np.cross(along, sideways)
@@ -88,6 +88,6 @@ def spring(start, end, coil: float, turns: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def dropped(center, normal, points) -> np.ndarray:
-    """The points (n, 3) straight below others on a plane that is not upright."""
+    """The feet of points (n, 3) straight below them, on a plane that is not vertical."""
     height = (center - points) @ normal / normal[2]
     return points + height[:, None] * np.array([0.0, 0.0, 1.0])

@@ -8,22 +8,22 @@ import numpy as np
 
 from vmri_jax import plots
 from vmri_jax.animation.drawing import Drawing
-from vmri_jax.animation.geometry import LAMP, SPAN, helix
+from vmri_jax.animation.geometry import JOINT_END, LAMP, helix
 from vmri_jax.animation.layout import Connection, Ground, Layout, layout, nice
 from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.parts import Solid
 from vmri_jax.running.files import check_place
 
-MOST_NUMBERS = 600_000
-"""Coordinates in a page; of longer runs every k-th node is taken."""
-WATCHED = 20.0
-"""Seconds that a run takes at the first speed, about."""
+MOST_COORDINATES = 600_000
+"""Largest number of coordinates of bodies in a page, about 6 MB; of longer runs the page has every k-th node."""
+PLAY_SECONDS = 20.0
+"""Target seconds to watch a run at the first speed; runs of about this length play in real time."""
 
 
 def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     """Write one HTML file that shows the motion in a browser: no network, nothing to install.
 
-    ``page.html#t=3.5`` opens it at rest at that time, ``#theme=dark`` in dark colours.
+    ``page.html#t=3.5`` opens the page stopped at that time, ``#theme=dark`` in dark colours.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
@@ -33,7 +33,7 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    every = -(-motion.points.size // MOST_NUMBERS)
+    every = -(-motion.points.size // MOST_COORDINATES)
     drawing, sizes = motion.drawing, layout(motion)
     springs = [connection for connection in sizes.connections if connection.kind == "spring"]
     uncoloured = [body for body in drawing.bodies if body.color is None and body.shown]
@@ -57,12 +57,14 @@ def write_html(motion: Motion, path: str | Path, title: str = "") -> None:
 
 
 def _data(motion: Motion, sizes: Layout) -> dict:
-    """What the script reads; names as in its files."""
+    """The data of the script, with the names that its files use."""
     drawing, t = motion.drawing, motion.t
     duration = float(t[-1] - t[0])
-    speed = 1.0 if 0.15 * WATCHED <= duration <= 3 * WATCHED or duration == 0 else nice(duration / WATCHED)
+    speed = (
+        1.0 if 0.15 * PLAY_SECONDS <= duration <= 3 * PLAY_SECONDS or duration == 0 else nice(duration / PLAY_SECONDS)
+    )
     turns = {connection.turns for connection in sizes.connections if connection.kind == "spring"}
-    many = len(sizes.connections) > 20  # every helix is drawn anew in every picture
+    many = len(sizes.connections) > 20  # fewer points then: the script draws every helix in every picture
     constrained = bool(np.nanmax(motion.residual, initial=0.0) > 0)
     return {
         "t": _packed(t, np.float64),
@@ -84,7 +86,7 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         ],
         "helices": {n: helix(n, 10 if many else 16).tolist() for n in turns},
         "lamp": LAMP,
-        "span": SPAN,
+        "span": JOINT_END,
         "size": sizes.size,
         "rod": sizes.rod,
         "coil": sizes.coil,
@@ -92,7 +94,9 @@ def _data(motion: Motion, sizes: Layout) -> dict:
         "view": {"azimuth": sizes.azimuth, "elevation": sizes.elevation},
         "fitted": sizes.hull.tolist(),
         "margin": float(sizes.radii.max()),
-        "trails": any(sum(map(bool, body.forms)) > 1 for body in drawing.bodies if body.shown),  # not along one line
+        "trails": any(
+            sum(map(bool, body.forms)) > 1 for body in drawing.bodies if body.shown
+        ),  # a trail along a line would show nothing
         "speed": speed,
         "speeds": [float(f"{speed * factor:.1g}") for factor in (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10)],
         "caption": drawing.caption,
@@ -101,14 +105,14 @@ def _data(motion: Motion, sizes: Layout) -> dict:
 
 
 def _energy_title(motion: Motion) -> str:
-    name, *others = motion.energy_names
-    if others:
+    name, *further_names = motion.energy_names
+    if further_names:
         return "since the start:"
     return f"{name} {'ΔE / |E₀|' if motion.relative else 'ΔE'}"
 
 
 def _solid(drawing: Drawing, solid: Solid) -> dict:
-    """Numbers of its four points, and the rest."""
+    """The data of a solid, with the numbers of its four bodies."""
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
     return {
         "points": [index[name] for name in solid.points],
@@ -119,7 +123,7 @@ def _solid(drawing: Drawing, solid: Solid) -> dict:
 
 
 def _plain(record: Connection | Ground) -> dict:
-    """Its fields, arrays as lists."""
+    """The fields of a record by name, arrays as lists."""
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(record).items()}
 
 

@@ -1,4 +1,4 @@
-"""How large things are drawn, where the ground lies, and from where one looks: shared by pages and pictures."""
+"""Sizes of balls, links and springs, the ground, and the first view, for pages and pictures."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,14 +10,15 @@ from vmri_jax.animation.geometry import grid
 from vmri_jax.animation.motion import Motion
 from vmri_jax.animation.parts import Body
 
-TURNS = (4, 14)
-"""Fewest and most turns of a spring."""
-FADED = 0.45
-"""A floor fades away outwards: so much of it must be seen."""
-POINT = 0.01
-"""Radius of a point that is not shown, in that of a ball."""
-LEVEL = 0.9
-"""Least vertical part of the unit normal of a plane that counts as level."""
+TURNS_RANGE = (4, 14)
+"""Smallest and largest number of turns of a spring."""
+FLOOR_IN_VIEW = 0.45
+"""Part of the floor that the view has to contain, from its middle to its corners; the rest has faded away. A larger part makes the scene
+smaller."""
+HIDDEN_RADIUS = 0.01
+"""Radius of a point that is not drawn as a ball, over the default radius of a ball: joints end at this distance from it."""
+LEVEL_COSINE = 0.9
+"""Smallest cosine between the vertical and the normal of a plane that counts as level."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Ground:
         sides: (2, 3) unit vectors along its sides.
         corners: (4, 3).
         grid: (n, 7) pieces of lines, as of `vmri_jax.animation.geometry.grid`.
-        solid: given by the drawing; else a floor below the scene that shows depth only.
+        solid: True for a plane of the drawing, False for a floor below the scene that only shows depth.
     """
 
     center: np.ndarray
@@ -42,15 +43,20 @@ class Ground:
 
     @property
     def bears(self) -> bool:
-        """Whether shadows fall on it."""
+        """Whether shadows fall on this ground."""
         return bool(self.normal[2] > 0.5)
 
 
 @dataclass(frozen=True)
 class Connection:
-    """A "link" or "spring" (`kind`) from a body to another one, or to a fixed point; numbers of bodies.
+    """A link or spring from a body to another body, or to a fixed point.
 
-    turns: of a spring.
+    Attributes:
+        kind: "link" or "spring".
+        body, other: numbers of the bodies; None if the connection ends at a point.
+        point: (3,) the fixed point, or None.
+        pace: "slow" or "fast".
+        turns: number of turns of a spring.
     """
 
     kind: str
@@ -63,16 +69,16 @@ class Connection:
 
 @dataclass(frozen=True)
 class Layout:
-    """Sizes in the unit of the coordinates, and places in those of the picture.
+    """Sizes in the unit of the coordinates, and positions in coordinates of the picture.
 
     Attributes:
-        size: diagonal of the box around all there is.
-        radii: of the bodies.
-        rod, coil, wire: radius of links, of springs, and of their wire.
+        size: diagonal of the box around bodies, solids, spheres and fixed points along the whole motion.
+        radii: radii of the bodies.
+        rod, coil, wire: radius of links, of springs, and of the wire of springs.
         connections: links, springs and anchors.
         spheres, sphere_radii: (n, 3) centres and (n,) radii of fixed spheres.
-        grounds: given planes, or a floor.
-        hull: (n, 3) points that must be seen.
+        grounds: planes of the drawing, and a floor if none of them is level.
+        hull: (n, 3) points that the view has to contain.
         azimuth, elevation: of the first view.
     """
 
@@ -91,7 +97,7 @@ class Layout:
 
 
 def layout(motion: Motion) -> Layout:
-    """Sizes that suit the picture: balls do not touch their neighbours, springs keep inside the space they have.
+    """Sizes for a picture: balls do not touch their neighbours, coils are thinner than the shortest spring is long.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
@@ -111,9 +117,9 @@ def layout(motion: Motion) -> Layout:
     shown = [float(r) for r, body in zip(radii, drawing.bodies, strict=True) if body.shown == "ball"]
     sprung = [length for c, length in zip(connections, lengths, strict=True) if c.kind == "spring"]
     coil = min(0.015 * size, 0.16 * min(sprung, default=size))
-    turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS).astype(int).tolist()
+    turns = np.clip(np.rint(np.array(lengths) / (1.1 * coil)), *TURNS_RANGE).astype(int).tolist()
     grounds = _grounds(drawing, box, float(radii.max()), size)
-    corners = [g.center + (1.0 if g.solid else FADED) * (g.corners - g.center) for g in grounds]
+    corners = [g.center + (1.0 if g.solid else FLOOR_IN_VIEW) * (g.corners - g.center) for g in grounds]
     azimuth, elevation = drawing.view or ((-88, 7) if drawing.dimension < 3 else (-62, 14))
     return Layout(
         size,
@@ -133,20 +139,20 @@ def layout(motion: Motion) -> Layout:
 
 def _radius(body: Body, small: float) -> float:
     if body.shown != "ball":
-        return POINT * small
+        return HIDDEN_RADIUS * small
     return small if body.radius is None else body.radius
 
 
 def _connections(drawing: Drawing) -> list[Connection]:
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
     points = drawing.place([joint.point or () for joint in drawing.joints])
-    found = []
+    connections = []
     for joint, point in zip(drawing.joints, points, strict=True):
         body, other = index[joint.bodies[0]], None
         if joint.point is None:
             other, point = index[joint.bodies[1]], None
-        found.append(Connection(joint.kind, body, other, point, drawing.pace(joint), turns=0))
-    return found
+        connections.append(Connection(joint.kind, body, other, point, drawing.pace(joint), turns=0))
+    return connections
 
 
 def _median_length(connection: Connection, points: np.ndarray) -> float:
@@ -155,21 +161,21 @@ def _median_length(connection: Connection, points: np.ndarray) -> float:
 
 
 def _grounds(drawing: Drawing, box: np.ndarray, radius: float, size: float) -> list[Ground]:
-    """Given planes, as far as the scene goes, and a floor below it if none of them is level."""
+    """Planes of the drawing, cut to the size of the scene, and a floor below the scene if none of them is level."""
     points = drawing.place([plane.point for plane in drawing.planes])
     normals = drawing.place([plane.normal for plane in drawing.planes])
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    given = [_ground(p, n, box, size, solid=True) for p, n in zip(points, normals, strict=True)]
-    if np.any(np.abs(normals[:, 2]) > LEVEL):
-        return given
+    planes = [_ground(p, n, box, size, solid=True) for p, n in zip(points, normals, strict=True)]
+    if np.any(np.abs(normals[:, 2]) > LEVEL_COSINE):
+        return planes
     point = np.array([0.0, 0.0, box[:, 2].min() - radius - 0.03 * size])
-    return [_ground(point, np.array([0.0, 0.0, 1.0]), box, size, solid=False), *given]
+    return [_ground(point, np.array([0.0, 0.0, 1.0]), box, size, solid=False), *planes]
 
 
 def _ground(point, normal, box, size: float, *, solid: bool) -> Ground:
     low, high = box.min(axis=0), box.max(axis=0)
     middle = (low + high) / 2
-    level = abs(normal[2]) > LEVEL
+    level = abs(normal[2]) > LEVEL_COSINE
     first = np.cross(normal, [0.0, 1.0, 0.0] if level else [0.0, 0.0, 1.0])
     first /= np.linalg.norm(first)
     sides = np.array([first, np.cross(normal, first)])
@@ -183,7 +189,7 @@ def _ground(point, normal, box, size: float, *, solid: bool) -> Ground:
 
 
 def _hull(points: np.ndarray, count: int = 200) -> np.ndarray:
-    """The points farthest out in directions spread over the sphere (a Fibonacci spiral)."""
+    """The farthest points in `count` directions spread evenly over the sphere (a Fibonacci spiral)."""
     k = np.arange(count) + 0.5
     z, angle = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
     directions = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z])
@@ -191,6 +197,6 @@ def _hull(points: np.ndarray, count: int = 200) -> np.ndarray:
 
 
 def nice(x: float) -> float:
-    """The one of 1, 2, 5 times a power of ten that is nearest to x in ratio."""
+    """The number of the form 1, 2 or 5 times a power of ten whose ratio to x is closest to 1."""
     power = 10.0 ** math.floor(math.log10(x))
     return min((digit * power for digit in (1, 2, 5, 10)), key=lambda y: abs(math.log(y / x)))

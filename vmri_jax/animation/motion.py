@@ -1,4 +1,4 @@
-"""From a trajectory to where every body is at any time: nodes, velocities at them, and a cubic between two of them."""
+"""Positions of all bodies at any time of a trajectory: nodes, velocities at the nodes, and a cubic polynomial between two nodes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,18 +21,19 @@ from vmri_jax.steppers.results import Result
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the bodies of a drawing are, as a cubic Hermite polynomial between nodes.
+    """Positions of the bodies of a drawing, a cubic Hermite polynomial between nodes.
 
     Attributes:
-        drawing: its blocks are bodies, see `vmri_jax.animation.bars`.
+        drawing: with a body for each coordinate of its blocks, see `vmri_jax.animation.bars`.
         t: (k,) times of the nodes.
         points, velocities: (k, n_bodies, 3) in the coordinates of the picture, where z points upwards.
-        energy: (k, c) change of the energy since the start, relative to the start where that is not zero and should be kept.
-            Where it should not be kept: and the work of forces and of moving constraints since the start, and the balance.
-        energy_names: (c,) what the columns are.
-        relative: whether the first is relative.
-        residual: (k, 2) largest constraint value and largest rate of one.
-        ending: why the run stopped early; empty if it did not.
+        energy: (k, c) change of the energy since the start. For a system that keeps its energy it is relative to the energy at the
+            start, unless that is zero. For other systems there are further columns: the work of forces and of moving
+            constraints since the start, and the balance.
+        energy_names: names of the c columns.
+        relative: whether the change of the energy is relative.
+        residual: (k, 2) largest value and largest rate of a constraint.
+        ending: a sentence about the failure of the run; empty if the run did not fail.
     """
 
     drawing: Drawing
@@ -46,10 +47,10 @@ class Motion:
     ending: str = ""
 
     def at(self, times: Sequence[float] | np.ndarray) -> np.ndarray:
-        """(len(times), n_bodies, 3) positions, beyond the ends those of the ends.
+        """(len(times), n_bodies, 3) positions; before the start and after the end, the first and the last ones.
 
         Args:
-            times: where to look.
+            times: in any order.
         """
         if len(self.t) == 1:
             return np.repeat(self.points, len(times), axis=0)
@@ -76,10 +77,10 @@ class Motion:
         return replace(self, **{name: getattr(self, name)[part] for name in names})
 
     def thinned(self, most: int) -> "Motion":
-        """With fewer nodes; energy and residuals keep the largest of those left out.
+        """The motion at every k-th node; energy and residual are the largest of the nodes that each node stands for.
 
         Args:
-            most: so many nodes at most, about.
+            most: about the largest number of nodes.
         """
         every = -(-len(self.t) // most)
         if every == 1:
@@ -98,16 +99,16 @@ class Motion:
 
 
 def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = None) -> Motion:
-    """The motion of a drawing along a run, up to where it failed.
+    """The motion of a drawing along a run, up to a failure of the run.
 
-    Velocities at the nodes are those of the momenta if the system is given, else central differences. Where the run kept
-    the micro nodes of all its macro steps, these are nodes too; without the system, fast velocities are then those of a
-    cubic spline through all of them.
+    Velocities at the nodes follow from the momenta if the system is known, else from central differences. If the run kept the
+    micro nodes of all its macro steps, they are nodes as well; without the system, fast velocities are then the derivatives of a
+    cubic spline through all nodes.
 
     Args:
         trajectory: one run, of at least one node.
-        drawing: its bodies name coordinates of the run.
-        system: what was simulated; None for that which the run knows.
+        drawing: of the system that was simulated.
+        system: the system that was simulated; None for the system that the run carries, if it does.
 
     Raises:
         ValueError: a batch of runs, no node that is finite, a drawing or system of other coordinates.
@@ -116,7 +117,12 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
         raise ValueError(
             f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
         )
-    check_type("motion: drawing", drawing, Drawing, "a Drawing, e.g. Drawing.from_dict(problem.drawing)")
+    check_type(
+        "motion: drawing",
+        drawing,
+        Drawing,
+        "a Drawing, e.g. Drawing.from_dict(problem.drawing), or scene.drawing() in place of problem.drawing",
+    )
     system = system or (trajectory.origin.system() if trajectory.origin.knows_system else None)
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.states.q_s, trajectory.states.q_f, trajectory.t))
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
@@ -150,41 +156,45 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
 
 
 def _energies(trajectory: Trajectory, count: int, system: System | None) -> tuple[dict[str, np.ndarray], bool]:
-    """Curves of the energy by name, as in `Motion`, and whether that of the energy is relative to the start."""
+    """Columns of `Motion.energy` by name, and `Motion.relative`."""
     energy = np.asarray(trajectory.energy, dtype=float)[:count]
     change = energy - energy[0]
     if system is not None and not system.keeps_energy:
-        known = trajectory if trajectory.origin.knows_system else trajectory.of(system)
-        work = known[:count].work()
+        of_known_system = trajectory if trajectory.origin.knows_system else trajectory.of(system)
+        work = of_known_system[:count].work()
         parts = {"work of forces": work.forces, "work of moving constraints": work.constraints}
-        done = {name: values for name, values in parts.items() if np.any(values != 0)}
-        return {"energy": change, **done, "balance": work.balance}, False
+        works = {name: values for name, values in parts.items() if np.any(values != 0)}
+        return {"energy": change, **works, "balance": work.balance}, False
     relative = bool(abs(energy[0]) > 1e-12)
     name = "energy change" if system is None else "energy error"
     return {name: change / (abs(energy[0]) if relative else 1.0)}, relative
 
 
 def _differences(t, values) -> np.ndarray:
-    """Central differences, of second order at the ends too; zero for a single node."""
+    """Central differences, also at the ends of second order; zero for a single node."""
     if len(t) == 1:
         return np.zeros_like(values)
     return np.gradient(values, t, axis=0, edge_order=2 if len(t) > 2 else 1)
 
 
 def _velocities(system: System, trajectory: Trajectory, count: int) -> np.ndarray:
-    """(count, n_s + n_f) velocities of the momenta."""
+    """(count, n_s + n_f) velocities from the momenta of the first nodes.
+
+    Raises:
+        ValueError: the system is not the one that was simulated.
+    """
     phase = [jnp.asarray(a)[:count] for a in tuple(vars(trajectory.states).values())[1:]]
     try:
-        start = float(diagnostics.energy(system, *(a[0] for a in phase)))
+        start_energy = float(diagnostics.energy(system, *(a[0] for a in phase)))
         v_s, v_f = jax.jit(jax.vmap(partial(diagnostics.velocity, system)))(*phase)
     except (TypeError, ValueError, IndexError) as error:
         sizes = f"{phase[0].shape[1]} slow and {phase[1].shape[1]} fast coordinates"
         raise ValueError(f"motion: the system does not go with a run of {sizes}: {error}") from error
-    known = float(trajectory.energy[0])
-    if abs(start - known) > 1e-6 * max(1.0, abs(known)):
+    run_energy = float(trajectory.energy[0])
+    if abs(start_energy - run_energy) > 1e-6 * max(1.0, abs(run_energy)):
         raise ValueError(
-            f"motion: the system has the energy {start:.6g} at the start, the run {known:.6g}; give the system, with the "
-            "parameters, that was simulated."
+            f"motion: the system has the energy {start_energy:.6g} at the start, the run {run_energy:.6g}; give the system that was simulated, with "
+            "its parameters."
         )
     return np.concatenate([v_s, v_f], axis=1)
 
@@ -199,12 +209,16 @@ def _ending(trajectory: Trajectory, count: int) -> str:
 
 
 def _with_micro_nodes(trajectory: Trajectory, t, q, v) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes with the micro nodes between them, if the run kept those of all its macro steps and they are in order."""
+    """Times, positions and velocities with the micro nodes inserted, if the run kept them for all macro steps and their times increase."""
     steps = len(t) - 1
     micro = trajectory.micro
     if micro is None or why_not(t, micro.t[:steps]):
         return t, q, v
     n_s = np.shape(trajectory.states.q_s)[1]
     nodes = Nodes(t, q[:, :n_s], q[:, n_s:], v[:, :n_s], v[:, n_s:])
-    every = with_micro_nodes(nodes, micro.t[:steps], micro.q_f[:steps])
-    return every.t, np.concatenate([every.q_s, every.q_f], axis=1), np.concatenate([every.v_s, every.v_f], axis=1)
+    all_nodes = with_micro_nodes(nodes, micro.t[:steps], micro.q_f[:steps])
+    return (
+        all_nodes.t,
+        np.concatenate([all_nodes.q_s, all_nodes.q_f], axis=1),
+        np.concatenate([all_nodes.v_s, all_nodes.v_f], axis=1),
+    )

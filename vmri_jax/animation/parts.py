@@ -8,15 +8,15 @@ PACES = ("slow", "fast")
 
 @dataclass(frozen=True)
 class Body:
-    """A point of 1 to 3 coordinates, each a linear form ``sum_k weight_k q[index_k]`` over q_s and q_f; none is zero.
+    """A point with 1 to 3 coordinates. Each is a linear form ``sum_k weight_k q[index_k]`` over q_s and q_f; without terms it is zero.
 
     Attributes:
         name: unique in a drawing.
-        forms: per coordinate its terms (weight, "s" or "f", index).
-        offset: added to the coordinates: where the body is at q = 0.
-        radius: in the unit of the coordinates; None for one that suits the picture.
-        color: as in CSS, ``#rrggbb``; None for that of its pace.
-        shown: "ball", "name" (of a solid, whose centre it is), or "" for a point of which nothing is shown.
+        forms: for each coordinate its terms (weight, "s" or "f", index).
+        offset: added to the linear forms: the position of the body at q = 0.
+        radius: in the unit of the coordinates; None for a radius that depends on the size of the picture.
+        color: as in CSS, ``#rrggbb``; None for the colour of its pace.
+        shown: "ball"; "name" for the centre of a solid, which shows its name alone; or "" for a point that is not shown.
     """
 
     name: str
@@ -28,19 +28,19 @@ class Body:
 
     @property
     def pace(self) -> str:
-        """ "slow" if all its coordinates are, else "fast"."""
+        """ "slow" if all coordinates of q in it are slow, else "fast"."""
         return "slow" if all(part == "s" for form in self.forms for _, part, _ in form) else "fast"
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A convex solid that moves with four points: a corner with the weights c is at ``x_0 + sum_i c_i (x_i - x_0)``.
+    """A convex solid that moves with four points x_i: a corner with the weights c is at ``x_0 + sum_i c_i (x_i - x_0)``.
 
     Attributes:
-        points: names of the four bodies, the centre first.
+        points: names of the four bodies at the points, the centre first.
         corners: the weights (c_1, c_2, c_3) of each corner.
-        faces: numbers of their corners, anticlockwise from outside.
-        color: None for that of the pace of its centre.
+        faces: for each face the numbers of its corners, anticlockwise from outside.
+        color: None for the colour of the pace of its centre.
     """
 
     points: tuple[str, ...]
@@ -51,9 +51,11 @@ class Solid:
 
 @dataclass(frozen=True)
 class Block:
-    """General coordinates, ("s" or "f", index) each, that are not those of a point: each is shown as a bar.
+    """General coordinates, which are no coordinates of points: each is shown as a bar.
 
-    labels: names of the coordinates, ``name[i]`` if they have none.
+    Attributes:
+        coordinates: ("s" or "f", index) of each.
+        labels: their names.
     """
 
     name: str
@@ -68,8 +70,8 @@ class Joint:
     Attributes:
         kind: "link" or "spring".
         bodies: one name or two.
-        point: the fixed point, if there is one body.
-        pace: "slow" or "fast", colours a spring; None for that of the bodies.
+        point: the fixed point of a joint with one body.
+        pace: "slow" or "fast", which colours a spring; None for the pace of the bodies.
     """
 
     kind: str

@@ -49,7 +49,11 @@ def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
             "fewer, of one with fewer directors) and a number along each director for every corner."
         )
     if any(not 0 <= i < len(corners) for face in faces for i in face):
-        raise ValueError(f"{where}: a face has corners that there are not; there are {len(corners)}.")
+        raise ValueError(
+            f"{where}: a face has the number of a corner that does not exist; there are {len(corners)} corners."
+        )
+    # The points are the centre and, along each director, the point at the distance `size` of the farthest corner: points at a
+    # length of 1 could lie far outside the picture.
     size = float(np.abs(corners).max()) or 1.0
     centre = tuple(forms[:3])
     bodies = [Body(name, centre, (0.0,) * 3, None, data.get("color"), "name")]
@@ -58,8 +62,8 @@ def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
         along = [(*a, *((size * w, part, i) for w, part, i in b)) for a, b in zip(centre, directors, strict=True)]
         bodies.append(Body(f"{name} axis {k + 1}", tuple(along), (0.0,) * 3, shown=""))
     weights = np.pad(corners / size, [(0, 0), (0, 3 - count)])
-    named = tuple(body.name for body in bodies)
-    return Solid(named, tuple(map(tuple, weights.tolist())), faces, data.get("color")), bodies
+    names = tuple(body.name for body in bodies)
+    return Solid(names, tuple(map(tuple, weights.tolist())), faces, data.get("color")), bodies
 
 
 def read_block(data: Any, where: str) -> Block:
@@ -91,7 +95,7 @@ def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
 
 def read_joint(kind: str, names: Sequence[str], entry: Any, where: str) -> Joint:
     if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
-        raise ValueError(f"{where} is {entry!r}; it must be a pair of names, or one and 'slow' or 'fast'.")
+        raise ValueError(f"{where} is {entry!r}; it must be a pair of names, or a pair of names and 'slow' or 'fast'.")
     a, b = (_body_name(name, names, where) for name in entry[:2])
     if a == b:
         raise ValueError(f"{where} joins {a!r} with itself.")
@@ -108,7 +112,7 @@ def read_anchor(names: Sequence[str], data: Any, where: str) -> Joint:
 
 
 def read_record(kind: type, readers: dict[str, Callable], data: Any, where: str) -> Any:
-    """What has just these entries, each read and checked by a function of its own."""
+    """A `kind` from a dict with one entry for each reader, which checks and converts it."""
     check_keys(data, list(readers), list(readers), where)
     return kind(**{key: read(data[key], f"{where}: {key}") for key, read in readers.items()})
 
@@ -129,7 +133,7 @@ def _pace(pace: Any, where: str) -> str | None:
 
 
 def read_carried(data: Any) -> tuple[Kinematics, dict[str, np.ndarray]] | None:
-    """The map of bodies on joints, of its plain data."""
+    """The map from joint coordinates to coordinates of the bodies, and the arrays of its joints."""
     if data is None:
         return None
     check_keys(data, ("map", "joints"), ("map", "joints"), "drawing: kinematics")

@@ -1,4 +1,4 @@
-"""One moment of a motion in a matplotlib panel, the farthest things first, as in the script of the page."""
+"""One moment of a motion in a matplotlib panel, painted from the farthest part to the nearest, as in the script of the page."""
 
 import math
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from vmri_jax.animation.geometry import LAMP, dropped, joint, spring
 from vmri_jax.animation.layout import Ground, Layout, layout
 from vmri_jax.animation.motion import Motion
 
-ON_TOP = 1e9
-"""In front of all things, of whatever depth."""
-AMBIENT = -0.12
-"""Shade of a face that is neither turned to the lamp nor away from it."""
-TRAIL = (160, 2000)
-"""Fewest and most places of a trail."""
+FRONT_ZORDER = 1e9
+"""Drawing order of text: in front of all parts, whose order is their scale in the view."""
+AMBIENT_SHADE = -0.12
+"""Shade of a face at a right angle to the lamp, from -1 (dark) to 1 (light)."""
+TRAIL_POINTS = (160, 2000)
+"""Smallest and largest number of points of a trail."""
 NAME_SIZE = 7.5
-"""Of the names of bodies, in points of print."""
+"""Font size of the names of bodies, in points."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What the pictures of one motion have in common: sizes of things, and a view `aspect` times as wide as high."""
+    """The settings that all pictures of one motion share: sizes, colours, and a view `aspect` times as wide as high."""
 
     motion: Motion
     sizes: Layout
@@ -39,7 +39,7 @@ class Stage:
 
     @classmethod
     def of(cls, motion: Motion, theme: plots.Theme) -> "Stage":
-        """With the first view, in a frame as wide as the scene asks for.
+        """The stage of a motion with its first view; the frame is as wide as the scene, between half and eight times its height.
 
         Args:
             motion: from `vmri_jax.animation.motion`.
@@ -67,8 +67,8 @@ class Stage:
             figure: in the style of the theme.
             place: left, bottom, width and height of the panel, in parts of the figure.
             time: the moment.
-            trail: so long ago is the oldest place that is shown of a body.
-            names: whether bodies are named, as far as there is room.
+            trail: duration of the trail behind each body.
+            names: whether to write names beside bodies where there is room.
         """
         figure.set_layout_engine("none")
         axes = figure.add_axes(place)
@@ -92,11 +92,11 @@ class Stage:
         span = float(self.motion.t[-1] - self.motion.t[0])
         digits = max(0, 2 - math.floor(math.log10(span))) if span > 0 else 2
         label = f"$t = {time:.{digits}f}$"
-        axes.text(-0.97 * self.aspect, -0.97, label, va="bottom", fontsize=9, color=self.theme.ink, zorder=ON_TOP)
+        axes.text(-0.97 * self.aspect, -0.97, label, va="bottom", fontsize=9, color=self.theme.ink, zorder=FRONT_ZORDER)
 
     @property
     def paces(self) -> dict[str, str]:
-        """Colours of what is slow and what is fast."""
+        """Colours of slow and of fast parts."""
         return {"slow": self.theme.curves[0], "fast": self.theme.curves[1]}
 
     @property
@@ -104,16 +104,16 @@ class Stage:
         return [body.color or self.paces[body.pace] for body in self.motion.drawing.bodies]
 
     def _trail_times(self, start: float, end: float) -> np.ndarray:
-        """Times of the places of a trail, as many as there are nodes: else fast motion would be drawn as a zigzag."""
+        """Times of the points of a trail, two for each node: with fewer points fast motion would be a zigzag."""
         nodes = int(np.sum((self.motion.t >= start) & (self.motion.t <= end)))
-        return np.linspace(start, end, int(np.clip(2 * nodes, *TRAIL)))
+        return np.linspace(start, end, int(np.clip(2 * nodes, *TRAIL_POINTS)))
 
     def _ends(self, points: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Centres that a connection joins."""
+        """The two points that each connection joins."""
         return [(points[c.body], points[c.other] if c.point is None else c.point) for c in self.sizes.connections]
 
     def _draw_around(self, pen: "_Pen", points: np.ndarray) -> None:
-        """Planes with the shadows on them, and fixed spheres."""
+        """Draw the planes with the shadows on them, and fixed spheres."""
         sizes, drawing = self.sizes, self.motion.drawing
         balls = [i for i, body in enumerate(drawing.bodies) if body.shown == "ball"]
         centers = np.concatenate([points[balls], sizes.spheres])
@@ -143,29 +143,29 @@ class Stage:
                 pen.rod(*ends, sizes.rod, sizes.size)
             elif ends is not None:
                 pen.spring(*ends, sizes.coil, sizes.wire, self.paces[c.pace], c.turns)
-            if c.point is not None and np.linalg.norm(a - b) > reach[0]:  # else within the body
+            if c.point is not None and np.linalg.norm(a - b) > reach[0]:  # else the ball of the body hides the point
                 pen.ball(c.point, 1.5 * sizes.rod, self.theme.rod)
 
 
 class _Pen:
-    """Draws in a panel, seen by a camera; `points` is the size of a unit of the view in points of print."""
+    """Draws parts in a panel, as a camera sees them; `points` is the length of a unit of the view in typographic points."""
 
     def __init__(self, axes: Axes, camera: Camera, theme: plots.Theme, points: float):
         self.axes, self.camera, self.theme, self.points = axes, camera, theme, points
 
     def tone(self, color, shade):
-        """A colour from dark (-1) over itself to light (1)."""
+        """Shades of a colour: -1 is nearly black, 0 the colour, 1 white."""
         shade = np.atleast_1d(shade)[:, None]
         ends = np.where(shade < 0, 0.06, 1.0)
         return np.array(to_rgb(color)) * (1 - np.abs(shade)) + ends * np.abs(shade)
 
     def lines(self, ends, colors, widths, zorder: float, **style) -> None:
-        """Segments (n, 2, 2); widths in points of print."""
+        """Segments (n, 2, 2), their widths in typographic points."""
         lines = LineCollection(list(ends), colors=colors, linewidths=np.maximum(0.5, widths), zorder=zorder, **style)
         self.axes.add_collection(lines, autolim=False)
 
     def ball(self, center, radius: float, color) -> None:
-        """Discs that grow lighter towards the lamp; nearer things have a larger scale, and are drawn later."""
+        """A ball as discs that grow smaller and lighter towards the lamp. Nearer parts have a larger scale and are drawn later."""
         (x, y), scale = self.camera.project(center)
         share = np.linspace(0, 1, int(np.clip(2 * self.points * scale * radius, 12, 60)))
         r = scale * radius * (1 - 0.93 * share)
@@ -176,7 +176,7 @@ class _Pen:
         self.axes.scatter(*xy.T, s=area, c=self.tone(color, shades), linewidths=0, zorder=float(scale))
 
     def face(self, corners, color) -> None:
-        """A face of a convex solid, lit by the lamp, if it is seen from outside."""
+        """A face of a convex solid, lit by the lamp, if its outer side is turned to the camera."""
         normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
         normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
         back = self.camera.axes[2]
@@ -185,19 +185,19 @@ class _Pen:
         if normal @ (eye - corners.mean(axis=0)) <= 0 or not (scale > 0).all():
             return
         bright = float((self.camera.axes @ normal) @ LAMP / np.linalg.norm(LAMP))
-        tone = self.tone(color, AMBIENT + (0.5 if bright > 0 else 0.35) * bright)[0]
+        tone = self.tone(color, AMBIENT_SHADE + (0.5 if bright > 0 else 0.35) * bright)[0]
         style = {"facecolor": tone, "edgecolor": tone, "linewidth": 0.4, "joinstyle": "round"}
         self.axes.add_patch(PathPatch(Path(places, closed=False), zorder=float(scale.mean()), **style))
 
     def rod(self, start, end, radius: float, size: float) -> None:
-        """In pieces, each with its own depth."""
+        """A rod in pieces, each with a depth of its own, so that bodies may hide a part of the rod."""
         pieces = int(np.clip(np.ceil(10 * np.linalg.norm(end - start) / size), 1, 12))
         places, scale = self.camera.project(start + np.linspace(0, 1, pieces + 1)[:, None] * (end - start))
         along = places[-1] - places[0]
         along /= max(float(np.linalg.norm(along)), 1e-12)
         side = np.array([along[1], -along[0]])
         side *= 1.0 if side @ LAMP[:2] > 0 else -1.0
-        overlap = 0.3 / self.points * np.array([-along, along])  # or seams would show
+        overlap = 0.3 / self.points * np.array([-along, along])  # without it seams show between pieces
         tones = self.tone(self.theme.rod, [-0.35, 0.05, 0.5])
         for k in range(pieces):
             w = radius * (scale[k] + scale[k + 1])
@@ -219,7 +219,7 @@ class _Pen:
         self.lines(segments[order], tones[order], widths[order], float(scale.mean()), capstyle="round")
 
     def trail(self, path, color, radius: float) -> None:
-        """Fading into the past, from the surface of the ball on."""
+        """The trail of a ball, from its surface on, fading into the past."""
         outside = np.linalg.norm(path - path[-1], axis=1) >= 0.9 * radius
         path = path[: len(path) - int(np.argmax(outside[::-1]))] if outside.any() else path[:0]
         if len(path) < 2:
@@ -231,7 +231,7 @@ class _Pen:
         self.lines(segments, color, 0.5 + 0.9 * young, behind, alpha=0.7 * young**1.5, capstyle="butt")
 
     def names(self, points, radii, names: list[str]) -> None:
-        """Beside the balls, to the right or to the left, the largest first; one that would cover something is left out."""
+        """Names to the right or left of the balls, the largest ball first; a name that would cover a ball or another name is left out."""
         places, scale = self.camera.project(points)
         letter, sizes = NAME_SIZE / self.points, scale * radii
         edge = np.array(self.axes.get_xlim())
@@ -246,11 +246,11 @@ class _Pen:
                     taken.append(box)
                     x, y = corner.tolist()
                     ink = self.theme.ink
-                    self.axes.text(x, y, names[i], va="bottom", fontsize=NAME_SIZE, color=ink, zorder=ON_TOP)
+                    self.axes.text(x, y, names[i], va="bottom", fontsize=NAME_SIZE, color=ink, zorder=FRONT_ZORDER)
                     break
 
     def ground(self, ground: Ground) -> None:
-        """Its grid; a solid plane is tinted too."""
+        """The grid of a ground; a solid plane is tinted as well."""
         places, scale = self.camera.project(ground.grid[:, :6].reshape(-1, 2, 3))
         seen = (scale > 0).all(axis=1)
         self.lines(places[seen], self.theme.faint, 0.7, -3, alpha=ground.grid[seen, 6])
@@ -258,12 +258,13 @@ class _Pen:
             self.polygons([ground.corners], self.theme.faint, 0.4, -4)
 
     def shadows(self, ground: Ground, points, radii, joints, rod: float) -> None:
-        """Straight down onto a plane that bears; where those of a kind overlap they are no darker."""
+        """Shadows of balls and joints, straight down onto a ground. Balls are one path and joints another, so that overlaps are no darker."""
         angle = np.linspace(0, 2 * np.pi, 25)[:-1]
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ ground.sides
         color, strength = "#000000", 1.0 if self.theme is plots.LIGHT else 2.0
         feet = dropped(ground.center, ground.normal, points)
         above = (points - ground.center) @ ground.normal > 0
+        # discs of growing radius and low opacity make a soft edge
         for grown in np.arange(0.7, 1.5, 0.1):
             balls = zip(feet[above], radii[above], strict=True)
             self.polygons([foot + grown * radius * circle for foot, radius in balls], color, 0.026 * strength, -2)
@@ -276,7 +277,7 @@ class _Pen:
             self.axes.add_patch(PathPatch(path, fill=False, edgecolor=color, zorder=-2, **style))
 
     def shadow(self, ground: Ground, faces) -> None:
-        """Of a convex solid: its faces that are seen from above, straight down."""
+        """The shadow of a convex solid: its faces that are turned upwards, projected straight down."""
         strength = 1.0 if self.theme is plots.LIGHT else 2.0
         for corners in faces:
             if np.cross(corners[1] - corners[0], corners[2] - corners[1]) @ ground.normal > 0:
@@ -286,12 +287,12 @@ class _Pen:
                 )
 
     def polygons(self, corners, color, alpha: float, zorder: float) -> None:
-        """Of as many corners each, in one path."""
+        """Polygons with equal numbers of corners, in one path: where they overlap they are no darker."""
         if len(corners):
             path = Path.make_compound_path_from_polys(self.camera.project(np.array(corners))[0])
             self.axes.add_patch(PathPatch(path, facecolor=color, linewidth=0, alpha=alpha, zorder=zorder))
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two boxes, lower left and upper right corner, have a part in common."""
+    """Whether two boxes overlap, each given by its lower left and upper right corner."""
     return bool(np.all(a[0] < b[1]) and np.all(b[0] < a[1]))

@@ -1,4 +1,4 @@
-"""Which numbers of a motion show what moves slowly and what fast: coordinates of bodies and lengths of springs."""
+"""The choice of the curves that show slow and fast motion: coordinates of bodies and lengths of springs."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,22 +8,24 @@ import numpy as np
 from vmri_jax.animation.motion import Motion
 from vmri_jax.mechanics.names import AXES
 
-RESOLVED = 1.5
-"""Radians from node to node: what turns faster is not resolved by the nodes, and would be drawn as something else."""
-SEEN = 0.02
-"""Part of the largest motion of its kind below which a signal is left out."""
+MOST_RADIANS_PER_NODE = 1.5
+"""Largest phase change from node to node, in radians, of a signal that is drawn. Above pi the drawn curve would have a false, lower
+frequency; half of that leaves a margin, since frequencies are estimates."""
+LEAST_RELATIVE_SIZE = 0.02
+"""Smallest size of a signal, over the largest size of the signals of its kind; a smaller part would also draw motion that nobody sees in the
+pictures."""
 PERIODS = 8
-"""In the window of a fast signal."""
+"""Number of periods in the window of a fast signal; with more they run together."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A number that follows from where the bodies are.
+    """A function of the positions of the bodies.
 
     Attributes:
-        label: what it is.
+        label: its name, for the title of a panel.
         pace: "slow" or "fast".
-        of: from (k, n_bodies, 3) points to (k,) values.
+        of: the function, from points (k, n_bodies, 3) to values (k,).
         size: standard deviation along the motion.
         speed: standard deviation of its rate.
     """
@@ -36,29 +38,29 @@ class Signal:
 
     @property
     def frequency(self) -> float:
-        """Mean angular frequency."""
+        """Mean angular frequency: of a sine, rate over size."""
         return self.speed / self.size
 
 
 def slow_signal(motion: Motion) -> Signal | None:
-    """The coordinate of a slow body that moves slowest and most; of a fast one if no slow body moves.
+    """The coordinate of a slow body with the largest size over frequency; of a fast body if no slow body moves.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
     """
-    found = _seen(_coordinates(motion))
-    found = [signal for signal in found if signal.pace == "slow"] or found
-    return max(found, key=lambda signal: signal.size / signal.frequency, default=None)
+    signals = _seen(_coordinates(motion))
+    signals = [signal for signal in signals if signal.pace == "slow"] or signals
+    return max(signals, key=lambda signal: signal.size / signal.frequency, default=None)
 
 
 def fast_signal(motion: Motion) -> Signal | None:
-    """The length of a fast spring, else the coordinate of a fast body, that moves fastest and most, if nodes resolve it.
+    """The length of a fast spring with the largest speed times frequency that the nodes resolve; else such a coordinate of a fast body.
 
     Args:
         motion: from `vmri_jax.animation.motion`.
     """
-    for kind in (_lengths(motion), _coordinates(motion)):
-        fast = [s for s in kind if s.pace == "fast" and s.frequency * _step(motion) < RESOLVED]
+    for signals in (_lengths(motion), _coordinates(motion)):
+        fast = [s for s in signals if s.pace == "fast" and s.frequency * _step(motion) < MOST_RADIANS_PER_NODE]
         if fast:
             return max(_seen(fast), key=lambda signal: signal.speed * signal.frequency)
     return None
@@ -69,7 +71,7 @@ def window(motion: Motion, signal: Signal) -> tuple[float, float]:
 
     Args:
         motion: from `vmri_jax.animation.motion`.
-        signal: of it.
+        signal: of this motion.
     """
     first, last = float(motion.t[0]), float(motion.t[-1])
     rates = np.gradient(signal.of(motion.points), motion.t)
@@ -85,32 +87,32 @@ def _step(motion: Motion) -> float:
 
 def _seen(signals: list[Signal]) -> list[Signal]:
     largest = max((signal.size for signal in signals), default=0.0)
-    return [signal for signal in signals if signal.size >= SEEN * largest]
+    return [signal for signal in signals if signal.size >= LEAST_RELATIVE_SIZE * largest]
 
 
 def _coordinates(motion: Motion) -> list[Signal]:
-    """Those of all bodies, in the coordinates of the drawing."""
-    drawing, found = motion.drawing, []
+    """Signals of the moving coordinates of all bodies, in coordinates of the drawing."""
+    drawing, signals = motion.drawing, []
     frame = drawing.frame()
     for i, body in enumerate(drawing.bodies):
         moved = [axis for axis, form in enumerate(body.forms) if form]
         for axis in moved:
             label = body.name if len(moved) == 1 else f"{body.name} {AXES[axis]}"
-            found += _signal(motion, label, body.pace, _along(i, frame[:, axis]))
-    return found
+            signals += _signal(motion, label, body.pace, _along(i, frame[:, axis]))
+    return signals
 
 
 def _lengths(motion: Motion) -> list[Signal]:
-    """Those of all springs."""
-    drawing, found = motion.drawing, []
+    """Signals of the lengths of all springs."""
+    drawing, signals = motion.drawing, []
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
     for joint in drawing.joints:
         if joint.kind != "spring":
             continue
         end = index[joint.bodies[-1]] if joint.point is None else drawing.place([joint.point])[0]
         of = _distance(index[joint.bodies[0]], end)
-        found += _signal(motion, f"length of spring {' to '.join(joint.bodies)}", drawing.pace(joint), of)
-    return found
+        signals += _signal(motion, f"length of spring {' to '.join(joint.bodies)}", drawing.pace(joint), of)
+    return signals
 
 
 def _along(body: int, direction: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -122,7 +124,7 @@ def _distance(body: int, end: int | np.ndarray) -> Callable[[np.ndarray], np.nda
 
 
 def _signal(motion: Motion, label: str, pace: str, of: Callable[[np.ndarray], np.ndarray]) -> list[Signal]:
-    """The signal, unless it is at rest."""
+    """A list of the signal, empty if it does not move."""
     values = of(motion.points)
     if len(values) < 3 or np.ptp(values) <= 1e-9 * np.abs(values).max():
         return []
@@ -130,5 +132,8 @@ def _signal(motion: Motion, label: str, pace: str, of: Callable[[np.ndarray], np
 
 
 def _speed(t: np.ndarray, values: np.ndarray) -> float:
-    """Standard deviation of the rate, from node to node: central differences would miss what turns by pi between nodes."""
+    """Standard deviation of the differences from node to node over the time between them.
+
+    Central differences would be zero for a signal that turns by pi between nodes.
+    """
     return float(np.std(np.diff(values) / np.diff(t)))

@@ -1,4 +1,4 @@
-"""Files for ParaView and others that read VTK: bodies as points, links and springs as lines, solids as polygons."""
+"""Files for ParaView and other programs that read VTK: bodies as points, links and springs as lines, solids as polygons."""
 
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -10,19 +10,19 @@ from vmri_jax.animation.motion import Motion
 from vmri_jax.running.files import check_place
 
 KINDS = ("body", "link", "spring", "solid")
-"""What the number `kind` of a cell says."""
+"""Kinds of cells; their numbers in this list are the cell data `kind`."""
 CELLS = {3: "triangle", 4: "quad"}
-"""Numbers of corners that VTK has kinds of cells for; other polygons are cut into triangles."""
+"""Names of cells by number of corners; polygons with more corners are cut into triangles."""
 
 
 def write_vtk(motion: Motion, path: str | Path) -> None:
     """Write ``run.pvd``, which lists the times, and for each node of the run a file ``run/0000.vtu``.
 
-    Cells have their `kind` (0 body, 1 link, 2 spring, 3 solid) and whether they are `fast`; points have their `velocity`.
+    Cell data: `kind` (0 body, 1 link, 2 spring, 3 solid) and `fast` (0 or 1); point data: `velocity`.
 
     Args:
         motion: from `vmri_jax.animation.motion`; ``motion.thinned(200)`` has fewer nodes.
-        path: of the ``.pvd`` file.
+        path: name of the ``.pvd`` file.
 
     Raises:
         ImportError: without the package meshio.
@@ -52,34 +52,34 @@ def write_vtk(motion: Motion, path: str | Path) -> None:
 
 
 def _cells(drawing: Drawing) -> tuple[list, dict]:
-    """Cells as meshio takes them, and the data of each block. Points are bodies, fixed ends of joints, corners of solids."""
+    """Cells for meshio, and the data of each block of cells. Points are the bodies, fixed ends of joints, corners of solids, in this order."""
     index = {body.name: i for i, body in enumerate(drawing.bodies)}
-    at = len(drawing.bodies)
-    found: dict[str, list[tuple[list[int], str, bool]]] = {}
+    next_point = len(drawing.bodies)
+    cells_by_type: dict[str, list[tuple[list[int], str, bool]]] = {}
     for body in drawing.bodies:
         if body.shown == "ball":
-            found.setdefault("vertex", []).append(([index[body.name]], "body", body.pace == "fast"))
+            cells_by_type.setdefault("vertex", []).append(([index[body.name]], "body", body.pace == "fast"))
     for joint in drawing.joints:
         ends = [index[name] for name in joint.bodies]
         if joint.point is not None:
-            ends, at = [*ends, at], at + 1
-        found.setdefault("line", []).append((ends, joint.kind, drawing.pace(joint) == "fast"))
+            ends, next_point = [*ends, next_point], next_point + 1
+        cells_by_type.setdefault("line", []).append((ends, joint.kind, drawing.pace(joint) == "fast"))
     for solid in drawing.solids:
         fast = drawing.bodies[index[solid.points[0]]].pace == "fast"
         for face in solid.faces:
-            numbers = [at + i for i in face]
+            numbers = [next_point + i for i in face]
             pieces = (
                 [numbers]
                 if len(face) in CELLS
                 else [[numbers[0], *numbers[i : i + 2]] for i in range(1, len(face) - 1)]
             )
             for piece in pieces:
-                found.setdefault(CELLS[len(piece)], []).append((piece, "solid", fast))
-        at += len(solid.corners)
-    cells = [(kind, np.array([numbers for numbers, *_ in items])) for kind, items in found.items()]
+                cells_by_type.setdefault(CELLS[len(piece)], []).append((piece, "solid", fast))
+        next_point += len(solid.corners)
+    cells = [(kind, np.array([numbers for numbers, *_ in items])) for kind, items in cells_by_type.items()]
     data = {
-        "kind": [np.array([KINDS.index(kind) for _, kind, _ in items]) for items in found.values()],
-        "fast": [np.array([int(fast) for *_, fast in items]) for items in found.values()],
+        "kind": [np.array([KINDS.index(kind) for _, kind, _ in items]) for items in cells_by_type.values()],
+        "fast": [np.array([int(fast) for *_, fast in items]) for items in cells_by_type.values()],
     }
     return cells, data
 

@@ -1,6 +1,6 @@
-"""The command line ``vmri``: systems, schemes, one run, many runs, what accuracy costs, hard cases.
+"""The command line ``vmri``: systems, schemes, one run, many runs, the cost of accuracy, hard cases.
 
-Each module has an ``app`` of its own with its commands; here they become one.
+This file joins the commands of the modules into one app.
 """
 
 import os

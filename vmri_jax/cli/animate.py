@@ -24,10 +24,10 @@ from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.store import StoredTrajectory
 from vmri_jax.running.trajectory import Trajectory
 
-MOST_FILES = 500
-"""Nodes in files for ParaView, one file each."""
-MOST_NODES = 100_000
-"""Read from a store; of longer runs every k-th node is."""
+MOST_VTK_NODES = 500
+"""Largest number of nodes for ParaView, each in a file of its own; more files take long to open."""
+MOST_STORE_NODES = 100_000
+"""Largest number of nodes that are read from a store into memory; of longer runs every k-th node is read."""
 
 
 def animate(
@@ -39,9 +39,11 @@ def animate(
         ),
     ] = None,
     system: Annotated[
-        str | None, typer.Option(help="What was simulated: fpu, tsp, sam, or my_file.py:my_problem.")
+        str | None, typer.Option(help="System of the run: fpu, tsp, sam, or my_file.py:my_problem.")
     ] = None,
-    drawing: Annotated[Path | None, typer.Option(help="What to draw, .json, instead of what the run says.")] = None,
+    drawing: Annotated[
+        Path | None, typer.Option(help="Drawing in a .json file, in place of the one in the run.")
+    ] = None,
     title: Annotated[str | None, typer.Option(help="Over the picture. [dim]name of the system or file[/dim]")] = None,
     start: Annotated[float | None, typer.Option("--from", help="Start at this time.")] = None,
     end: Annotated[float | None, typer.Option("--to", help="Stop at this time.")] = None,
@@ -54,7 +56,7 @@ def animate(
 ) -> None:
     """Show a run: a page to open in a browser, a strip of pictures, or a GIF.
 
-    The drawing is the one stored with the run, else that of --system; without one every coordinate is a bar.
+    The drawing is the one stored with the run, else the drawing of --system; without a drawing every coordinate is a bar.
     """
     with refusals():
         out = run.with_suffix(".html") if out is None else out
@@ -68,24 +70,24 @@ def animate(
 
 
 def _motion(run: Path, system: str | None, drawing: Path | None) -> Motion:
-    """Of a saved run, with the first drawing there is."""
+    """The motion of a saved run, with the drawing of --drawing, of the run or of --system, else with bars."""
     (trajectory, description), problem = _load(run), None if system is None else find_problem(system)
     sizes = [np.shape(a)[-1] for a in (trajectory.states.q_s, trajectory.states.q_f)]
     if problem is not None and sizes != [np.size(problem.q_s), np.size(problem.q_f)]:
         raise ValueError(
-            f"--system {system} has {np.size(problem.q_s)} slow and {np.size(problem.q_f)} fast coordinates, the run "
+            f"--system {system} has {np.size(problem.q_s)} slow and {np.size(problem.q_f)} fast coordinates, the run has "
             f"{sizes[0]} and {sizes[1]}; give the system that was simulated."
         )
     if drawing is not None:
         description = _read(drawing)
     if not description and problem is not None:
         description = problem.drawing or built_in(system or "", np.size(problem.q_s))
-    found = Drawing.from_dict(description or bars(trajectory))
-    return motion(trajectory, found, None if problem is None else problem.system)
+    parsed = Drawing.from_dict(description or bars(trajectory))
+    return motion(trajectory, parsed, None if problem is None else problem.system)
 
 
 def _seen_from(shown: Motion, view: str | None) -> Motion:
-    """The motion with the view of the option."""
+    """The motion with the view of --view, if it is given."""
     if view is None:
         return shown
     parts: list = [part.strip() for part in view.split(",")]
@@ -97,10 +99,10 @@ def _seen_from(shown: Motion, view: str | None) -> Motion:
 
 
 def _load(run: Path) -> tuple[Trajectory, str | dict]:
-    """A saved run, of a long store every k-th node, and the drawing stored with it; empty if there is none."""
+    """A saved run, every k-th node of a long store, and the drawing stored with the run, empty if it has none."""
     if run.suffix.lower() == ".zarr":
         stored = StoredTrajectory.open(run)
-        return stored[:: max(1, len(stored) // MOST_NODES)], stored.attributes.get("drawing", "")
+        return stored[:: max(1, len(stored) // MOST_STORE_NODES)], stored.attributes.get("drawing", "")
     trajectory = Trajectory.load(run)
     with np.load(run, allow_pickle=False) as arrays:
         return trajectory, str(arrays["drawing"]) if "drawing" in arrays else ""
@@ -120,7 +122,7 @@ def _write(shown: Motion, out: Path, title: str, frames: int, seconds: float, th
     if suffix == ".html":
         write_html(shown, out, title)
     elif suffix == ".pvd":
-        write_vtk(shown.thinned(MOST_FILES), out)
+        write_vtk(shown.thinned(MOST_VTK_NODES), out)
     elif suffix == ".gif":
         with progress_shown() as tell:
             write_gif(shown, out, seconds, theme, lambda done, total: tell("drawing", done, total))

@@ -1,4 +1,4 @@
-"""`vmri check`: the hard cases that make sense for any system, on one of yours."""
+"""`vmri check`: hard cases that make sense for any system, applied to a system of the user."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from vmri_jax.hard_cases import Case, cases_for, run_cases
 from vmri_jax.running.interrupts import Interrupted
 from vmri_jax.running.progress import progress_shown
 
-Numbers = Annotated[list[int] | None, typer.Option("--case", help="Number of a case; again for more of them.")]
+Numbers = Annotated[list[int] | None, typer.Option("--case", help="Number of a case; may be repeated.")]
 Full = Annotated[bool, typer.Option("--full", help="Full forms: runs of up to a million steps, minutes.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for tables (md, csv, json) and pictures.")]
 
@@ -30,7 +30,10 @@ def check(system: options.System, case: Numbers = None, full: Full = False, out:
 
 
 def run_and_show(cases: Sequence[Case], numbers: Sequence[int], full: bool, out: Path | None) -> None:
-    """Run these cases, print the table, write the files; exit code 1 if a criterion is not met, 2 for an unknown number."""
+    """Run cases, print their table and write their files.
+
+    Exit code 1 if a criterion is not met, 2 for an unknown number, 130 after Ctrl-C.
+    """
     stopped = None
     with refusals(), progress_shown() as tell:
         try:

@@ -1,4 +1,4 @@
-"""What all commands share: the console, refusals and failures, tables, a progress bar, files to be written."""
+"""Parts of all commands: the console, refusals and failures, tables, a spinner, checks of files to write."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,11 +18,11 @@ from vmri_jax.running.printed import OutputConsole
 console = OutputConsole()
 
 PICTURES = (".png", ".svg", ".pdf")
-"""Endings of files that a figure is written to."""
+"""Endings of files of figures."""
 
 
 class BadInput(typer.BadParameter):
-    """Something the user typed: shown in a panel, exit code 2."""
+    """A wrong argument: its message is shown in a panel, exit code 2."""
 
     def format_message(self) -> str:
         return self.message
@@ -34,12 +34,12 @@ RUN = "Run and see:  vmri simulate fpu --macro-dt 0.05 --steps 400 --out run.npz
 RIGHT = "Is it right:  vmri check my_system.py:problem"
 COSTS = "What it costs:  vmri tune fpu --error 1e-4 --t-end 2"
 MANY = "Many runs, and what there is:  vmri sweep --example"
-"""The groups of commands, each with an example: what `vmri` shows."""
+"""Titles of the four groups of commands in the help of `vmri`, each with an example."""
 
 
 @contextmanager
 def refusals() -> Iterator[None]:
-    """Refusals of what is called within become panels; any other error is a fault inside, and is shown as such.
+    """Show refusals of the library as panels; show any other ValueError, TypeError or ImportError as a fault of the program.
 
     Raises:
         BadInput: an argument was wrong, or a file is missing or in the way.
@@ -65,7 +65,7 @@ def refusals() -> Iterator[None]:
 
 @contextmanager
 def status(text: str) -> Iterator[None]:
-    """Say what is done meanwhile: beside a spinner, or in a line on the error stream where the output is no terminal."""
+    """Show a text while the block runs: beside a spinner, or in a line on the error stream if the output is no terminal."""
     if console.is_terminal:
         with console.status(text):
             yield
@@ -75,14 +75,14 @@ def status(text: str) -> Iterator[None]:
 
 
 def print_failure(title: str, text: str) -> None:
-    """A red panel on the error stream."""
+    """Print a red panel on the error stream."""
     Console(stderr=True).print(Panel(Text(text), title=title, title_align="left", border_style="red"))
 
 
-def print_written(what: str, path: Path | None) -> None:
-    """Where a file is, if it was asked for."""
+def print_written(title: str, path: Path | None) -> None:
+    """Print the path of a written file, if there is one."""
     if path is not None:
-        console.print(f"{what}: [bold]{escape(str(path))}[/bold]", soft_wrap=True)
+        console.print(f"{title}: [bold]{escape(str(path))}[/bold]", soft_wrap=True)
 
 
 def plain_table(*columns: str, show_header: bool = True) -> Table:
@@ -91,7 +91,7 @@ def plain_table(*columns: str, show_header: bool = True) -> Table:
 
 
 def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) -> None:
-    """Refuse a file to be written before anything is computed.
+    """Refuse a file that cannot be written, before anything is computed.
 
     Raises:
         ValueError: the file has another ending, no folder, or cannot be written.
@@ -111,7 +111,7 @@ def check_target_file(option: str, path: Path | None, endings: tuple[str, ...]) 
 
 
 def check_target_folder(option: str, path: Path | None) -> None:
-    """Make a folder that results are to be written into, and refuse a place where none can be, before anything is computed.
+    """Make the folder for results, or refuse it, before anything is computed.
 
     Raises:
         ValueError: the folder cannot be made, or no file can be written in it.

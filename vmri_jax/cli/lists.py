@@ -1,4 +1,4 @@
-"""`vmri systems` and `vmri schemes`: what there is by name."""
+"""`vmri systems` and `vmri schemes`: lists of the built-in systems and schemes."""
 
 import numpy as np
 import typer
@@ -33,7 +33,7 @@ def systems() -> None:
 @app.command(rich_help_panel=MANY)
 def schemes() -> None:
     """List the built-in schemes."""
-    table = plain_table("name", "order", "options", "what")
+    table = plain_table("name", "order", "options", "scheme")
     for name, entry in SCHEMES.items():
         options = " ".join(f"--{option}" for option in entry.options)
         table.add_row(f"[bold]{name}[/bold]", entry.order, options, entry.title)

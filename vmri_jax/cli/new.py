@@ -1,4 +1,4 @@
-"""`vmri new`: a file to start from."""
+"""`vmri new`: a commented file with a system or a scene, which the user changes."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -16,7 +16,7 @@ def new(
     file: Annotated[Path, typer.Argument(help="Where to write it, a .py.")] = FILE,
     scene: Annotated[bool, typer.Option("--scene", help="Bodies and effects instead of functions.")] = False,
 ) -> None:
-    """Write a commented file that runs: a system of your own to be, or a scene."""
+    """Write a commented program that runs, to change into your own system or scene."""
     with refusals():
         check_target_file("FILE", file, (".py",))
         if file.exists():
@@ -26,6 +26,6 @@ def new(
         file.write_text(text.replace("FILE", file.as_posix()), encoding="utf-8")
         thing = "scene" if scene else "problem"
         commands = f"python {file}", f"vmri simulate {file}:{thing} --macro-dt 0.02 --steps 200 --out run.npz"
-        console.print(f"wrote [bold]{escape(str(file))}[/bold]; what it says runs:", soft_wrap=True)
+        console.print(f"wrote [bold]{escape(str(file))}[/bold]; these commands run it:", soft_wrap=True)
         for command in commands:
             console.print(f"    {escape(command)}", soft_wrap=True)

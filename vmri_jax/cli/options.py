@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have: which system, which scheme, which step."""
+"""Arguments and options that several commands have: system, scheme and step."""
 
 from typing import Annotated
 

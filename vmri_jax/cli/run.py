@@ -1,4 +1,4 @@
-"""`vmri simulate`: one run and how it went."""
+"""`vmri simulate`: one run, and a report of its steps, errors and files."""
 
 import math
 import shlex
@@ -29,10 +29,10 @@ from vmri_jax.steppers.results import Method, SimulationError
 
 DEFAULT_SCHEME = "fully-implicit"
 """The scheme of a run without --scheme and --accuracy."""
-SAVED_NODES = 1000
-"""About as many nodes are saved by default."""
-DRAWN = 10_000
-"""Most nodes of a run on disk that a figure has; more are not seen, and take longer to read."""
+DEFAULT_SAVED_NODES = 1000
+"""Approximate number of saved nodes of a run without --save-every; more make larger files, and figures do not show them."""
+MOST_DRAWN_NODES = 10_000
+"""Largest number of nodes of a stored run in a figure; more are not seen, and take longer to read."""
 
 app = typer.Typer()
 
@@ -70,21 +70,23 @@ def simulate(
         bool, typer.Option("--error", help="Estimate the error of the positions, its slow and its fast share.")
     ] = False,
     save_every: Annotated[
-        int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {SAVED_NODES} nodes[/dim]")
+        int | None, typer.Option(help=f"Macro steps between saved nodes. [dim]about {DEFAULT_SAVED_NODES} nodes[/dim]")
     ] = None,
     save_micro: Annotated[
         bool,
-        typer.Option("--save-micro", help="Keep the fast motion within macro steps too; of every one, if not told."),
+        typer.Option(
+            "--save-micro", help="Keep the fast motion within macro steps too, by default of every macro step."
+        ),
     ] = False,
     method: Annotated[str, typer.Option(help="auto, nested, arrowhead, null-space or dense.")] = "auto",
     out: Annotated[
-        Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr all along the run.")
+        Path | None, typer.Option(help="Write the trajectory here: .npz at the end, or .zarr during the run.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out, a .zarr.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the run in --out, a .zarr.")] = False,
-    plot: Annotated[Path | None, typer.Option(help="Draw it here: .png, .svg or .pdf.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw the run here: .png, .svg or .pdf.")] = None,
 ) -> None:
-    """Simulate a system and say how it went."""
+    """Simulate a system, and report steps, energy, constraints and time."""
     with refusals():
         streamed = _check_out(out, resume, overwrite)
         check_target_file("--plot", plot, PICTURES)
@@ -121,13 +123,15 @@ def simulate(
         trajectory, stopped = _run(stream if streamed else run_at_once, problem, chosen, arguments)
         seconds, compiled = time.perf_counter() - start, sum(compiling)
         saved = [str(out)] if streamed else []
-        try:  # what was computed is told whatever happens to its files
+        try:  # the report is printed even if a file cannot be written
             if out is not None and isinstance(trajectory, Trajectory):
                 trajectory.save(out, problem.drawing)
                 saved.append(str(out))
             if plot is not None:
                 nodes = (
-                    trajectory if isinstance(trajectory, Trajectory) else trajectory[:: -(-len(trajectory) // DRAWN)]
+                    trajectory
+                    if isinstance(trajectory, Trajectory)
+                    else trajectory[:: -(-len(trajectory) // MOST_DRAWN_NODES)]
                 )
                 title = (
                     f"{system}, accuracy {accuracy:g}" if accuracy else f"{system}, {scheme}, {num_micro} micro steps"
@@ -136,7 +140,7 @@ def simulate(
                 saved.append(str(plot))
         finally:
             if stopped is None:
-                done = 0  # micro steps; of a run with an accuracy the time has trials in it
+                done = 0  # micro steps; the time of a run with an accuracy includes trial runs, so that it has no time per step
                 if steps is not None and chosen is not None:
                     done = (steps - (0 if before is None else before.step)) * chosen.num_micro
                 _print_named(
@@ -162,7 +166,11 @@ def simulate(
 
 
 def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None, streamed: bool, error: bool) -> None:
-    """Refuse options that say nothing of the length of a run, or too much."""
+    """Refuse options that do not fix the length of a run, or contradict each other.
+
+    Raises:
+        ValueError: with the options.
+    """
     if (steps is None) == (accuracy is None):
         got = "neither" if steps is None else "both"
         raise ValueError(f"got {got} of --steps and --accuracy; give exactly one of them.")
@@ -174,7 +182,7 @@ def _check_steps(steps: int | None, accuracy: float | None, t_end: float | None,
 
 
 def _steps_in_words(trajectory, scheme, steps: int | None) -> dict[str, str]:
-    """How many steps a run took; of one with an accuracy the scheme and steps that were chosen."""
+    """The number of steps; for a run with an accuracy the scheme and steps that were chosen."""
     if steps is not None:
         return {"macro steps": f"{steps}, of {scheme.num_micro} micro steps each"}
     chosen = trajectory.settings
@@ -182,18 +190,18 @@ def _steps_in_words(trajectory, scheme, steps: int | None) -> dict[str, str]:
 
 
 def _print_again(chosen: Settings, system: str, method: str) -> None:
-    """The command that makes a run with the scheme and steps that were chosen; none for a scheme that was given."""
+    """Print the command for a run with the chosen scheme and steps, unless the user gave the scheme."""
     if not chosen.options:
         return
     numbers = f"--num-micro {stage_scheme(chosen.scheme).num_micro} --macro-dt {chosen.macro_dt!r}"
     saved = f"--steps {chosen.num_steps} --save-every {chosen.save_every}"
-    other = "" if method == "auto" else f" --method {method}"
-    command = f"vmri simulate {shlex.quote(system)} {chosen.options} {numbers} {saved}{other}"
+    method_option = "" if method == "auto" else f" --method {method}"
+    command = f"vmri simulate {shlex.quote(system)} {chosen.options} {numbers} {saved}{method_option}"
     console.print(f"The same run again:\n[bold]{escape(command)}[/bold]", soft_wrap=True)
 
 
 def _print_named(texts: dict[str, str]) -> None:
-    """Names and texts, line by line; empty ones are left out."""
+    """Print a line for each name and its text; empty texts are left out."""
     table = plain_table("", "", show_header=False)
     for name, text in texts.items():
         if text:
@@ -202,7 +210,7 @@ def _print_named(texts: dict[str, str]) -> None:
 
 
 def _run(run, problem, scheme, arguments: dict):
-    """The trajectory, and what stopped the run before its end, if anything did."""
+    """The trajectory, and the exception that stopped the run before its end, or None."""
     try:
         return jax.block_until_ready(run(problem, scheme, **arguments)), None
     except (SimulationError, Interrupted) as stopped:
@@ -210,7 +218,11 @@ def _run(run, problem, scheme, arguments: dict):
 
 
 def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], streamed: bool) -> int:
-    """Say how far a run came, and where that is; returns the exit code."""
+    """Print where a run stopped, and the files of its trajectory.
+
+    Returns:
+        The exit code: 1 for a failure, 130 for Ctrl-C.
+    """
     kept = f"\n\nThe trajectory up to there is in {' and '.join(saved)}." if saved else ""
     if isinstance(stopped, SimulationError):
         labels = f"\n\n{stopped.labels}" if stopped.labels else ""
@@ -226,27 +238,34 @@ def _print_stop(stopped: SimulationError | Interrupted, saved: list[str], stream
     return 130
 
 
-def _print_advice(system: str, given: dict) -> None:
-    """The command that judges the step of a run that failed: resonances, limits, slow and fast swapped."""
-    options = [word for name, value in given.items() if value is not None for word in (f"--{name}", str(value))]
+def _print_advice(system: str, values: dict) -> None:
+    """Print the command that judges the step of a failed run: resonances, limits, slow and fast swapped.
+
+    Args:
+        system: its name.
+        values: of the options of the run, by name; None for options that are not given.
+    """
+    options = [word for name, value in values.items() if value is not None for word in (f"--{name}", str(value))]
     command = shlex.join(["vmri", "advise", system, *options])
     text = f"Whether this step is stable, which one near it is, and whether slow and fast are swapped:\n[bold]{escape(command)}[/bold]"
     Console(stderr=True).print(text, soft_wrap=True)
 
 
 def _check_out(out: Path | None, resume: bool, overwrite: bool) -> bool:
-    """Whether the run is to be streamed."""
+    """Whether to stream the run into a store, after a check of the options about files."""
     streamed = out is not None and out.suffix.lower() == ".zarr"
     if (resume or overwrite) and not streamed:
         option = "--resume" if resume else "--overwrite"
-        raise ValueError(f"{option} is for a run that is written all along; give --out with a file that ends in .zarr.")
-    if out is not None and not (streamed and out.is_dir()):  # what is in a store decides whether it may be gone on with
+        raise ValueError(
+            f"{option} is for a run that is written while it goes; give --out with a file that ends in .zarr."
+        )
+    if out is not None and not (streamed and out.is_dir()):  # `stream` checks an existing store
         check_target_file("--out", out, (".npz", ".zarr"))
     return streamed
 
 
 def _compile_clock() -> list[float]:
-    """A list to which JAX adds the seconds of every compilation from now on."""
+    """A list to which JAX appends the seconds of every later compilation."""
     seconds: list[float] = []
 
     def listen(event: str, duration_secs: float, **_) -> None:
@@ -258,9 +277,9 @@ def _compile_clock() -> list[float]:
 
 
 def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> dict[str, str]:
-    """How a run went, in words; one on disk is read piece by piece."""
+    """Times, iterations, energy, error and residuals of a run, in words; a stored run is read piece by piece."""
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
-    times, energies, largest = (np.array(found) for found in zip(*map(_extremes, pieces), strict=True))
+    times, energies, largest = (np.array(column) for column in zip(*map(_extremes, pieces), strict=True))
     position, velocity, method, iterations = largest.max(axis=0)
     return {
         "simulated time": f"{times[0, 0]:g} to {times[-1, 1]:g}",
@@ -272,12 +291,16 @@ def _summary(trajectory: Trajectory | StoredTrajectory, constrained: bool) -> di
 
 
 def _error(trajectory: Trajectory | StoredTrajectory) -> str:
-    """The estimated error of the positions, if there is an estimate."""
+    """The estimated error of the positions in words, empty without an estimate."""
     return trajectory.error.in_words() if isinstance(trajectory, Trajectory) and trajectory.error is not None else ""
 
 
 def _energy_error(energies: np.ndarray) -> dict[str, str]:
-    """Of a system that keeps its energy: at the start, lowest, highest of every piece."""
+    """The largest change of the energy of a system that keeps it.
+
+    Args:
+        energies: (pieces, 3) at the start, lowest and highest of each piece of the run.
+    """
     start = energies[0, 0]
     change = np.abs(energies - start).max()
     energy = f"{change / abs(start):.2e} of the energy at the start" if abs(start) > 1e-12 else f"{change:.2e}"
@@ -285,21 +308,21 @@ def _energy_error(energies: np.ndarray) -> dict[str, str]:
 
 
 def _energy_balance(trajectory: Trajectory | StoredTrajectory) -> dict[str, str]:
-    """Of a system with forces or moving constraints: energy, their work, and what is left of the balance."""
+    """Energy, work of forces and of moving constraints, and the remainder of their balance, in words."""
     pieces = [trajectory] if isinstance(trajectory, Trajectory) else trajectory.chunks()
     works = [piece.work() for piece in pieces]
     forces, constraints, left = (sum(part[-1] for part in parts) for parts in zip(*(w[:3] for w in works), strict=True))
     uncertainty = sum(work.uncertainty for work in works)
     work = {"forces": forces, "moving constraints": constraints}
-    found = {f"work of {name}": f"{value:.6g}" for name, value in work.items() if value != 0}
+    work_texts = {f"work of {name}": f"{value:.6g}" for name, value in work.items() if value != 0}
     start, end = (float(trajectory[nodes].energy[0]) for nodes in (slice(0, 1), slice(-1, None)))
     energy = {"energy": f"{start:.6g} at the start, {end:.6g} at the end"}
     resolved = f"; the saved nodes resolve the work to {uncertainty:.1e}"
-    return energy | found | {"energy balance": f"{left:.1e} left at the end{resolved}"}
+    return energy | work_texts | {"energy balance": f"{left:.1e} left at the end{resolved}"}
 
 
 def _extremes(piece: Trajectory) -> tuple:
-    """First and last time; energy at the start, lowest, highest; largest residuals, dearest method, most iterations."""
+    """First and last time; energy at the start, lowest, highest; largest residuals, largest code of a method, most iterations."""
     energy, info = np.asarray(piece.energy), piece.info
     residuals = np.asarray(piece.constraint_residual).max(axis=0)
     return (
@@ -311,8 +334,8 @@ def _extremes(piece: Trajectory) -> tuple:
 
 def default_save_every(steps: int) -> int:
     """The divisor of `steps` that saves a number of nodes nearest to SAVED_NODES, every node of a short run."""
-    if steps <= SAVED_NODES:
+    if steps <= DEFAULT_SAVED_NODES:
         return 1
     small = [d for d in range(1, math.isqrt(steps) + 1) if steps % d == 0]
     divisors = [*small, *(steps // d for d in reversed(small))]
-    return min(divisors, key=lambda d: abs(np.log(steps / d / SAVED_NODES)))
+    return min(divisors, key=lambda d: abs(np.log(steps / d / DEFAULT_SAVED_NODES)))

@@ -1,4 +1,4 @@
-"""`vmri explain`: what a scene or a system adds to a macro step, body by body and term by term; and its vibrations."""
+"""`vmri explain`: grid and cost of every body and effect of a scene or function of a system, and small vibrations."""
 
 from typing import Annotated
 
@@ -32,10 +32,10 @@ def explain(
     ] = None,
     measure: Annotated[bool, typer.Option(help="Time a macro step, and the derivatives of every effect.")] = True,
 ) -> None:
-    """Where every body and effect of a scene, or function of a system, lives and why, and what it adds; and all frequencies.
+    """Show the grid of every body and effect of a scene, or function of a system, with the reason, its cost, and all frequencies.
 
-    What it adds are unknowns, evaluations, and the time of its first derivatives at all of its nodes, once. Frequencies are
-    those of small vibrations about the start.
+    The cost are unknowns, evaluations, and the time of the first derivatives at all nodes, once. Frequencies are of
+    small vibrations about the start.
     """
     with refusals():
         chosen = find_scheme(scheme, num_micro, compose, alpha=alpha, degree=degree, rule=rule)

@@ -1,4 +1,4 @@
-"""`vmri advise` and `vmri stability`: is a step stable, and which steps are."""
+"""`vmri advise` and `vmri stability`: whether a step is stable, and all stable steps of a scheme."""
 
 from pathlib import Path
 from typing import Annotated
@@ -54,7 +54,7 @@ def advise(
         if (macro_dt is None) == (micro_dt is None):
             raise ValueError("give exactly one of --macro-dt and --micro-dt.")
         step = macro_dt if micro_dt is None else chosen.num_micro * micro_dt
-        with status("looking at the steps around it"):
+        with status("judging this step and the steps around it"):
             advice = advise_on(problem, chosen, macro_dt=step)  # pyright: ignore[reportArgumentType]
     console.print(advice.table() if advice.findings else escape(advice.verdict))
     if not advice.ok:
@@ -83,7 +83,7 @@ def stability(
     until: Annotated[float, typer.Option(help="Largest omega H, in units of pi.", min=0.1)] = 4.0,
     out: Annotated[Path | None, typer.Option(help="Draw the map here: .png, .svg or .pdf.")] = None,
 ) -> None:
-    """Which macro steps are stable with a scheme, in units of the fastest vibration."""
+    """Find the stable macro steps of a scheme, in units of the fastest vibration."""
     with refusals():
         check_target_file("--out", out, PICTURES)
         problem = linear_model() if system is None else find_problem(system)
@@ -97,8 +97,8 @@ def stability(
         if out is not None:
             plots.save(plot_stability(maps, system or "one slow and one stiff spring"), out)
     table = plain_table("scheme", "num_micro", "unstable where omega H / pi is in")
-    for name, found in maps.items():
-        for n, windows in found.shown():
+    for name, stability_of_scheme in maps.items():
+        for n, windows in stability_of_scheme.shown():
             table.add_row(name, str(n), windows_text(windows))
     console.print(table)
     print_written("Figure", out)

@@ -1,4 +1,4 @@
-"""`vmri tune` and `vmri cost`: what accuracy costs."""
+"""`vmri tune` and `vmri cost`: the least time of runs with a given error."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -50,25 +50,27 @@ def tune(
         check_target(error, t_end, problem)
         try:
             with _search(out) as tell:
-                found = study.tune(problem, error, t_end, exhaustive=exhaustive, progress=tell)
+                choice = study.tune(problem, error, t_end, exhaustive=exhaustive, progress=tell)
         except NothingReached as failure:
             console.print(failure.runs.table())
             _write_runs(failure.runs, out)
             print_failure("Nothing reached the error", f"{failure} The best runs are above.")
             raise typer.Exit(1) from failure
-    console.print("[bold]Errors against time[/bold], the best of all runs\n", found.runs.table())
-    best = rich_table(found.columns, found.shown())
+    console.print("[bold]Errors against time[/bold], the best of all runs\n", choice.runs.table())
+    best = rich_table(choice.columns, choice.shown())
     console.print(f"\n[bold]For an error of {error:g}[/bold], the choice first\n", best)
-    seen = found.verification
-    if seen is not None:
+    verification = choice.verification
+    if verification is not None:
         console.print(
-            f"\nFrom another start the choice has an error of {seen.error_q:.1e} and takes {duration(seen.seconds)}."
+            f"\nFrom another start the choice has an error of {verification.error_q:.1e} and takes {duration(verification.seconds)}."
         )
-    if any(setting.row.seconds < found.setting.row.seconds for setting in found.others):
-        console.print("Faster ones kept the error by luck: from another start theirs is more than twice as large.")
-    console.print(f"\n[bold]{escape(found.setting.command(system))}[/bold]", soft_wrap=True)
+    if any(setting.row.seconds < choice.setting.row.seconds for setting in choice.others):
+        console.print(
+            "Faster settings kept the error by luck: from another start their error is more than twice as large."
+        )
+    console.print(f"\n[bold]{escape(choice.setting.command(system))}[/bold]", soft_wrap=True)
     with refusals():
-        _write_runs(found.runs, out)
+        _write_runs(choice.runs, out)
 
 
 @app.command(
@@ -81,15 +83,15 @@ def cost(
         float | None, typer.Option(help=f"Simulated time. [dim]{PERIODS} periods of the fastest vibration[/dim]")
     ] = None,
     error: Annotated[
-        list[float] | None, typer.Option(help="Error asked for; may be repeated. [dim]1e-2 to 1e-8 of the motion[/dim]")
+        list[float] | None, typer.Option(help="Target error; may be repeated. [dim]1e-2 to 1e-8 of the motion[/dim]")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the page.")] = Path("out/cost"),
 ) -> None:
-    """One page: what accuracy costs, which scheme to take for which error, where the time goes."""
+    """Write a page about the cost of accuracy: time over error, the best scheme for each error, where the time goes."""
     with refusals():
         problem = find_problem(system)
-        for asked in error or [np.finfo(float).max]:
-            check_target(asked, 1.0 if t_end is None else t_end, problem)
+        for target in error or [np.finfo(float).max]:
+            check_target(target, 1.0 if t_end is None else t_end, problem)
         check_target_folder("--out", out)
         try:
             with _search(None) as tell:
@@ -104,7 +106,10 @@ def cost(
 
 @contextmanager
 def _search(out: Path | None) -> Iterator[Progress]:
-    """A progress bar, and a panel where the reference solution fails; after Ctrl-C the best of the runs so far, which are written to `out`."""
+    """A progress bar for a search, and a panel if the reference solution fails.
+
+    After Ctrl-C it prints the best of the runs up to then, and writes them to `out`.
+    """
     try:
         with progress_shown() as tell:
             yield tell

@@ -1,4 +1,4 @@
-"""`vmri sweep`: an ensemble that a file describes."""
+"""`vmri sweep`: an ensemble that a .toml file describes."""
 
 import json
 import os
@@ -33,7 +33,7 @@ from vmri_jax.running.interrupts import Interrupted
 
 EXAMPLE = Path("sweep.toml")
 SETTINGS = ("t_end", "num_steps", "macro_dt", "micro_dt", "num_micro", "save", "num_saves", "project", "chunk")
-"""Entries that are arguments of `ensemble` as they are."""
+"""Entries whose names and values are arguments of `ensemble`."""
 ENTRIES = ("system", "scheme", "out", *SETTINGS, "axes", "draws")
 AXIS = ("from", "to", "count", "log", "values", "unit", "description")
 DRAWS = ("count", "seed", "method", "columns")
@@ -43,17 +43,17 @@ def sweep(
     file: Annotated[Path, typer.Argument(help="The sweep, a .toml; see --example.")] = EXAMPLE,
     workers: Annotated[int | None, typer.Option(help="Workers on this machine. [dim]this process[/dim]", min=1)] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a scheduler of Dask, tcp://host:port.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in the store.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is in the store.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Compute the missing runs of the store.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the store.")] = False,
     plot: Annotated[
         Path | None,
         typer.Option(help="Draw the last number per run that is saved over the longest axes: .png, .svg or .pdf."),
     ] = None,
-    example: Annotated[bool, typer.Option("--example", help="Write a file with comments that runs, and stop.")] = False,
+    example: Annotated[bool, typer.Option("--example", help="Write a commented file that runs, and stop.")] = False,
 ) -> None:
     """Run a sweep of parameters, starts, steps and schemes, on one core or on a cluster, into a store on disk.
 
-    Whatever dies meanwhile, runs that were done stay, and --resume computes the others.
+    Finished runs stay if a worker or this program dies; --resume computes the others.
     """
     with refusals():
         if example:
@@ -61,15 +61,15 @@ def sweep(
             return
         check_target_file("--plot", plot, PICTURES)
         if plot is not None:
-            for package in ("xarray", "dask.array"):  # they read the store, after all is computed
+            for package in ("xarray", "dask.array"):  # refuse a missing package now: the figure comes after all runs
                 extra(package, "--plot", "ensemble")
         if workers is not None and scheduler is not None:
             raise ValueError("--workers and --scheduler are given; choose one of them.")
-        given = read_sweep(file)
-        drawn = "" if plot is None else _drawn(given)
+        arguments = read_sweep(file)
+        drawn = "" if plot is None else _drawn(arguments)
         with _client(workers, scheduler) as client:
             try:
-                runs = ensemble(**given, executor=client, resume=resume, overwrite=overwrite, progress=True)
+                runs = ensemble(**arguments, executor=client, resume=resume, overwrite=overwrite, progress=True)
             except EnsembleError as error:
                 _print_summary(error.ensemble)
                 print_failure("Not all chunks could be computed", str(error))
@@ -86,26 +86,26 @@ def sweep(
             print_written(f"Figure of {drawn}", plot)
 
 
-def _drawn(given: Mapping[str, Any]) -> str:
-    """What --plot draws of the arrays that are saved, before anything runs.
+def _drawn(arguments: Mapping[str, Any]) -> str:
+    """The array that --plot draws, chosen before anything runs.
 
     Raises:
         ValueError: nothing that is saved can be drawn over the axes.
     """
-    drawn = drawn_by_default(given["save"], find_problem(given["system"]))
+    drawn = drawn_by_default(arguments["save"], find_problem(arguments["system"]))
     if not drawn:
         raise ValueError(
-            f"--plot draws one number per run, and save = {json.dumps(given['save'])} keeps none. Add one to the file, e.g. save = "
-            f"{json.dumps([*given['save'], 'energy_error'])}, or a function of your own that returns one, my_file.py:function."
+            f"--plot draws one number per run, and save = {json.dumps(arguments['save'])} keeps none. Add one to the file, e.g. save = "
+            f"{json.dumps([*arguments['save'], 'energy_error'])}, or a function of your own that returns one, my_file.py:function."
         )
     return drawn[-1]
 
 
 def read_sweep(file: Path) -> dict[str, Any]:
-    """Arguments of `ensemble` from a file; its paths are seen from its folder.
+    """Arguments of `ensemble` from a file; paths in it are relative to its folder.
 
     Raises:
-        FileNotFoundError, ValueError: no such file, or something wrong in it.
+        FileNotFoundError, ValueError: the file does not exist, or an entry is wrong.
     """
     if not file.is_file():
         raise FileNotFoundError(f"{file} does not exist; write one with: vmri sweep --example")
@@ -121,9 +121,9 @@ def read_sweep(file: Path) -> dict[str, Any]:
         raise ValueError(f"{file}: give either [axes] or [draws].")
     folder = file.resolve().parent
     scheme = entries["scheme"]
-    given = {name: entries[name] for name in SETTINGS if name in entries}
-    given["save"] = [_located(name, folder) for name in np.atleast_1d(given.get("save", "end")).tolist()]
-    return given | {
+    arguments = {name: entries[name] for name in SETTINGS if name in entries}
+    arguments["save"] = [_located(name, folder) for name in np.atleast_1d(arguments.get("save", "end")).tolist()]
+    return arguments | {
         "system": _located(entries["system"], folder),
         "scheme": scheme if isinstance(scheme, str) else {name: name for name in scheme},
         "out": folder / entries["out"],
@@ -135,17 +135,17 @@ def _axes(file: Path, entries: Mapping[str, Any]) -> Product:
     return Product({name: _axis(f"{file}: the axis {name}", axis) for name, axis in entries.items()})
 
 
-def _axis(what: str, entry) -> Any:
+def _axis(subject: str, entry) -> Any:
     if not isinstance(entry, Mapping):
         return np.atleast_1d(np.asarray(entry))
-    _check_entries(what, entry, AXIS)
-    about = entry.get("unit", ""), entry.get("description", "")
+    _check_entries(subject, entry, AXIS)
+    words = entry.get("unit", ""), entry.get("description", "")
     if "values" in entry:
-        return Axis(entry["values"], *about)
+        return Axis(entry["values"], *words)
     if not {"from", "to", "count"} <= set(entry):
-        raise ValueError(f"{what}: give values, or from, to and count.")
+        raise ValueError(f"{subject}: give values, or from, to and count.")
     spaced = np.geomspace if entry.get("log") else np.linspace
-    return Axis(spaced(float(entry["from"]), float(entry["to"]), int(entry["count"])), *about)
+    return Axis(spaced(float(entry["from"]), float(entry["to"]), int(entry["count"])), *words)
 
 
 def _draws(file: Path, entries: Mapping[str, Any]) -> Draws:
@@ -174,14 +174,14 @@ def _check_entries(where: str, entries: Mapping[str, Any], known: Collection[str
 
 
 def _located(name: str, folder: Path) -> str:
-    """A name whose file, if it has one, is seen from a folder."""
-    file, colon, rest = name.partition(":")
-    return f"{folder / file}{colon}{rest}" if file.endswith((".py", ".xml", ".mjcf", ".urdf")) else name
+    """The name of a system or function, with the path of its file, if it has one, relative to a folder."""
+    file, colon, function = name.partition(":")
+    return f"{folder / file}{colon}{function}" if file.endswith((".py", ".xml", ".mjcf", ".urdf")) else name
 
 
 @contextmanager
 def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """A client of workers of this machine or of a scheduler, None for neither; says where its dashboard is."""
+    """A client of workers on this machine, or of a scheduler, whose dashboard it prints; None without either option."""
     if workers is None and scheduler is None:
         yield None
         return

@@ -24,7 +24,7 @@ SCHEMES = ("scheme", "num_micro")
 START = ("t", "q_s", "q_f", "v_s", "v_f")
 
 
-class Place(NamedTuple):
+class ColumnPlace(NamedTuple):
     """The numbers that a column replaces.
 
     part: "params", or the part of the start: t, q_s, q_f, v_s, v_f.
@@ -48,14 +48,14 @@ class Lanes(NamedTuple):
     start: dict[str, np.ndarray]
 
 
-def places(problem: Problem, columns: Collection[str]) -> dict[str, Place]:
+def places(problem: Problem, columns: Collection[str]) -> dict[str, ColumnPlace]:
     """The place of each column that sets a parameter or a part of the start.
 
     Raises:
         ValueError: a name that the problem does not have, an index that does not exist, or two columns for one number.
     """
     known = _known(problem)
-    by_column: dict[str, Place] = {}
+    by_column: dict[str, ColumnPlace] = {}
     for name in columns:
         if name not in (*STEPS, *SCHEMES):
             by_column[name] = _place(name, problem, known)
@@ -68,7 +68,7 @@ def places(problem: Problem, columns: Collection[str]) -> dict[str, Place]:
     return by_column
 
 
-def lanes_of(problem: Problem, where: Mapping[str, Place], rows: Rows, count: int) -> Lanes:
+def lanes_of(problem: Problem, where: Mapping[str, ColumnPlace], rows: Rows, count: int) -> Lanes:
     """Parameters and starts of some runs.
 
     Args:
@@ -102,24 +102,24 @@ def _repeated(value, count: int) -> np.ndarray:
     return np.repeat(value[None], count, axis=0)
 
 
-def _known(problem: Problem) -> dict[str, Callable[[tuple[int, ...]], Place]]:
+def _known(problem: Problem) -> dict[str, Callable[[tuple[int, ...]], ColumnPlace]]:
     """For each name of a column, a function that gives its place from an index."""
     known: dict[str, Callable] = {}
     paths, _ = jax.tree_util.tree_flatten_with_path(problem.system.params)
     for leaf, (path, _) in enumerate(paths):
         name = jax.tree_util.keystr(path, simple=True, separator=".")
-        known[name or "params"] = lambda index, leaf=leaf: Place("params", leaf, index)
+        known[name or "params"] = lambda index, leaf=leaf: ColumnPlace("params", leaf, index)
     names = (problem.names or Names()).of_coordinates(problem.q_s.size, problem.q_f.size)
     for part, labels in (("s", names.slow_coordinates), ("f", names.fast_coordinates)):
         for i, label in enumerate(labels):
-            known.setdefault(label, lambda _, part=part, i=i: Place(f"q_{part}", 0, (i,)))
-            known.setdefault(f"v {label}", lambda _, part=part, i=i: Place(f"v_{part}", 0, (i,)))
+            known.setdefault(label, lambda _, part=part, i=i: ColumnPlace(f"q_{part}", 0, (i,)))
+            known.setdefault(f"v {label}", lambda _, part=part, i=i: ColumnPlace(f"v_{part}", 0, (i,)))
     for part in START:
-        known.setdefault(part, lambda index, part=part: Place(part, 0, index))
+        known.setdefault(part, lambda index, part=part: ColumnPlace(part, 0, index))
     return known
 
 
-def _place(name: str, problem: Problem, known: Mapping[str, Callable]) -> Place:
+def _place(name: str, problem: Problem, known: Mapping[str, Callable]) -> ColumnPlace:
     if name in known:
         return known[name](())
     match = re.fullmatch(r"(.+)\[(\d+(?:,\s*\d+)*)\]", name)
@@ -138,13 +138,13 @@ def _place(name: str, problem: Problem, known: Mapping[str, Callable]) -> Place:
     return place
 
 
-def _target(problem: Problem, place: Place) -> np.ndarray:
+def _target(problem: Problem, place: ColumnPlace) -> np.ndarray:
     """The array of the problem that the place is in."""
     if place.part != "params":
         return np.asarray(getattr(problem, place.part))
     return np.asarray(jax.tree.leaves(problem.system.params)[place.leaf])
 
 
-def _shown(place: Place, number) -> str:
+def _shown(place: ColumnPlace, number) -> str:
     target = "a parameter" if place.part == "params" else place.part
     return f"{target}{list(number) if len(number) else ''}"

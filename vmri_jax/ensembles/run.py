@@ -14,7 +14,7 @@ from vmri_jax.ensembles.design import Design, Draws, Product, Table
 from vmri_jax.ensembles.executors import Here, as_done, executor_of
 from vmri_jax.ensembles.prepared import attributes_of, check_same, prepared
 from vmri_jax.ensembles.task import Chunks, Done, Job, job_of, run_chunk, run_packed_chunk
-from vmri_jax.ensembles.work import AnyScheme, Steps, Work
+from vmri_jax.ensembles.work import AnyScheme, StepArguments, Work
 from vmri_jax.ensembles.worker import NotAWorker, call_in_worker, known_versions, packed
 from vmri_jax.mechanics.arrays import require_x64, whole_number
 from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
@@ -187,7 +187,7 @@ def ensemble(
         system=system,
         schemes=schemes,
         columns=tuple(design.described()),
-        steps=Steps(t_end, num_steps, macro_dt, micro_dt),
+        steps=StepArguments(t_end, num_steps, macro_dt, micro_dt),
         num_micro=num_micro,
         solver=solver,
         project=project,

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from vmri_jax.catalogue import find_problem, find_scheme
-from vmri_jax.ensembles.columns import SCHEMES, STEPS, Place, lanes_of, places
+from vmri_jax.ensembles.columns import SCHEMES, STEPS, ColumnPlace, lanes_of, places
 from vmri_jax.ensembles.design import Design, Rows, unique_rows
 from vmri_jax.ensembles.quantities import Quantity, of_lanes, quantity
 from vmri_jax.mechanics.names import near
@@ -31,7 +31,7 @@ AnyScheme = str | Scheme | Composition | Callable[[int], Scheme | Composition]
 """A scheme, the name of one, or a function from the number of micro steps to a scheme."""
 
 
-class Steps(NamedTuple):
+class StepArguments(NamedTuple):
     """Arguments of `ensemble` about steps; None for columns, and for values that follow from the others."""
 
     t_end: float | None = None
@@ -70,7 +70,7 @@ class Work:
     system: str | Problem
     schemes: Mapping[str, AnyScheme]
     columns: tuple[str, ...]
-    steps: Steps
+    steps: StepArguments
     num_micro: int | None = None
     solver: Newton | None = None
     project: bool | None = None
@@ -117,7 +117,7 @@ class Work:
         return find_problem(self.system) if isinstance(self.system, str) else self.system
 
     @cached_property
-    def places(self) -> dict[str, Place]:
+    def places(self) -> dict[str, ColumnPlace]:
         """The place of each column in the problem."""
         return places(self.problem, self.columns)
 
@@ -191,9 +191,8 @@ class Work:
 
     def _compute(self, group: Group, rows: Rows, width: int) -> dict[str, np.ndarray]:
         count = len(group.lanes)
-        filled = np.minimum(
-            np.arange(max(count, width)), count - 1
-        )  # copies of the last run: all batches are `width` wide, for one program
+        # Copies of the last run fill up the batch: one program, compiled for `width` runs, computes all batches.
+        filled = np.minimum(np.arange(max(count, width)), count - 1)
         rows = {name: values[filled] for name, values in rows.items()}
         macro_dt = group.macro_dt[filled] if np.ndim(group.macro_dt) else group.macro_dt
         lanes = lanes_of(self.problem, self.places, rows, len(filled))

@@ -64,7 +64,8 @@ class _Call:
 def call_in_worker(versions: dict[str, str], task: Callable, packed: bytes, *plain) -> tuple[Callable, bytes]:
     """A function and its argument for an executor, ``(pickle.loads, bytes)``, that make the call of `in_worker`.
 
-    A worker without this package can read both, and reports the missing package. Workers of Dask end at a task that they cannot read.
+    `pickle.loads` makes the call while it unpickles `_Call`. A worker without this package therefore raises ModuleNotFoundError within the
+    task, which is reported; a worker of Dask ends at a task whose function it cannot import.
     """
     return pickle.loads, pickle.dumps(_Call(in_worker, versions, task, packed, *plain))
 
