@@ -1,6 +1,6 @@
 // A perspective view that turns about a target: z points upwards.
 
-const FIELD = 1 / Math.tan(Math.PI / 12); // half the height of the view is seen under 15 degrees
+const FIELD = 1 / Math.tan(Math.PI / 12); // cotangent of half the angle of view, 15 degrees
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -19,7 +19,7 @@ class Camera {
     this.distance = 1;
   }
 
-  // To be called before `project`, with the size of the view in pixels.
+  // Sets the size of the view in pixels; called before `project`.
   aim(width, height) {
     const [ca, sa, ce, se] = [Math.cos(this.azimuth), Math.sin(this.azimuth), Math.cos(this.elevation), Math.sin(this.elevation)];
     this.back = [ce * ca, ce * sa, se];
@@ -31,7 +31,7 @@ class Camera {
     this.aspect = width / height;
   }
 
-  // Pixels x and y, and the distance from the eye along the view.
+  // Pixels x and y, and the depth: distance from the eye along the axis of the view.
   project(p) {
     const x = p[0] - this.eye[0], y = p[1] - this.eye[1], z = p[2] - this.eye[2];
     const depth = -(x * this.back[0] + y * this.back[1] + z * this.back[2]);
@@ -43,7 +43,7 @@ class Camera {
     ];
   }
 
-  // Target and distance such that all points are seen, with room around them and below what is covered at the top.
+  // Chooses target and distance so that the view has all points, with a margin, below the title that covers its top.
   fit(points, radius, width, height, covered) {
     const low = [0, 1, 2].map((k) => points.reduce((least, p) => Math.min(least, p[k]), Infinity));
     const high = [0, 1, 2].map((k) => points.reduce((most, p) => Math.max(most, p[k]), -Infinity));

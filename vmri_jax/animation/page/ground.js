@@ -1,4 +1,4 @@
-// Planes with a grid that fades outwards, shadows on those that bear, and fixed spheres.
+// Planes with a grid that fades outwards, shadows on planes that are turned upwards, and fixed spheres.
 
 function drawPlane(painter, plane, positions) {
   const { context, camera, colors } = painter, near = 0.02 * camera.distance;
@@ -21,10 +21,10 @@ function drawPlane(painter, plane, positions) {
   if (plane.bears) shadows(painter, plane, positions);
 }
 
-// Straight down onto the plane.
+// Foot of a point on the plane, straight below the point.
 const dropped = ({ center, normal }, p) => plus(p, [0, 0, 1], dot(plus(center, p, -1), normal) / normal[2]);
 
-// All of a kind in one path: where they overlap they are no darker.
+// Shadows of joints, solids and balls, each kind in a single path: where they overlap they are no darker.
 function shadows(painter, plane, positions) {
   const { context, camera, colors, data } = painter, { bodies, connections, spheres } = data, near = 0.02 * camera.distance;
   const at = (i) => positions.subarray(3 * i, 3 * i + 3);
@@ -39,10 +39,10 @@ function shadows(painter, plane, positions) {
   }
   context.stroke();
   context.beginPath();
-  for (const one of data.solids) {
-    const corners = cornersOf(one, at).map((p) => camera.project(dropped(plane, p)));
+  for (const shape of data.solids) {
+    const corners = cornersOf(shape, at).map((p) => camera.project(dropped(plane, p)));
     const area = (face) => face.reduce((sum, i, k) => sum + cross(corners[face.at(k - 1)], corners[i])[2], 0);
-    for (const face of one.faces) if (area(face) < 0) outline(context, face.map((i) => corners[i]), near); // the upper ones cover the shadow
+    for (const face of shape.faces) if (area(face) < 0) outline(context, face.map((i) => corners[i]), near); // the upper ones cover the shadow
   }
   context.globalAlpha = 0.1 * painter.shade;
   context.fill("nonzero");
@@ -64,7 +64,7 @@ function ring(painter, { sides }, center, radius) {
   });
 }
 
-// Adds a polygon to the path; nothing if a corner lies behind the eye.
+// Adds a polygon to the path, unless a corner lies behind the eye.
 function outline(context, corners, near) {
   if (corners.some((corner) => corner[2] < near)) return;
   trace(context, corners);

@@ -1,4 +1,4 @@
-// Where every body is at a time: cubic Hermite interpolation between nodes.
+// Positions of all bodies at a time: cubic Hermite interpolation between nodes.
 
 function decoded(text, type) {
   return new type(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
@@ -14,7 +14,7 @@ class Motion {
     this.last = this.t[this.t.length - 1];
   }
 
-  // Index i of the interval [t_i, t_i+1] of a time.
+  // Index i of the interval [t_i, t_i+1] that contains a time.
   interval(time) {
     let low = 0, high = this.t.length - 1;
     while (high - low > 1) {
@@ -30,7 +30,7 @@ class Motion {
     return i + 1 < this.t.length && this.t[i + 1] - time < time - this.t[i] ? i + 1 : i;
   }
 
-  // Positions of all bodies: x, y, z of the first, then of the second ...
+  // Positions of all bodies: x, y, z of the first body, then of the second ...
   at(time, out = new Float32Array(this.size)) {
     const { points, velocities, size } = this;
     if (this.t.length === 1) return out.set(points), out;

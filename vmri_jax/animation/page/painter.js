@@ -1,4 +1,4 @@
-// Draws a picture of one moment, the farthest things first.
+// Draws a picture of one moment, the farthest parts first.
 
 const mix = (a, b, share) => a.map((x, k) => x + (b[k] - x) * share);
 const rgb = (text) => [1, 3, 5].map((k) => parseInt(text.trim().slice(k, k + 2), 16));
@@ -21,7 +21,7 @@ function disc(context, x, y, radius) {
   context.fill();
 }
 
-// Gives a canvas a size in pixels of the page, with as many of its own as the screen has; returns their ratio.
+// Gives a canvas a size in pixels of the page, and as many pixels of the screen; returns their ratio.
 function sharpen(canvas, width, height) {
   const ratio = Math.min(3, window.devicePixelRatio || 1);
   [canvas.width, canvas.height] = [width * ratio, height * ratio].map(Math.round);
@@ -44,7 +44,7 @@ class Painter {
       this.colors[name] = rgb(style.getPropertyValue(`--${name}`));
     }
     this.bodies = this.data.bodies.map((body) => (body.color ? rgb(body.color) : this.colors[body.pace]));
-    this.shade = this.colors.paper[0] < 100 ? 2 : 1; // on dark paper they need more
+    this.shade = this.colors.paper[0] < 100 ? 2 : 1; // shadows on dark paper have to be stronger
     this.tones = new Map();
   }
 
@@ -53,7 +53,7 @@ class Painter {
     sharpen(this.canvas, width, height);
   }
 
-  // A colour from dark (shade -1) over itself to light (1), faded into the paper with the distance from the eye.
+  // A shade of a colour, -1 dark, 0 the colour, 1 light, faded into the paper with the distance from the eye.
   tone(color, shade = 0, depth = 0) {
     const { distance, radius } = this.camera;
     const fade = Math.round(10 * clamped((depth - distance + radius) / (2 * radius)));
@@ -67,12 +67,12 @@ class Painter {
     return text;
   }
 
-  // Something to be drawn when everything farther from the eye is.
+  // Notes a part to draw, after all parts that are farther from the eye.
   add(depth, paint) {
     if (depth > 0.01 * this.camera.distance) this.items.push([depth, paint]);
   }
 
-  // positions: x, y, z of all bodies; trail: such positions at times up to now, the oldest first.
+  // positions: x, y, z of all bodies; trail: such positions at earlier times, the oldest first.
   draw(camera, positions, trail) {
     const { data, context } = this, { bodies } = data;
     const at = (i) => positions.subarray(3 * i, 3 * i + 3);
@@ -86,10 +86,10 @@ class Painter {
       const ends = [at(body), point ?? at(other), bodies[body].radius, point ? 0 : bodies[other].radius];
       if (kind === "link") rod(this, ...ends);
       else spring(this, ...ends, this.colors[pace], turns);
-      if (point && Math.hypot(...plus(point, ends[0], -1)) > ends[2]) ball(this, point, 1.5 * data.rod, this.colors.rod); // else within the body
+      if (point && Math.hypot(...plus(point, ends[0], -1)) > ends[2]) ball(this, point, 1.5 * data.rod, this.colors.rod); // else the ball of the body hides the point
     }
     bodies.forEach((body, i) => body.shown === "ball" && ball(this, at(i), body.radius, this.bodies[i]));
-    data.solids.forEach((one) => solid(this, one, at));
+    data.solids.forEach((shape) => solid(this, shape, at));
     this.items.sort((a, b) => b[0] - a[0]);
     for (const item of this.items) item[1](context);
     if (this.names) bodies.forEach((body, i) => body.shown && label(this, at(i), body));

@@ -4,9 +4,9 @@ const data = JSON.parse(document.getElementById("data").textContent);
 const find = (id) => document.getElementById(id);
 const motion = new Motion(data), camera = new Camera(data.view), painter = new Painter(find("view"), data);
 const seconds = (text) => parseFloat(text) || 0;
-const asked = new URLSearchParams(location.hash.slice(1)); // #t=3.5&theme=dark: open there, at rest
-const TRAIL = 1.6; // seconds of watching
-const INSET = 9; // half the thumb of the slider: time 0 of the strips is below it
+const query = new URLSearchParams(location.hash.slice(1)); // #t=3.5&theme=dark: open the page stopped at this time
+const TRAIL = 1.6; // seconds of play time that a trail shows
+const INSET = 9; // half the thumb of the slider: the first time of the strips lies below its middle
 
 const state = { time: motion.first, playing: false, speed: data.speed, trails: data.trails, stale: true, before: 0 };
 const colored = ["slow", "third", "rod", "fast"];
@@ -20,9 +20,9 @@ if (data.residual) {
 function trail() {
   if (!state.trails) return [];
   const from = Math.max(motion.first, state.time - TRAIL * state.speed), count = Math.max(8, Math.min(90, Math.round(2400 / data.bodies.length)));
-  const found = [];
-  for (let k = 0; k <= count; k++) found.push(motion.at(from + ((state.time - from) * k) / count));
-  return found;
+  const places = [];
+  for (let k = 0; k <= count; k++) places.push(motion.at(from + ((state.time - from) * k) / count));
+  return places;
 }
 
 function digits() {
@@ -73,13 +73,13 @@ function home() {
   changed();
 }
 
-// Height of the view that lies under the title.
+// Height of the view that the title covers.
 function covered() {
   const header = document.querySelector("header");
   return getComputedStyle(header).position === "absolute" ? 0.7 * header.offsetHeight : 0;
 }
 
-// All that depends on the size of the window.
+// Adapts canvases and view to the size of the window.
 function fit() {
   const { clientWidth: width, clientHeight: height } = painter.canvas;
   painter.resize(width, height);
@@ -165,8 +165,8 @@ handle(find("view"), camera, changed, home);
 new ResizeObserver(fit).observe(find("view"));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolor);
 
-if (asked.has("theme")) document.documentElement.dataset.theme = asked.get("theme");
+if (query.has("theme")) document.documentElement.dataset.theme = query.get("theme");
 fit();
-if (asked.has("t")) seek(seconds(asked.get("t")));
+if (query.has("t")) seek(seconds(query.get("t")));
 else play(!matchMedia("(prefers-reduced-motion: reduce)").matches);
 requestAnimationFrame(frame);

@@ -1,4 +1,4 @@
-// Bodies as balls and solids, links as rods, springs as helices, and where bodies have been.
+// Bodies as balls and solids, links as rods, springs as helices, and trails of bodies.
 
 function ball(painter, center, radius, color) {
   const { camera } = painter, [x, y, depth] = camera.project(center), r = Math.max(1.2, (camera.scale * radius) / depth);
@@ -10,17 +10,17 @@ function ball(painter, center, radius, color) {
   });
 }
 
-// Corners of a solid: its first point, plus weights times the ways to the other three.
+// Corners of a solid: its first point, plus weights times the vectors to the other three.
 function cornersOf({ points, corners }, at) {
   const [center, ...others] = points.map(at), axes = others.map((p) => plus(p, center, -1));
   return corners.map((weights) => weights.reduce((p, w, k) => plus(p, axes[k], w), center));
 }
 
-// The faces of a convex solid that are seen from outside, lit by the lamp.
-function solid(painter, one, at) {
-  const { camera } = painter, lamp = unit(painter.data.lamp), color = one.color ? rgb(one.color) : painter.bodies[one.points[0]];
-  const corners = cornersOf(one, at), places = corners.map((p) => camera.project(p));
-  for (const face of one.faces) {
+// The faces of a convex solid whose outer side is turned to the eye, lit by the lamp.
+function solid(painter, shape, at) {
+  const { camera } = painter, lamp = unit(painter.data.lamp), color = shape.color ? rgb(shape.color) : painter.bodies[shape.points[0]];
+  const corners = cornersOf(shape, at), places = corners.map((p) => camera.project(p));
+  for (const face of shape.faces) {
     const [a, b, c] = face.map((i) => corners[i]), normal = unit(cross(plus(b, a, -1), plus(c, b, -1)));
     const middle = face.reduce((sum, i) => plus(sum, corners[i], 1 / face.length), [0, 0, 0]);
     if (dot(normal, plus(camera.eye, middle, -1)) <= 0) continue;
@@ -28,7 +28,7 @@ function solid(painter, one, at) {
     const depth = face.reduce((sum, i) => sum + places[i][2], 0) / face.length;
     painter.add(depth, (context) => {
       context.fillStyle = context.strokeStyle = painter.tone(color, -0.12 + (bright > 0 ? 0.5 : 0.35) * bright, depth);
-      context.lineWidth = 0.7; // or seams would show
+      context.lineWidth = 0.7; // without it seams show between faces
       context.beginPath();
       outline(context, face.map((i) => places[i]), 0.02 * camera.distance);
       context.fill();
@@ -37,7 +37,7 @@ function solid(painter, one, at) {
   }
 }
 
-// Where a joint of two balls starts and ends, and its direction; null if they touch or an end lies within the other ball.
+// Start and end of a joint between two balls, and its direction; null if the balls touch or an end lies within the other ball.
 function joint({ span }, a, b, reachA, reachB) {
   const gap = plus(b, a, -1), length = Math.hypot(...gap);
   if (length <= Math.max(span * (reachA + reachB), reachA, reachB)) return null;
@@ -45,7 +45,7 @@ function joint({ span }, a, b, reachA, reachB) {
   return [plus(a, along, span * reachA), plus(b, along, -span * reachB), along];
 }
 
-// In pieces, each with its own depth, so that a rod may pass in front of one ball and behind another.
+// A rod in pieces, each with a depth of its own, so that a rod may pass in front of one ball and behind another.
 function rod(painter, a, b, reachA, reachB) {
   const ends = joint(painter.data, a, b, reachA, reachB);
   if (!ends) return;
@@ -71,11 +71,11 @@ function rodPiece(painter, context, from, to) {
   context.fillStyle = across;
   const edge = ([x, y], along, across) => [x + across * nx + along * ox, y + across * ny + along * oy];
   context.beginPath();
-  trace(context, [edge(from, -1, w), edge(to, 1, v), edge(to, 1, -v), edge(from, -1, -w)]); // they overlap by a pixel, or seams would show
+  trace(context, [edge(from, -1, w), edge(to, 1, v), edge(to, 1, -v), edge(from, -1, -w)]); // pieces overlap by a pixel, without it seams show
   context.fill();
 }
 
-// A helix with straight ends: its turns stay the same when it stretches.
+// A helix with straight ends, whose number of turns stays when it stretches.
 function spring(painter, a, b, reachA, reachB, color, turns) {
   const ends = joint(painter.data, a, b, reachA, reachB);
   if (!ends) return;
@@ -105,7 +105,7 @@ function spring(painter, a, b, reachA, reachB, color, turns) {
   piece(last, camera.project(end), 0);
 }
 
-// Fading and thinning into the past.
+// A trail that gets fainter and thinner into the past.
 function drawTrail(painter, trail, i, now, radius) {
   const { camera } = painter, color = painter.bodies[i];
   let last = null;
@@ -117,7 +117,7 @@ function drawTrail(painter, trail, i, now, radius) {
     const depth = (from[2] + to[2]) / 2;
     painter.add(depth + 0.002 * camera.distance, (context) => {
       context.globalAlpha = 0.7 * (1 - age) ** 1.5;
-      context.lineCap = "butt"; // round ends would show as dots where they overlap
+      context.lineCap = "butt"; // round ends overlap and show as dots
       context.strokeStyle = painter.tone(color, 0, depth);
       context.lineWidth = 0.6 + 1.6 * (1 - age);
       stroke(context, [from, to]);

@@ -1,4 +1,4 @@
-// Curves against time under the view, with a cursor that moves along.
+// Curves against time under the view, with a cursor at the time of the picture.
 
 // A power of ten as the page shows it: 1.2 × 10 with a raised exponent.
 function shown(x) {
@@ -9,7 +9,7 @@ function shown(x) {
   return `${digits.replace("-", "−")} × 10${raised}`;
 }
 
-// Round-off of numbers of order one: no logarithmic curve goes below.
+// Round-off of numbers of order one: the lowest value of logarithmic curves.
 const FLOOR = 1e-17;
 
 class Strip {
@@ -19,11 +19,11 @@ class Strip {
     this.largest = curves.map(([, values]) => values.reduce((most, x) => Math.max(most, Math.abs(x)), 0));
   }
 
-  // The curves, once per size and theme, on a canvas of their own.
+  // Draws the curves once for each size and theme, on a second canvas.
   resize(colors, inset) {
     const { canvas, still, curves, motion } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    const [ratio] = [canvas, still].map((one) => sharpen(one, width, height));
+    const [ratio] = [canvas, still].map((surface) => sharpen(surface, width, height));
     Object.assign(this, { width, height, inset, colors, ratio });
     const context = still.getContext("2d"), scaled = this.range();
     context.lineJoin = "round";
