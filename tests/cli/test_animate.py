@@ -118,7 +118,7 @@ def test_a_failed_run_is_drawn_up_to_there_and_says_so(vmri):
         (["plain.npz", "--out", "run.mp4"], ["--out run.mp4", ".html", ".gif"]),
         (["plain.npz", "--out", "no/run.html"], ["--out no/run.html", "does not exist"]),
         (["plain.npz", "--system", "tps"], ["no system 'tps'", "Did you mean tsp?"]),
-        (["plain.npz", "--system", "fpu"], ["has 3 slow and 3 fast coordinates, the run 2 and 2"]),
+        (["plain.npz", "--system", "fpu"], ["has 3 slow and 3 fast coordinates, the run has 2 and 2"]),
         (["plain.npz", "--drawing", "none.json"], ["--drawing none.json does not exist"]),
         (["plain.npz", "--drawing", "broken.json"], ["broken.json is not valid JSON"]),
         (["plain.npz", "--drawing", "wrong.json"], ["links[0]", "'tipp'", "Did you mean tip?"]),
