@@ -246,7 +246,10 @@ def test_a_full_disk_is_told(vmri, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fpu", *RUN, "--out", "run.npz", "--resume"], "--resume is for a run that is written while it goes; give --out"),
+        (
+            ["fpu", *RUN, "--out", "run.npz", "--resume"],
+            "--resume is for a run that is written while it goes; give --out",
+        ),
         (["fpu", *RUN, "--out", "folder.zarr", "--resume"], "folder.zarr is not a stored trajectory"),
         (["fpu", *RUN, "--out", "nowhere/run.zarr"], "the folder nowhere does not exist; make it first"),
         (["fpuu", *RUN], "there is no system 'fpuu'. Did you mean fpu? There are fpu, tsp, sam."),
