@@ -58,7 +58,7 @@ def test_all_take_the_direction_of_the_derivative_of_the_residual(name):
         found = {"dense": ravel_pytree(dense.solve(dense.factor(equations, x), residual))[0]}
         for name, inverted in INVERSES.items():
             march = MarchEquations(equations, inverted)
-            direction = solve(march, factor(march, *march.rows(x)), *march.rows(residual))
+            direction = solve(march, factor(march, *march.flat(x)), *march.flat(residual))
             found[name] = ravel_pytree(march.by_name(*direction))[0]
         return found
 

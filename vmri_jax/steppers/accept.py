@@ -1,16 +1,18 @@
-"""When the corrections of a step are small enough: one test for all solvers, with one meaning of `Newton.tolerance`.
+"""When the corrections of a step are small enough: the test of all solvers, and the meaning of `Newton.tolerance`.
 
-The next correction c of the slow (or of the fast) increments need not be made if
+A solver may omit the next correction c of the slow (or of the fast) increments if
 
     max |c|  <=  tolerance / 10 * max |increments|  +  4 eps max |positions|  +  eps max |all increments|
 
-each with its own increments and positions: those of the slow variables over the macro step, those of the fast ones over a micro
-interval. The error of a step is the sum of the corrections that were not made, and the errors of all steps add up: hence the tenth.
-Positions cannot be known better than their round-off. The last term is for variables at rest, whose increments have no size of
-their own.
+The slow variables have their increments over the macro step and their positions on the right-hand side, the fast variables their
+increments over a micro interval and their positions. A solver may take the largest free motion ``|h M^-1 p|`` for the size of the increments.
 
-Solvers know the next correction from the residual, or expect it from how the last ones shrank (`expected`). Corrections that have stopped
-shrinking near round-off are accepted, too (`Accepted.at_floor`).
+- The omitted corrections are the error of a step, and errors of steps accumulate: the tenth is a safety factor for that.
+- Positions are known up to their round-off.
+- Variables at rest have increments of size zero: the last term allows them the round-off of the other increments.
+
+Solvers compute the next correction from the residual, or extrapolate it from the last two (`expected`). They also accept corrections
+that no longer shrink near round-off (`Accepted.at_floor`).
 """
 
 from typing import Any, NamedTuple
@@ -24,46 +26,49 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.schemes.equations import StepEquations
 
 ROUNDOFF = 4.0
-"""Units of round-off of the positions below which a correction is accepted. With fewer, steps at round-off would not end; with more,
-the momenta would lose digits."""
-PATIENCE = 20
-"""Iterations after which the round-off of tied variables is accepted too: constraints hand it from slow to fast variables and back. With
-fewer, slow variables at the origin would be solved to fewer digits."""
+"""Accepted correction in units of ``eps max |positions|``. With a smaller value steps at round-off would not end; with a larger one the momenta
+would lose digits."""
+ITERATIONS_BEFORE_TIED_ROUNDOFF = 20
+"""Iterations after which also the round-off of variables that constraints tie to these is accepted: constraints carry round-off from slow to fast
+variables and back. A smaller number would solve slow variables at the origin to fewer digits."""
 FLOOR = 100.0
-"""Units of round-off of the positions below which corrections that no longer shrink are accepted. Nearly dependent constraints
-let corrections wander there; with more, steps that converge slowly would be cut off."""
+"""Largest correction, in units of ``eps max |positions|``, that is accepted if corrections no longer shrink: with nearly dependent constraints
+they fluctuate at this size. A larger value would cut off steps that converge slowly."""
 FLOOR_OF_NEWTON = 1e5
-"""The same for a pass with exact matrices. Near a regular solution its correction shrinks, unless the residual is nothing but round-off
-of the constraints, which rows that hardly depend on the fast variables magnify. With more, singular solutions are taken for regular ones."""
+"""`FLOOR` for a pass with exact matrices. Near a regular solution the correction of such a pass shrinks, unless the residual is the round-off of
+constraints, magnified by constraints that hardly depend on the fast variables. A larger value would take singular solutions for regular ones."""
 SAFETY = 10.0
-"""Factor between the tolerance of a run and that of a correction, since errors of steps add up. A larger one costs passes."""
+"""Tolerance of a run over tolerance of a correction, since errors of steps accumulate. A larger factor costs passes."""
 MARGIN = 10.0
-"""Factor on the contraction of the last two corrections that is expected of the next one. A larger one costs passes; with a smaller one an
-iteration that shrinks by luck ends too early."""
+"""Safety factor on the contraction ``|d_k| / |d_(k-1)|`` that is expected of the next correction. A larger factor costs passes; with a smaller one
+an iteration whose correction is small by chance ends too early."""
 
 
 class Accepted(NamedTuple):
-    """Changes of the increments that are accepted: relative to the motion over the step, and round-off of the positions.
+    """Accepted corrections of the increments: a part relative to the motion over the step, and a part for round-off of the positions.
 
-    tolerance: of Newton, over `SAFETY`, since what is left of every step adds up.
-    slow, fast: round-off, (2,): of these variables alone, and with that of variables that constraints tie to them. At the origin
-        they have none of their own.
-    stopped: round-off of positions at which corrections may stop shrinking. Coordinates of a kinetic energy that is a function may be
-        angles: where bodies are is known to no more digits than with angles of one radian, also at angles near zero.
+    tolerance: `Newton.tolerance` over `SAFETY`.
+    slow, fast: accepted round-off. First entry: of these variables, used in the first `ITERATIONS_BEFORE_TIED_ROUNDOFF` iterations. Second
+        entry, used later: with the round-off of the variables that constraints tie to them.
+    roundoff: `ROUNDOFF` units of round-off of all positions, ``4 eps max |q|``, for `at_floor`. If the kinetic energy is a function,
+        ``4 eps max(1, |q|)``: coordinates may be angles, and an angle near zero has the round-off of one radian.
     """
 
     tolerance: Number
     slow: Float[Array, "2"]
     fast: Float[Array, "2"]
-    stopped: Float[Array, ""]
+    roundoff: Float[Array, ""]
 
     @classmethod
     def of(cls, equations: StepEquations, newton) -> "Accepted":
-        """For a step from its positions."""
+        """The accepted corrections of a step, from the positions at its start."""
         slow, fast = max_abs(equations.q_s), max_abs(equations.q_f)
         to_slow = to_fast = 0.0
         largest = jnp.maximum(slow, fast)
         largest = largest if equations.system.has_constant_mass else jnp.maximum(largest, 1.0)
+        # A constraint g(q_s, q_f) moves the slow variables by M_s^-1 G_s^T mu and the fast ones by M_f^-1 G_f^T mu: round-off of q_f
+        # becomes one of q_s, smaller by the ratio of the masses, and vice versa:
+        #     floor_s = 4 eps max(|q_s|, min(1, max M_f / min M_s) |q_f|)
         if equations.system.constraint is not None and equations.q_s.size and equations.q_f.size:
             to_slow = to_fast = 1.0
             masses = equations.system.kinetic
@@ -77,28 +82,38 @@ class Accepted(NamedTuple):
         roundoff = (ROUNDOFF * jnp.finfo(float).eps * floor for floor in (*floors, largest))
         return cls(newton.tolerance / SAFETY, *roundoff)
 
-    def sizes(self, motions, iterations) -> tuple[Any, Any]:
-        """The changes (slow, fast) that are accepted with these motions after this number of iterations."""
+    def allowed(self, motions, iterations) -> tuple[Any, Any]:
+        """The largest accepted corrections (slow, fast): the right-hand sides of the formula at the top of this module.
+
+        Args:
+            motions: largest increments (slow, fast).
+            iterations: iterations so far.
+        """
         numbers = jnp.finfo(float)
-        rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny  # variables at rest have no size of their own
-        late = (iterations >= PATIENCE) * 1
+        at_rest = numbers.eps * jnp.maximum(*motions) + numbers.tiny
+        late = (iterations >= ITERATIONS_BEFORE_TIED_ROUNDOFF) * 1
         floors = self.slow[late], self.fast[late]
-        slow, fast = (self.tolerance * size + floor + rest for size, floor in zip(motions, floors, strict=True))
+        slow, fast = (self.tolerance * size + floor + at_rest for size, floor in zip(motions, floors, strict=True))
         return slow, fast
 
     def at_floor(self, size, before, floor=FLOOR):
-        """Whether corrections have stopped shrinking at or below `floor` units of round-off of the positions."""
+        """Whether corrections no longer shrink, from `before` to `size`, and are at most `floor` units ``eps max |positions|``."""
         return (size > before / 2) & self.is_roundoff(size, floor)
 
     def is_roundoff(self, size, floor=FLOOR):
-        """Whether a correction is at most `floor` units of round-off of the positions."""
-        return size <= floor / ROUNDOFF * self.stopped
+        """Whether a correction is at most `floor` units ``eps max |positions|``."""
+        return size <= floor / ROUNDOFF * self.roundoff  # `roundoff` counts ROUNDOFF of these units
 
-    def over(self, changes, motions, iterations):
-        """Changes (slow, fast) over what is accepted of them, see `sizes`; the larger of the two."""
-        return jnp.maximum(*(c / size for c, size in zip(changes, self.sizes(motions, iterations), strict=True)))
+    def ratio(self, changes, motions, iterations):
+        """Ratio of the next corrections (slow, fast) to the allowed ones, the larger of the two: at most 1 if both are accepted.
+
+        Args:
+            changes: largest next corrections (slow, fast).
+            motions, iterations: as in `allowed`.
+        """
+        return jnp.maximum(*(c / size for c, size in zip(changes, self.allowed(motions, iterations), strict=True)))
 
 
 def expected(moved, before):
-    """The correction ``min(MARGIN moved / before, 1) moved`` that is expected after the corrections `before` and `moved`."""
+    """The expected next correction ``min(MARGIN moved / before, 1) moved`` after the corrections `before` and then `moved`."""
     return jnp.minimum(MARGIN * moved / (before + jnp.finfo(float).tiny), 1.0) * moved

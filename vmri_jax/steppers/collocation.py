@@ -6,13 +6,13 @@ the step, the Newton matrix is
     [A x M - h^2 B x W'',  -I x G^T;  I x G,  0]
 
 with A, B (r, r) the stiffness and the mass matrix of the polynomials in time, rows of the nodes 0..r-1, columns of 1..r. In the
-eigenvectors of A^-1 B, which are known once and for all, it falls apart into one complex saddle per pair of eigenvalues gamma,
+eigenvectors of A^-1 B, which depend on the degree alone, the matrix decouples into one complex saddle per pair of eigenvalues gamma,
 
     [M - h^2 gamma W'',  -G^T;  G,  0],
 
-so that matrices are of the size of the system, whatever the degree (Butcher 1976; Hairer, Wanner, Solving
-Ordinary Differential Equations II, IV.8). Of these only as many rows are solved as there are combinations of variables that the
-potentials are curved along. Forces are exact, so that all of this decides only how many steps there are.
+so that matrices have the size of the system for every degree (Butcher 1976; Hairer, Wanner, Solving
+Ordinary Differential Equations II, IV.8). Each saddle is reduced to the rows of the d combinations of variables along which the
+potentials are curved (`Saddles`). The residual is exact, so that these approximations change only the number of iterations.
 """
 
 from dataclasses import dataclass
@@ -38,11 +38,10 @@ from vmri_jax.steppers.time_modes import TimeModes, product, taken, times_i
 
 
 class JoinedEquations:
-    """The equations of the step, with the variables joined, q = (q_s, q_f), and nodes as the last axis.
+    """The equations of the step in the joined variables q = (q_s, q_f), with the nodes as the last axis.
 
-    num_curved: how many variables, the last ones, the Hessian is taken by: the fast ones where there are any.
-    directions, along: (d, n) the combinations of these that the potentials are curved along, and (n, d) changes of the variables
-        that change one of them each.
+    num_curved: number of variables, the last ones, in the Hessian W'': the fast variables, or all without fast ones.
+    directions, along: L (d, n), the combinations of variables along which the potentials are curved, and its pseudo-inverse (n, d).
     """
 
     def __init__(self, equations: StepEquations):
@@ -68,7 +67,7 @@ class JoinedEquations:
         return self.system.constraints(t, q[: self.n_s], q[self.n_s :])
 
     def jacobian(self, t, q):
-        """Their Jacobian G (n_c, n)."""
+        """The Jacobian G (n_c, n) of the constraints."""
         return jax.jacrev(self.constraints, argnums=1)(t, q)
 
     def times_mass(self, x):
@@ -82,48 +81,46 @@ class JoinedEquations:
         return jnp.concatenate([inverse.times(part.T).T for inverse, part in parts])
 
     def by_name(self, term: Term, q) -> tuple:
-        """What a term takes of (n, ...) joined variables."""
-        at = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
-        return tuple(at[name] for name in term.arguments)
+        """The arguments of a term, out of joined variables (n, ...)."""
+        parts = {"q_s": q[: self.n_s], "q_f": q[self.n_s :]}
+        return tuple(parts[name] for name in term.arguments)
 
     def potential(self, q):
         """All potentials at one point."""
         return sum((-term.sign * term.integrand(*self.by_name(term, q)) for term in self.potentials), jnp.zeros(()))
 
     def potential_of_curved(self, q, curved):
-        """The same with the last `num_curved` variables apart."""
+        """`potential` with the last `num_curved` variables as an argument of their own."""
         return self.potential(jnp.concatenate([q[: -self.num_curved], curved]))
 
     def curvature(self, q):
-        """Hessian of the potentials by these variables times the changes `along` (n, d)."""
+        """(n, d) the product of W'' with `along`, zero in the rows of the other variables."""
         curved, gradient = q[-self.num_curved :], jax.grad(partial(self.potential_of_curved, q))
         changes = self.along.T[:, -self.num_curved :]
         columns = jax.vmap(lambda change: jax.jvp(gradient, (curved,), (change,))[1], out_axes=1)(changes)
         return jnp.pad(columns, ((self.q.size - self.num_curved, 0), (0, 0)))
 
     def forces(self, x, mu) -> "Forces":
-        """Of potentials and constraints.
-
-        Args:
-            x, mu: increments (n, r) and multipliers (n_c, r).
-        """
+        """Forces of potentials and constraints for the increments x (n, r) and multipliers mu (n_c, r)."""
         q = self.q[:, None] + x  # at the nodes 1..r
 
-        def at_node(at):
-            t, q, mu = at
+        def at_node(t_q_mu):
+            t, q, mu = t_q_mu
             g, pull = jax.vjp(lambda q: self.constraints(t, q), q)
             return g, -pull(mu)[0]
 
+        # constraint forces -G(q_j)^T mu_j at the nodes 0..r-1: `first` at node 0, the others in `total`; no multiplier at node r
         later = jnp.concatenate([mu[:, 1:], jnp.zeros_like(mu[:, :1])], axis=1)
         g, total = at_nodes(at_node)((self.times[1:], q, later))
         first = -jnp.sum(mu[:, :1] * self.at_start, axis=0)
+        # forces of the potentials, h^2 sum_k w_k l_j(c_k) (-dW/dq)(q(c_k)), at node j
         for term in self.potentials:
             theta = np.concatenate([term.inside.theta(group) for group in term.inside.groups])
             basis, weights = lagrange_basis(self.r, theta), self.h**2 * term.inside.weights
             gradient = jax.grad(lambda q, term=term: term.sign * term.integrand(*self.by_name(term, q)))
             before, k = int(np.argmax(basis[0, 1:])), len(theta)
             consecutive = np.eye(self.r + 1)[before + 1 : before + 1 + k]
-            if np.array_equal(basis, consecutive):  # nodes of the path: nothing to interpolate
+            if np.array_equal(basis, consecutive):  # quadrature nodes are control nodes: no interpolation
                 d = at_nodes(gradient)(q[:, before : before + k])
                 total += jnp.pad(weights * d, ((0, 0), (before, self.r - before - k)))
             else:
@@ -134,16 +131,16 @@ class JoinedEquations:
         return Forces(inside, total[:, -1], g)
 
     def residual(self, x, forces: "Forces"):
-        """Of the momentum equations of the nodes 0..r-1, times h, (n, r)."""
+        """Residual (n, r) of the momentum equations at the nodes 0..r-1, times h."""
         return self.times_mass(matmul(x, self.form[:, :-1])) + forces.inside
 
     def momentum(self, x, forces: "Forces"):
-        """At the end of the step (n,)."""
+        """Momentum (n,) at the end of the step."""
         return (self.times_mass(matmul(x, self.form[:, -1:]))[:, 0] + forces.last) / self.h
 
 
 class Forces(NamedTuple):
-    """What increments and multipliers make of a step.
+    """Forces and constraint values for some increments and multipliers.
 
     inside: forces at the nodes 0..r-1, times h, at node 0 with the momentum that arrives.
     last: forces at the end of the step, times h.
@@ -156,20 +153,23 @@ class Forces(NamedTuple):
 
 
 class Saddles(NamedTuple):
-    """The saddles of all modes, eliminated; with z = L x for the d combinations of variables that the potentials are curved along.
+    """The saddles of all modes after elimination, with z = L x for the d combinations of variables along which the potentials are curved.
 
-    ``M x - gamma L^T w z - G^T nu = M y`` is ``x = y + gamma Q z + M^-1 G^T nu`` and ``(1 - gamma L Q) z = L y + L M^-1 G^T nu``, so
-    that only d rows, and those of the constraints, are solved for each mode.
+    With ``h^2 W'' = L^T w L`` and ``Q = M^-1 L^T w``, the equation ``M x - gamma L^T w z - G^T nu = M y`` gives
 
-    modes: of time; everything below except `push` and `pull` is given for each of their parts.
+        x = y + gamma Q z + M^-1 G^T nu        (1 - gamma L Q) z = L y + L M^-1 G^T nu
+
+    so that each mode needs a solve for d rows and one for the constraints.
+
+    modes: of time; k is the number of real and imaginary parts of modes, see `TimeModes`.
     gamma: eigenvalues, for every part of a mode.
-    push: L and G, of the variables.
-    pull: ``Q = M^-1 L^T w`` and ``M^-1 G^T``, with ``w = h^2 W''``.
+    push: L and G.
+    pull: Q and ``M^-1 G^T``.
     bend: ``L Q``.
     denominator: inverses of ``|1 - gamma L Q|^2``.
     push_bend: ``G Q``.
     pull_bend: real and imaginary part of ``(1 - gamma L Q)^-1 L M^-1 G^T``.
-    schur: of the inverse of G times x for every multiplier.
+    schur: real and imaginary part of the inverse of ``G M^-1 G^T + gamma G Q (1 - gamma L Q)^-1 L M^-1 G^T``.
     """
 
     modes: TimeModes
@@ -184,7 +184,7 @@ class Saddles(NamedTuple):
 
     @classmethod
     def at(cls, joined: JoinedEquations, modes: TimeModes, t, q) -> "Saddles":
-        """With Hessian and Jacobian at a point."""
+        """The saddles with Hessian and Jacobian at one point."""
         along, jacobian = joined.directions, joined.jacobian(t, q)
         bend, pull = joined.over_mass(joined.h**2 * joined.curvature(q)), joined.over_mass(jacobian.T)
         k, d, n_c = modes.gamma.shape[1], len(along), len(jacobian)
@@ -197,12 +197,13 @@ class Saddles(NamedTuple):
         bent = matmul(along, bend)
         denominator = inverse(np.eye(d) - 2 * re * bent + (re**2 + im**2) * matmul(bent, bent))
 
-        straight = matmul(along, pull)
-        columns = jnp.concatenate([straight, matmul(bent, straight)], axis=1)
-        through = (matmul(denominator.reshape(k * d, d), columns)).reshape(k, d, 2 * n_c)
-        # real and imaginary part of (1 - conj(gamma) L Q) / |1 - gamma L Q|^2 times the columns
-        real, imaginary = through[..., :n_c] - re * through[..., n_c:], im * through[..., n_c:]
+        # (1 - gamma L Q)^-1 L M^-1 G^T = |1 - gamma L Q|^-2 (1 - conj(gamma) L Q) L M^-1 G^T, by real and imaginary part
+        pulled = matmul(along, pull)
+        columns = jnp.concatenate([pulled, matmul(bent, pulled)], axis=1)
+        products = (matmul(denominator.reshape(k * d, d), columns)).reshape(k, d, 2 * n_c)
+        real, imaginary = products[..., :n_c] - re * products[..., n_c:], im * products[..., n_c:]
 
+        # G M^-1 G^T + gamma G Q (real + i imaginary)
         push_bend = matmul(jacobian, bend)
         a, b = (matmul(push_bend, z) for z in (re * real - im * imaginary, re * imaginary + im * real))
         schur = inverse(regularized(jax.lax.complex(a + matmul(jacobian, pull), b)))
@@ -219,9 +220,13 @@ class Saddles(NamedTuple):
         pushed = matmul(self.push, y)
         pushed = matmul(jnp.concatenate([pushed[:d], g - pushed[d:]]), self.modes.of_values)
         z, g = pushed[:d], pushed[d:]
+        # (1 - gamma L Q)^-1 z = |1 - gamma L Q|^-2 (1 - conj(gamma) L Q) z
         z = z - self._times_gamma(matmul(self.bend, z), -1)
         products = (a * row for a, row in zip(self.denominator, z, strict=True))
-        z = reduce(jnp.add, products, jnp.zeros_like(z))  # written out: within a sum z would be made anew for every row
+        z = reduce(
+            jnp.add, products, jnp.zeros_like(z)
+        )  # written out: inside jnp.sum XLA would recompute z for every row
+        # nu = schur (g - G y - gamma G Q z), then gamma z with the part of nu, then x = y + Q gamma z + M^-1 G^T nu
         nu = product(self.schur, g - matmul(self.push_bend, self._times_gamma(z)))
         z = self._times_gamma(z + product(self.pull_bend, nu))
         return y + matmul(self.pull, matmul(jnp.concatenate([z, nu]), self.modes.increments)), matmul(
@@ -229,13 +234,13 @@ class Saddles(NamedTuple):
         )
 
     def _times_gamma(self, z, sign=1):
-        """Or times the conjugate of gamma."""
+        """``gamma z``, or with the sign -1 ``conj(gamma) z``."""
         re, im = self.gamma
         return re * z + sign * im * times_i(z)
 
 
 class Increments(NamedTuple):
-    """Increments x, multipliers mu, largest corrections (slow, fast), how many there were, and what the last one tells."""
+    """Increments x, multipliers mu, largest last corrections (slow, fast), number of corrections, and `Result` or RUNNING."""
 
     x: Float[Array, "n r"]
     mu: Float[Array, "n_c r"]
@@ -245,7 +250,7 @@ class Increments(NamedTuple):
 
 
 class Evaluated(NamedTuple):
-    """An iterate with forces; `result` is final only if the forces belong to this iterate, else RUNNING."""
+    """An iterate with forces. `result` is `last.result` if the forces belong to this iterate, else RUNNING."""
 
     last: Increments
     forces: Forces
@@ -253,22 +258,18 @@ class Evaluated(NamedTuple):
 
 
 def at_nodes(function):
-    """`function` at all nodes, which are the last axis."""
+    """`function` mapped over the nodes, the last axis."""
     return jax.vmap(function, in_axes=-1, out_axes=-1)
 
 
 def only_if(wanted, function, x):
-    """``function(x)``, or x itself. As a loop of at most one pass: of two branches, lanes would always compute both."""
+    """``function(x)`` if `wanted`, else x. A loop of at most one turn: in a batch `jax.lax.cond` would compute both branches."""
     return jax.lax.while_loop(lambda a: a[0], lambda a: (jnp.asarray(False), function(a[1])), (wanted, x))[1]
 
 
 @dataclass(frozen=True)
 class Collocation(Solver):
-    """Newton steps until one more would change no increment.
-
-    What it would change them by is known from how the corrections shrink. Accepted are changes of ``newton.tolerance``
-    relative to the motion over the step, and round-off of the positions.
-    """
+    """Newton steps until the next one would change no increment (`Accepted`); its correction is extrapolated from the last two."""
 
     newton: Newton
 
@@ -285,17 +286,18 @@ class Collocation(Solver):
             return max_abs(x[:n_s]), max_abs(x[n_s:])
 
         def corrected(last: Increments, forces: Forces) -> Increments:
+            # residual R = M x A^T + forces, times (A x M)^-1: x + M^-1 forces A^-T
             moves = matmul(joined.over_mass(forces.inside), modes.of_rows)
-            missing = last.x + moves  # what these forces do not bring about
-            dx, dmu = saddles.solve(-missing, -forces.g)
+            residual = last.x + moves
+            dx, dmu = saddles.solve(-residual, -forces.g)
             x, mu, moved, iterations = last.x + dx, last.mu + dmu, slow_and_fast(dx), last.iterations + 1
-            left = map(expected, moved, last.moved)
-            result = newton.status(accepted.over(left, slow_and_fast(x), iterations), iterations)
+            next_moves = map(expected, moved, last.moved)
+            result = newton.status(accepted.ratio(next_moves, slow_and_fast(x), iterations), iterations)
             return Increments(x, mu, moved, iterations, result)
 
-        def step(at: Evaluated) -> Evaluated:
-            """Forces first: evaluated in one place, they are compiled once."""
-            last, fixed = at.last, newton.fixed_iterations
+        def step(iterate: Evaluated) -> Evaluated:
+            """Forces of the last iterate, then a correction unless it has converged: one place for the forces compiles them once."""
+            last, fixed = iterate.last, newton.fixed_iterations
             forces = joined.forces(last.x, last.mu)
             goes_on = last.result == RUNNING if fixed is None else last.iterations < fixed
             return Evaluated(only_if(goes_on, lambda last: corrected(last, forces), last), forces, last.result)
@@ -308,8 +310,8 @@ class Collocation(Solver):
         x, mu = last.x.T, last.mu.T
         unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
         end = equations.q_f + x[-1, n_s:], p[:n_s], p[n_s:]
-        left = max_abs(rows), max_abs(forces.g)
-        status = status_of(equations, last.result, Method.COLLOCATION, last.iterations, *left, newton.tolerance)
+        residuals = max_abs(rows), max_abs(forces.g)
+        status = status_of(equations, last.result, Method.COLLOCATION, last.iterations, *residuals, newton.tolerance)
         return Solution(unknowns, end, status), memory
 
     def describe(self) -> list[str]:

@@ -13,7 +13,11 @@ from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 
 class ComposedState(NamedTuple):
-    """last: what the last stage hands on. stages: the memory of every stage, stacked."""
+    """Memory of a composition.
+
+    last: memory of the last stage.
+    stages: memories of all stages, stacked.
+    """
 
     last: Any
     stages: Any
@@ -35,8 +39,8 @@ class Composed(Stepper):
         return ComposedState(jax.tree.map(lambda a: a[0], stages), stages)
 
     def advance(self, state: State, memory: ComposedState, macro_dt) -> tuple[State, StepInfo, ComposedState]:
-        def stage(carry, at):
-            (state, last), (c, memory) = carry, at
+        def stage(carry, coefficient_and_memory):
+            (state, last), (c, memory) = carry, coefficient_and_memory
             memory = self.stage.continued(memory, last, state, c * macro_dt)
             state, info, memory = self.stage.step(state, memory, c * macro_dt)
             return (state, memory), (memory, info)

@@ -1,11 +1,12 @@
 """Continuation in the length of a step, where Newton's iteration from the guess fails.
 
-The solution that is meant is the one connected to the straight motion of a short step. Where plain iteration does not find
-it from the guess, the equations are solved for parts of the step, each from the solution of the part before and with care
-(Deuflhard, *Newton Methods for Nonlinear Problems*, 2011, chapters 3 and 5). The parts grow while that succeeds and shrink where
-it does not. Plain iteration and continuation are one loop, compiled once, and the second costs nothing where the first suffices.
+A step may have several solutions; the physical one is connected to the straight motion of a short step. If plain iteration from the
+guess fails, the solver solves the equations of a shorter step, then of longer and longer ones, each from the scaled solution of the one
+before and with damping (Deuflhard, *Newton Methods for Nonlinear Problems*, 2011, chapters 3 and 5). The stride doubles after a success
+and halves after a failure. Plain iteration and continuation are one loop, compiled once; a step that converges at once takes one turn.
 
-Attempts are: the whole step from what the steps before lead to; the whole step from straight motion; parts of it.
+The first attempt is the whole step from the prediction of the steps before, the second the whole step from straight motion, all further
+attempts are parts of the step.
 """
 
 from collections.abc import Callable
@@ -24,18 +25,19 @@ from vmri_jax.steppers.results import RUNNING, Result
 from vmri_jax.steppers.stepper import Status
 
 SHORTEST_PART = 1 / 64
-"""Continuation gives up where it would have to advance by less than this part of the step."""
+"""Smallest stride, relative to the step. Continuation has failed if it would need a smaller one; a smaller value makes failing runs slower."""
 RANK = 1e-7
-"""Constraint rows of length one whose smallest singular value is below this are dependent."""
+"""Largest singular value of a dependence: constraint gradients of length one are dependent if their smallest singular value is below. A larger
+value names nearly dependent constraints as the cause of a failed step."""
 
 
 class Part(NamedTuple):
-    """A part of the step that is tried.
+    """An attempt at a part of the step.
 
-    length, stride: its length over that of the step, and by how much it is longer than the part solved before.
-    rates: unknowns of the longest part that has been solved, per length (multipliers: per length squared).
-    solution: of the last attempt, any tree.
-    attempts: how many there were.
+    length, stride: length of the part relative to the step, and its excess over the longest part solved so far.
+    rates: unknowns of the longest solved part, divided by its length (multipliers: by the square of its length).
+    solution: of the last attempt, any pytree.
+    attempts: number of attempts so far.
     """
 
     length: Float[Array, ""]
@@ -47,12 +49,16 @@ class Part(NamedTuple):
     attempts: Int[Array, ""]
 
     def after(self, solution, x: Unknowns, result, iterations, most) -> "Part":
-        """The part to try next, after this one gave x; it might have taken `most` iterations."""
+        """The next attempt.
+
+        Args:
+            solution, x, result, iterations: of this attempt, with its unknowns x.
+            most: iterations that were left to this attempt; if it used all of them, no attempt follows.
+        """
         good, is_first = result <= Result.CONVERGED_AT_ROUNDOFF, self.attempts == 0
         solved = jnp.where(good, self.length, self.length - self.stride)
-        stride = (
-            jnp.where(good, 2.0, jnp.where(is_first, 1.0, 0.5)) * self.stride
-        )  # the second attempt is the whole step, too
+        # the second attempt is the whole step again: after the first failure the stride stays
+        stride = jnp.where(good, 2.0, jnp.where(is_first, 1.0, 0.5)) * self.stride
         rates = jax.tree.map(partial(jnp.where, good), stretched(x, 1 / self.length), self.rates)
         goes_on = jnp.where(good, self.length < 1, (stride >= SHORTEST_PART) & (iterations < most))
         result = jnp.where(goes_on, RUNNING, result)
@@ -63,47 +69,48 @@ class Part(NamedTuple):
 def solve_in_parts(
     equations: StepEquations, guess: Unknowns, solution, iterate: Callable, max_iterations, plain_iterations: int
 ) -> Part:
-    """The whole step at once; where that fails, part by part.
+    """The whole step at once; if that fails, part by part.
 
     Args:
         equations: of the step.
         guess: straight motion, from which all attempts but the first one start.
-        solution: any tree of the type of solutions.
+        solution: any pytree of the type of solutions.
         iterate: ``(equations of the part, guess, most iterations, whether it is the first attempt) -> (solution, its unknowns,
             Result, iterations)``.
         max_iterations: of all attempts together.
-        plain_iterations: of each of the first two attempts. One that needs more has lost its way, and might end at another solution
-            than the one meant.
+        plain_iterations: of each of the first two attempts. An attempt that needs more is far from the guess, and might end at another
+            solution than the physical one.
     """
 
-    def attempt(at: Part) -> Part:
-        shorter = eqx.tree_at(lambda e: e.macro_dt, equations, at.length * equations.macro_dt)
-        most = max_iterations - at.iterations
-        limit = jnp.where(at.attempts < 2, jnp.minimum(most, plain_iterations), most)
-        found = iterate(shorter, stretched(at.rates, at.length), limit, at.attempts == 0)
-        solution, x, result, iterations = found
-        return at.after(solution, x, result, iterations, most)
+    def attempt(part: Part) -> Part:
+        shorter = eqx.tree_at(lambda e: e.macro_dt, equations, part.length * equations.macro_dt)
+        most = max_iterations - part.iterations
+        limit = jnp.where(part.attempts < 2, jnp.minimum(most, plain_iterations), most)
+        solution, x, result, iterations = iterate(
+            shorter, stretched(part.rates, part.length), limit, part.attempts == 0
+        )
+        return part.after(solution, x, result, iterations, most)
 
-    tried = jnp.where(starts_finite(equations), RUNNING, Result.NON_FINITE)  # after a failure nothing is tried
-    whole = Part(jnp.ones(()), jnp.ones(()), guess, solution, tried, jnp.asarray(0), jnp.asarray(0))
-    return jax.lax.while_loop(lambda at: at.result == RUNNING, attempt, whole)
+    start = jnp.where(starts_finite(equations), RUNNING, Result.NON_FINITE)  # no attempt after a failed step
+    whole = Part(jnp.ones(()), jnp.ones(()), guess, solution, start, jnp.asarray(0), jnp.asarray(0))
+    return jax.lax.while_loop(lambda part: part.result == RUNNING, attempt, whole)
 
 
 def starts_finite(equations: StepEquations):
-    """Whether the step starts from numbers: it does not where a step before it failed."""
+    """Whether the momenta at the start are finite; they are not after a failed step."""
     return jnp.isfinite(max_abs(equations.p_s) + max_abs(equations.p_f))
 
 
 def stretched(x: Unknowns, factor) -> Unknowns:
-    """The unknowns of a step that is `factor` times as long, to first order: increments by it, multipliers by its square."""
+    """The unknowns of a step that is `factor` times as long, to first order: increments times `factor`, multipliers times its square."""
     multipliers = {"slow_multiplier": factor**2 * x.slow_multiplier, "multiplier": factor**2 * x.multiplier}
     return Unknowns(slow=factor * x.slow, fast=factor * x.fast, **multipliers)
 
 
 def has_dependent_constraints(equations: StepEquations):
-    """Whether, at the start of the step, the constraints have rank less than their number where they are held.
+    """Whether dg/dq_f or dg_s/dq_s at the start of the step has linearly dependent rows.
 
-    g on the micro grid must be satisfiable by the fast variables alone, g_s by the slow ones.
+    The fast variables alone must be able to satisfy g on the micro grid, the slow ones g_s.
     """
     system, q_s, q_f = equations.system, equations.q_s, equations.q_f
     g_s, g_f = jax.jacrev(system.g, argnums=(1, 2))(equations.t, q_s, q_f)
@@ -112,7 +119,7 @@ def has_dependent_constraints(equations: StepEquations):
 
 
 def with_dependent_constraints(equations: StepEquations, status: Status) -> Status:
-    """The status of a step, RANK_DEFICIENT where it failed and constraints are dependent."""
+    """The status of a step, with RANK_DEFICIENT as the result if it failed and constraints are dependent."""
     if not equations.system.is_constrained:
         return status
     failed = (status.result > Result.CONVERGED_AT_ROUNDOFF) & starts_finite(equations)

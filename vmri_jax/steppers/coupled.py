@@ -1,4 +1,4 @@
-"""Newton's iteration over all unknowns of a macro step at once, and in parts of the step where it fails, see `continuation`."""
+"""Newton's iteration over all unknowns of a macro step at once; where it fails, over parts of the step (`continuation`)."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -19,19 +19,19 @@ from vmri_jax.steppers.solved import Solution, Solver, ended, status_of
 from vmri_jax.steppers.solvers import Newton
 
 MARGIN = 100.0
-"""Factor on the contraction that quadratic convergence promises for the next update. With more, most steps take one more iteration; with
-less, an update that shrinks by luck is trusted."""
+"""Safety factor on the contraction that quadratic convergence predicts for the next update. With a larger one most steps take one more iteration;
+with a smaller one the test trusts an update that is small by chance."""
 PLAIN_ITERATIONS = 15
-"""Newton iterations of the first attempt, after which parts of the step are tried."""
+"""Most Newton iterations of the first attempt, before parts of the step are tried. A larger number makes failing runs slower."""
 LEAST_DAMPING = 1 / 64
-"""An iteration gives up where less than this part of its update makes the next one smaller."""
+"""Smallest damping factor of an update. If the next update is still not smaller, the iteration has failed; a smaller value delays that."""
 
 
 @dataclass(frozen=True)
 class Coupled(Solver):
-    """Newton's iteration on all unknowns, with continuation where it fails.
+    """Newton's iteration on all unknowns with one dense matrix, with continuation where it fails.
 
-    Every iteration solves with one dense matrix: the way of the study that is reproduced, kept as its reference.
+    The method of the reference paper, kept as a reference for tests and studies.
     """
 
     newton: Newton
@@ -61,27 +61,29 @@ class Coupled(Solver):
     def _iterate(self, equations: StepEquations, guess: Unknowns, limit, damped):
         """Newton's iteration from a guess: (x, `Result`, iterations).
 
-        Converged when the updates that are still to come are accepted (`Accepted`). With the contraction
-        ``theta = |d_k| / |d_(k-1)|`` the next one is expected to be ``|d_k| theta min(1, MARGIN theta)``: quadratic
-        convergence with a margin, linear convergence at worst.
+        Converged when the sum of all further updates is accepted (`Accepted`). With ``theta = |d_k| / |d_(k-1)|``, every further update
+        is expected to shrink by ``s = theta min(1, MARGIN theta)``: quadratic convergence with a margin, linear convergence at worst.
+        The sum is ``|d_k| s / (1 - s)``.
 
-        Where `damped`, an update that leads to a larger next one is taken back and halved (natural monotonicity test).
+        If `damped`, an update is taken back and halved when the next update is not smaller (natural monotonicity test).
         """
         newton, accepted = self.newton, Accepted.of(equations, self.newton)
 
-        def iterate(at: Iterate) -> Iterate:
-            residual = equations.residual(at.x)
-            d = dense.solve(dense.factor(equations, at.x), residual)
-            x = jax.tree.map(jnp.add, at.x, d)
+        def iterate(last: Iterate) -> Iterate:
+            # d = -(dR/dx)^-1 R
+            residual = equations.residual(last.x)
+            d = dense.solve(dense.factor(equations, last.x), residual)
+            x = jax.tree.map(jnp.add, last.x, d)
             changes, motions = _slow_and_fast(d), _slow_and_fast(x)
-            update = accepted.over(changes, motions, at.iterations + 1)
-            back = damped & ~(update < (1 - at.damping / 4) * at.update)
-            damping = jnp.where(back, at.damping / 2, jnp.minimum(2 * at.damping, 1.0))
+            size = accepted.ratio(changes, motions, last.iterations + 1)
+            # the step to last.x with damping lambda is taken back unless |d_(k+1)| < (1 - lambda / 4) |d_k|
+            back = damped & ~(size < (1 - last.damping / 4) * last.size)
+            damping = jnp.where(back, last.damping / 2, jnp.minimum(2 * last.damping, 1.0))
             is_roundoff = accepted.is_roundoff(jnp.maximum(*changes))
-            result = _result(at, update, is_roundoff, damping, residual, at.iterations + 1 >= limit, back)
-            before, d = jax.tree.map(partial(jnp.where, back), (at.before, at.direction), (at.x, d))
-            x = jax.tree.map(lambda a, b: a + damping * b, before, d)
-            return Iterate(x, before, d, jnp.where(back, at.update, update), damping, at.iterations + 1, result)
+            result = _result(last, size, is_roundoff, damping, residual, last.iterations + 1 >= limit, back)
+            base, d = jax.tree.map(partial(jnp.where, back), (last.base, last.update), (last.x, d))
+            x = jax.tree.map(lambda a, b: a + damping * b, base, d)
+            return Iterate(x, base, d, jnp.where(back, last.size, size), damping, last.iterations + 1, result)
 
         start = Iterate(guess, guess, guess, jnp.inf, jnp.ones(()), jnp.asarray(0), jnp.asarray(RUNNING))
         done = newton.iterate(iterate, start)
@@ -94,12 +96,17 @@ class Coupled(Solver):
 
 
 class Iterate(NamedTuple):
-    """A point x with the last accepted one, its update (a direction) and how large that was, over what is accepted."""
+    """An iterate ``x = base + damping update``.
+
+    base: the last iterate that was not taken back.
+    update: the Newton update d of `base`.
+    size: size of `update`, as the ratio to the accepted correction.
+    """
 
     x: Unknowns
-    before: Unknowns
-    direction: Unknowns
-    update: Number
+    base: Unknowns
+    update: Unknowns
+    size: Number
     damping: Float[Array, ""]
     iterations: Int[Array, ""]
     result: Int[Array, ""]
@@ -110,28 +117,31 @@ def _slow_and_fast(x: Unknowns):
     return max_abs(x.slow), max_abs(x.fast)
 
 
-def _result(at: Iterate, update, is_roundoff, damping, residual: Unknowns, is_last, back):
+def _result(last: Iterate, size, is_roundoff, damping, residual: Unknowns, is_last, back):
     """`Result` of an iteration, or RUNNING.
 
     Args:
-        at: the iteration before.
-        update: largest change of an increment over the change that is accepted.
-        is_roundoff: whether that change is round-off of the positions.
+        last: the iterate before.
+        size: size of the new update, as the ratio to the accepted correction.
+        is_roundoff: whether the new update is round-off of the positions.
         damping: of the next update.
+        residual: at the iterate before.
         is_last: whether no iterations are left.
-        back: whether the update has been taken back.
+        back: whether the iterate before is taken back.
     """
-    contraction = update / jnp.maximum(at.update, jnp.finfo(float).tiny)
-    shrink = contraction * jnp.minimum(1.0, MARGIN * contraction)
-    predicted = jnp.where(contraction < 1, update * shrink / (1 - shrink), jnp.inf)
-    error = jnp.where((at.iterations == 0) | (at.damping < 1), update, predicted)
+    # sum of all further updates, |d_k| s / (1 - s) with s = theta min(1, MARGIN theta)
+    theta = size / jnp.maximum(last.size, jnp.finfo(float).tiny)
+    s = theta * jnp.minimum(1.0, MARGIN * theta)
+    predicted = jnp.where(theta < 1, size * s / (1 - s), jnp.inf)
+    # without two full updates theta is unknown: the update itself bounds the error
+    error = jnp.where((last.iterations == 0) | (last.damping < 1), size, predicted)
 
-    last = jnp.where(update > at.update, Result.DIVERGED, Result.STAGNATED)
-    result = jnp.where(is_last, last, RUNNING)
+    exhausted = jnp.where(size > last.size, Result.DIVERGED, Result.STAGNATED)
+    result = jnp.where(is_last, exhausted, RUNNING)
     result = jnp.where(damping < LEAST_DAMPING, Result.DIVERGED, result)
-    result = jnp.where((contraction > 0.5) & is_roundoff, Result.CONVERGED_AT_ROUNDOFF, result)
+    result = jnp.where((theta > 0.5) & is_roundoff, Result.CONVERGED_AT_ROUNDOFF, result)
     result = jnp.where(error <= 1, Result.CONVERGED, result)
 
     functions_finite = jnp.isfinite(max_abs(residual.slow) + max_abs(residual.fast))
     broken = jnp.where(functions_finite, Result.SINGULAR, Result.NON_FINITE)
-    return jnp.where(jnp.isfinite(update) | (back & (result == RUNNING)), result, broken)
+    return jnp.where(jnp.isfinite(size) | (back & (result == RUNNING)), result, broken)

@@ -1,4 +1,4 @@
-"""Slow equations that do not see the fast unknowns: the slow variables make one step, then the fast ones some smaller steps."""
+"""Slow equations that do not depend on the fast unknowns: the slow variables make one step, then the fast variables several shorter ones."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from vmri_jax.steppers.stepper import StepInfo, Stepper, indented
 
 
 class DecoupledState(NamedTuple):
-    """What the steppers of the slow and of the fast variables carry."""
+    """Memories of the steppers of the slow and of the fast variables."""
 
     slow: Any
     fast: Any
@@ -19,10 +19,10 @@ class DecoupledState(NamedTuple):
 
 @dataclass(frozen=True)
 class Decoupled(Stepper):
-    """Each part is a system of fast variables alone on a single interval; kicks that join them stay outside.
+    """Two independent parts, each a system of fast variables alone on a single interval; kicks by both variables stay outside.
 
-    slow: takes one step over the macro interval.
-    fast: takes `num_fast` steps.
+    slow: stepper of the slow variables, one step over the macro interval.
+    fast: stepper of the fast variables, `num_fast` steps.
     """
 
     slow: Kicked

@@ -1,4 +1,4 @@
-"""Free flight: straight motion at constant momentum, where nothing but kinetic energy of constant masses is left."""
+"""Free flight: straight motion at constant momentum, for kinetic energy of constant masses alone."""
 
 from dataclasses import dataclass
 

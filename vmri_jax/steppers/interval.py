@@ -1,4 +1,13 @@
-"""One micro interval as a problem of its own, and the Newton matrix its fast increments are corrected with."""
+"""One micro interval as a problem of its own, and the Newton matrix K of its fast increments.
+
+K (r n_f, r n_f) is the derivative of the fast momentum equations, times h and without constraint forces, by the fast increments.
+With the nodes c_k and weights w_k of W on the micro interval, rows i = 0..r-1 and columns j = 1..r,
+
+    K_ij = k_ij M_f - h^2 sum_k w_k l_i(c_k) l_j(c_k) W''(q_f(c_k)),        k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
+
+where k has the nodes and weights of T. For r = 1 and the midpoint rule ``K = -(M_f + h^2 W'' / 4)``: negative definite where the mass
+dominates. The row i = r is the derivative of the momentum at the end of the interval.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,8 +30,8 @@ from vmri_jax.schemes.quadrature import micro, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
 SMALL = 16
-"""Fast variables up to which an interval of high degree is solved with one matrix for all of them. For more, matrices that are taken apart
-or kept are cheaper."""
+"""Most fast variables for which an interval of high degree is solved with one full matrix. For more variables, matrices per coordinate, or
+matrices that are kept over many steps, are cheaper."""
 
 
 def weighted_sum(weights, increments):
@@ -31,13 +40,13 @@ def weighted_sum(weights, increments):
 
 
 def constant_mass(system: System) -> ConstantMass:
-    """The masses of a system that can be cut."""
+    """The kinetic energy of a system of constant masses, with its type."""
     assert isinstance(system.kinetic, ConstantMass)
     return system.kinetic
 
 
 def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
-    """System and scheme of one micro interval: without the kicks at nodes that only some intervals have, and the slow constraint."""
+    """System and scheme of one micro interval, without the slow constraint and without terms that only some intervals have."""
     changes: dict[str, Any] = {"slow_constraint": None}
     rules: dict[str, Any] = {"slow": scheme.slow, "fast": scheme.fast, "force": scheme.force}
     for name, placed in rules.items():
@@ -54,21 +63,21 @@ def interval_problem(system: System, scheme: Scheme) -> tuple[System, Scheme]:
 
 
 def implicit_terms(system: System, scheme: Scheme) -> list[Term]:
-    """The potentials that the fast unknowns of a micro interval enter."""
+    """The potentials with nodes inside a micro interval, whose gradients depend on the fast unknowns."""
     terms = lagrangian(*interval_problem(system, scheme)).terms
     return [term for term in terms if isinstance(term, Term) and term.inside.groups]
 
 
 def _of_fast(term: Term, q_s, q_f):
-    """The integrand of a term at slow positions that are known."""
+    """The integrand of a term as a function of q_f."""
     return term.integrand(*({"q_s": q_s, "q_f": q_f}[name] for name in term.arguments))
 
 
 class DiagonalMatrix(NamedTuple):
-    """K of a micro interval for every coordinate alone.
+    """K as one matrix (r, r) for every fast coordinate.
 
-    inverse: of the rows of slots 0..r-1.
-    last: the row of slot r, which is the momentum handed on.
+    inverse: ``K^-1``, of the rows i = 0..r-1.
+    last: the row i = r, which gives the momentum at the end.
     """
 
     inverse: Float[Array, "r r n_f"]
@@ -84,7 +93,7 @@ class DiagonalMatrix(NamedTuple):
 
 
 class FullMatrix(NamedTuple):
-    """K of a micro interval, as in `DiagonalMatrix` with the increments in a row."""
+    """K as one matrix for all fast coordinates; fields as in `DiagonalMatrix`."""
 
     inverse: Float[Array, "r*n_f r*n_f"]
     last: Float[Array, "n_f r*n_f"]
@@ -103,14 +112,12 @@ Matrix = DiagonalMatrix | FullMatrix
 
 @dataclass(frozen=True)
 class Interval:
-    """What one micro interval is like, decided from structure.
+    """The structure of a micro interval.
 
-    is_explicit: its fast increment is the momentum that arrives plus the constraint force.
-    is_diagonal: its matrix K, the derivative of its fast equations (r n_f rows, times h) by its increments without constraints,
-        negative definite where the mass dominates, is taken for every fast coordinate alone: fast equations are explicit, or W is a
-        sum over the coordinates. V is then left out: it is the soft potential, and h^2 times its curvature is small beside the
-        mass.
-    is_constant: K is the same for a whole run.
+    is_explicit: whether the fast increments are explicit functions of the multipliers, ``x = M_f^-1 (h p_f - G_0^T mu)``.
+    is_diagonal: whether K is taken as one matrix per fast coordinate: the fast equations are explicit, or W is a sum over the
+        coordinates. K then leaves V out: V is the soft potential, and h^2 times its curvature is small beside the mass.
+    is_constant: whether K is the same for a whole run.
     sparsity: of ``G K^-1 G^T``.
     """
 
@@ -121,14 +128,16 @@ class Interval:
 
     @classmethod
     def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "Interval":
-        """For positions of these shapes."""
+        """The structure for a system, a scheme, and positions of these shapes."""
         terms = implicit_terms(system, scheme)
         of_fast = [term for term in terms if term.arguments == ("q_f",)]
         sums = bool(of_fast) and all(has_diagonal_hessian(term.integrand, q_f) for term in of_fast)
-        sums = sums and all(term.name in ("V", "W") for term in terms)  # further potentials may be stiff: K sees them
-        straight = all(is_linear(partial(_of_fast, term, q_s), q_f) for term in terms)
-        straight &= scheme.degree == 1 or q_f.size > SMALL  # few of high degree are taken together
-        is_diagonal = DIAGONAL_MATRICES and isinstance(constant_mass(system).fast_mass, Diagonal) and (straight or sums)
+        sums = sums and all(
+            term.name in ("V", "W") for term in terms
+        )  # further potentials may be stiff: K must contain them
+        linear = all(is_linear(partial(_of_fast, term, q_s), q_f) for term in terms)
+        linear &= scheme.degree == 1 or q_f.size > SMALL  # few variables and a high degree: one full matrix is cheaper
+        is_diagonal = DIAGONAL_MATRICES and isinstance(constant_mass(system).fast_mass, Diagonal) and (linear or sums)
         is_constant = True
         if is_diagonal:
             terms = of_fast
@@ -144,7 +153,7 @@ class Interval:
         return cls(is_explicit, is_diagonal, is_constant, sparsity)
 
     def no_matrix(self, equations: StepEquations) -> Matrix:
-        """The shapes of K, all zero."""
+        """K filled with zeros, for its shapes."""
         r, n_f = equations.scheme.degree, equations.q_f.shape[0]
         if self.is_diagonal:
             return DiagonalMatrix(jnp.zeros((r, r, n_f)), jnp.zeros((r, n_f)))
@@ -165,9 +174,10 @@ def _full_matrix(local: StepEquations, path: Path) -> FullMatrix:
     kinetic = lagrangian(local.system, local.scheme).kinetic
     _, r, n_f = path.fast.shape
 
+    # h D_{F_i} L, i = 0..r, of the action L of the interval without constraints; forces are evaluated along the same path
     def slots(increments):
-        at = replace(path, fast=increments[None])
-        d = jax.grad(local.without_kinetic)(at, at)
+        varied = replace(path, fast=increments[None])
+        d = jax.grad(local.without_kinetic)(varied, varied)
         d_fast = d.fast[0] + kinetic.rows(path.slow, increments)[1]
         return jnp.concatenate([d.fast_start - d_fast.sum(0), d_fast])
 
@@ -177,6 +187,7 @@ def _full_matrix(local: StepEquations, path: Path) -> FullMatrix:
 
 def _diagonal_matrix(local: StepEquations, path: Path) -> DiagonalMatrix:
     _, r, n_f = path.fast.shape
+    # block_ija = k_ij M_a - h^2 sum_k w_k l_i(c_k) l_j(c_k) W''_aa, i = 0..r, j = 1..r, coordinate a
     block = jnp.zeros((r + 1, r, n_f))
     for term in lagrangian(local.system, local.scheme).terms:
         if isinstance(term, QuadraticKinetic):
@@ -184,7 +195,9 @@ def _diagonal_matrix(local: StepEquations, path: Path) -> DiagonalMatrix:
         elif term.inside.groups and term.arguments == ("q_f",):
             q = term.inside.sample(path, ("q_f",))["q_f"]
             gradient = jax.vmap(jax.grad(term.integrand))
-            curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[1]  # the diagonal of each Hessian
+            curvature = jax.jvp(gradient, (q,), (jnp.ones_like(q),))[
+                1
+            ]  # W'' times ones: its diagonal, since W is a sum over coordinates
             basis = lagrange_basis(r, np.array([group.c for group in term.inside.groups]))
             weights = term.sign * local.macro_dt**2 * term.inside.weights
             block += jnp.einsum("k,ki,kj,ka->ija", weights, basis, basis[:, 1:], curvature)
@@ -206,6 +219,7 @@ def solve_saddle(solve_k, jacobian, push, rows, g):
     dx = -solve_k(rows)
     if n_g == 0:
         return dx, g
+    # columns of G_0^T, then response = K^-1 G_0^T; vmap stacks both by column in rows, so that `schur` is the transposed complement
     columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
     response = jax.vmap(solve_k)(columns.reshape(r * n_g, r, -1))
     schur = regularized(jax.vmap(push)(response).reshape(r * n_g, r * n_g))

@@ -1,4 +1,4 @@
-"""Kicks: potentials at the ends of an interval, which only shift momenta before and after everything else."""
+"""Kicks: potentials at the ends of an interval, which only shift the momenta before and after the motion inside."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
 
 
 class KickedState(NamedTuple):
-    """What a step hands to the next one.
+    """Memory that a step hands to the next one.
 
-    gradients: of every kick, ``(dL/dq_s, dL/dq_f)`` at the node that two steps share.
-    inner: what the inner stepper carries.
+    gradients: ``(dL/dq_s, dL/dq_f)`` of every kick at the node that two steps share.
+    inner: memory of the inner stepper.
     """
 
     gradients: tuple[tuple[Float[Numbers, "n_s"], Float[Numbers, "n_f"]], ...]
@@ -28,14 +28,12 @@ class KickedState(NamedTuple):
 
 @dataclass(frozen=True)
 class Kicked(Stepper):
-    """``p + H w dL/dq`` before and after an inner step, with the weight w that a term has at that end of the interval.
+    """Kicks ``p <- p + H w dL/dq`` before and after an inner step, with the weight w of the term at that end of the interval.
 
-    A mollified kick is taken at averaged fast positions.
-
-    kicks: the terms that have nodes at the ends, maybe none.
-    inner: what happens between the kicks.
-    average: the filter of mollified kicks, ``average(macro_dt)(q_s, q_f) -> q_f``; None if there is no such kick.
-    projects: whether a step ends with momenta on the hidden constraints.
+    kicks: the terms with nodes at the ends of the interval; may be empty.
+    inner: the stepper between the kicks.
+    average: the filter of mollified kicks, ``average(macro_dt)(q_s, q_f) -> q_f``; None without mollified kicks.
+    projects: whether every step ends with a projection of the momenta onto the hidden constraints.
     """
 
     kicks: tuple[Term, ...]
@@ -63,13 +61,13 @@ class Kicked(Stepper):
     def advance_many(
         self, state: State, memory: KickedState, macro_dt, count: int
     ) -> tuple[State, StepInfo, KickedState]:
-        """`count` steps; the kicks of two steps at the node they share are one, and so are the matrices of all."""
+        """`count` steps with the same matrices; the two kicks at a node that two steps share are one."""
         return self.advance_with_matrices(state, self.renew(state, memory, macro_dt), macro_dt, count)
 
     def advance_with_matrices(
         self, state: State, memory: KickedState, macro_dt, count: int
     ) -> tuple[State, StepInfo, KickedState]:
-        """The same with the matrices that `memory` has."""
+        """`count` steps with the matrices in `memory`."""
 
         def step(state, inner, start: float):
             state, info, inner = self.inner.advance(state, inner, macro_dt)
@@ -85,11 +83,12 @@ class Kicked(Stepper):
 
         inner = memory.inner
         state = kicked(state, self.kicks, memory.gradients, macro_dt, start=1.0)
-        none = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
-        (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, inner, none), length=count - 1)
-        # the last step apart: in the loop, its other weight and its gradients would cost half of a short step
+        best = Status(jnp.asarray(0), jnp.asarray(0), jnp.asarray(0), jnp.zeros(()))
+        (state, inner, worst), (q_f, multiplier) = jax.lax.scan(between, (state, inner, best), length=count - 1)
+        # The last step stands outside of the loop: a weight that depends on the number of the step, and a carry with its gradients, would
+        # cost as much as half of a short step.
         state, last, memory = step(state, inner, 0.0)
-        is_same = is_concrete(last.status)  # a status that is known before the step is that of all steps
+        is_same = is_concrete(last.status)  # a stepper with a constant status, known while tracing, has it in all steps
         status = last.status if is_same else worst.worse(last.status)
         q_f, multiplier = _all_steps(q_f, last.q_f_micro), _all_steps(multiplier, last.multiplier)
         return state, StepInfo(*status, q_f, multiplier, last.slow_multiplier), memory
@@ -108,10 +107,11 @@ class Kicked(Stepper):
         def gradient(term: Term):
             if self.average is None or not term.mollified:
                 return term.gradient(q_s, q_f)
+            # mollified: gradient of V(q_s, a(q_s, q_f)), dV/dq_s + (da/dq_s)^T dV/da and (da/dq_f)^T dV/da
             averaged, pull = jax.vjp(self.average(macro_dt), q_s, q_f)
             d_s, d_f = term.gradient(q_s, averaged)
-            more_s, d_f = pull(d_f)
-            return d_s + more_s, d_f
+            through_average_s, through_average_f = pull(d_f)
+            return d_s + through_average_s, through_average_f
 
         return tuple(map(gradient, self.kicks))
 
@@ -130,7 +130,7 @@ class Kicked(Stepper):
 
 @dataclass(frozen=True)
 class Repeated(Stepper):
-    """`count` smaller steps of a kicked stepper: what is between two kicks of a potential with a longer interval."""
+    """`count` shorter steps of a kicked stepper, between two kicks of a potential with a longer interval."""
 
     inner: Kicked
     count: int
@@ -155,19 +155,19 @@ class Repeated(Stepper):
 
 
 def steps_in_words(count: int, stepper: Kicked) -> str:
-    """How many steps a stepper makes, and whether they are micro steps."""
+    """The number of steps of a stepper in words; "micro steps" if it has no shorter steps inside."""
     return f"{count} {'' if isinstance(stepper.inner, Repeated) else 'micro '}step{'s' * (count > 1)}"
 
 
 def _all_steps(before, last):
-    """What is along the steps before, (count - 1, k, ...) or without the axis k = 1, and along the last one, (k, ...): in one row."""
+    """Values along all steps: those of the steps before, (count - 1, k, ...) or (count - 1, ...) for k = 1, then of the last, (k, ...)."""
     if len(last) > 1:
         before = before.reshape(before.shape[0] * len(last), *last.shape[1:])
     return jnp.concatenate([before, last])
 
 
 def kicked(state: State, kicks: tuple[Term, ...], gradients, macro_dt, start: float = 0.0, end: float = 0.0) -> State:
-    """A state after kicks with these gradients, `start` and `end` times those at the ends of an interval."""
+    """The state after kicks with these gradients: `start` times the weight at the start of an interval plus `end` times that at its end."""
     p_s, p_f = state.p_s, state.p_f
     for term, (d_s, d_f) in zip(kicks, gradients, strict=True):
         weights = [part * w for part, w in ((start, term.start), (end, term.end)) if part and w is not None]
@@ -181,11 +181,11 @@ def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
     """The filter of a mollified slow potential, ``average(macro_dt)(q_s, q_f) -> a``.
 
     ``a = (x_0 / 2 + x_1 + ... + x_{n - 1} + x_n / 2) / n`` over the n = num_micro micro nodes of the fast motion from rest at
-    q_f, slow variables at rest: the trapezoidal rule on the micro grid. A fast vibration whose phase advances by k pi over
-    the macro step, as the scheme resolves it, has the average zero, so that V cannot excite it.
+    q_f with the slow variables at rest: the trapezoidal rule on the micro grid. A fast vibration whose discrete phase advances by k pi
+    over the macro step has the average zero, so that V cannot excite it.
 
     Args:
-        stepper_of: ``(q_s, q_f) -> Kicked``, the stepper of one micro interval of the fast variables with the slow ones at rest.
+        stepper_of: ``(q_s, q_f) -> Kicked``, the stepper of one micro interval of the fast variables with the slow variables at rest.
         num_micro: micro steps per macro step.
     """
 

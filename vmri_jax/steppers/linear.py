@@ -16,7 +16,7 @@ from vmri_jax.steppers.stepper import Status, StepInfo, Stepper
 
 @dataclass(frozen=True)
 class Linear(Stepper):
-    """``x = -K^-1 r(0)`` with the residual r of no motion at all; K is what it carries."""
+    """The step ``x = -K^-1 r(0)``, with the residual r at zero increments; the memory is K."""
 
     system: System
     scheme: Scheme
@@ -27,9 +27,10 @@ class Linear(Stepper):
 
     def advance(self, state: State, memory: Matrix, macro_dt) -> tuple[State, StepInfo, Matrix]:
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
-        h, rest = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
-        path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), rest[None])
+        h, zero = macro_dt, jnp.zeros((self.scheme.degree, state.q_f.size))
+        path = equations.path_of(jnp.zeros((self.scheme.degree, 0)), zero[None])
         d = jax.grad(equations.without_kinetic)(path, path)
+        # r(0): h p_f + h D_{F_0} L and h D_{F_j} L, 0 < j < r
         rows = jnp.concatenate([d.fast_start - d.fast[0].sum(0) + h * state.p_f, d.fast[0, :-1]])
         increments = -memory.solve(rows)
 

@@ -1,22 +1,25 @@
 """The march: a macro step of any Lagrangian, micro interval by micro interval, with exact matrices.
 
-A micro interval is a map ``(q_f, p_f, slow path) -> (q_f, p_f, impulses on the slow path)``, given by its equations R_m = 0 for its own
-unknowns x_m (`vmri_jax.schemes.intervals`). Unknowns of the macro step are those and z, the slow increments and slow multipliers.
+A micro interval is a map ``(q_f, p_f, slow path) -> (q_f, p_f, impulses on the slow path)``, given by its equations R_m = 0 for its
+unknowns x_m (`vmri_jax.schemes.intervals`). The macro step has the unknowns x_m of all intervals, and z: slow increments and slow
+multipliers.
 
-A pass goes over the intervals in order. Each corrects its unknowns once, and hands on what follows from the correction to first
-order:
+A pass goes over the intervals in order. Each interval corrects its unknowns once, and hands on its end position, momentum and
+impulses, corrected to first order:
 
     d_m = -(dR_m/dx_m)^-1 R_m        x_m <- x_m + d_m
 
-After the last one the slow equations R_s = 0, which the impulses of all intervals enter, are corrected once,
+After the last interval the pass corrects z once by the slow equations R_s = 0, which the impulses of all intervals enter,
 
-    d = -(dR_s/dz)^-1 R_s            z <- z + d,    x_m <- x_m + (dx_m/dz) d
+    d = -S^-1 R_s                    z <- z + d,    x_m <- x_m + (dx_m/dz) d
 
-In an *exact* pass the matrices are computed: those of the intervals by `jax.jacfwd`, and dR_s/dz with the answer of all
-intervals to the slow path, since the pass carries along how x_m and what is handed on change with z. Further passes, also those of
-the next steps, keep all matrices while the corrections shrink, and cost one gradient of the action each.
+with S the total derivative of R_s by z, the Schur complement of the intervals: z acts on R_s itself, and through all x_m.
 
-Nothing here remembers a step before: the guess and the matrices that are kept come from `vmri_jax.steppers.marched`.
+An *exact* pass computes the matrices, the derivatives of the intervals in forward mode. It carries along how x_m and the numbers that
+are handed on change with z, so that S is known at the end. Further passes, also those of the next steps, keep all matrices while the
+corrections shrink, and cost one gradient of the action each.
+
+This module remembers nothing from step to step: the guess and the kept matrices come from `vmri_jax.steppers.marched`.
 """
 
 from functools import partial
@@ -32,11 +35,11 @@ from vmri_jax.schemes.intervals import Arriving, Intervals, IntervalUnknowns
 
 
 class IntervalMatrices(NamedTuple):
-    """The equations of a micro interval, linearised: k unknowns, r n_v slow increments that are seen; o numbers are handed on besides q_f.
+    """The linearised equations of a micro interval: k unknowns, r n_v slow increments that the interval sees, o gradients (`Handed`).
 
-    inverse: of the derivative of its residual by its unknowns.
-    by_position, by_slow: derivative of the residual by the position that arrives and by the slow increments.
-    hands_on, hands_on_by_position, hands_on_by_slow: derivative of the momentum and the impulses that are handed on.
+    inverse: ``(dR/dx)^-1`` of the residual R by the unknowns x of the interval.
+    by_position, by_slow: derivative of R with respect to the position that arrives and to the slow increments.
+    hands_on, hands_on_by_position, hands_on_by_slow: derivative of the gradients that are handed on, with respect to the same variables.
     """
 
     inverse: Float[Array, "k k"]
@@ -48,11 +51,11 @@ class IntervalMatrices(NamedTuple):
 
 
 class Matrices(NamedTuple):
-    """What an exact pass leaves for further passes.
+    """The matrices of an exact pass, which further passes keep.
 
-    inverse, hands_on: of the intervals, as of `IntervalMatrices`, with the intervals as first axis.
-    response: ``dx_m/dz`` by the slow increments that intervals see.
-    slow: inverse of the slow equations once the intervals are eliminated.
+    inverse, hands_on: as in `IntervalMatrices`, with the intervals as first axis.
+    response: ``dx_m/dz``, for the slow increments that intervals see.
+    slow: ``S^-1``, the inverse of the slow equations after elimination of the intervals.
     """
 
     inverse: Float[Array, "num_micro k k"]
@@ -62,14 +65,15 @@ class Matrices(NamedTuple):
 
 
 class Handed(NamedTuple):
-    """What arrives at an interval, as vectors or as matrices with one column for each direction.
+    """The quantities that arrive at an interval, as vectors, or their derivatives, as matrices with one column for each direction.
 
     position: q_f.
-    rest: momentum p_f times h, then the gradients of h times the action by the start and by the increments of the slow path.
+    gradients: of h times the action of the intervals before: by q_f (the momentum ``h p_f``), by the start of the slow path, by its
+        increments.
     """
 
     position: Float[Array, "n_f ..."]
-    rest: Float[Array, "o ..."]
+    gradients: Float[Array, "o ..."]
 
 
 class MarchEquations:
@@ -77,7 +81,7 @@ class MarchEquations:
 
     Args:
         equations: of the macro step.
-        inverted: inverts a matrix ``[[A, B], [C, 0]]``, given as (A, B, C, number of nodes).
+        inverted: function of (A, B, C, number of nodes) that inverts the matrix ``[[A, B], [C, 0]]``.
     """
 
     def __init__(self, equations: StepEquations, inverted=None):
@@ -89,13 +93,13 @@ class MarchEquations:
         self.n_v = self.intervals.seen.count  # the slow variables that intervals see
         self.num_fast, self.num_slow, self.num_seen = self.r * self.n_f, self.r * self.n_s, self.r * self.n_v
 
-    def rows(self, x: Unknowns):
-        """(z, x) of the unknowns by name."""
+    def flat(self, x: Unknowns):
+        """The unknowns as arrays z (b,) and x (num_micro, k)."""
         z = jnp.concatenate([x.slow.reshape(-1), x.slow_multiplier.reshape(-1)])
         return z, jnp.concatenate([x.fast.reshape(self.n, -1), x.multiplier.reshape(self.n, -1)], axis=1)
 
     def by_name(self, z, x) -> Unknowns:
-        """The unknowns by name, of their rows."""
+        """The inverse of `flat`."""
         return Unknowns(
             z[: self.num_slow].reshape(self.r, self.n_s),
             z[self.num_slow :].reshape(self.r, self.n_gs),
@@ -108,7 +112,7 @@ class MarchEquations:
         return self.intervals.seen.take(z[: self.num_slow].reshape(self.r, self.n_s)).reshape(self.num_seen)
 
     def start(self) -> Handed:
-        """What arrives at the first interval."""
+        """The fast position and momentum at the start of the step; no interval has pushed the slow path yet."""
         equations = self.equations
         return Handed(
             equations.q_f, jnp.concatenate([equations.micro_dt * equations.p_f, jnp.zeros(self.n_v + self.num_seen)])
@@ -121,12 +125,12 @@ class MarchEquations:
         return Matrices(*map(jnp.zeros, ((n, k, k), (n, o, k), (n, k, self.num_seen), (b, b))))
 
     def interval(self, m, x, arriving: Handed, slow):
-        """Residual (k,) of interval m, and the rest (o,) that it hands on."""
+        """Residual (k,) of interval m, and the gradients (o,) that it hands on."""
         unknowns = IntervalUnknowns(
             x[: self.num_fast].reshape(self.r, self.n_f), x[self.num_fast :].reshape(self.r, self.n_g)
         )
         residual, on = self.intervals.evaluate(m, unknowns, self._apart(arriving), slow.reshape(self.r, self.n_v))
-        return jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)]), _together(on).rest
+        return jnp.concatenate([residual.fast.reshape(-1), residual.multiplier.reshape(-1)]), _together(on).gradients
 
     def slow_equations(self, z, arriving: Handed):
         """Residual (b,) of the slow equations, and the slow momentum at the end."""
@@ -135,75 +139,85 @@ class MarchEquations:
         return jnp.concatenate([rows.reshape(-1), g.reshape(-1)]), p_s
 
     def _apart(self, arriving: Handed) -> Arriving:
-        p_f, start, slow = jnp.split(arriving.rest, [self.n_f, self.n_f + self.n_v])
+        p_f, start, slow = jnp.split(arriving.gradients, [self.n_f, self.n_f + self.n_v])
         return Arriving(arriving.position, p_f, start, slow.reshape(self.r, self.n_v))
 
     def interval_matrices(self, m, x, arriving: Handed, slow) -> IntervalMatrices:
-        """The derivatives of interval m."""
+        """The derivatives of interval m with respect to its unknowns, the arriving position and the slow increments."""
 
-        def all_of(x, position, slow):
-            return self.interval(m, x, Handed(position, arriving.rest), slow)
+        def residual_and_gradients(x, position, slow):
+            return self.interval(m, x, Handed(position, arriving.gradients), slow)
 
         by_x, by_position, by_slow = zip(
-            *jax.jacfwd(all_of, argnums=(0, 1, 2))(x, arriving.position, slow), strict=True
+            *jax.jacfwd(residual_and_gradients, argnums=(0, 1, 2))(x, arriving.position, slow), strict=True
         )
         return IntervalMatrices(
             self.inverse(by_x[0], self.num_fast), by_position[0], by_slow[0], by_x[1], by_position[1], by_slow[1]
         )
 
     def slow_inverse(self, z, arriving: Handed, answers: Handed):
-        """Inverse (b, b) of the slow equations.
+        """The inverse (b, b) of the total derivative S of the slow residual.
 
         Args:
-            answers: how what arrives at them changes with the slow increments, one column for each that intervals see.
+            answers: derivative of `arriving` with respect to the slow increments, one column for each increment that intervals see.
         """
 
         def slow_residual_change(dz, answer: Handed):
             return jax.jvp(lambda z, a: self.slow_equations(z, a)[0], (z, arriving), (dz, answer))[1]
 
-        # other slow increments and multipliers of the slow constraints change nothing that arrives
+        # zero columns for the slow increments that no interval sees and for the slow multipliers: they do not change `arriving`
         def for_all(answer):
             none = jnp.zeros((len(answer), self.r, self.n_s))
             seen = self.intervals.seen.put(answer.reshape(len(answer), self.r, self.n_v), none)
             return jnp.pad(seen.reshape(len(answer), self.num_slow), [(0, 0), (0, z.size - self.num_slow)])
 
         answers = jax.tree.map(for_all, answers)
+        # column j of S: dR_s/dz e_j + dR_s/d(arriving) d(arriving)/dz_j
         matrix = jax.vmap(slow_residual_change, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)
         return self.inverse(matrix, self.num_slow)
 
     def inverse(self, matrix, size: int):
-        """Of a matrix whose first `size` unknowns are increments, the others multipliers."""
+        """The inverse of a matrix whose first `size` unknowns are increments, and the remaining ones multipliers."""
         return self.inverted(matrix[:size, :size], matrix[:size, size:], matrix[size:, :size], self.r)
 
     def answer(self, matrices: IntervalMatrices, residual, arriving: Handed, slow=None):
-        """To a change of the residual, of what arrives, and (unless None) of the slow increments: (dx, change of what is handed on).
+        """The linearised interval solved for dx: returns dx, and the change of the position and gradients that are handed on.
 
-        All have one column for each direction. With dx the linearised residual is zero.
+            dx = -(dR/dx)^-1 (residual + dR/dq dq + dR/dp dp + dR/ds ds)
+
+        All arrays have one column for each direction.
+
+        Args:
+            matrices: of the interval.
+            residual: R, or its change by other arguments.
+            arriving: dq and dp, changes of the position and of the gradients that arrive.
+            slow: ds, changes of the slow increments; None for none.
         """
         rows = residual + matmul(matrices.by_position, arriving.position)
-        rest = matmul(matrices.hands_on_by_position, arriving.position)
+        gradients = matmul(matrices.hands_on_by_position, arriving.position)
         if slow is not None:
-            rows, rest = rows + matmul(matrices.by_slow, slow), rest + matmul(matrices.hands_on_by_slow, slow)
-        rows = rows.at[: self.n_f].add(arriving.rest[: self.n_f])  # the momentum that arrives
+            rows, gradients = rows + matmul(matrices.by_slow, slow), gradients + matmul(matrices.hands_on_by_slow, slow)
+        # h p_f is added to the first momentum equation: dR/dp is the unit matrix there, zero elsewhere
+        rows = rows.at[: self.n_f].add(arriving.gradients[: self.n_f])
         dx = -matmul(matrices.inverse, rows)
-        return dx, self.handed(arriving, dx, matmul(matrices.hands_on, dx) + rest)
+        return dx, self.handed(arriving, dx, matmul(matrices.hands_on, dx) + gradients)
 
     def last_increment(self, x):
-        """(n_f, ...) of the unknowns (k, ...): from the start of the interval to its end."""
+        """The fast increment (n_f, ...) from the start of the interval to its end, out of the unknowns (k, ...)."""
         return x[self.num_fast - self.n_f : self.num_fast]
 
-    def handed(self, arriving: Handed, dx, rest):
-        """The change of what is handed on: the momentum is a new one, impulses add up."""
+    def handed(self, arriving: Handed, dx, gradients):
+        """The change of the quantities that are handed on: the interval replaces the momentum, and adds to the slow gradients."""
         position = arriving.position + self.last_increment(dx)
-        return Handed(position, rest.at[self.n_f :].add(arriving.rest[self.n_f :]))
+        return Handed(position, gradients.at[self.n_f :].add(arriving.gradients[self.n_f :]))
 
-    def corrected(self, inverse, hands_on, x, residual, arriving: Handed, rest) -> tuple[Any, Handed]:
-        """The correction ``-(dR/dx)^-1 R`` of an interval, and what it hands on with it."""
+    def corrected(self, inverse, hands_on, x, residual, arriving: Handed, gradients) -> tuple[Any, Handed]:
+        """The correction ``d = -(dR/dx)^-1 R`` of an interval, and its end position and gradients, corrected to first order."""
         d = -matvec(inverse, residual)
-        return d, Handed(arriving.position + self.last_increment(x + d), rest + matvec(hands_on, d))
+        return d, Handed(arriving.position + self.last_increment(x + d), gradients + matvec(hands_on, d))
 
     def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed) -> "Passed":
-        """A pass that has met all intervals, with the correction of the slow unknowns."""
+        """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``."""
         residual, p_s = self.slow_equations(z, end)
         dz = -matvec(matrices.slow, residual)
         dx = jnp.sum(matrices.response * self.seen(dz), axis=-1)
@@ -215,12 +229,12 @@ def _together(on: Arriving) -> Handed:
 
 
 def inverse_with_multipliers(a, b, c, nodes: int):
-    """Inverse of ``[[A, B], [C, 0]]`` by elimination, kept regular where constraints become dependent."""
+    """The inverse of ``[[A, B], [C, 0]]`` by elimination, regularised for dependent constraints (`vmri_jax.kernels.saddle`)."""
     return inverse_in_loop(saddle(a, b, c) if b.shape[-1] else a)
 
 
 class Worst(NamedTuple):
-    """The worst of all intervals in a pass.
+    """Maxima over the intervals of a pass.
 
     moved: largest correction of a fast increment.
     rows: largest entry of a residual before the corrections; momentum equations are times h.
@@ -233,22 +247,27 @@ class Worst(NamedTuple):
 
     @classmethod
     def none(cls) -> "Worst":
-        """Before the first interval."""
+        """The value before the first interval."""
         return cls(jnp.zeros(()), jnp.zeros(()), jnp.asarray(False))
 
     def add(self, residual, correction, moved) -> "Worst":
-        """With one more residual, its correction, and the largest correction of a fast increment in it."""
+        """The maxima with one more interval included.
+
+        Args:
+            residual, correction: of the interval (or of the slow equations).
+            moved: largest correction of a fast increment in it.
+        """
         rows = max_abs(residual)
         singular = jnp.isfinite(rows) & ~jnp.isfinite(max_abs(correction))
         return Worst(jnp.maximum(self.moved, moved), jnp.maximum(self.rows, rows), self.is_singular | singular)
 
 
 class Passed(NamedTuple):
-    """Unknowns after a pass, with their next correction by the slow equations.
+    """The unknowns after a pass, and the slow correction with which the next pass begins.
 
     z, x: unknowns, x corrected by the pass.
-    dz, dx: correction of z, and the answer of x to it; the next pass begins with it.
-    end, p_s: what the last interval hands on, and the slow momentum at the end.
+    dz, dx: correction of z, and the change of x that follows from it.
+    end, p_s: the quantities that the last interval hands on, and the slow momentum at the end of the step.
     """
 
     z: Float[Array, "b"]
@@ -261,7 +280,7 @@ class Passed(NamedTuple):
 
 
 def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, Passed]:
-    """A pass that computes all matrices, each interval at what the intervals before it hand on after their correction.
+    """A pass that computes all matrices; every interval starts from the corrected end of the interval before.
 
     Args:
         march: the equations.
@@ -271,57 +290,59 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
     """
     slow, unit = march.seen(z), jnp.eye(march.num_seen)
 
-    def interval(carry, given):
+    def interval(carry, unknowns):
         arriving, answers, last, worst = carry
-        m, x = given
+        m, x = unknowns
         x = jnp.where(from_last, last, x)
-        (residual, rest), push = jax.linearize(partial(march.interval, m), x, arriving, slow)
+        (residual, gradients), push = jax.linearize(partial(march.interval, m), x, arriving, slow)
 
-        # columns: the unknowns of the interval, then the slow increments with the answers of the intervals before. One program for both:
-        # the tangents of the action are most of what there is to compile
+        # Columns: the unknowns of the interval, then the slow increments with the answers of the intervals before. One vmap for both
+        # kinds of columns: the tangents of the action are most of the program, and two calls would compile them twice.
         by_unknowns = jnp.eye(x.size, x.size + march.num_seen)
         by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, 0))), (answers, unit))
         by_both, on_by_both = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, *by_slow)
-        (by_x, rows), (hands_on, rests) = (jnp.split(a, [x.size], axis=1) for a in (by_both, on_by_both))
+        (by_x, by_z), (hands_on, hands_on_by_z) = (jnp.split(a, [x.size], axis=1) for a in (by_both, on_by_both))
         inverse = march.inverse(by_x, march.num_fast)
-        response = -matmul(inverse, rows)
-        answers = Handed(answers.position + march.last_increment(response), rests + matmul(hands_on, response))
+        # dx_m/dz = -(dR_m/dx_m)^-1 dR_m/dz, with the dependence of the arriving quantities on z inside dR_m/dz
+        response = -matmul(inverse, by_z)
+        answers = Handed(answers.position + march.last_increment(response), hands_on_by_z + matmul(hands_on, response))
 
-        d, on = march.corrected(inverse, hands_on, x, residual, arriving, rest)
+        # d_m = -(dR_m/dx_m)^-1 R_m
+        d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
         carry = on, answers, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))
         return carry, (x + d, inverse, hands_on, response)
 
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
     carry = start, none, last, Worst.none()
-    (end, answers, _, worst), kept = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
-    x, inverse, hands_on, response = kept
+    (end, answers, _, worst), stacked = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
+    x, inverse, hands_on, response = stacked
     matrices = Matrices(inverse, hands_on, response, march.slow_inverse(z, end, answers))
     return matrices, march.passed(matrices, z, x, worst, end)
 
 
 def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
-    """A pass with the matrices of an earlier one, of this step or of one before. Arguments as of `exact_pass`."""
+    """A pass with kept matrices, of an earlier pass of this step or of a step before. Arguments as of `exact_pass`."""
     slow = march.seen(z)
 
-    def interval(carry, given):
+    def interval(carry, unknowns_and_matrices):
         arriving, last, worst = carry
-        m, x, inverse, hands_on = given
+        m, x, inverse, hands_on = unknowns_and_matrices
         x = jnp.where(from_last, last, x)
-        residual, rest = march.interval(m, x, arriving, slow)
-        d, on = march.corrected(inverse, hands_on, x, residual, arriving, rest)
+        residual, gradients = march.interval(m, x, arriving, slow)
+        d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
         return (on, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))), x + d
 
-    given = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
-    (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), given)
+    intervals = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
+    (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), intervals)
     return march.passed(matrices, z, x, worst, end)
 
 
 class Factors(NamedTuple):
-    """The Newton matrix of a macro step, with the intervals eliminated, one after the other.
+    """The Newton matrix ``dR/d(z, x)`` of a macro step after block elimination of the intervals, in order.
 
-    intervals: their derivatives, with the intervals as first axis.
-    response, slow: as of `Matrices`.
+    intervals: derivatives of every interval, with the intervals as first axis.
+    response, slow: as in `Matrices`.
     """
 
     intervals: IntervalMatrices
@@ -330,16 +351,16 @@ class Factors(NamedTuple):
 
 
 def factor(march: MarchEquations, z, x) -> Factors:
-    """The matrix ``dR/d(z, x)`` at the solution, factored. A macro step is solved with it once, for the derivative of the solution."""
+    """The matrix ``dR/d(z, x)`` at the solution, factored, for the derivative of the solution."""
     slow, unit = march.seen(z), jnp.eye(march.num_seen)
 
-    def interval(carry, given):
+    def interval(carry, unknowns):
         arriving, answers = carry
-        m, x = given
-        rest = march.interval(m, x, arriving, slow)[1]
+        m, x = unknowns
+        gradients = march.interval(m, x, arriving, slow)[1]
         matrices = march.interval_matrices(m, x, arriving, slow)
         response, answers = march.answer(matrices, jnp.zeros((x.size, march.num_seen)), answers, unit)
-        return (Handed(arriving.position + march.last_increment(x), rest), answers), (matrices, response)
+        return (Handed(arriving.position + march.last_increment(x), gradients), answers), (matrices, response)
 
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
@@ -348,16 +369,19 @@ def factor(march: MarchEquations, z, x) -> Factors:
 
 
 def solve(march: MarchEquations, factors: Factors, rows_z, rows_x):
-    """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and has a transpose."""
+    """(dz, dx) with ``dR/d(z, x) (dz, dx) = -(rows_z, rows_x)``; linear in the rows, and JAX can transpose it.
 
-    def interval(arriving, given):
-        matrices, rows = given
+    Forward elimination with z fixed, then ``S dz = -(rows_z + change of R_s)``, then back substitution ``dx + (dx/dz) dz``.
+    """
+
+    def interval(arriving, matrices_and_rows):
+        matrices, rows = matrices_and_rows
         dx, arriving = march.answer(matrices, rows[:, None], arriving)
         return arriving, dx[:, 0]
 
     none = Handed(*(jnp.zeros((a.size, 1)) for a in march.start()))
     end, dx = jax.lax.scan(interval, none, (factors.intervals, rows_x))
-    # the slow equations are linear in what arrives at them
+    # The slow equations are linear in the arriving quantities: their derivative may be taken at any point.
     along = Handed(*(a[:, 0] for a in end))
     zero = jnp.zeros_like(rows_z)
     change = jax.jvp(lambda a: march.slow_equations(zero, a)[0], (march.start(),), (along,))[1]

@@ -28,22 +28,22 @@ from vmri_jax.steppers.solved import Solution, Solver, ended, largest_constraint
 from vmri_jax.steppers.solvers import Newton
 
 PLAIN_PASSES = 30
-"""Most passes of an attempt at the whole step, before parts of it are tried. Newton's method needs at most 15 from a good guess, and half of
-the passes are exact ones. With more, runs that fail take longer; with fewer, parts are tried where they are not needed."""
+"""Most passes of an attempt at the whole step, before parts of the step are tried. Newton's method needs at most 15 exact passes from a good
+guess, and about half of the passes are exact. A larger number makes failing runs slower; a smaller one tries parts without need."""
 INVERSES: dict[str, Callable] = {
     "arrowhead": inverse_with_multipliers,
     "null_space": null_space.inverse_without_multipliers,
 }
-"""How the matrices of micro intervals and of the slow equations are inverted."""
+"""Functions that invert the matrices of micro intervals and of the slow equations, by the name of the linear solver."""
 
 
 class MarchMemory(NamedTuple):
-    """What a macro step hands to the next one.
+    """Memory that a macro step hands to the next one.
 
-    slow: the past of the slow unknowns, step by step.
+    slow: predictor of the slow unknowns z.
     fast: unknowns of the last micro interval.
     matrices: of the last exact pass.
-    rate: by which passes with them made the corrections smaller, the last time; infinite where there are no matrices.
+    rate: ratio of the last two corrections with these matrices; infinite if there are none.
     """
 
     slow: PolynomialPredictor
@@ -53,16 +53,17 @@ class MarchMemory(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Where the iteration is.
+    """State of the iteration.
 
     passed: the last pass.
     matrices: of the last exact pass.
-    size: its largest correction, of slow and fast increments.
-    rate: expected ratio of the next correction to this one with the matrices that are kept.
-    curvature: kappa in ``|d_next| = kappa |d|^2`` for passes after an exact one with the correction d.
-    exact_size: size of the last exact pass.
-    still_moves: largest correction of fast increments that is expected of another pass.
-    passes, result: how many passes there were, and `Result`.
+    size: largest correction ``|d|`` of slow and fast increments in the last pass.
+    rate: expected ratio ``|d_next| / |d|`` with the kept matrices.
+    curvature: kappa, with ``|d_next| = kappa |d_exact| |d|`` for passes that keep the matrices of an exact pass: the simplified Newton
+        iteration converges linearly, at a rate that is proportional to the correction d_exact of the exact pass.
+    exact_size: ``|d_exact|``.
+    still_moves: correction of the fast increments that the next pass is expected to make.
+    passes, result: number of passes, and `Result` or RUNNING.
     """
 
     passed: Passed
@@ -78,10 +79,10 @@ class Progress(NamedTuple):
 
 @dataclass(frozen=True)
 class Marched(Solver):
-    """Passes until one more would change neither the slow increments nor those of the micro intervals.
+    """Passes until the next one would change neither the slow nor the fast increments.
 
     linear_solver: "arrowhead", elimination with multipliers, or "null_space", without them.
-    sizes: (n_s, n_gs, n_f, n_g) and the degree, which are told where multipliers are eliminated.
+    sizes: (n_s, n_gs, n_f, n_g) and the degree r, for `describe` of the null space method.
     """
 
     newton: Newton
@@ -90,12 +91,12 @@ class Marched(Solver):
 
     def remembers(self, equations: StepEquations, guess: Unknowns) -> MarchMemory:
         march = self._march(equations)
-        z, x = march.rows(guess)
+        z, x = march.flat(guess)
         return MarchMemory(PolynomialPredictor.constant(z), x[0], march.no_matrices(), jnp.asarray(jnp.inf))
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: MarchMemory) -> tuple[Solution, MarchMemory]:
         march = self._march(equations)
-        z, x = march.rows(guess)
+        z, x = march.flat(guess)
         zero, infinite = jnp.zeros(()), jnp.asarray(jnp.inf)
         start = Progress(
             passed=Passed(z, x, z, x, march.start(), equations.p_s, Worst.none()),
@@ -126,64 +127,68 @@ class Marched(Solver):
     def _iterate(
         self, march: MarchEquations, guess: Unknowns, start: Progress, memory: MarchMemory, limit, is_first: Any = True
     ) -> Progress:
-        """Passes, at most `limit`: of the first attempt from what the steps before lead to, of others from the guess."""
+        """At most `limit` passes. The first attempt starts from the predicted slow unknowns, later attempts from the guess."""
         accepted, fixed = Accepted.of(march.equations, self.newton), self.newton.fixed_iterations
-        z, x = march.rows(guess)
+        z, x = march.flat(guess)
         z = jnp.where(is_first, memory.slow.next(march.num_slow), z)
-        at = start._replace(
+        progress = start._replace(
             passed=start.passed._replace(z=z, x=x, dz=jnp.zeros_like(z), dx=jnp.zeros_like(x)),
             rate=jnp.where(is_first, memory.rate, jnp.inf),
         )
 
         def judged(now: Passed, before: Progress) -> Progress:
             slow, fast = max_abs(now.dz[: march.num_slow]), now.worst.moved
+            # dz is the next slow correction itself; the next fast one is expected from the last two, or without a pair from the last one
             still_moves = jnp.where(before.passes > 0, expected(fast, before.passed.worst.moved), fast)
             motions = max_abs(now.z[: march.num_slow]), max_abs(now.x[:, : march.num_fast])
             passes, size = before.passes + 1, jnp.maximum(slow, fast)
-            over = accepted.over((slow, still_moves), motions, passes)
+            ratio = accepted.ratio((slow, still_moves), motions, passes)
             at_floor = accepted.at_floor(size, before.size)
-            result = jnp.where(over <= 1, Result.CONVERGED, jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, RUNNING))
+            result = jnp.where(ratio <= 1, Result.CONVERGED, jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, RUNNING))
             if limit is not None:
                 failed = jnp.where(size > before.size, Result.DIVERGED, Result.STAGNATED)
                 result = jnp.where((passes >= limit) & (result == RUNNING), failed, result)
-            # the prediction was poor: the next attempt starts from straight motion
+            # a correction that grows in the first attempt: the prediction was poor, and the next attempt starts from straight motion
             lost = is_first & (size > before.size)
             result = jnp.where(lost & (result == RUNNING), Result.DIVERGED, result)
             broken = jnp.where(now.worst.is_singular, Result.SINGULAR, Result.NON_FINITE)
-            result = jnp.where(jnp.isfinite(over), result, broken)
+            result = jnp.where(jnp.isfinite(ratio), result, broken)
             return before._replace(passed=now, size=size, still_moves=still_moves, passes=passes, result=result)
 
-        def unknowns(at: Progress) -> tuple:
-            passed = at.passed
-            return passed.z + passed.dz, passed.x + passed.dx, memory.fast, is_first & (at.passes == 0)
+        def unknowns(last: Progress) -> tuple:
+            passed = last.passed
+            # every interval of the very first pass starts from the corrected unknowns of the interval before
+            return passed.z + passed.dz, passed.x + passed.dx, memory.fast, is_first & (last.passes == 0)
 
-        def exact(at: Progress) -> Progress:
-            matrices, now = exact_pass(march, *unknowns(at))
-            after = judged(now, at)
-            at_floor = (after.result == RUNNING) & accepted.at_floor(after.size, at.size, FLOOR_OF_NEWTON)
+        def exact(last: Progress) -> Progress:
+            matrices, now = exact_pass(march, *unknowns(last))
+            after = judged(now, last)
+            at_floor = (after.result == RUNNING) & accepted.at_floor(after.size, last.size, FLOOR_OF_NEWTON)
             result = jnp.where(at_floor, Result.CONVERGED_AT_ROUNDOFF, after.result)
-            rate = after.curvature * after.size
+            rate = after.curvature * after.size  # kappa |d_exact|
             return after._replace(matrices=matrices, rate=rate, exact_size=after.size, result=result)
 
-        def further(at: Progress) -> Progress:
-            now = judged(further_pass(march, at.matrices, *unknowns(at)), at)
-            rate = jnp.where(at.passes > 0, now.size / at.size, at.rate)
-            return now._replace(rate=rate, curvature=jnp.maximum(at.curvature, rate / at.exact_size))
+        def further(last: Progress) -> Progress:
+            now = judged(further_pass(march, last.matrices, *unknowns(last)), last)
+            rate = jnp.where(last.passes > 0, now.size / last.size, last.rate)
+            return now._replace(rate=rate, curvature=jnp.maximum(last.curvature, rate / last.exact_size))
 
-        def passes(at: Progress) -> Progress:
-            """Passes with the matrices that are kept, and exact ones where they are not enough.
+        def passes(last: Progress) -> Progress:
+            """Passes with kept matrices while these contract fast enough, then exact passes.
 
-            Both are loops: in a batch, a branch of `jax.lax.cond` would be computed in every turn, whether or not a lane takes it.
+            Both are loops: in a batch `jax.lax.cond` would compute both branches in every turn, for all lanes.
             """
-            at = jax.lax.while_loop(lambda at: (at.result == RUNNING) & (at.rate <= CONTRACTION), further, at)
-            return jax.lax.while_loop(lambda at: (at.result == RUNNING) & ~(at.rate <= CONTRACTION), exact, at)
+            last = jax.lax.while_loop(lambda p: (p.result == RUNNING) & (p.rate <= CONTRACTION), further, last)
+            return jax.lax.while_loop(lambda p: (p.result == RUNNING) & ~(p.rate <= CONTRACTION), exact, last)
 
-        return self.newton.iterate(passes if fixed is None else exact, at)
+        return self.newton.iterate(passes if fixed is None else exact, progress)
 
     def _solution(self, march: MarchEquations, done: Progress, result, passes) -> Solution:
         equations, passed = march.equations, done.passed
         x = march.by_name(passed.z, passed.x)
-        end = passed.end.position, passed.p_s, passed.end.rest[: march.n_f] / equations.micro_dt
+        end = passed.end.position, passed.p_s, passed.end.gradients[: march.n_f] / equations.micro_dt
+        # The residual after the last correction is not evaluated. Estimate: it has shrunk like the fast corrections,
+        # |R| = |R before the correction| min(1, expected correction / last correction).
         shrinks = done.still_moves / jnp.maximum(passed.worst.moved, jnp.finfo(float).tiny)
         rows, g = passed.worst.rows * jnp.minimum(shrinks, 1.0), largest_constraint(equations, x)
         method = Method[self.linear_solver.upper()]
@@ -200,5 +205,5 @@ class Marched(Solver):
             return [head]
         *counts, r = self.sizes
         parts = zip(("slow variables", "each micro interval"), counts[::2], counts[1::2], strict=True)
-        few = [f"  unknowns of {what}: {r * (n - g)}, with multipliers {r * (n + g)}" for what, n, g in parts if g]
-        return [head, *few]
+        unknowns = [f"  unknowns of {part}: {r * (n - g)}, with multipliers {r * (n + g)}" for part, n, g in parts if g]
+        return [head, *unknowns]

@@ -1,19 +1,19 @@
-"""Nested march: the slow path outside, the micro intervals in order inside, each solving only its own small system.
+"""Nested iteration: the slow path outside, the micro intervals in order inside, each with a small system of its own.
 
-A pass takes the slow path as known. It marches over the micro intervals; each corrects its fast increments and
-multipliers once, by a Newton step on its exact residual, and adds its impulse to the slow equations. Then the slow
-increments and slow multipliers are corrected from what is left of their equations. The matrices are cheap ones:
+A pass holds the slow path fixed. It visits the micro intervals in order; each corrects its fast increments and multipliers once, by a
+Newton step on its exact residual, and adds its impulse to the slow equations. Then the pass corrects the slow increments and slow
+multipliers by the residual of the slow equations. All matrices are cheap approximations:
 
-* micro interval: ``[K, -G^T; G, 0]``, with ``K = -(M + h^2 W'' / 4)`` for the implicit midpoint rule, from the start of the macro step, or of
-  one before it while that costs no passes. Where the fast equations are explicit K is ``-M``, and only the multipliers are solved for.
-  ``G K^-1 G^T`` is that of the first pass;
-* slow equations: masses, with those that constraints tie to the slow ones, and the slow constraint (`SlowEquations`). Where nothing is
-  constrained, the derivative of the slow forces is added where updates by the masses alone would cost a pass.
+* micro interval: ``[K, -G_0^T; G_1, 0]`` with K of `vmri_jax.steppers.interval`, e.g. ``-(M_f + h^2 W'' / 4)`` for the implicit midpoint
+  rule, at the start of the macro step, or of an earlier one while that costs no passes. Where the fast equations are explicit,
+  ``K = -M_f`` and only the multipliers are unknown. ``G_1 K^-1 G_0^T`` is computed in the first pass and kept;
+* slow equations: the slow masses, the fast masses that constraints tie to them, and the slow constraint (`SlowEquations`). Without
+  constraints, the derivative of the slow forces is added where updates by the masses alone would cost a pass.
 
-The slow unknowns start from the polynomial through those of the steps before (`PolynomialPredictor`); the fast increments from
-straight motion, and the multipliers from those of the interval before. The residual is exact, so all of this decides only how many
-passes there are: two where the slow motion is smooth. A pass costs one gradient of each term at each of its nodes; nothing is stored but
-the path and those small matrices.
+The slow unknowns start from a polynomial through the last steps (`PolynomialPredictor`), the fast increments from straight motion, the
+multipliers from the interval before. The residual is exact, so that these approximations change only the number of passes: mostly two
+or three where the slow motion is smooth. A pass costs one gradient of each term at each of its nodes; memory holds the path and the
+small matrices.
 """
 
 from dataclasses import dataclass
@@ -36,22 +36,22 @@ from vmri_jax.steppers.solved import Solution, Solver, largest_constraint, statu
 from vmri_jax.steppers.solvers import Newton
 
 EXTRA_PASSES = 1
-"""A step that needs more passes than this above the fewest with its matrix K renews K. With more, steps with an old K take more passes; with
-none, K is computed for every fluctuation of the passes."""
-UNKNOWN = 10**6
-"""Fewest passes with a matrix that no step has used: more than any step takes."""
+"""Passes above the least seen with a matrix K, from which the solver renews K. A larger number lets steps with an old K take more passes; with
+zero, every fluctuation of the number of passes renews K."""
+PASSES_OF_UNUSED_MATRIX = 10**6
+"""Initial value of the least number of passes with a new matrix: larger than the number of any step."""
 
 
 class NestedState(NamedTuple):
-    """What a macro step hands to the next one.
+    """Memory that a macro step hands to the next one.
 
     matrix: K of the micro intervals.
-    slow: slow increments and slow multipliers of the last steps.
+    slow: predictor of slow increments and slow multipliers.
     multiplier: multipliers lambda of the last micro interval.
-    slow_model_error: ``|next update| / |update|`` of the slow unknowns by the masses alone; once the derivative of the slow forces has been
-        taken, ``|update with it - update by the masses| / |update with it|``.
-    fewest_passes: of a step with this matrix, UNKNOWN before one.
-    last_passes: of the last step.
+    slow_model_error: relative error of the slow update d by the masses alone. It is measured as ``|next update| / |d|``, or, in passes that
+        solve with the derivative of the slow forces for the update d_F, as ``|d_F - d| / |d_F|``.
+    fewest_passes: least number of passes of a step with this matrix.
+    last_passes: number of passes of the last step.
     """
 
     matrix: Matrix
@@ -63,12 +63,12 @@ class NestedState(NamedTuple):
 
 
 class Pass(NamedTuple):
-    """Unknowns of a pass, what it left, and how the iteration stands.
+    """Unknowns after a pass, the totals of its micro intervals, and the state of the iteration.
 
-    d: the next update of the slow unknowns, with which their equations, linearised, are zero.
+    d: the next update of the slow unknowns, by their linearised equations.
     inertia: masses that constraints tie to the slow variables, from the first pass.
     impulse: on the slow variables over the step, times h.
-    rows: largest row of the momentum equations, times h.
+    rows: estimated residual of the momentum equations, times h: ``max(|R_s|, max M_f |expected fast correction|)``.
     """
 
     slow: Float[Array, "r n_s"]
@@ -86,11 +86,10 @@ class Pass(NamedTuple):
 
 @dataclass(frozen=True)
 class Nested(Solver):
-    """Passes until one more would change neither the slow increments nor those of the micro intervals.
+    """Passes until the next one would change neither the slow nor the fast increments (`Accepted`).
 
-    The next change of the slow increments is known from the residual, that of the fast ones from how their corrections shrink, as in
-    stiff solvers (Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8). Accepted are changes of
-    ``newton.tolerance`` relative to the motion over the macro step and over a micro interval, and round-off of the positions.
+    The next slow correction follows from the residual of the slow equations, the next fast one is extrapolated from the last two, as in
+    stiff solvers (Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8).
     """
 
     newton: Newton
@@ -101,13 +100,16 @@ class Nested(Solver):
         matrix = self.interval.matrix if self.interval.is_constant else self.interval.no_matrix
         increments = control_nodes(r)[1:, None] * (equations.macro_dt * velocity[0])
         slow = PolynomialPredictor.constant(jnp.concatenate([increments.reshape(-1), jnp.zeros(r * n_gs)]))
-        fewest, last = jnp.asarray(0), jnp.asarray(2 * EXTRA_PASSES)  # with these the first step computes the matrix
+        fewest, last = (
+            jnp.asarray(0),
+            jnp.asarray(2 * EXTRA_PASSES),
+        )  # with these numbers the first step renews the matrix
         return NestedState(matrix(equations), slow, jnp.zeros((r, n_g)), jnp.ones(()), fewest, last)
 
     def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
-        """With a new matrix K, unless it is constant.
+        """The memory with a new matrix K, unless K is constant.
 
-        A large one is kept for as long as it costs no passes; a number of passes that is fixed needs a new one.
+        A large K is kept as long as it costs no passes. With a fixed number of passes K is always new: old matrices converge slower.
         """
         if self.interval.is_constant:
             return memory
@@ -115,7 +117,9 @@ class Nested(Solver):
             return memory._replace(matrix=self.interval.matrix(equations))
         stale = memory.last_passes > memory.fewest_passes + EXTRA_PASSES
         matrix = jax.lax.cond(stale, lambda: self.interval.matrix(equations), lambda: memory.matrix)
-        return memory._replace(matrix=matrix, fewest_passes=jnp.where(stale, UNKNOWN, memory.fewest_passes))
+        return memory._replace(
+            matrix=matrix, fewest_passes=jnp.where(stale, PASSES_OF_UNUSED_MATRIX, memory.fewest_passes)
+        )
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory: NestedState) -> tuple[Solution, NestedState]:
         scheme, newton = equations.scheme, self.newton
@@ -166,22 +170,25 @@ class _Passes:
         self.r, self.n_s = equations.scheme.degree, equations.q_s.size
 
     def first(self) -> Pass:
-        """From the predicted unknowns."""
+        """The first pass, from the predicted slow unknowns."""
         z = self.memory.slow.next(self.r * self.n_s)
         fast, totals = self.sweep.first_pass(self._apart(z)[0], self.memory.multiplier)
         inertia = self.slow_equations.constraint_inertia(jax.tree.map(lambda a: a[0], fast.schur_inverse))
         return self._judged(z, fast, totals, inertia, self.memory.slow_model_error, totals.moved, 1)
 
     def next(self, last: Pass) -> Pass:
-        """With slow unknowns corrected by what the last pass left."""
+        """The next pass, with corrected slow unknowns."""
         if self.equations.system.is_constrained or not (self.n_s and LINEARISES_FORCES):
             return self._moved_by(last.d, last)
-        # After the update d by the masses alone the next one is slow_model_error |d|. It must be accepted, or d is solved for with the
-        # derivative of the slow forces. After the first pass it is the one after next: the fast unknowns take three passes anyway.
+        # With eps = slow_model_error, the update d by the masses alone leaves a next update eps |d|. Where that would not be accepted, this
+        # pass solves for d with the derivative of the slow forces. After the first pass the test is eps^2 |d|, the update after the
+        # next one: the fast unknowns mostly need a third pass, so that a second slow update costs nothing.
         error = last.slow_model_error
         still_missing = jnp.where(last.passes == 1, error**2, error)
-        is_hard = still_missing * self.accepted.over((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
-        wanted = jnp.where(is_hard, last.d, 0.0)  # lanes of a batch that are not hard take no part
+        is_hard = (
+            still_missing * self.accepted.ratio((max_abs(last.d), 0.0), (max_abs(last.slow), 0.0), last.passes) > 1
+        )
+        wanted = jnp.where(is_hard, last.d, 0.0)  # in lanes of a batch without a hard step the loop ends at once
         x = Unknowns(last.slow, last.slow_multiplier, last.fast.increments, last.fast.multiplier)
         d = jax.lax.cond(is_hard, lambda: self.slow_equations.with_forces(wanted, x), lambda: last.d)
         now = self._moved_by(d, last)
@@ -197,25 +204,35 @@ class _Passes:
     def _judged(
         self, z, fast: FastUnknowns, totals: SweepTotals, inertia: ConstraintInertia | None, error, still_moves, passes
     ) -> Pass:
-        """A pass with slow unknowns z, the next update of these, and whether what is still to come is accepted."""
+        """A pass with slow unknowns z, with their next update d, and with the `Result` of the iteration so far.
+
+        Args:
+            z: slow increments and slow multipliers.
+            fast, totals: of the micro intervals.
+            inertia: of the tied masses.
+            error: slow_model_error.
+            still_moves: expected next correction of the fast increments.
+            passes: number of passes so far.
+        """
         equations, inverse_fast = self.equations, self.mass.fast_mass.inverse().times
         slow, slow_multiplier = self._apart(z)
         x = Unknowns(slow, slow_multiplier, fast.increments, fast.multiplier)
         d, rows, impulse = self.slow_equations.update(x, totals.d_start, totals.d_increments, inertia)
         arrives, leaves = inverse_fast(equations.micro_dt * equations.p_f), inverse_fast(totals.p_f)
+        # size of the fast motion: largest |h M_f^-1 p_f| at both ends of the macro step
         motion = jnp.maximum(max_abs(arrives), max_abs(leaves))
         changes = max_abs(d[: self.r * self.n_s]), still_moves
-        result = self.newton.status(self.accepted.over(changes, (max_abs(slow), motion), passes), passes)
+        result = self.newton.status(self.accepted.ratio(changes, (max_abs(slow), motion), passes), passes)
         rows = jnp.maximum(max_abs(rows), max_abs(self.mass.fast) * still_moves)
         passes = jnp.asarray(passes)
         return Pass(slow, slow_multiplier, fast, totals, d, inertia, error, impulse, rows, passes, result)
 
     def _apart(self, z):
-        """Slow increments (r, n_s) and slow multipliers (r, n_gs)."""
+        """Slow increments (r, n_s) and slow multipliers (r, n_gs) of z."""
         size = self.r * self.n_s
         return z[:size].reshape(self.r, self.n_s), z[size:].reshape(self.r, -1)
 
 
-def _joined(at: Pass):
-    """Slow increments and slow multipliers in a row."""
-    return jnp.concatenate([at.slow.reshape(-1), at.slow_multiplier.reshape(-1)])
+def _joined(last: Pass):
+    """The slow unknowns z of a pass: slow increments, then slow multipliers."""
+    return jnp.concatenate([last.slow.reshape(-1), last.slow_multiplier.reshape(-1)])

@@ -1,16 +1,16 @@
-"""The plan: how a macro step of a system under a scheme is taken, decided once, from structure alone.
+"""The plan: which steppers take a macro step of a system under a scheme, decided once, from structure alone.
 
-The cheapest stepper that the rules and the system allow is found from outside to inside:
+The plan chooses the cheapest stepper that the rules and the system allow, from outside to inside:
 
 * *composed*: a composition runs its stage over parts of the step;
-* *kicked*: potentials at the ends of the interval only shift momenta, before and after everything else;
-* *decoupled*: where, kicks aside, the slow equations do not see the fast unknowns, the slow variables make one step over the
-  macro interval and the fast ones num_micro steps over the micro intervals, each a problem of the same kind;
-* *free flight*: nothing but kinetic energy of constant masses is left;
-* *linear*: what is left is linear, in fast variables alone;
-* else equations are solved: for the multipliers of a drift (*Rattle*), for one interval of high degree (*collocation*), for the
-  micro intervals in order with cheap matrices (*nested*), or in the same order with exact ones (*march*), also where one of the
-  others fails (*fallback*). The dense matrix of all unknowns at once (*coupled*) is the reference of studies.
+* *kicked*: potentials at the ends of the interval only shift momenta, before and after the motion inside;
+* *decoupled*: where, apart from kicks, the slow equations do not depend on the fast unknowns, the slow variables make one step over
+  the macro interval and the fast variables num_micro steps over the micro intervals, each a problem of the same kind;
+* *free flight*: only kinetic energy of constant masses is left;
+* *linear*: only fast variables with linear equations are left;
+* else a solver: for the multipliers of a drift (*Rattle*), for one interval of high degree (*collocation*), for the micro intervals in
+  order with cheap matrices (*nested*) or with exact ones (*march*). The march is also the *fallback* of the other three. The dense
+  matrix of all unknowns at once (*coupled*) is a reference for studies.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,12 @@ from vmri_jax.steppers.subsystems import fast_part, frozen_slow, slow_part
 
 @dataclass(frozen=True)
 class _Choice:
-    """How implicit equations are solved, whether the first choice may give way to another one, and how often it is differentiated."""
+    """Settings of the solvers.
+
+    newton: as the user chose.
+    falls_back: whether the march with exact matrices solves the steps that the first choice does not solve.
+    reverse_only: whether steps are differentiated in reverse mode only, once.
+    """
 
     newton: Newton
     falls_back: bool
@@ -60,15 +65,15 @@ class _Choice:
 
 @dataclass(frozen=True)
 class Plan:
-    """A stepper with what it was planned for: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)``.
+    """A stepper with its system and scheme: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)``.
 
     ``print`` shows it in words, ``print(plan.describe())`` with the rules of the scheme.
 
     Attributes:
-        system, scheme, solver: as they were given.
+        system, scheme, solver: arguments of `plan`.
         stepper: the tree of steppers.
-        defers_projection: momenta are on the hidden constraints only after `project`, which is needed where they are looked at;
-            else every step ends with it.
+        defers_projection: if True, steps do not project the momenta onto the hidden constraints, and a run calls `project` where it saves
+            momenta; else every step ends with a projection.
     """
 
     system: System
@@ -78,7 +83,7 @@ class Plan:
     defers_projection: bool
 
     def init(self, state: State, macro_dt):
-        """What the first step starts from besides the state."""
+        """The memory of the first step."""
         return self.stepper.init(state, macro_dt)
 
     def step(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
@@ -86,16 +91,16 @@ class Plan:
         return self.stepper.step(state, memory, macro_dt)
 
     def project(self, state: State, memory) -> tuple[State, Any]:
-        """Momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
+        """Project the momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
         return self.stepper.project(state, memory)
 
     @property
     def has_fallback(self) -> bool:
-        """Whether some solver inside may give way to another one."""
+        """Whether some solver inside has a fallback."""
         return any(isinstance(solver, Fallback) for solver in _solvers(self.stepper))
 
     def describe(self) -> str:
-        """What the scheme does with the system: the rules of what it has, order, symmetry, and how a step is taken."""
+        """The scheme applied to the system in words: rules of the terms that the system has, order, symmetry, and the steppers."""
         system = self.system
         has = {"T": system.kinetic, "V": system.slow_potential, "W": system.fast_potential, "F": system.force}
         has |= {"g": system.constraint, "g_s": system.slow_constraint}
@@ -121,17 +126,18 @@ def plan(
     fallback: bool = True,
     reverse_only: bool = False,
 ) -> Plan:
-    """How macro steps of a system under a scheme are taken; ``print`` shows it in words.
+    """The plan of macro steps of a system under a scheme; ``print`` shows it in words.
 
     Args:
-        system, scheme: what moves, a `Problem` or a scene, or a `System` with a state, and how.
+        system: a `Problem` or a scene, or a `System` with a state.
+        scheme: a `Scheme` or a `Composition`.
         state: any state of the system; only the shapes of its arrays matter.
-        solver: how implicit equations are solved.
-        fallback: whether a step that the first choice does not solve is solved by the march with exact matrices, in the same program.
+        solver: one of `vmri_jax.solvers`, by default `Auto`.
+        fallback: whether the march with exact matrices solves the steps that the first choice does not solve, in the same program.
         reverse_only: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:
-        ValueError: `Nested` is asked for where it is not possible; a scheme that the system does not allow.
+        ValueError: `solvers.Nested` for a system or scheme that does not allow it; a scheme that the system does not allow.
     """
     system, state = start_of("plan", system, state)
     newton = solver or solvers.Auto()
@@ -151,17 +157,17 @@ def plan(
 
 
 def _defers_projection(stepper: Stepper) -> bool:
-    """Whether momenta have to be projected only where they are looked at.
+    """Whether steps may leave out the projection of the momenta.
 
-    A projection is a shift by ``G^T mu``, which the multipliers of the next step take back where nothing but drifts move along
-    constraints.
+    A drift (RATTLE) depends on the momentum through ``h p - G_0^T mu`` alone. A projection ``p - G_0^T nu`` at the start changes mu, and
+    not the motion. So only momenta that are saved need it.
     """
     solvers = [_first(solver) for solver in _solvers(stepper, constrained=True)]
     return DEFERS_PROJECTION and bool(solvers) and all(isinstance(solver, Rattle) for solver in solvers)
 
 
 def _solvers(stepper: Stepper, constrained: bool = False) -> list[Solver]:
-    """The solvers of a tree of steppers, all or those of constrained systems."""
+    """The solvers of a tree of steppers, all of them or only those of constrained systems."""
     if isinstance(stepper, Solved):
         return [stepper.solver] if stepper.system.is_constrained or not constrained else []
     inner = [getattr(stepper, name) for name in ("stage", "inner", "slow", "fast") if hasattr(stepper, name)]
@@ -173,11 +179,12 @@ def _first(solver: Solver) -> Solver:
 
 
 def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Kicked:
-    """Kicks, and what happens between them."""
+    """Kicks, and the stepper between them."""
     kicks = lagrangian(system, scheme).kicks
     average = _average(system, scheme, choice)
     if is_decoupled(system, scheme, q_s, q_f):
         between = _decoupled(system, scheme, choice, q_s, q_f)
+        # kicks of other terms belong to the steps of the slow or of the fast part
         kicks = tuple(term for term in kicks if term.grid == "macro" and not term.inside.groups)
         return Kicked(kicks, between, average)
     return Kicked(kicks, _between_kicks(system, scheme, choice, q_s, q_f), average)
@@ -215,21 +222,21 @@ def _first_choice(
     if DRIFTS and _is_drift(system, scheme):
         return Rattle(newton, rows)
     single = COLLOCATES and scheme.num_micro == 1 and scheme.degree > 1
-    small = (q_f.size or q_s.size) <= SMALL  # a large matrix is better kept for many steps, which the march does
+    small = (q_f.size or q_s.size) <= SMALL  # Nested keeps a larger matrix over many steps, Collocation does not
     if single and small and system.force is None and not interval.is_diagonal:
         return Collocation(newton)
     return Nested(newton, interval)
 
 
 def _can_be_nested(system: System, scheme: Scheme) -> bool:
-    """Whether every term lives on single micro intervals or is a kick at nodes where they meet, with constant masses."""
+    """Whether masses are constant, and every term has its nodes inside single micro intervals or at nodes where they meet."""
     local = all(placed.is_local or placed.only_ends for *_, placed in placed_potentials(system, scheme))
     force = system.force is None or scheme.force.grid == "micro"
     return system.has_constant_mass and local and force
 
 
 def _is_drift(system: System, scheme: Scheme) -> bool:
-    """Whether on a single micro interval, kicks aside, only kinetic energy of constant masses and constraints are left."""
+    """Whether, apart from kicks, a single micro interval has kinetic energy of constant masses and constraints alone."""
     terms = lagrangian(system, scheme).terms
     return (
         scheme.num_micro == scheme.degree == 1
@@ -240,27 +247,28 @@ def _is_drift(system: System, scheme: Scheme) -> bool:
 
 
 def _is_linear(system: System, scheme: Scheme, interval: Interval, q_s) -> bool:
-    """Whether there are only fast equations on one interval, linear ones with the matrix K."""
+    """Whether only the fast equations of one interval are left, and they are linear with the matrix K."""
     alone = not system.is_constrained and system.force is None and not q_s.shape[0] and scheme.num_micro == 1
     complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
     return alone and interval.is_constant and (complete or not interval.is_diagonal)
 
 
 def is_decoupled(system: System, scheme: Scheme, q_s, q_f) -> bool:
-    """Whether, kicks aside, the slow equations do not see the fast unknowns."""
+    """Whether, apart from kicks, the slow equations do not depend on the fast unknowns."""
     if scheme.degree > 1 or system.force is not None or not system.has_constant_mass:
         return False
     if scheme.num_micro == 1 and not q_s.shape[0]:
-        return False  # a part already
+        return False  # this is already a part of a decoupled system
     inside = _Inside.of(system, scheme, q_s, q_f)
     return inside is not None and not depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
 
 
 class _Inside(NamedTuple):
-    """The potentials with other nodes than the ends of the macro interval, where each sees the slow or the fast variables alone.
+    """The potentials with nodes inside the macro interval, if each depends on slow variables alone or on fast variables alone.
 
-    slow: on the macro grid.
-    fast: by the number of micro intervals that a copy of the rule spans, each a multiple of the one before; first those on every one.
+    slow: potentials of slow variables, on the macro grid.
+    fast: potentials of fast variables, by the number k of micro intervals that a copy of their rule spans; the keys k increase, start
+        with 1, and each is a multiple of the one before.
     """
 
     slow: list[PlacedPotential]
@@ -268,7 +276,8 @@ class _Inside(NamedTuple):
 
     @classmethod
     def of(cls, system: System, scheme: Scheme, q_s, q_f) -> "_Inside | None":
-        """None where a potential sees both, or is where such a part has no steps: the slow and the fast variables must be solved for together."""
+        """None if the variables must be solved for together: a potential depends on slow and fast variables, or has nodes between the steps
+        of its part (a slow potential on the micro grid, copies of rules whose lengths do not divide each other)."""
         slow, fast = [], {1: []}
         for potential in placed_potentials(system, scheme):
             placed = potential.placed
@@ -314,14 +323,14 @@ def _named(potentials: list[PlacedPotential], name: str) -> tuple[Callable | Non
 
 
 def with_rules_for(system: System, scheme: Scheme | Composition) -> Scheme | Composition:
-    """A scheme with the rules of the further potentials of a system, also where it gives them by their names alone."""
+    """The scheme with an explicit rule for each of `System.potentials`, also for those whose name implies the rule."""
     if isinstance(scheme, Composition):
         return replace(scheme, scheme=with_rules_for(system, scheme.scheme))
     return replace(scheme, potentials={label(name): scheme.rule_of(name) for name, _ in system.potentials})
 
 
 def _average(system: System, scheme: Scheme, choice: _Choice) -> Callable | None:
-    """The filter of a mollified slow potential, if that is what the scheme has."""
+    """The filter of a mollified slow potential, None if the slow potential is not mollified."""
     if not scheme.slow.mollified:
         return None
     if scheme.fast.every > 1 or any(not scheme.rule_of(name).only_kicks for name, _ in system.potentials):

@@ -1,8 +1,12 @@
-"""RATTLE: a step on which nothing is left but kinetic energy of constant masses and constraints.
+"""RATTLE: a step with kinetic energy of constant masses and constraints alone.
 
-The increments ``x = M^-1 (h p - G_0^T mu)`` follow from the multipliers, so that ``g(q + x) = 0`` is solved for these alone.
-The matrix is ``G_1 M^-1 G_0^T`` at the position that the multipliers of the steps before lead to. With kicks before and
-after this is RATTLE (Andersen 1983).
+The increments are explicit functions of the multipliers mu, which are the only unknowns:
+
+    x = M^-1 (h p - G_0^T mu)        g(q + x) = 0        dmu = (G_1 M^-1 G_0^T)^-1 g(q + x)
+
+G_0 is the Jacobian at the start of the step, G_1 at the predicted end. The prediction extrapolates the multipliers of the last two
+steps, ``mu = s (2 lambda_n - lambda_(n-1))`` with the scale s of `multiplier_scales`. With kicks before and after the step this is
+RATTLE (Andersen 1983).
 """
 
 from dataclasses import dataclass
@@ -22,24 +26,24 @@ from vmri_jax.steppers.solved import Solution, Solver, status_of
 from vmri_jax.steppers.solvers import Newton
 
 LEAST_SCALE = 0.1
-"""If the forward and the backward step of a composition cancel to less than this part of h^2, their common multiplier is round-off: it is
-skipped as a prediction. With more, predictions are lost; with less, round-off is multiplied."""
+"""Smallest scale s of a multiplier, in units of h^2, that is used for predictions. If a forward and a backward step of a composition nearly cancel,
+their common multiplier is round-off, divided by a small s. A larger value loses predictions, a smaller one amplifies round-off."""
 
 
 class RattleState(NamedTuple):
-    """What a step hands to the next one.
+    """Memory that a step hands to the next one.
 
-    multiplier: of all constraints in the last two steps, the last one first.
-    before: length of the last step, 0 where the momenta have been projected since. Otherwise its half of the constraint force at
-        the node between the two steps is left to the next one.
+    multiplier: multipliers lambda of all constraints in the last two steps, the last step first.
+    last_dt: length of the last step, 0 after a projection of the momenta. Without a projection, the multipliers of the next step also
+        contain the half of the constraint force that the last step left out at the common node.
     """
 
     multiplier: Float[Array, "2 n_g+n_gs"]
-    before: Float[Array, ""]
+    last_dt: Float[Array, ""]
 
 
 class Correction(NamedTuple):
-    """Increments x of all variables, scaled multipliers mu, constraint values g there, and the corrections that g asks for."""
+    """Increments x of all variables, scaled multipliers mu, constraint values ``g(q + x)``, and the next corrections -dx and dmu."""
 
     x: Float[Array, "n_s+n_f"]
     mu: Float[Array, "n_g+n_gs"]
@@ -52,9 +56,7 @@ class Correction(NamedTuple):
 
 @dataclass(frozen=True)
 class Rattle(Solver):
-    """Corrects the multipliers until one more correction would change no increment.
-
-    Accepted are changes relative to the motion of the slow and of the fast variables, and round-off of the positions (`Accepted`).
+    """Corrects the multipliers until the next correction would change no increment (`Accepted`).
 
     sparsity: of ``G M^-1 G^T`` with all constraints.
     """
@@ -75,6 +77,7 @@ class Rattle(Solver):
         def constraints(t, q):
             return system.constraints(t, q[:n_s], q[n_s:])
 
+        # M^-1 forces
         def moves(forces):
             return jnp.concatenate([velocity_s(forces[..., :n_s]), velocity_f(forces[..., n_s:])], axis=-1)
 
@@ -82,32 +85,35 @@ class Rattle(Solver):
         pull = jax.vjp(partial(constraints, equations.t), q)[1]
         forces = jax.vmap(lambda seed: pull(seed)[0])(seeds)
         columns = moves(forces)
-        if isinstance(self.sparsity, Full):  # few rows: these are all of them
+        # mu -> G_0^T mu and mu -> M^-1 G_0^T mu. A full pattern has all rows of G_0 at hand; else one product by reverse mode is cheaper.
+        if isinstance(self.sparsity, Full):
             force, move = partial(weighted_sum, increments=forces), partial(weighted_sum, increments=columns)
         else:
             force, move = (lambda mu: pull(mu)[0]), (lambda mu: moves(pull(mu)[0]))
         straight = h * velocity_s(equations.p_s), h * velocity_f(equations.p_f)
         scale = self._scale(equations, memory)
         mu = scale * (2 * memory.multiplier[0] - memory.multiplier[1])
-        x = jnp.concatenate(straight) - move(mu)
+        x = jnp.concatenate(straight) - move(mu)  # M^-1 (h p - G_0^T mu)
         g, push = jax.linearize(lambda x: constraints(equations.t + h, q + x), x)
-        schur = self.sparsity.inverse(jax.vmap(push)(columns))
+        schur = self.sparsity.inverse(jax.vmap(push)(columns))  # (G_1 M^-1 G_0^T)^-1
         accepted, motions = Accepted.of(equations, newton), tuple(map(max_abs, straight))
 
-        def at(x, mu, g, iterations) -> Correction:
+        def judged(x, mu, g, iterations) -> Correction:
             dmu = schur.times(g)
             dx = move(dmu)
-            change = accepted.over((max_abs(dx[:n_s]), max_abs(dx[n_s:])), motions, iterations)
-            return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(change, iterations))
+            ratio = accepted.ratio((max_abs(dx[:n_s]), max_abs(dx[n_s:])), motions, iterations)
+            return Correction(x, mu, g, dx, dmu, jnp.asarray(iterations), newton.status(ratio, iterations))
 
         def corrected(last: Correction) -> Correction:
             x = last.x - last.dx
-            return at(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
+            return judged(x, last.mu + last.dmu, constraints(equations.t + h, q + x), last.iterations + 1)
 
-        first = corrected(at(x, mu, g, 0))  # nearly all steps take one: outside of the loop it is cheaper
+        first = corrected(
+            judged(x, mu, g, 0)
+        )  # nearly all steps need one correction: outside of the loop it is cheaper
         done = newton.iterate(corrected, first, done=1)
 
-        impulse = force(done.mu) / h
+        impulse = force(done.mu) / h  # p+ = p - G_0^T mu / h
         end = equations.q_f + done.x[n_s:], equations.p_s - impulse[:n_s], equations.p_f - impulse[n_s:]
         status = status_of(
             equations, done.result, Method.RATTLE, done.iterations, 0.0, max_abs(done.g), newton.tolerance
@@ -115,22 +121,22 @@ class Rattle(Solver):
         n_g, _ = system.num_constraints(equations.q_s, equations.q_f)
         x, mu = done.x[None], done.mu[None]
         unknowns = Unknowns(x[:, :n_s], mu[:, n_g:], x[None, :, n_s:], mu[None, :, :n_g])
-        tells = jnp.abs(scale) > LEAST_SCALE * h**2
-        multiplier = jnp.where(tells, done.mu / jnp.where(tells, scale, 1.0), memory.multiplier[0])
+        is_meaningful = jnp.abs(scale) > LEAST_SCALE * h**2
+        multiplier = jnp.where(is_meaningful, done.mu / jnp.where(is_meaningful, scale, 1.0), memory.multiplier[0])
         multipliers = jnp.stack([multiplier, memory.multiplier[0]])
         return Solution(unknowns, end, status), RattleState(multipliers, jnp.asarray(h, dtype=float))
 
     def _scale(self, equations: StepEquations, memory: RattleState):
-        """What turns multipliers (n_g + n_gs,) into unknowns."""
+        """The factors mu / lambda (n_g + n_gs,)."""
         counts = equations.system.num_constraints(equations.q_s, equations.q_f)
-        scales = multiplier_scales(equations.scheme, equations.macro_dt, memory.before)
+        scales = multiplier_scales(equations.scheme, equations.macro_dt, memory.last_dt)
         return jnp.concatenate([jnp.broadcast_to(a.reshape(-1)[:1], n) for a, n in zip(scales, counts, strict=True)])
 
     def continued(self, memory: RattleState, last: RattleState) -> RattleState:
         return last
 
     def projected(self, memory: RattleState) -> RattleState:
-        return memory._replace(before=jnp.zeros_like(memory.before))
+        return memory._replace(last_dt=jnp.zeros_like(memory.last_dt))
 
     def describe(self) -> list[str]:
         return ["drift along the constraints (RATTLE): Newton's iteration on the multipliers"]

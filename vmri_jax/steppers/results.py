@@ -1,4 +1,4 @@
-"""Outcome of a step: a status code whose message tells the user what happened and what to change."""
+"""Outcome of a step: a status code whose message names the failure, its likely causes and a remedy."""
 
 from enum import IntEnum
 
@@ -25,7 +25,7 @@ class Result(IntEnum):
 
     @property
     def message(self) -> str:
-        """What happened, likely causes, what to do."""
+        """The failure, its likely causes, and a remedy."""
         return _MESSAGES[self]
 
 
@@ -76,7 +76,7 @@ _MESSAGES = {
 
 
 class Status(np.int64):
-    """The `Result` of a whole run as a number of NumPy: a run stays a pytree of arrays, and its status prints as a sentence."""
+    """The `Result` of a run as a NumPy integer: a trajectory stays a pytree of arrays, and its status prints as a sentence."""
 
     def __str__(self) -> str:
         result = Result(int(self))
@@ -94,7 +94,7 @@ RUNNING = -1
 
 
 class Method(IntEnum):
-    """Which stepper took a step; of several the one with the largest number is reported, mostly the most expensive one.
+    """The solver that took a step; of several solvers in a step, the one with the largest number, mostly the most expensive one.
 
     EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. RATTLE: the multipliers of a drift along the
     constraints. NESTED: the slow path outside, micro intervals in order inside. COLLOCATION: one interval of high degree,
@@ -113,7 +113,7 @@ class Method(IntEnum):
 
 
 class SimulationError(RuntimeError):
-    """A run failed at some macro step; what was computed before is in `.trajectory`.
+    """A run failed at some macro step; the trajectory up to there is in `.trajectory`.
 
     Attributes:
         result: the `Result` of the failing step.
@@ -121,8 +121,8 @@ class SimulationError(RuntimeError):
         time: time at the start of that step.
         iterations, residual: the most Newton iterations and the largest residual of a step from the saved node before to it.
         trajectory: the `Trajectory` up to the failure (NaN after it).
-        moved: which body or coordinate moved most before it, and what that means for the step; empty where it is not known.
-        labels: what is wrong with what is slow and what is fast; empty where nothing is.
+        moved: sentence on the body or coordinate that moved most before the failure; empty if it is not known.
+        labels: sentence on variables that are slow but move fast, or the other way round; empty if there are none.
     """
 
     def __init__(
@@ -130,20 +130,20 @@ class SimulationError(RuntimeError):
     ):
         self.result, self.step, self.time, self.moved = result, step, time, moved
         self.iterations, self.residual, self.trajectory, self.labels = iterations, residual, trajectory, ""
-        said = f"{result.message} {moved}".strip()
+        explanation = f"{result.message} {moved}".strip()
         super().__init__(
             f"macro step {step} at t = {time:.6g} failed ({result.name}) after {iterations} Newton iterations with residual "
-            f"{residual:.2e}: {said} The trajectory up to there is in this exception's .trajectory; "
+            f"{residual:.2e}: {explanation} The trajectory up to there is in this exception's .trajectory; "
             "throw=False returns it instead of raising."
         )
 
     def advised(self, macro_dt: float, labels: str = "", jump: str = "") -> "SimulationError":
-        """The same with notes on a cause and on what to ask next.
+        """This exception with notes on likely causes and on `vmri_jax.stability.advise`.
 
         Args:
             macro_dt: of the run.
-            labels: what is wrong with what is slow and what is fast.
-            jump: which force jumps where the run failed.
+            labels: as of the attribute.
+            jump: sentence on a force that jumps at the failure; empty if none does.
         """
         self.labels = labels
         for cause in filter(None, (jump, labels)):

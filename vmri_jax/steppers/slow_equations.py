@@ -1,12 +1,17 @@
 """The slow equations of a macro step, linearised by a cheap matrix: masses, tied masses and the slow constraint.
 
-In the first micro interval the constraints give the fast variables the velocity that the slow path asks for, and later ones let
-them keep it. So a change dx of the slow increments changes the multipliers of the first interval by ``-S G_s dx``, with
-``S = (G K^-1 G^T)^-1`` of that interval and G_s the Jacobian by the slow variables, and the multipliers of other intervals hardly.
-That is the inertia of the fast masses that are tied to the slow variables; the rest of their answer is small.
+The constraints of the first micro interval give the fast variables the velocity that the slow path prescribes; in the later intervals
+the fast variables keep it. So a change dx of the slow increments changes the multipliers of the first interval by ``-S G_s dx``, with
+``S = (G K^-1 G^T)^-1`` of that interval and G_s the Jacobian of g with respect to the slow variables, and hardly changes the
+multipliers of other intervals. With the slow masses K_s, the matrix of the slow equations is therefore
 
-Where nothing is constrained, what masses leave out is the derivative of the slow forces by the slow path: over a long macro
-step it is as large as they are, and an update can be solved for with it (`SlowEquations.with_forces`).
+    K_s + G_s^T S G_s        (Woodbury)   (K_s + G_s^T S G_s)^-1 = (1 - U P) K_s^-1
+    U = K_s^-1 G_s^T         P = (1 + S G_s U)^-1 S G_s
+
+The second term is the inertia of the fast masses that constraints tie to the slow variables.
+
+Without constraints this matrix leaves out the derivative of the slow forces by the slow path. Over a long macro step that derivative
+is as large as the masses, and `SlowEquations.with_forces` solves for an update with it.
 """
 
 from collections.abc import Callable
@@ -26,19 +31,19 @@ from vmri_jax.schemes.quadrature import gauss
 from vmri_jax.steppers.interval import constant_mass, interval_problem, solve_saddle
 
 NODES = 4
-"""Gauss nodes of a macro step at which the slow forces are linearised. With more, a solve costs more; with fewer, steps in which slow forces
-turn over take more passes."""
+"""Gauss nodes per macro step at which the slow forces are linearised. A larger number makes the solve dearer; with a smaller one, steps in which
+slow forces change sign take more passes."""
 ITERATIONS = 6
-"""Most iterations of `minimal_residuals`. With more, a solve costs as much as a pass."""
+"""Most iterations of `minimal_residuals`. With a larger number a solve may cost as much as a pass."""
 LEFT_OVER = 1e-5
-"""Part of an update that `minimal_residuals` may leave. With more, the update costs another pass."""
+"""Accepted residual of `minimal_residuals`, relative to the right-hand side. With a larger value the update costs another pass."""
 
 
 class ConstraintInertia(NamedTuple):
-    """The masses K_s of the slow variables and those tied to them have the inverse ``(1 - U P) K_s^-1``.
+    """The factors U and P of the inverse ``(1 - U P) K_s^-1`` at the top of this module.
 
-    responses: U, slow increments by each multiplier of the first micro interval.
-    multipliers: P, those multipliers by the slow increments that K_s alone would give.
+    responses: U, slow increments for each multiplier of the first micro interval.
+    multipliers: P, multipliers of the first interval for the slow increments ``K_s^-1 rows``.
     """
 
     responses: Float[Array, "r*n_g r n_s"]
@@ -46,7 +51,11 @@ class ConstraintInertia(NamedTuple):
 
 
 class SlowEquations(NamedTuple):
-    """inverse_form, inverse_mass: ``K_s^-1 = inverse_form x inverse_mass``, a matrix for the slots and an operator for the coordinates."""
+    """The slow equations, with ``K_s^-1`` as the Kronecker product of a matrix for the nodes and an operator for the coordinates.
+
+    inverse_form: ``n (k_ij)^-1``, with the form k of the kinetic energy.
+    inverse_mass: ``v -> M_s^-1 v``.
+    """
 
     equations: StepEquations
     kinetic: QuadraticKinetic
@@ -55,36 +64,40 @@ class SlowEquations(NamedTuple):
 
     @classmethod
     def of(cls, equations: StepEquations) -> "SlowEquations":
-        """With the inverse of the masses."""
+        """The slow equations of a macro step."""
         kinetic = lagrangian(equations.system, equations.scheme).kinetic
         inverse_form = equations.scheme.num_micro * inverse(kinetic.slow_form[:-1, 1:])
         return cls(equations, kinetic, inverse_form, constant_mass(equations.system).slow_mass.inverse().times)
 
     def constraint_inertia(self, schur: FullInverse | BandInverse) -> ConstraintInertia | None:
-        """The masses tied by the constraints of the first micro interval, with its matrix S (r n_g, r n_g)."""
+        """U and P from the matrix S (r n_g, r n_g) of the first micro interval; None without constraints."""
         equations, r, n_s = self.equations, self.equations.scheme.degree, self.equations.q_s.shape[0]
         jacobian = jax.jacrev(equations.system.g, argnums=1)(equations.t, equations.q_s, equations.q_f)
         if not jacobian.size:
             return None
-        jacobian = jax.lax.optimization_barrier(jacobian)  # round-off is not to depend on how the constraint is written
+        jacobian = jax.lax.optimization_barrier(
+            jacobian
+        )  # keeps round-off independent of the expression of the constraint
         basis = slow_basis_at_control_nodes(equations.scheme.num_micro, r)[0]
         forces, values = (b[:, None, :, None] * jacobian[:, None, :] for b in (basis[:-1, :-1], basis[1:, 1:]))
         responses = jax.vmap(self._by_masses)(forces.reshape(-1, r, n_s))
         multipliers = jax.vmap(schur.times, 1, 1)(values.reshape(-1, r * n_s))
+        # both = 1 + S G_s U
         both = np.eye(len(multipliers)) + matmul(multipliers, responses.reshape(-1, r * n_s).T)
         return ConstraintInertia(responses, solve(both, multipliers).reshape(responses.shape))
 
     def update(self, x: Unknowns, start, increments, inertia: ConstraintInertia | None):
-        """Update of the slow unknowns, residual of their momentum equations, impulse on them over the step times h.
+        """Update of the slow unknowns, residual R of the slow momentum equations, and slow impulse over the step, the latter two times h.
 
-        With the residual R of the slow momentum equations, the masses K_s and the slow constraint with the Jacobians G_0 at the start of a slot
-        and G_1 at its end,
+        With the masses K_s (and the tied ones), and the Jacobians G_0, G_1 of g_s at the macro control nodes 0..r-1 and 1..r,
 
             K_s dx - G_0^T dnu = -R        G_1 dx = -g_s
 
         Args:
-            start, increments: gradient (n_s,), (r, n_s) of h times the action without the slow kinetic energy and the slow
-                constraint.
+            x: unknowns of the macro step.
+            start, increments: (n_s,), (r, n_s) gradients of h times the action by the start and by the increments of the slow path,
+                without the slow kinetic energy and the slow constraint.
+            inertia: of the tied masses, None without constraints.
         """
         equations, n, r = self.equations, self.equations.scheme.num_micro, self.equations.scheme.degree
         system, q_s = equations.system, equations.q_s
@@ -93,21 +106,23 @@ class SlowEquations(NamedTuple):
         nodes = jnp.concatenate([q_s[None], q_s + x.slow[:-1]])
         jacobian = jax.vmap(jax.jacrev(system.g_slow, argnums=1))(times[:-1], nodes)
         pull = jnp.sum(x.slow_multiplier[..., None] / n * jacobian, axis=1)
+        # R: h p_s + h D_{S_0} A, h D_{S_i} A; nu is scaled by n = num_micro (`multiplier_scales`)
         d = increments + self.kinetic.rows(x.slow, x.fast)[0] / n
         rows = jnp.concatenate([(start - d.sum(0) + equations.micro_dt * equations.p_s)[None], d[:-1]]) - pull
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
         return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), rows, start - pull.sum(0)
 
     def with_forces(self, d, x: Unknowns):
-        """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces.
+        """The update ``(1 + K_s^-1 C)^-1 d`` for an update d by the masses alone, with the derivative C of the slow forces,
 
-            ``(C dx)_i = h H sum_k w_k l_i(c_k) dF_s(sum_j l_j(c_k) dx_j, sum_j l_j'(c_k) dx_j / H)``
+            (C dx)_i = h H sum_k w_k l_i(c_k) dF_s(sum_j l_j(c_k) dx_j, sum_j l_j'(c_k) dx_j / H)
 
-        on a few Gauss nodes c_k, ``F_s = F - dV/dq_s`` of all potentials and forces inside the macro interval, with the fast path as it is.
+        on a few Gauss nodes c_k. ``F_s = F - dV/dq_s`` has all potentials and forces with nodes inside the macro interval. The fast path is
+        approximated: q_f of the start, v_f the mean velocity of the micro interval of c_k. C only decides on the number of passes.
 
         Args:
-            d: (r n_s,) update.
-            x: the path.
+            d: (r n_s,) update by the masses alone.
+            x: unknowns, which give the path.
         """
         equations, H, r, n = self.equations, self.equations.macro_dt, len(x.slow), len(x.fast)
         system, _ = interval_problem(equations.system, equations.scheme)
@@ -115,20 +130,20 @@ class SlowEquations(NamedTuple):
         c, basis, slopes = np.array(rule.nodes), lagrange_basis(r, rule.nodes), lagrange_derivative(r, rule.nodes)
         weights = equations.micro_dt * H * (np.array(rule.weights)[:, None] * basis[:, :-1]).T
 
-        m = (c * n).astype(int)  # the micro intervals that the nodes are in
+        m = (c * n).astype(int)  # micro interval of each node c_k
         moved = [jnp.sum(part, axis=0) for part in jnp.split(x.fast[:, -1], m)[:-1]]
         q_f, v_f = equations.q_f + jnp.stack(list(accumulate(moved))), x.fast[m, -1] / equations.micro_dt
 
         def sample(increments):
             return matmul(basis[:, 1:], increments), matmul(slopes[:, 1:], increments) / H
 
-        others = [f for name, f in equations.system.potentials if not equations.scheme.rule_of(name).only_kicks]
+        further = [f for name, f in equations.system.potentials if not equations.scheme.rule_of(name).only_kicks]
 
         def forces(q_s, v_s):
             total = jax.vmap(system.forces)(equations.t + c * H, q_s, q_f, v_s, v_f)[0]
             if system.slow_potential is not None:
                 total -= jax.vmap(jax.grad(system.slow_potential), (0, 0, None))(q_s, q_f, system.params)
-            for potential in others:
+            for potential in further:
                 total -= jax.vmap(jax.grad(potential), (0, 0, None))(q_s, q_f, system.params)
             return total
 
@@ -141,7 +156,7 @@ class SlowEquations(NamedTuple):
         return minimal_residuals(operator, d.reshape(x.slow.shape)).reshape(-1)
 
     def _by_masses(self, rows, inertia: ConstraintInertia | None = None):
-        """Slow increments (r, n_s) for given rows (r, n_s)."""
+        """``K_s^-1 rows`` (r, n_s) for rows (r, n_s), or ``(1 - U P) K_s^-1 rows`` with tied masses."""
         dx = matmul(self.inverse_form, self.inverse_mass(rows))
         if inertia is None:
             return dx
@@ -150,24 +165,27 @@ class SlowEquations(NamedTuple):
 
 
 def minimal_residuals(operator, b):
-    """x with ``operator(x) = b`` to `LEFT_OVER` of b or after `ITERATIONS`, for an operator close to one.
+    """x with ``A x = b`` for an operator A close to one, to `LEFT_OVER` of b or after `ITERATIONS`.
 
-    By Orthomin(1) (Vinsome 1976; Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20, 1983): along the residual, with what
-    it has in common with the move before taken out, to where the next residual is least.
+    Orthomin(1) (Vinsome 1976; Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20, 1983), with residual r and direction p:
+
+        p <- r - beta p,         beta  = (A r . A p) / (A p . A p)
+        x <- x + alpha p,        alpha = (r . A p) / (A p . A p)
+        r <- r - alpha A p
     """
 
-    def goes_on(at):
-        i, _, rest, *_ = at
-        return (i < ITERATIONS) & (max_abs(rest) > LEFT_OVER * max_abs(b))
+    def goes_on(carry):
+        i, _, r, *_ = carry
+        return (i < ITERATIONS) & (max_abs(r) > LEFT_OVER * max_abs(b))
 
-    def move_on(at):
-        i, x, rest, move, change, squared = at
-        change_of_rest = operator(rest)
-        part = jnp.sum(change_of_rest * change) / squared
-        move, change = rest - part * move, change_of_rest - part * change
-        squared = jnp.sum(change**2) + jnp.finfo(float).tiny
-        part = jnp.sum(rest * change) / squared
-        return i + 1, x + part * move, rest - part * change, move, change, squared
+    def iterate(carry):
+        i, x, r, p, A_p, squared = carry
+        A_r = operator(r)
+        beta = jnp.sum(A_r * A_p) / squared
+        p, A_p = r - beta * p, A_r - beta * A_p
+        squared = jnp.sum(A_p**2) + jnp.finfo(float).tiny
+        alpha = jnp.sum(r * A_p) / squared
+        return i + 1, x + alpha * p, r - alpha * A_p, p, A_p, squared
 
-    none = jnp.zeros_like(b)
-    return jax.lax.while_loop(goes_on, move_on, (0, none, b, none, none, 1.0))[1]
+    zero = jnp.zeros_like(b)
+    return jax.lax.while_loop(goes_on, iterate, (0, zero, b, zero, zero, 1.0))[1]

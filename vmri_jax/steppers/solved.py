@@ -1,4 +1,4 @@
-"""A step whose equations are solved by iteration: start of the iteration, solver, derivative of the solution."""
+"""A step that solves its equations by iteration: initial guess, solver, derivative of the solution."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -24,11 +24,14 @@ from vmri_jax.steppers.results import RUNNING, Result
 from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
 
 ROOT = "root"
-"""Name of the solution of a step and of its status for `jax.checkpoint`: with them, derivatives need not solve the step again."""
+"""Name of the solution and the status of a step for `jax.checkpoint`: a policy that saves this name lets derivatives reuse the solution."""
+CONSTRAINT_OVER_TOLERANCE = 100
+"""Accepted constraint value over `Newton.tolerance`, where that is above CONSTRAINT_TOLERANCE. The tolerance is relative to the motion, the value
+of a constraint has its own unit: a smaller factor would refuse converged steps of loose tolerances."""
 
 
 class Solution(NamedTuple):
-    """Unknowns x of a macro step, (q_f, p_s, p_f) at its end, and how they were found."""
+    """Unknowns x of a macro step, (q_f, p_s, p_f) at its end, and the status of the solver."""
 
     x: Unknowns
     end: tuple[Float[Numbers, "n_f"], Float[Numbers, "n_s"], Float[Numbers, "n_f"]]
@@ -43,13 +46,18 @@ class Solver(ABC):
     """
 
     def init(self, equations: StepEquations, velocity) -> Any:
-        """What the first step starts from; velocity (v_s, v_f) at the start of the run."""
+        """The memory of the first step.
+
+        Args:
+            equations: of the first step.
+            velocity: (v_s, v_f) at the start of the run.
+        """
         n_g, n_gs = equations.system.num_constraints(equations.q_s, equations.q_f)
         v_s, v_f = velocity
         return self.remembers(equations, equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs)))
 
     def remembers(self, equations: StepEquations, guess: Unknowns) -> Any:
-        """What a step starts from that has no other past than a guess."""
+        """The memory of a step that has no step before it, only a guess."""
         return ()
 
     def renew(self, equations: StepEquations, memory) -> Any:
@@ -62,16 +70,16 @@ class Solver(ABC):
 
         Args:
             equations: of the step.
-            guess: straight motion with the multipliers of the last step; solvers that predict unknowns from `memory` do without.
-            memory: from `init`, or what the last step handed on.
+            guess: straight motion with the multipliers of the last step; a solver may predict its unknowns from `memory` instead.
+            memory: from `init`, or of the step before.
         """
 
     def continued(self, memory, last) -> Any:
-        """For a stage of a composition, see `Stepper.continued`."""
+        """The memory of a stage of a composition, see `Stepper.continued`."""
         return memory
 
     def projected(self, memory) -> Any:
-        """After the momenta have been projected."""
+        """The memory after a projection of the momenta."""
         return memory
 
     @abstractmethod
@@ -80,12 +88,12 @@ class Solver(ABC):
 
 
 class SolvedState(NamedTuple):
-    """Where the next iteration starts.
+    """Memory from which the next iteration starts.
 
-    velocity: (v_s, v_f), the mean of the last micro interval, or after a projection that of the node; with constant masses the
-        velocities of a guess follow from the momenta instead.
-    multiplier, slow_multiplier: Lagrange multipliers at the last control nodes that have any.
-    solver: what the solver carries.
+    velocity: (v_s, v_f) of the guess, used without constant masses: the means ``(q_s(H) - q_s(0)) / H`` and ``(q_f(H) - q_f(H - h)) / h`` of
+        the last step, or the velocities of the projected momenta. With constant masses the guess takes ``M^-1 p``.
+    multiplier, slow_multiplier: Lagrange multipliers at the last control node of the step before that has multipliers.
+    solver: memory of the solver.
     """
 
     velocity: tuple[Float[Numbers, "n_s"], Float[Numbers, "n_f"]]
@@ -96,12 +104,12 @@ class SolvedState(NamedTuple):
 
 @dataclass(frozen=True)
 class Solved(Stepper):
-    """All unknowns of a step by a solver; the solution is differentiable in both modes, twice.
+    """A step whose unknowns a solver computes; differentiable in both modes, twice.
 
-    The derivative is that of the root, ``dx = -(dR/dx)^-1 dR``, so that iterations are never differentiated.
+    Derivatives follow from the implicit function theorem, ``dx = -(dR/dx)^-1 dR``: iterations are never differentiated.
 
     sparsity: of ``G M^-1 G^T`` with all constraints.
-    reverse_only: differentiable in reverse mode only, once, in half the time.
+    reverse_only: allows one derivative in reverse mode only, in half the time.
     """
 
     system: System
@@ -128,10 +136,11 @@ class Solved(Stepper):
         equations = StepEquations.of(self.system, self.scheme, state, macro_dt)
         v_s, v_f = memory.velocity
         if self.system.has_constant_mass:
-            v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)  # with the kicks
+            v_s, v_f = constant_mass(self.system).velocity(state.p_s, state.p_f)  # momenta after the kicks
         guess = equations.guess(v_s, v_f, memory.multiplier, memory.slow_multiplier)
-        found, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, memory.solver)))
-        root, status = checkpoint_name(((found.x, found.end), found.status), ROOT)
+        # no derivative enters the iteration; `derivative` attaches the one of the root
+        solution, solver = self.solver.solve(*jax.lax.stop_gradient((equations, guess, memory.solver)))
+        root, status = checkpoint_name(((solution.x, solution.end), solution.status), ROOT)
         derivative = differentiable_reverse_only if self.reverse_only else differentiable
         x, (q_f, p_s, p_f) = derivative(equations, *root)
 
@@ -140,7 +149,7 @@ class Solved(Stepper):
         info = StepInfo(*Status(*status), q_f_micro, *lambdas)
         end = State(state.t + macro_dt, state.q_s + x.slow[-1], q_f, p_s, p_f)
         velocity = memory.velocity
-        if not self.system.has_constant_mass:  # the mean over the last interval, as a guess for the next step
+        if not self.system.has_constant_mass:  # mean velocities of the last intervals: guess of the next step
             velocity = jax.lax.stop_gradient((x.slow[-1] / macro_dt, x.fast[-1, -1] / equations.micro_dt))
         return end, info, SolvedState(velocity, lambdas[0][-1, -1], lambdas[1][-1], solver)
 
@@ -158,7 +167,7 @@ class Solved(Stepper):
 
 @dataclass(frozen=True)
 class Fallback(Solver):
-    """`first`, and where it does not converge `exact`."""
+    """The solver `first`, and the solver `exact` for steps where `first` does not converge."""
 
     first: Solver
     exact: Solver
@@ -170,12 +179,14 @@ class Fallback(Solver):
         return self.first.renew(equations, memory)
 
     def solve(self, equations: StepEquations, guess: Unknowns, memory) -> tuple[Solution, Any]:
-        found, learned = self.first.solve(equations, guess, memory)
-        converged = found.status.result <= Result.CONVERGED_AT_ROUNDOFF
-        memory = jax.tree.map(partial(jnp.where, converged), learned, memory)  # nothing is learned from a failure
+        solution, learned = self.first.solve(equations, guess, memory)
+        converged = solution.status.result <= Result.CONVERGED_AT_ROUNDOFF
+        memory = jax.tree.map(
+            partial(jnp.where, converged), learned, memory
+        )  # a failed step leaves the memory as it was
         return jax.lax.cond(
             converged,
-            lambda: found,
+            lambda: solution,
             lambda: self.exact.solve(equations, guess, self.exact.remembers(equations, guess))[0],
         ), memory
 
@@ -190,30 +201,32 @@ class Fallback(Solver):
 
 
 def status_of(equations: StepEquations, result, method, iterations, rows, g, tolerance) -> Status:
-    """How a solver ended. Increments that converged with constraints that are not kept mean rows that contradict each other.
+    """The status of a step. Converged increments with violated constraints get CONSTRAINT_VIOLATED: the constraints contradict each other.
 
     Args:
+        equations: of the step.
         result, method, iterations: as in `StepInfo`.
-        rows: largest row of the momentum equations, times h.
+        rows: largest residual of the momentum equations, times h.
         g: largest constraint value.
-        tolerance: of Newton; constraints may miss zero by more where it is loose.
+        tolerance: of Newton; a loose one raises the accepted constraint value.
     """
     if equations.system.is_constrained:
-        violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
+        violated = g > jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
         contradicts = (result <= Result.CONVERGED_AT_ROUNDOFF) & violated
         result = jnp.where(contradicts, Result.CONSTRAINT_VIOLATED, result)
+    # residual = max(|R| / (h max |p|), max |g|), with |R| itself where all momenta are zero
     momentum = jnp.maximum(max_abs(equations.p_s), max_abs(equations.p_f)) * equations.micro_dt
     residual = jnp.maximum(rows / jnp.where(momentum > 0, momentum, 1.0), g)
     return Status(result, jnp.asarray(int(method)), iterations, residual)
 
 
 def ended(result):
-    """The `Result` of an iteration that is over: STAGNATED where it would have gone on."""
+    """The final `Result` of an iteration with a fixed number of turns: STAGNATED if it is still RUNNING."""
     return jnp.where(result == RUNNING, Result.STAGNATED, result)
 
 
 def largest_constraint(equations: StepEquations, x: Unknowns):
-    """Largest absolute value of g and g_s along the step, its start excluded."""
+    """Largest absolute value of g and g_s at the control nodes of the step, the first one excluded."""
     if not equations.system.is_constrained:
         return jnp.zeros(())
     path = equations.path(x)

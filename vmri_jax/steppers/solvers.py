@@ -1,21 +1,20 @@
-"""Solvers: how the implicit equations of a step are solved. All of them end at the same solution.
+"""Settings of the solvers for the implicit equations of a step. All solvers converge to the same solution.
 
-| solver | matrix of an iteration | cost per micro step |
+| solver | Newton matrix | operations per micro step |
 |---|---|---|
-| `Nested` | slow path outside, micro intervals in order, each with a small matrix of its own | lowest |
-| `Arrowhead` | the same march with exact matrices, kept over passes and steps while corrections shrink | |
-| `NullSpace` | the same without multipliers: matrices of the free motions alone | |
-| `Dense` | exact, one dense factorisation, O(num_micro^2): baseline and oracle | highest |
+| `Nested` | approximate: slow path outside, micro intervals in order, each with a small matrix of its own | O(1), fewest |
+| `Arrowhead` | exact, by elimination of the micro intervals in order; kept over passes and steps while corrections shrink | O(1) |
+| `NullSpace` | as `Arrowhead`, in coordinates of the free motions: no multipliers among the unknowns | O(1) |
+| `Dense` | exact, one dense matrix of all unknowns: baseline and reference | O(num_micro^2) |
 
-`Auto` takes `Nested` where the terms can be cut into micro intervals (constant masses, potentials on the micro grid or kicks at the macro
-nodes), and `Arrowhead` where they cannot. A run in which the nested march does not converge is made again by `Arrowhead`, from where it
-failed; under a transformation of JAX the step that fails is solved again. ``StepInfo.method`` and ``Trajectory.info.method`` say which one
-took a step, ``print(vm.plan(problem, scheme))`` says it beforehand. `Nested` includes its special cases: a single drift along the
-constraints between kicks (RATTLE), and a single interval of higher degree (``galerkin(1, degree)``), which is solved for all variables at
-once in modes of time.
+`Auto` takes `Nested` where every term belongs to single micro intervals (constant masses, potentials on the micro grid or kicks at the macro
+nodes), else `Arrowhead`. If a run does not converge with `Nested`, `Auto` computes it again with `Arrowhead`: a single `vmri_jax.macro_step`
+the step, a run the whole run or the piece of it that failed. ``StepInfo.method`` and ``Trajectory.info.method`` say which solver took a step,
+``print(vm.plan(problem, scheme))`` says it beforehand. `Nested` includes two special cases: a single drift along the constraints between
+kicks (RATTLE), and a single interval of higher degree (``galerkin(1, degree)``), solved for all variables at once in modes of time.
 
-A correction that is still to come is accepted if it is below a tenth of the tolerance times the motion (of slow variables over the macro
-step, of fast ones over a micro step), or round-off of the positions: the formula is in `vmri_jax.steppers.accept`.
+An iteration ends if its next correction is below a tenth of the tolerance times the motion (of slow variables over the macro step, of
+fast variables over a micro step), or is round-off of the positions: the formula is in `vmri_jax.steppers.accept`.
 """
 
 from collections.abc import Callable
@@ -33,18 +32,18 @@ if TYPE_CHECKING:
 
 
 class Newton(eqx.Module):
-    """Newton's iteration, as all solvers use it.
+    """Settings of Newton's iteration, shared by all solvers.
 
     Args:
-        tolerance: error of the increments of a step that is accepted, relative to the largest of them, slow and fast apart. Round-off of
-            the positions is always accepted.
-        max_iterations: a step that needs more iterations has failed; for `Nested` passes count.
-        fixed_iterations: do this number of iterations and check the result afterwards, without a loop that depends on the data; a step that
-            has not converged then has failed, whatever the solver. None for as many as the tolerance needs.
+        tolerance: the iteration ends when the next correction is below a tenth of ``tolerance * max |increments|``, for slow and for fast
+            variables each, or below round-off of the positions (`vmri_jax.steppers.accept`).
+        max_iterations: a step that needs more iterations has failed; for the march and for `Nested` the passes count.
+        fixed_iterations: number of iterations of every step, without a loop that depends on the data; the result is checked at the end, and
+            a step that has not converged has failed, without a fallback. None: as many iterations as the tolerance needs.
 
     Raises:
         ValueError: a tolerance that is not positive, a number of iterations below 1.
-        TypeError: no number.
+        TypeError: an argument that is no number.
     """
 
     method: ClassVar[str] = ""
@@ -64,24 +63,35 @@ class Newton(eqx.Module):
                 raise ValueError(f"{name}: {field} is {value}; it must be positive.")
 
     def exact(self) -> "Arrowhead":
-        """The march with exact matrices, with the same numbers."""
+        """`Arrowhead` with the same tolerance and numbers of iterations."""
         return Arrowhead(self.tolerance, self.max_iterations, self.fixed_iterations)
 
-    def status(self, change, iterations):
-        """`Result` after this number of iterations, from the largest change still to come over the accepted one, or RUNNING."""
+    def status(self, ratio, iterations):
+        """`Result` or RUNNING after some iterations.
+
+        Args:
+            ratio: next correction over the accepted one, see `vmri_jax.steppers.accept.Accepted.ratio`.
+            iterations: number of iterations so far.
+        """
         goes_on = self.fixed_iterations is None and iterations < self.max_iterations
         otherwise = jnp.where(goes_on, RUNNING, Result.STAGNATED)
-        return jnp.where(jnp.isfinite(change), jnp.where(change <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
+        return jnp.where(jnp.isfinite(ratio), jnp.where(ratio <= 1, Result.CONVERGED, otherwise), Result.NON_FINITE)
 
-    def iterate(self, step, at, done: int = 0):
-        """``step(at)`` while ``at.result`` is RUNNING, or `fixed_iterations` times; `done` iterations are behind."""
+    def iterate(self, step, iterate, done: int = 0):
+        """Repeat ``iterate = step(iterate)``: while ``iterate.result`` is RUNNING, or ``fixed_iterations - done`` times.
+
+        Args:
+            step: from iterate to iterate.
+            iterate: the first one.
+            done: number of iterations that went into it; counts with `fixed_iterations` only.
+        """
         if self.fixed_iterations is None:
-            return jax.lax.while_loop(lambda at: at.result == RUNNING, step, at)
-        return jax.lax.fori_loop(done, self.fixed_iterations, lambda _, at: step(at), at)
+            return jax.lax.while_loop(lambda iterate: iterate.result == RUNNING, step, iterate)
+        return jax.lax.fori_loop(done, self.fixed_iterations, lambda _, iterate: step(iterate), iterate)
 
 
 class Auto(Newton):
-    """`Nested` where it is possible, with `Arrowhead` for steps that it does not solve; else `Arrowhead`."""
+    """`Nested` where the terms allow it, with `Arrowhead` as a fallback; else `Arrowhead`."""
 
     method = "auto"
 
@@ -93,7 +103,7 @@ class Nested(Newton):
 
 
 class Arrowhead(Newton):
-    """The march over micro intervals with exact matrices, by `jax.jacfwd`, kept over passes and steps while corrections shrink."""
+    """The march over the micro intervals with exact matrices, kept over passes and steps while corrections shrink."""
 
     method = "arrowhead"
 
@@ -105,19 +115,22 @@ class NullSpace(Newton):
 
 
 class Dense(Newton):
-    """The exact matrix of all unknowns of a macro step, factorised by LAPACK: baseline and oracle."""
+    """The exact matrix of all unknowns of a macro step, factorised by LAPACK: baseline and reference."""
 
     method = "dense"
 
 
 class Custom(Newton):
-    """Steps by a stepper of one's own, see the page on steppers of one's own.
+    """Steps by a stepper of the user, see docs/how_to/steppers.md.
 
         vm.simulate(chain, scheme, solver=vm.solvers.Custom(rotation), macro_dt=0.01, num_steps=100)
 
     Args:
-        stepper: a function of a module, ``stepper(system, scheme)``, that returns a `vmri_jax.steppers.stepper.Stepper` for the whole step or
-            a `vmri_jax.steppers.solved.Solver` for the equations between the kicks; of a composition it gets the scheme of a stage. It is called while JAX traces the run, so that runs, batches, files and gradients work as with other solvers.
+        stepper: function ``stepper(system, scheme)`` that returns a `vmri_jax.steppers.stepper.Stepper` for the whole step, or a
+            `vmri_jax.steppers.solved.Solver` for the equations between the kicks; of a composition it gets the scheme of a stage. Define it
+            at module level: programs are compiled once per function, and a new function is compiled anew. It is called while JAX traces the
+            run, so that runs, batches, files and gradients work as with other solvers.
+        tolerance: constraints are kept if their values are below a hundred times this number, and never refused below 1e-6.
     """
 
     method = "custom"

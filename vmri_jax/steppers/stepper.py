@@ -1,4 +1,4 @@
-"""What every stepper offers, and what a macro step tells about itself."""
+"""The interface of all steppers, and the record of a macro step."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -15,14 +15,15 @@ from vmri_jax.steppers.results import Method, Result
 
 
 class StepInfo(eqx.Module):
-    """What a macro step did.
+    """The record of a macro step.
 
     result: status code, see `Result`.
-    method: code of the stepper that ran, see `Method`; with "auto" ARROWHEAD says that the cheaper choices are not possible, or did not converge.
-    iterations: Newton iterations or passes, the most that any of its solves took; 0 for explicit steps.
-    residual: largest residual left, relative to the momentum, and of the constraints; 0 where equations are linear.
+    method: code of the solver, see `Method`; with "auto" ARROWHEAD says that the cheaper solvers are not possible, or did not converge.
+    iterations: most Newton iterations or passes of a solve in the step; 0 for explicit steps.
+    residual: ``max(|R| / max |p|, max |g|)``, with the residual R of the momentum equations and the constraint values g; 0 for linear
+        equations. Solvers estimate R after their last correction; where only multipliers are unknown it is 0.
     q_f_micro: fast positions at the micro nodes, the start excluded.
-    multiplier, slow_multiplier: Lagrange multipliers at the control nodes; of a composition with s stages those of all, s r
+    multiplier, slow_multiplier: Lagrange multipliers at the control nodes; of a composition with s stages those of all stages, s r
         slow ones.
     """
 
@@ -36,7 +37,7 @@ class StepInfo(eqx.Module):
 
     @property
     def status(self) -> "Status":
-        """Without the arrays along the step."""
+        """The fields without the arrays along the step."""
         return Status(self.result, self.method, self.iterations, self.residual)
 
 
@@ -50,11 +51,11 @@ class Status(NamedTuple):
 
     @classmethod
     def direct(cls, method: Method) -> "Status":
-        """Of a step that solves nothing by iteration: known before it is taken."""
+        """The status of a step without iteration, as constants that are known while JAX traces."""
         return cls(np.asarray(int(Result.CONVERGED)), np.asarray(int(method)), np.asarray(0), np.zeros(()))
 
     def worse(self, other: "Status") -> "Status":
-        """Field by field the larger one."""
+        """The larger value of every field."""
         return Status(*(jnp.maximum(a, b) for a, b in zip(self, other, strict=True)))
 
 
@@ -62,45 +63,53 @@ class Status(NamedTuple):
 class Stepper(ABC):
     """Takes macro steps: ``memory = init(state, dt)``, then ``state, info, memory = step(state, memory, dt)`` again and again.
 
-    Arguments of its methods are the `State` at the start of a step, `memory`, which is what a stepper carries from step to step, a
-    NamedTuple that its file documents, and the length of the step.
+    The methods take the `State` at the start of a step, the `memory` that the stepper carries from step to step, and the length of the
+    step. A memory is a pytree whose structure, shapes and types do not change: it is the carry of a loop. Only `advance` and
+    `describe` must be written.
     """
 
     def init(self, state: State, macro_dt) -> Any:
-        """What the first step starts from besides the state."""
+        """The memory of the first step."""
         return ()
 
     def renew(self, state: State, memory, macro_dt) -> Any:
-        """`memory` with the matrices that all steps until the next `renew` share. Whoever kicks a stepper calls it before the first kick."""
+        """The memory with new matrices, which all steps until the next `renew` share. `Kicked` calls it before the first kick."""
         return memory
 
     @abstractmethod
     def advance(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
-        """The step itself; its momenta are those of the discrete Legendre transform."""
+        """One step: (state at its end, with the momenta of the discrete Legendre transform; record; memory)."""
 
     def step(self, state: State, memory, macro_dt) -> tuple[State, StepInfo, Any]:
-        """A macro step: `advance`, and NON_FINITE where a momentum is, since positions follow momenta."""
+        """A macro step: `advance`, with the result NON_FINITE if a momentum at its end is not finite."""
         state, info, memory = self.advance(state, memory, macro_dt)
         finite = jnp.all(jnp.isfinite(state.p_s)) & jnp.all(jnp.isfinite(state.p_f))
-        stands = finite | (info.result > Result.CONVERGED_AT_ROUNDOFF)  # a failure has been named already
-        return state, replace(info, result=jnp.where(stands, info.result, Result.NON_FINITE)), memory
+        has_result = finite | (info.result > Result.CONVERGED_AT_ROUNDOFF)  # a solver that failed has said why
+        return state, replace(info, result=jnp.where(has_result, info.result, Result.NON_FINITE)), memory
 
     def project(self, state: State, memory) -> tuple[State, Any]:
-        """Momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
+        """Project the momenta onto the hidden constraints, ``G v + dg/dt = 0``."""
         return state, memory
 
     def continued(self, memory, last, state: State, macro_dt) -> Any:
-        """For a stage of a composition: what it learned in the macro step before, going on where the last stage ended."""
+        """The memory of a stage of a composition.
+
+        Args:
+            memory: of the same stage in the macro step before.
+            last: memory of the stage that has just ended, at the state where this stage starts.
+            state: at the start of this stage.
+            macro_dt: length of this stage.
+        """
         return memory
 
     @abstractmethod
     def describe(self) -> list[str]:
-        """This stepper and what is inside of it in words, one line each."""
+        """This stepper and its inner steppers in words, one line each."""
 
     def __str__(self) -> str:
         return "\n".join(self.describe())
 
 
 def indented(lines: list[str]) -> list[str]:
-    """Lines of an inner stepper."""
+    """The lines of an inner stepper, indented."""
     return ["  " + line for line in lines]

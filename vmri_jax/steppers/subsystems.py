@@ -1,6 +1,6 @@
-"""Systems taken apart: the slow and the fast variables as systems of their own, each of fast variables on a single interval.
+"""Decoupled parts of a system: the slow and the fast variables as systems of their own, each of fast variables on a single interval.
 
-Functions of the parts are values that are equal where what they are made of is, so that they are traced once.
+The functions of the parts are dataclasses. They compare by value, so that JAX traces equal ones once.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from vmri_jax.steppers.interval import constant_mass
 
 @dataclass(frozen=True)
 class PotentialOfSlow:
-    """V where it does not see the fast variables, as a function of the slow ones."""
+    """V, if it does not depend on the fast variables, as a function of the slow variables."""
 
     potential: Callable
     num_fast: int
@@ -30,7 +30,7 @@ class PotentialOfSlow:
 
 @dataclass(frozen=True)
 class FurtherOfSlow:
-    """A further potential where it does not see the fast variables, as a potential of a part with the slow ones."""
+    """A further potential that does not depend on the fast variables, as a potential of the slow part."""
 
     potential: Callable
     num_fast: int
@@ -41,7 +41,7 @@ class FurtherOfSlow:
 
 @dataclass(frozen=True)
 class FurtherOfFast:
-    """A further potential where it does not see the slow variables, as a potential of a part with the fast ones."""
+    """A further potential that does not depend on the slow variables, as a potential of the fast part."""
 
     potential: Callable
     num_slow: int
@@ -52,7 +52,7 @@ class FurtherOfFast:
 
 @dataclass(frozen=True)
 class ConstraintOfSlow:
-    """g_s as a constraint of fast variables."""
+    """g_s as a constraint of the fast variables of the slow part."""
 
     constraint: Callable | Rheonomic
 
@@ -63,7 +63,7 @@ class ConstraintOfSlow:
 
 @dataclass(frozen=True)
 class ConstraintOfFast:
-    """g where it does not see the slow variables."""
+    """g, if it does not depend on the slow variables, as a constraint of the fast part."""
 
     constraint: Callable | Rheonomic
     num_slow: int
@@ -76,12 +76,13 @@ class ConstraintOfFast:
 def slow_part(
     system: System, scheme: Scheme, potential: Callable | None, others: Sequence[PlacedPotential], num_fast: int
 ) -> tuple[System, Scheme]:
-    """The slow variables, and the scheme of their step over the macro interval.
+    """The system of the slow variables, and the scheme of their step over the macro interval.
 
     Args:
-        potential: V, None where it only kicks.
-        others: further potentials of slow variables alone that do not only kick.
-        num_fast: of the system.
+        system, scheme: of the whole system.
+        potential: V; None if it only kicks.
+        others: further potentials of slow variables alone, with nodes inside the macro interval.
+        num_fast: number of fast variables of the whole system.
     """
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).slow),
@@ -96,12 +97,13 @@ def slow_part(
 def fast_part(
     system: System, scheme: Scheme, potential: Callable | None, others: Sequence[PlacedPotential], num_slow: int
 ) -> tuple[System, Scheme]:
-    """The fast variables, and the scheme of their steps over the micro intervals, or over the intervals that copies of rules span.
+    """The system of the fast variables, and the scheme of a step of k micro intervals.
 
     Args:
-        potential: W, None where it has no nodes of its own on these.
-        others: potentials of fast variables alone whose rules have a copy on each of these.
-        num_slow: of the system.
+        system, scheme: of the whole system.
+        potential: W; None if its rule does not span k micro intervals.
+        others: further potentials of fast variables alone whose rules span k micro intervals.
+        num_slow: number of slow variables of the whole system.
     """
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).fast),
@@ -115,26 +117,26 @@ def fast_part(
 
 @dataclass(frozen=True)
 class PotentialAtRest:
-    """W with parameters ``(params, q_s)``."""
+    """W with the parameters ``(params, q_s)``."""
 
     potential: Callable
 
-    def __call__(self, q, at):
-        return self.potential(q, at[0])
+    def __call__(self, q, params):
+        return self.potential(q, params[0])
 
 
 @dataclass(frozen=True)
 class ConstraintAtRest:
-    """g with the slow variables at rest, parameters ``(params, q_s)``."""
+    """g with the slow variables at rest, and the parameters ``(params, q_s)``."""
 
     constraint: Callable
 
-    def __call__(self, _, q, at):
-        return self.constraint(at[1], q, at[0])
+    def __call__(self, _, q, params):
+        return self.constraint(params[1], q, params[0])
 
 
 def frozen_slow(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
-    """The fast variables under W and g with the slow ones at rest in q_s, and the scheme of one micro interval of them."""
+    """The system of the fast variables under W and g with the slow variables at rest in q_s, and the scheme of one micro interval."""
     alone = System(
         ConstantMass(jnp.zeros(0), constant_mass(system).fast),
         fast_potential=None if system.fast_potential is None else PotentialAtRest(system.fast_potential),

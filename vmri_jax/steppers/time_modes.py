@@ -1,8 +1,8 @@
-"""Modes of time: the polynomials on one interval in coordinates in which its stiffness and mass matrix fall apart.
+"""Modes of time: coordinates of the polynomials on one interval that decouple its stiffness and mass matrix.
 
 With A, B (r, r) the stiffness and the mass matrix of the polynomials, the equations of one interval are decoupled by the
-eigenvectors of A^-1 B (Butcher 1976; Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8). Complex numbers are kept
-as all real parts before all imaginary ones, so that rows fill vector registers.
+eigenvectors of A^-1 B (Butcher 1976; Hairer, Wanner, *Solving Ordinary Differential Equations II*, IV.8). Complex
+arrays are stored as all real parts before all imaginary ones, so that rows fill vector registers.
 """
 
 from typing import NamedTuple
@@ -19,14 +19,14 @@ from vmri_jax.schemes.scheme import Scheme
 class TimeModes(NamedTuple):
     """Eigenvectors of ``A^-1 B``, one of every complex pair.
 
-    What has one entry per part of a mode has all real parts before all imaginary ones. Two real modes share what a complex one
-    takes, and parts of no mode fill vector registers.
+    Axes of size k hold the parts of modes, all real parts before all imaginary ones. Two real modes share the two parts of a complex
+    mode; parts of no mode are zeros that fill vector registers.
 
-    gamma: eigenvalues.
-    mode: which mode it is a part of.
-    of_rows: ``A^-1``, from the rows of the momentum equations to increments.
+    gamma: eigenvalues, real and imaginary parts.
+    mode: number of the mode of each part.
+    of_rows: ``A^-T``, from the rows of the momentum equations to increments.
     of_values: from values at the nodes to modes.
-    increments, multipliers: from modes to increments, and (through A) to multipliers.
+    increments, multipliers: from modes to increments, and through A to multipliers.
     """
 
     gamma: Float[np.ndarray, "2 modes"]
@@ -38,7 +38,7 @@ class TimeModes(NamedTuple):
 
     @classmethod
     def of(cls, scheme: Scheme) -> "TimeModes":
-        """Of the polynomials and the nodes of the rules for T and W."""
+        """The modes of a scheme: A has the nodes of the rule of T, B those of the rule of W."""
         a, b = (
             _form(basis, scheme.degree, placed.rule.nodes)[:-1, 1:]
             for basis, placed in ((lagrange_derivative, scheme.kinetic), (lagrange_basis, scheme.fast))
@@ -51,10 +51,10 @@ class TimeModes(NamedTuple):
         first, second = np.arange(half), np.concatenate([np.arange(pairs), np.arange(half, distinct)])
 
         def parts(z):
-            """Of modes (r, m), those of no mode zero."""
+            """(k, m) the parts of modes (r, m), zero for parts of no mode."""
             imaginary = np.where(np.imag(gamma)[:, None] == 0, z.real, z.imag)
-            some = z.real[first], imaginary[second]
-            return np.concatenate([np.pad(a, [(0, half - len(a)), (0, 0)]) for a in some])
+            both = z.real[first], imaginary[second]
+            return np.concatenate([np.pad(a, [(0, half - len(a)), (0, 0)]) for a in both])
 
         to = np.linalg.inv(vectors)
         back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T  # a mode and its conjugate: the real part
@@ -64,24 +64,24 @@ class TimeModes(NamedTuple):
 
 
 def _form(basis, degree: int, nodes) -> np.ndarray:
-    """``sum_n w_n l_i(c_n) l_j(c_n)`` (r + 1, r + 1) of the interpolatory rule on these nodes."""
-    at = basis(degree, np.array(nodes))
-    return at.T @ (interpolatory_weights(nodes)[:, None] * at)
+    """``sum_n w_n b_i(c_n) b_j(c_n)`` (r + 1, r + 1), with the functions b of the basis and the interpolatory rule on the nodes c_n."""
+    values = basis(degree, np.array(nodes))
+    return values.T @ (interpolatory_weights(nodes)[:, None] * values)
 
 
 def taken(a, index: np.ndarray):
-    """What is at a known index of the last axis, as slices."""
+    """``a[..., index]`` for a static index, by slices."""
     runs = np.split(index, np.flatnonzero(np.diff(index) != 1) + 1)
     return jnp.concatenate([a[..., run[0] : run[-1] + 1] for run in runs], axis=-1)
 
 
 def times_i(z):
-    """Complex numbers, all real parts before all imaginary ones."""
+    """``i z`` for complex z, stored as all real parts before all imaginary ones."""
     re, im = jnp.split(z, 2, axis=-1)
     return jnp.concatenate([-im, re], axis=-1)
 
 
 def product(matrix, z):
-    """Of complex matrices, their real and their imaginary parts (columns, rows, k), and vectors (columns, k)."""
+    """(rows, k) products of complex matrices, real and imaginary part (columns, rows, k), with vectors z (columns, k)."""
     re, im = matrix
     return jnp.sum(re * z[:, None] + im * times_i(z)[:, None], axis=0)

@@ -1,1 +1,1 @@
-"""Newton's iteration over all unknowns of a macro step: linear solvers, derivative of the solution."""
+"""Linear solvers for Newton's matrix of a macro step, and the derivative of the solution."""

@@ -1,6 +1,6 @@
-"""Newton direction by one dense factorisation over all unknowns of the macro step: O(num_micro^3).
+"""Newton direction by one dense factorisation over all unknowns of the macro step: O(num_micro^3) operations per macro step.
 
-The way of the reference paper; kept as baseline and oracle. The matrix is the derivative of the whole residual.
+The method of the reference paper, kept as a baseline and as a reference for tests. The matrix is the derivative of the whole residual.
 """
 
 import jax
@@ -10,7 +10,7 @@ from vmri_jax.schemes.equations import StepEquations, Unknowns
 
 
 def matrix(equations: StepEquations, x: Unknowns):
-    """``dR/dx`` over all unknowns in a row."""
+    """``dR/dx`` (n, n) with all unknowns in one vector."""
     flat, unravel = ravel_pytree(x)
     return jax.jacfwd(lambda z: ravel_pytree(equations.residual(unravel(z)))[0])(flat)
 

@@ -1,7 +1,7 @@
-"""Derivative of the solution of a step: that of a root, never of the iterations that found it.
+"""Derivative of the solution of a step, by the implicit function theorem.
 
-The unknowns x of a step solve ``R(e, x) = 0``, where e are the equations with all that they depend on: the state at the start,
-the step, the parameters. So ``dx = -(dR/dx)^-1 (dR/de) de``, with one matrix in both modes.
+The unknowns x of a step solve ``R(e, x) = 0``, where e are the equations with all data that they depend on: the state at the start, the
+step, the parameters. So ``dx = -(dR/dx)^-1 (dR/de) de``, with one matrix in both modes; no iteration is differentiated.
 """
 
 from functools import partial
@@ -13,17 +13,17 @@ from jax.flatten_util import ravel_pytree
 from vmri_jax.schemes.equations import StepEquations, Unknowns
 from vmri_jax.steppers.march import MarchEquations, factor, solve
 
-SECOND = (
+ONLY_FIRST_DERIVATIVES = (
     "the adjoint of this run has first derivatives in reverse mode only. For second derivatives and forward mode take "
     "vmri_jax.simulate(..., adjoint='stored')."
 )
 
 
 def _direction(equations: StepEquations, x: Unknowns):
-    """``residual -> -(dR/dx)^-1 residual`` with the matrix at x, itself without derivative."""
+    """The map ``residual -> -(dR/dx)^-1 residual``, with the matrix at x as a constant for derivatives."""
     march = MarchEquations(equations)
-    factors = jax.lax.stop_gradient(factor(march, *march.rows(x)))
-    return lambda residual: march.by_name(*solve(march, factors, *march.rows(residual)))
+    factors = jax.lax.stop_gradient(factor(march, *march.flat(x)))
+    return lambda residual: march.by_name(*solve(march, factors, *march.flat(residual)))
 
 
 def _end(equations: StepEquations, x: Unknowns):
@@ -33,7 +33,7 @@ def _end(equations: StepEquations, x: Unknowns):
 
 @jax.custom_jvp
 def differentiable(equations: StepEquations, x: Unknowns, end):
-    """x and end unchanged, with the derivative of the root; in both modes, twice."""
+    """x and end unchanged, with the derivative of the root in both modes, twice."""
     return x, end
 
 
@@ -41,12 +41,14 @@ def differentiable(equations: StepEquations, x: Unknowns, end):
 def _implicit_derivative(primals, tangents):
     equations, root, _ = primals
     direction = _direction(equations, root)
-    # For second derivatives: one more Newton step moves nothing, but makes the root depend on the equations. To call `differentiable`
-    # again would not do: in reverse mode JAX forgets the rules of what it has evaluated already.
+    # For second derivatives: a Newton step x - (dR/dx)^-1 R at the root changes nothing, but makes x a function of the equations with the
+    # right first derivative. A recursive call of `differentiable` would not do: in reverse mode JAX has replaced it by its first derivative
+    # before it takes the second one.
     x = jax.tree.map(jnp.add, root, direction(equations.residual(root)))
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
 
-    # Another derivative of dx sees the matrix at x, by the rule of JAX for linear solves; the first one has one set of factors.
+    # dR/dx dx = -dR/de de. `custom_linear_solve` differentiates dx through `product`, that is through dR/dx at x; its own solves take the
+    # factors of `direction`, computed once.
     rows, by_name = ravel_pytree(jax.tree.map(jnp.negative, change))
 
     def product(dx):
@@ -67,7 +69,7 @@ def _implicit_derivative(primals, tangents):
 
 @jax.custom_vjp
 def differentiable_reverse_only(equations: StepEquations, x: Unknowns, end):
-    """The same in reverse mode only, once: half the work. Another derivative is refused."""
+    """x and end unchanged, with one derivative in reverse mode for half the work; any other derivative raises a TypeError."""
     return x, end
 
 
@@ -79,8 +81,9 @@ def _pulled_back(kept, cotangents):
     equations, x = only_once(kept)
     d_x, d_end = cotangents
     _, pull = jax.vjp(_end, equations, x)
-    by_end, more = pull(d_end)
-    d_x = jax.tree.map(jnp.add, d_x, more)
+    by_end, d_x_of_end = pull(d_end)
+    d_x = jax.tree.map(jnp.add, d_x, d_x_of_end)
+    # cotangent of e: (d end/de)^T d_end - (dR/de)^T (dR/dx)^-T d_x
     (d_residual,) = jax.linear_transpose(_direction(equations, x), x)(d_x)
     _, pull = jax.vjp(lambda e: e.residual(x), equations)
     (by_residual,) = pull(d_residual)
@@ -88,7 +91,7 @@ def _pulled_back(kept, cotangents):
 
 
 def _sum(a, b):
-    """Of cotangents; those of integers are nothing."""
+    """The sum of two cotangents; integers have the cotangent type float0, which has no sum."""
     return a if a.dtype == jax.dtypes.float0 else a + b
 
 
@@ -97,10 +100,10 @@ differentiable_reverse_only.defvjp(_kept, _pulled_back)
 
 @jax.custom_jvp
 def only_once(tree):
-    """The tree unchanged; its derivative is refused."""
+    """The tree unchanged; its derivative raises a TypeError."""
     return tree
 
 
 @only_once.defjvp
 def _refused(primals, tangents):
-    raise TypeError(SECOND)
+    raise TypeError(ONLY_FIRST_DERIVATIVES)

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 
 
 class Motions(NamedTuple):
-    """What constraints with the Jacobian G (n_g, n) leave free, and what they hold.
+    """Free directions, and a right inverse, of constraints with the Jacobian G (n_g, n).
 
     basis: P, orthonormal columns with ``G P = 0``.
     right_inverse: W, ``G W = 1``, its columns orthogonal to those of P.
@@ -60,6 +60,7 @@ def inverse(a, g_0, g_1):
     """
     (p_0, w_0), (p_1, w_1) = (Motions(*map(_block_diagonal, motions(g))) for g in (g_0, g_1))
     p_0, w_0 = (jnp.swapaxes(m, -1, -2) for m in (p_0, w_0))
+    # For the right-hand sides (b, c): dq = free b + held c with free = P_1 (P_0^T A P_1)^-1 P_0^T, and dmu = W_0^T (A dq - b)
     free = p_1 @ jnp.linalg.inv(p_0 @ a @ p_1) @ p_0
     held = w_1 - free @ (a @ w_1)
     top = jnp.concatenate([free, held], axis=-1)
