@@ -1,8 +1,8 @@
-"""Small dense algebra, and what steppers remember: the one place for what is written for speed alone.
+"""Small dense algebra and settings of the steppers: the only place for code that is written for speed alone.
 
-Two modules have the same names: `plain`, what a reader expects, and `cpu`, the tuned form. The environment variable
-VMRI_KERNELS (``plain`` or ``cpu``, the default) chooses one when the package is imported, see `chosen`. `band` inverts matrices with many zeros.
-`inverse_in_loop` is that of `cpu` with both.
+Two modules have the same names: `plain`, the textbook form, and `cpu`, the tuned form. The environment variable VMRI_KERNELS (``plain`` or
+``cpu``, the default) chooses one when the package is imported, see `chosen`. `band` inverts matrices with many zeros. `inverse_in_loop`
+comes from `cpu` in both cases.
 """
 
 from vmri_jax.kernels.band import Band, BandInverse, Full, FullInverse, Sparsity, sparsity

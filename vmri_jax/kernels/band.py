@@ -1,8 +1,8 @@
-"""Inverses of ``G M^-1 G^T``, full or as a band: of a chain of n bodies the band takes O(n) operations, the full one O(n^3).
+"""Inverses of ``G M^-1 G^T`` as a full or as a band matrix: for a chain of n bodies a band takes O(n) operations, a full matrix O(n^3).
 
-Rows of G that share no body leave zeros. In a good order those that are not zero lie close to the diagonal, and the matrix is
-block tridiagonal. Columns that have no row in common are computed together, as one product with the sum of their unit vectors
-(Curtis, Powell, Reid, J. Inst. Math. Appl. 13, 1974); the order is that of Cuthill and McKee.
+Two rows of G without a common body have a zero entry in the product. The order of Cuthill and McKee brings the other entries close to
+the diagonal, so that the matrix is block tridiagonal. Columns without a common row are computed together, as one product with the sum of
+their unit vectors, a seed (Curtis, Powell, Reid, J. Inst. Math. Appl. 13, 1974).
 
 Time of a RATTLE step of a hinged chain on one core, full over band: 2.8 with 10 bodies, 6 with 20, 16 with 40.
 """
@@ -18,12 +18,13 @@ from jaxtyping import Array, Float, Int
 from vmri_jax.kernels import chosen
 from vmri_jax.kernels.saddle import regularized
 
-PART = 0.2
-"""A band is taken where its half width is at most this part of the size."""
+LARGEST_HALF_WIDTH = 0.2
+"""Largest half width of a band, relative to the number of rows, for which the band is used. With a larger value wide bands cost more than the
+full matrix."""
 
 
 class FullInverse(NamedTuple):
-    """The inverse (n, n) itself."""
+    """An inverse as a matrix (n, n)."""
 
     matrix: Float[Array, "n n"]
 
@@ -34,34 +35,31 @@ class FullInverse(NamedTuple):
 
 @dataclass(frozen=True)
 class Full:
-    """Nothing is known about zeros.
-
-    size: n.
-    """
+    """The sparsity of a matrix (n, n) without known zeros; `size` is n."""
 
     size: int
 
     @property
     def seeds(self):
-        """(n, n) unit vectors: products with them are the columns."""
+        """(n, n) unit vectors: products of the matrix with them are its columns."""
         return jnp.eye(self.size)
 
     def inverse(self, products) -> FullInverse:
-        """Of the matrix with these products (n, n) with the seeds, one in each row."""
+        """The inverse of a matrix, from its products (n, n) with the seeds, one product in each row."""
         return FullInverse(chosen.inverse(regularized(products)).T)
 
     def solve(self, products, g):
-        """The x (n,) that the matrix with these products takes to g."""
+        """The x (n,) with ``A x = g``, for the matrix A with these products."""
         return chosen.solve(regularized(products.T), g[:, None])[:, 0]
 
 
 class BandInverse(NamedTuple):
-    """Block LU decomposition, blocks D, U to the right and L to the left of it, D' what elimination leaves of D.
+    """Block LU decomposition of a block tridiagonal matrix with the blocks L, D, U in a row of blocks; ``D' = D - L D'^-1 U`` after elimination.
 
     diagonal: ``D'^-1``.
     upper: ``D'^-1 U``.
     lower: ``L D'^-1`` with the D' of the block before.
-    places, back: order of the rows, and where each row is in it.
+    places, back: row at each place of the order (n at a place without a row), and place of each row.
     """
 
     diagonal: Float[Array, "blocks b b"]
@@ -75,13 +73,14 @@ class BandInverse(NamedTuple):
         rows = jnp.append(g, 0.0)[self.places].reshape(self.diagonal.shape[:2])
         zero = jnp.zeros_like(rows[0])
 
-        def down(before, at):
-            g, lower = at
+        # forward elimination y_i = g_i - L D'^-1 y_(i-1), then back substitution x_i = D'^-1 (y_i - U x_(i+1))
+        def down(before, row):
+            g, lower = row
             y = g - lower @ before
             return y, y
 
-        def up(after, at):
-            y, diagonal, upper = at
+        def up(after, row):
+            y, diagonal, upper = row
             x = diagonal @ y - upper @ after
             return x, x
 
@@ -92,7 +91,7 @@ class BandInverse(NamedTuple):
 
 @dataclass(frozen=True)
 class Band:
-    """All entries lie within `width` of the diagonal, when rows and columns are taken in this order."""
+    """The sparsity of a matrix whose entries lie within `width` of the diagonal, with rows and columns in this order."""
 
     order: tuple[int, ...]
     width: int
@@ -103,13 +102,13 @@ class Band:
 
     @property
     def _places(self) -> np.ndarray:
-        """(blocks b,) row at each place, n where there is none."""
+        """(blocks b,) row at each place, n at a place without a row."""
         free = self._blocks * self.width - len(self.order)
         return np.append(np.array(self.order), np.full(free, len(self.order)))
 
     @property
     def seeds(self):
-        """(3 b, n): one for every place in a block of every third block."""
+        """(3 b, n) seeds: one for each place in a block and each of three colours of blocks, the sum of its unit vectors in every third block."""
         n = len(self.order)
         place = np.arange(n)
         color = place % self.width + self.width * (place // self.width % 3)
@@ -118,18 +117,19 @@ class Band:
         return jnp.asarray(seeds)
 
     def inverse(self, products) -> BandInverse:
-        """Of the matrix with these products (3 b, n) with the seeds, one in each row."""
+        """The inverse of a matrix, from its products (3 b, n) with the seeds, one product in each row."""
         b, blocks, places = self.width, self._blocks, self._places
         rows = jnp.pad(products, [(0, 0), (0, 1)])[:, places]
         block = np.arange(blocks)
-        of = jnp.transpose(rows.reshape(3, b, blocks, b), (2, 0, 3, 1))  # block, third, row in it, column in it
-        lower, diagonal, upper = (of[block, (block + shift) % 3] for shift in (-1, 0, 1))
-        none = (places == len(self.order)).reshape(blocks, b)
-        diagonal = regularized(diagonal) + none[:, :, None] * np.eye(b)
+        # axes: block, colour of the block of columns, row in the block, column in its block
+        entries = jnp.transpose(rows.reshape(3, b, blocks, b), (2, 0, 3, 1))
+        lower, diagonal, upper = (entries[block, (block + shift) % 3] for shift in (-1, 0, 1))
+        is_free = (places == len(self.order)).reshape(blocks, b)  # places without a row get a unit diagonal
+        diagonal = regularized(diagonal) + is_free[:, :, None] * np.eye(b)
 
-        def eliminate(before, at):
+        def eliminate(before, row):
             inverse_before, upper_before = before
-            lower, diagonal, upper = at
+            lower, diagonal, upper = row
             lower = lower @ inverse_before
             inverse = chosen.inverse(diagonal - lower @ upper_before)
             return (inverse, upper), (inverse, inverse @ upper, lower)
@@ -142,7 +142,7 @@ class Band:
         return BandInverse(diagonal, upper, lower, jnp.asarray(places), jnp.asarray(back))
 
     def solve(self, products, g):
-        """The x (n,) that the matrix with these products takes to g."""
+        """The x (n,) with ``A x = g``, for the matrix A with these products."""
         return self.inverse(products).times(g)
 
 
@@ -150,24 +150,24 @@ Sparsity = Full | Band
 
 
 def sparsity(pattern: np.ndarray, nodes: int = 1) -> Sparsity:
-    """How to invert a matrix that is zero outside of a symmetric pattern (n, n).
+    """The sparsity of a matrix that is zero outside of a symmetric pattern (n, n): a band if it is narrow, else full.
 
     Args:
         pattern: True where an entry may differ from zero.
-        nodes: r; the matrix consists of r x r blocks with this pattern.
+        nodes: r; the matrix (r n, r n) has r x r blocks with this pattern.
     """
     n = len(pattern)
     if n <= 1:
         return Full(n * nodes)
 
-    from scipy.sparse import csr_array  # here: its import takes a tenth of a second
+    from scipy.sparse import csr_array  # imported here: the import takes a tenth of a second
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     order = np.asarray(reverse_cuthill_mckee(csr_array(pattern), symmetric_mode=True))
-    at = np.nonzero(pattern[np.ix_(order, order)])
-    width = int(np.max(np.abs(at[0] - at[1]), initial=0))
+    row, column = np.nonzero(pattern[np.ix_(order, order)])
+    width = int(np.max(np.abs(row - column), initial=0))
     order = (order[:, None] + n * np.arange(nodes)).reshape(-1)
     width = nodes * width + nodes - 1
-    if width > PART * len(order):
+    if width > LARGEST_HALF_WIDTH * len(order):
         return Full(len(order))
     return Band(tuple(order.tolist()), max(width, 1))

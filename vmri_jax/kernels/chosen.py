@@ -1,4 +1,4 @@
-"""The form of every function and constant that the package uses: that of `cpu`, or that of `plain` by the variable VMRI_KERNELS."""
+"""The functions and constants of `cpu`, or of `plain` if the environment variable VMRI_KERNELS says so."""
 
 import os
 

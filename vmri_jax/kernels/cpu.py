@@ -1,43 +1,45 @@
-"""Small dense algebra as elementwise operations, and what steppers remember: the names of `plain`, tuned for small systems on CPUs.
+"""Small dense algebra as elementwise operations, and settings of the steppers: the names of `plain`, tuned for small systems on CPUs.
 
-XLA compiles a loop without library calls into one kernel; a LAPACK call or a matrix product inside it costs about a
-microsecond each. Up to `ELEMENTWISE` rows systems are therefore eliminated by elementwise operations, beyond by LAPACK.
+XLA compiles a loop without library calls into one kernel; a LAPACK call or a matrix product inside the loop costs about a microsecond
+each. Elementwise operations therefore eliminate systems of up to `ELEMENTWISE` rows, LAPACK larger ones.
 """
 
 import jax
 import jax.numpy as jnp
 
 UNROLLED = 8
-"""Largest system whose elimination is written out step by step; larger ones go through a loop, which compiles faster."""
-TOGETHER = 3
-"""Steps of that loop that are written out."""
+"""Most rows of a system whose elimination is unrolled. A larger number makes steps of small systems faster and compiling slower: larger systems
+are eliminated in a loop."""
+UNROLLED_TURNS = 3
+"""Turns of that loop that XLA unrolls. A larger number compiles longer without a gain in speed."""
 REGISTER = 4
-"""Numbers in a vector register; rows of matrices are padded to a multiple of it."""
+"""Float64 numbers in a vector register (AVX2); rows of matrices are padded to a multiple of it."""
 ELEMENTWISE = 16
-"""Largest system that is eliminated by elementwise operations."""
+"""Most rows of a system that elementwise operations eliminate. Beyond, LAPACK is faster in spite of its call."""
 
-# What steppers remember from step to step, and which special cases they know. The results are the same without.
+# Memory of the steppers from step to step, and special cases that they know. Results agree without them, up to the tolerance.
 
 SLOW_ORDER = 10
-"""Highest order of the polynomial through the slow unknowns of the last steps, from which the next step starts. With less, small steps take
-more passes; a higher one is never the best."""
+"""Highest order of the polynomial through the slow unknowns of the last steps that predicts the next step. With a lower order small steps take
+more passes; a higher order is never the best."""
 CONTRACTION = 0.03
-"""Largest ratio of the corrections of two passes with which exact matrices are kept. An exact pass costs about as much as four others with
-constant masses, more in joint coordinates. With a larger ratio steps take more passes: at 0.1 the satellite of the gallery takes 0.8 of the time,
-a double pendulum in angles 0.9 to 1.0, but passes rise by a quarter. With a smaller one more passes are exact."""
+"""Largest ratio of the corrections of two passes with which exact matrices are kept. An exact pass costs about as much as four passes with
+kept matrices for constant masses, more in joint coordinates. A smaller ratio makes more passes exact. A larger ratio makes passes cheaper but
+raises their number: 0.1 takes a quarter more passes, in 0.8 of the time for the satellite of the gallery, in 0.9 to 1.0 of it for a double
+pendulum in angles."""
 LARGEST_RENEWED = 16
-"""Rows of the matrix K of a micro interval up to which it is computed in every macro step; a larger one is kept while the number of passes
-does not rise. With more, macro steps of large systems spend their time on it."""
+"""Most rows of the matrix K of a micro interval that every macro step computes anew; a larger K is kept while the number of passes does not
+rise. With a larger number, macro steps of large systems spend most of their time on K."""
 DIAGONAL_MATRICES = True
-"""Whether K is taken for every coordinate alone where W is a sum over the coordinates."""
+"""Whether K is one matrix per coordinate where W is a sum over the coordinates."""
 LINEARISES_FORCES = True
-"""Whether an update of the slow unknowns is solved for with the derivative of the slow forces where the masses alone would cost a pass."""
+"""Whether updates of the slow unknowns use the derivative of the slow forces where an update by the masses alone would cost a pass."""
 COLLOCATES = True
-"""Whether one interval of high degree is solved for all variables at once, in modes of time."""
+"""Whether `Collocation` solves a single interval of high degree, for all variables at once."""
 DRIFTS = True
-"""Whether a drift along constraints is solved for its multipliers alone (RATTLE)."""
+"""Whether `Rattle` solves a drift along constraints, for its multipliers alone."""
 DEFERS_PROJECTION = True
-"""Whether momenta are projected onto the hidden constraints only where they are looked at, after drifts."""
+"""Whether runs with drifts project the momenta onto the hidden constraints only at saved nodes."""
 
 
 def matmul(a, b):
@@ -65,7 +67,8 @@ def solve(a, b):
 
     rows = jnp.concatenate([a, b], axis=1)
     if n > UNROLLED:
-        return jax.lax.fori_loop(0, n, _eliminated, rows, unroll=TOGETHER)[:, n:]
+        return jax.lax.fori_loop(0, n, _eliminated, rows, unroll=UNROLLED_TURNS)[:, n:]
+    # pivot row r_1 <- r_1 / a_11, others r_i <- r_i - a_i1 r_1; the used column is dropped, and after n turns b has become x
     for _ in range(n):
         row = rows[0, 1:] / rows[0, 0]
         rows = jnp.concatenate([rows[1:, 1:] - rows[1:, :1] * row, row[None]])  # the first row becomes the last
@@ -73,13 +76,13 @@ def solve(a, b):
 
 
 def _eliminated(k, rows):
-    """One step of `solve`, in place."""
+    """Turn k of `solve` in place: row k becomes r_k / a_kk, row i becomes r_i - a_ik r_k / a_kk."""
     unit = jnp.arange(rows.shape[0])[:, None] == k
     return rows - (rows[:, k, None] - unit) * (rows[k] / rows[k, k])
 
 
 def inverse(a):
-    """The inverses of a (..., n, n), real or complex, see `solve`: every pivot's column is replaced by one of the inverse."""
+    """The inverses of a (..., n, n), real or complex, without pivoting (see `solve`): every turn replaces one column by a column of the inverse."""
     n = a.shape[-1]
     if n > ELEMENTWISE:
         return jnp.linalg.inv(a)
@@ -87,42 +90,41 @@ def inverse(a):
 
 
 def inverse_in_loop(a):
-    """`inverse` of every size without LAPACK.
+    """`inverse` without LAPACK for every size.
 
-    With `jnp.linalg.inv` of 18 rows in the loop of a march, over lanes and tangents (`advise` for docs/how_to/molecules.md), XLA's CPU
-    runtime waits for ever (jaxlib 0.10.2).
+    `jnp.linalg.inv` of 18 rows inside the loop of a march, with a batch of tangents (`advise` for docs/how_to/molecules.md), blocks XLA's CPU
+    runtime for ever (jaxlib 0.10.2).
     """
     n = a.shape[-1]
     if n > UNROLLED:
         full = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, -n % REGISTER)])
-        return jax.lax.fori_loop(0, n, _exchanged, full, unroll=TOGETHER)[..., :n]
+        return jax.lax.fori_loop(0, n, _exchanged, full, unroll=UNROLLED_TURNS)[..., :n]
     for _ in range(n):
         a = _first_exchanged(a)
     return a
 
 
 def _exchanged(k, a):
-    """One step of `inverse`, in place."""
+    """Turn k of `inverse` in place: an exchange step with the pivot a_kk."""
     rows, columns = (jnp.arange(m) == k for m in a.shape[-2:])
     row = jnp.where(columns, 1.0, a[..., k, None, :]) / a[..., k, k, None, None]
     return jnp.where(columns, rows[:, None] * 1.0, a) - (a[..., :, k, None] - rows[:, None]) * row
 
 
 def _first_exchanged(a):
-    """One step of `inverse` with the first pivot. All rows and columns move up by one, and the first ones become the last."""
-    pivot, one = 1 / a[..., :1, :1], jnp.ones((*a.shape[:-2], 1, 1))
+    """One exchange step with the first pivot. All rows and columns then move up by one, and the first ones become the last."""
+    pivot, unit = 1 / a[..., :1, :1], jnp.ones((*a.shape[:-2], 1, 1))
     row = jnp.concatenate([a[..., :1, 1:] * pivot, pivot], axis=-1)
-    column = jnp.concatenate([a[..., 1:, :1], -one], axis=-2)
+    column = jnp.concatenate([a[..., 1:, :1], -unit], axis=-2)
     moved = jax.lax.pad(a, jnp.zeros((), a.dtype), [(0, 0, 0)] * (a.ndim - 2) + [(-1, 1, 0)] * 2)
     return moved - column * row
 
 
 def max_abs(a):
-    """The largest absolute value in a, 0 of nothing, not finite if an entry is not.
+    """The largest absolute value in a; 0 if a is empty, not finite if an entry is not.
 
-    As integers with the order of ``|a|``, those of the same bits: a maximum of integers may be taken in any order, so that it
-    fills vector registers; one of floats is taken number by number, and XLA loses NaN in some of them. Axis by axis, so
-    that rows fill the registers.
+    The bits of ``|a|``, read as integers, have the same order. XLA may take a maximum of integers in any order, and uses vector registers;
+    a maximum of floats it takes number by number, and may lose a NaN. The maximum goes axis by axis, so that rows fill the registers.
     """
     order = jax.lax.bitcast_convert_type(jnp.abs(a), jnp.int64)
     while order.ndim:

@@ -1,15 +1,15 @@
-"""Small dense algebra as a reader expects it, NumPy's names and LAPACK, and steppers that remember nothing. What `cpu` is held against."""
+"""Small dense algebra in textbook form, with NumPy's names and LAPACK, and steppers without memory: the reference for tests of `cpu`."""
 
 import jax.numpy as jnp
 
 SLOW_ORDER = 0
-"""Slow unknowns start from their last values."""
+"""Order 0: slow unknowns start from their last values."""
 CONTRACTION = -1.0
-"""Matrices are never kept: the ratio of two corrections is not below zero."""
+"""Largest ratio of two corrections with which matrices are kept: negative, so that all passes are exact."""
 LARGEST_RENEWED = 10**9
-"""All are renewed."""
+"""Rows of K up to which every macro step computes it: all sizes."""
 DIAGONAL_MATRICES = LINEARISES_FORCES = COLLOCATES = DRIFTS = DEFERS_PROJECTION = False
-"""No special cases."""
+"""Steppers do not use any special case."""
 
 
 def matmul(a, b):
@@ -33,6 +33,6 @@ def inverse(a):
 
 
 def max_abs(a):
-    """The largest absolute value in a, 0 of nothing, not finite if an entry is not."""
+    """The largest absolute value in a; 0 if a is empty, not finite if an entry is not."""
     largest = jnp.max(jnp.abs(a), initial=0.0)
     return jnp.where(jnp.all(jnp.isfinite(a)), largest, jnp.inf)

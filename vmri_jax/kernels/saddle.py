@@ -1,23 +1,25 @@
-"""Matrices of constrained equations, kept invertible where constraints become dependent."""
+"""Regularised matrices of constrained equations, which stay invertible where constraints become dependent."""
 
 import jax.numpy as jnp
 import numpy as np
 
 REGULARIZATION = 2e-15
-"""Part of its diagonal that is added to ``G M^-1 G^T``, see `regularized`."""
+"""Relative change of the diagonal of ``G M^-1 G^T``, a few units of round-off, see `regularized`. A larger value slows down convergence with
+nearly dependent constraints; a smaller one is lost in round-off."""
 
 
 def regularized(a):
-    """``G M^-1 G^T`` (..., n, n), kept invertible where rows of G become dependent.
+    """The matrix ``G M^-1 G^T`` (..., n, n) with its diagonal times 1 + REGULARIZATION: invertible also for dependent rows of G.
 
-    Multipliers are then nearly those of least norm. Residuals are exact, so that it decides on convergence alone, not
-    on solutions: errors shrink by REGULARIZATION times the condition number, instead of at once.
+    For dependent rows the multipliers are then nearly those of least norm. The residuals of the iterations are exact, so that the
+    regularisation changes their convergence and not the solution: every iteration multiplies the error by REGULARIZATION times the
+    condition number.
     """
     return a * (1 + REGULARIZATION * np.eye(a.shape[-1]))
 
 
 def saddle(a, b, c):
-    """``[[a, b], [c, 0]]`` over any leading axes, `regularized`: 0 becomes a small part of the diagonal of ``-c a^-1 b``."""
+    """``[[a, b], [c, e]]`` over any leading axes, with ``e = -REGULARIZATION diag(c diag(a)^-1 b)`` in place of 0, see `regularized`."""
     diagonal = jnp.diagonal(a, axis1=-2, axis2=-1)[..., None]
     scale = jnp.sum(jnp.swapaxes(c, -1, -2) * b / jnp.where(diagonal == 0, 1.0, diagonal), axis=-2)
     corner = -REGULARIZATION * scale[..., None] * np.eye(b.shape[-1])
