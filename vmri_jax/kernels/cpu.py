@@ -11,7 +11,7 @@ UNROLLED = 8
 """Most rows of a system whose elimination is unrolled. A larger number makes steps of small systems faster and compiling slower: larger systems
 are eliminated in a loop."""
 UNROLLED_TURNS = 3
-"""Turns of that loop that XLA unrolls. A larger number compiles longer without a gain in speed."""
+"""Turns of that loop that XLA unrolls. A larger number makes compiling slower."""
 REGISTER = 4
 """Float64 numbers in a vector register (AVX2); rows of matrices are padded to a multiple of it."""
 ELEMENTWISE = 16

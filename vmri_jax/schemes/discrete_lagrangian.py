@@ -2,17 +2,17 @@
 
     L_d(S, F) = sum over terms, over nodes i of the term's rule:  H w_i term(q(theta_i), qdot(theta_i))
 
-`lagrangian` builds it by combinators, ``kinetic - slow - fast - others``, each term placed on its own nodes.
+`lagrangian` builds the sum ``T - V - W - sum_i V_i``, with every term on the nodes of its rule.
 
-A part ``T_s(q_s, q_s')`` of the kinetic energy that slow variables alone have, `System.slow_kinetic`, has the rule of the kinetic energy
-on the macro grid, as g_s has that of g:
+The part ``T_s(q_s, q_s')`` of the kinetic energy that depends on slow variables alone, `System.slow_kinetic`, has the rule of T on the
+macro grid, just as g_s has the rule of g:
 
     sum_i H w_i T_s(S(c_i H), S'(c_i H))        in place of        sum_m sum_i h w_i T_s at the nodes (m + c_i) h
 
-S is one polynomial over the macro interval, so that both sums have the order of the rule, and each is a discrete Lagrangian: symplectic,
-with its momentum maps. They are equal where T_s is that of constant masses and the rule is exact for the square of S', such as for
-bodies by directors. Else they differ by the error of the rule, of the order of the scheme; the left one does not cost more with more
-micro steps.
+S is one polynomial over the macro interval, so that both sums have the order of the rule, and both are discrete Lagrangians, whose steps
+are symplectic and keep momentum maps. The sums are equal if T_s has constant masses (as for rigid bodies in director coordinates) and the
+rule is exact for the square of S'. Else they differ by the error of the rule, of the order of the scheme. The cost of the left sum does
+not grow with the number of micro steps.
 """
 
 from collections.abc import Callable
@@ -41,9 +41,14 @@ from vmri_jax.schemes.scheme import Scheme
 class Term:
     """An integrand on its nodes: ``path -> H^(1 + power) sum_i w_i integrand(path at theta_i)``.
 
-    `integrand` takes the arguments it names, e.g. ``("q_s", "q_f")``. Weights at the ends of the macro interval
-    are held apart for terms without velocities (None where there is no such node): those are kicks, from averaged
-    positions where `mollified`. `grid` and `every` are where its rule was placed; `name` is for people.
+    integrand, arguments: function of the path, and the names of its arguments, e.g. ``("q_s", "q_f")``.
+    inside: nodes inside the macro interval.
+    start, end: weights at the ends of the macro interval, for terms without velocities; None without such a node. These nodes are kicks.
+    sign: of the term in the Lagrangian.
+    grid, every: placement of its rule, see `PlacedRule`.
+    mollified: whether kicks take averaged fast positions.
+    power: further powers of H in front of the sum, for corrections.
+    name: for texts.
     """
 
     integrand: Callable
@@ -59,14 +64,14 @@ class Term:
     name: str = ""
 
     def times_step(self, macro_dt):
-        """What the weights are multiplied by."""
+        """The factor ``H^(1 + power)`` of the weights."""
         return macro_dt ** (1 + self.power)
 
     def __call__(self, path: Path):
         return self.at_nodes_inside(path) + self.at_ends(path)
 
     def at_nodes_inside(self, path: Path):
-        """The part of the sum that the unknowns of a step enter."""
+        """The sum over the nodes inside the macro interval: its gradient stands in the equations that a step solves."""
         if not self.inside.groups:
             return jnp.zeros(())
         values = jax.vmap(self.integrand)(*self.inside.sample(path, self.arguments).values())
@@ -95,10 +100,12 @@ class Term:
 
 @dataclass(frozen=True)
 class QuadraticKinetic:
-    """Kinetic energy of constant masses: a quadratic form in the increments, assembled once.
+    """Kinetic energy of constant masses: a quadratic form in the increments Delta, assembled once.
 
-    ``sum_ij k_ij Delta_i^T M Delta_j / (2 dt)`` per interval, with ``k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)`` for the
-    slow increments over the macro interval and for the fast ones over each micro interval.
+        sum_ij k_ij Delta_i^T M Delta_j / (2 T),        k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
+
+    for the slow increments over the macro interval, T = H, and for the fast increments over each micro interval, T = h; the weights w_n
+    sum to 1 over the interval.
     """
 
     mass: ConstantMass
@@ -119,12 +126,12 @@ class QuadraticKinetic:
             np.array([g.c for g in groups]), jnp.stack([g.weights[0] for g in groups]) * self.nodes.num_micro
         )
 
-    def _form(self, at, weights):
-        slopes = lagrange_derivative(self.nodes.degree, at)
+    def _form(self, theta, weights):
+        slopes = lagrange_derivative(self.nodes.degree, theta)
         return jnp.sum(weights[:, None, None] * (slopes[:, :, None] * slopes[:, None, :]), axis=0)
 
     def rows(self, slow, fast):
-        """Derivative by the slow increments (r, n_s) times H, and by the fast ones (..., r, n_f) times h."""
+        """The derivatives ``sum_j k_ij M Delta_j``: by the slow increments (r, n_s) times H, by the fast ones (..., r, n_f) times h."""
         slow, fast = self.mass.momentum(slow, fast)
         return matmul(self.slow_form[1:, 1:], slow), matmul(self.fast_form[1:, 1:], fast)
 
@@ -174,7 +181,12 @@ class Sum:
 
 
 class PlacedPotential(NamedTuple):
-    """A potential of a system, with its rule: a function of the positions it names and of params. V and W have these names."""
+    """A potential of a system with its rule.
+
+    name: "V", "W", or the name of a further potential.
+    function, arguments: function of some positions and of params, and the names of the positions.
+    placed: its rule.
+    """
 
     name: str
     function: Callable
@@ -182,7 +194,7 @@ class PlacedPotential(NamedTuple):
     placed: PlacedRule
 
     def value(self, q_s, q_f, params):
-        """At positions of which it takes the ones that it names."""
+        """The potential at positions, of which the function gets those in `arguments`."""
         return self.function(*({"q_s": q_s, "q_f": q_f}[name] for name in self.arguments), params)
 
 
@@ -194,10 +206,10 @@ def placed_potentials(system: System, scheme: Scheme) -> tuple[PlacedPotential, 
     """
     both = ("q_s", "q_f")
     known = ("V", system.slow_potential, both, scheme.slow), ("W", system.fast_potential, ("q_f",), scheme.fast)
-    others = ((label(name), function, both, scheme.rule_of(name)) for name, function in system.potentials)
+    further = ((label(name), function, both, scheme.rule_of(name)) for name, function in system.potentials)
     return tuple(
         PlacedPotential(name, function, arguments, placed)
-        for name, function, arguments, placed in (*known, *others)
+        for name, function, arguments, placed in (*known, *further)
         if function is not None
     )
 
@@ -211,7 +223,12 @@ def lagrangian(system: System, scheme: Scheme) -> Sum:
 
 
 def _corrections(system: System, scheme: Scheme) -> Sum:
-    """The squares of gradients of `vmri_jax.schemes.quadrature.gradient_corrected`."""
+    """The corrections by squared gradients of `vmri_jax.schemes.quadrature.gradient_corrected`.
+
+        h^2/24 grad W . M^-1 grad W        H^2/24 grad V . M^-1 grad V + h^2/12 grad V . M^-1 grad W
+
+    as terms of the Lagrangian, with the factor H^2 in `Term.power` and h = H / num_micro.
+    """
     if not scheme.slow.gradient_corrected and not scheme.fast.gradient_corrected:
         return Sum(())
     if not isinstance(system.kinetic, ConstantMass):
@@ -272,8 +289,8 @@ def discrete_lagrangian(system: System, scheme: Scheme) -> Callable:
         fast: (num_micro r + 1, n_f) fast control points, shared ones once.
         macro_dt: length H of the macro interval.
 
-    Its slot derivatives are ``jax.grad(L_d, argnums=(0, 1))``; the discrete Legendre transforms are the first and
-    last of them, see `discrete_legendre`.
+    Its derivatives by the control points are ``jax.grad(L_d, argnums=(0, 1))``; the discrete Legendre transforms are the first and
+    the last of these, see `discrete_legendre`.
     """
     if scheme.slow.mollified:
         raise ValueError(

@@ -5,9 +5,13 @@
     p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)           g_s(S_i) = 0  (i = 1..r)
     p_f + D_{F_0} A = 0      D_{F_j} A = 0  (all but the last)    g = 0 at every micro control node but the first
 
-Everything is multiplied by the micro step h, and the multipliers absorb their weights: the unknowns are
-``mu_j = h H w_j lambda_j`` and ``num_micro h H w_i nu_i``, so that rows and columns stay of the size of the mass
-matrix and the constraint Jacobian for every step size.
+Forces add their virtual work ``H sum_i w_i F(t_i, q_i, v_i) . dq_i / dX`` to every D_X A (Lagrange-d'Alembert). Kicks are not part
+of these equations: p_s and p_f are the momenta after the kicks at the start of the step (`vmri_jax.steppers.kicked`).
+
+The momentum equations are multiplied by the micro step h, and the multipliers absorb their weights: the unknowns are
+``mu_j = h H w_j lambda_j`` and ``num_micro h H w_i nu_i``, so that rows and columns of the Newton matrix stay of the size of the
+masses and of the constraint Jacobian for every step size. The w_j are weights on the macro interval: with n = num_micro, the weight of
+the constraint rule over n, summed over both intervals at nodes where two intervals meet (`multiplier_scales`).
 """
 
 from typing import NamedTuple
@@ -27,7 +31,7 @@ from vmri_jax.schemes.scheme import Scheme
 
 
 class Unknowns(NamedTuple):
-    """Unknowns of a macro step, and with the same shapes its residual.
+    """Unknowns of a macro step; the residual has the same fields and shapes.
 
     | field | unknown | residual |
     |---|---|---|
@@ -44,9 +48,10 @@ class Unknowns(NamedTuple):
 
 
 class StepEquations(eqx.Module):
-    """The nonlinear equations of one macro step from given positions and (kicked) momenta.
+    """The nonlinear equations of one macro step, from positions and momenta after the kicks at its start.
 
-    The methods take x, the `Unknowns`; `path`, which is varied, and `at`, the same path held fixed where forces are evaluated.
+    Arguments of the methods: x, the `Unknowns`; `path`, which is varied; `held`, the same path as a constant, along which forces are
+    evaluated.
     """
 
     system: System
@@ -60,7 +65,7 @@ class StepEquations(eqx.Module):
 
     @classmethod
     def of(cls, system: System, scheme: Scheme, state: State, macro_dt) -> "StepEquations":
-        """Those of a step from a state."""
+        """The equations of a step from a state."""
         return cls(system, scheme, state.t, state.q_s, state.q_f, state.p_s, state.p_f, macro_dt)
 
     @property
@@ -81,23 +86,23 @@ class StepEquations(eqx.Module):
         """The path of these increments: fast starts are their running sums over whole intervals."""
         return Path(self.t, self.macro_dt, self.q_s, slow, self.q_f + sum_before(fast[:, -1]), fast)
 
-    def action(self, path: Path, at: Path, x: Unknowns):
-        """Augmented action times h; forces act on the virtual displacement of `path`, evaluated along `at`."""
-        return self._action(lagrangian(self.system, self.scheme), path, at) - self.constraint_work(path, x)
+    def action(self, path: Path, held: Path, x: Unknowns):
+        """Augmented action times h, with the virtual work of forces along `held` on displacements of `path`."""
+        return self._action(lagrangian(self.system, self.scheme), path, held) - self.constraint_work(path, x)
 
-    def without_kinetic(self, path: Path, at: Path):
-        """The same without constraints and without the kinetic energy of constant masses."""
-        return self._action(lagrangian(self.system, self.scheme).potentials, path, at)
+    def without_kinetic(self, path: Path, held: Path):
+        """`action` without constraints and without the kinetic energy of constant masses."""
+        return self._action(lagrangian(self.system, self.scheme).potentials, path, held)
 
-    def _action(self, terms: Sum, path: Path, at: Path):
-        return self.micro_dt * (terms.at_nodes_inside(path) + self.virtual_work(path, at))
+    def _action(self, terms: Sum, path: Path, held: Path):
+        return self.micro_dt * (terms.at_nodes_inside(path) + self.virtual_work(path, held))
 
-    def virtual_work(self, path: Path, at: Path):
-        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, with the forces along `at`."""
+    def virtual_work(self, path: Path, held: Path):
+        """Lagrange-d'Alembert: ``H sum_i w_i F(t_i, q_i, v_i) . q_i``, with the forces along `held`."""
         if self.system.force is None:
             return 0.0
         nodes = self.force_nodes
-        f_s, f_f = jax.vmap(self.system.forces)(*nodes.sample(at, ("t", "q_s", "q_f", "v_s", "v_f")).values())
+        f_s, f_f = jax.vmap(self.system.forces)(*nodes.sample(held, ("t", "q_s", "q_f", "v_s", "v_f")).values())
         q_s, q_f = nodes.sample(path, ("q_s", "q_f")).values()
         return self.macro_dt * jnp.sum(nodes.weights * (jnp.sum(f_s * q_s, axis=1) + jnp.sum(f_f * q_f, axis=1)))
 
@@ -112,6 +117,7 @@ class StepEquations(eqx.Module):
         """``h D_{S_i} A`` (r + 1, n_s) and, per micro interval, ``h D_{F_j} A`` (num_micro, r + 1, n_f)."""
         path = self.path(x)
         d = jax.grad(self.action)(path, path, x)
+        # control point X_j = X_0 + Delta_j: D_{X_j} = d/dDelta_j, and D_{X_0} = d/dX_0 at fixed control points = d_start - sum_j d/dDelta_j
         slow = jnp.concatenate([(d.slow_start - d.slow.sum(0))[None], d.slow])
         fast = jnp.concatenate([(d.fast_start - d.fast.sum(1))[:, None], d.fast], axis=1)
         return slow, fast
@@ -121,6 +127,7 @@ class StepEquations(eqx.Module):
         slow, fast = self.slots(x)
         path = self.path(x)
         q_s, q_f = path.control_points()
+        # momentum that arrives at each micro interval, times h: p_f, then D_last of the interval before
         incoming = jnp.concatenate([self.micro_dt * self.p_f[None], fast[:-1, -1]])
         residual = Unknowns(
             slow=slow[:-1].at[0].add(self.micro_dt * self.p_s),
@@ -152,11 +159,17 @@ def sum_before(increments):
 
 
 def multiplier_scales(scheme: Scheme, macro_dt, before: Number = 0.0):
-    """What turns multipliers into unknowns: ``h H w_j`` (num_micro, r, 1) and ``num_micro h H w_i`` (r, 1).
+    """The factors of the multipliers in the unknowns: ``mu / lambda = h H w_j`` (num_micro, r, 1), and ``num_micro h H w_i`` (r, 1) for nu.
+
+    With the weights w_0..w_r of the constraint rule, and H_before, the factors of g are
+
+        h^2 (w_0 + H_before / H w_r)  at the start of the step      h^2 (w_0 + w_r)  where micro intervals meet      h^2 w_j  inside
 
     Args:
-        before: length of the macro step before, if the momenta have not been projected since: the multipliers of the node that
-            the two steps share are then those of both.
+        scheme: its constraint rules.
+        macro_dt: length H of the step.
+        before: H_before, length of the step before if its end momenta were not projected, else 0. Without a projection, the multipliers at
+            the common node carry the constraint forces of both steps.
     """
     n, h = scheme.num_micro, macro_dt / scheme.num_micro
     w, w_slow = (jnp.asarray(placed.rule.weights) for placed in (scheme.constraint, scheme.slow_constraint))

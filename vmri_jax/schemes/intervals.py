@@ -1,6 +1,6 @@
 """The equations of a macro step, cut into its micro intervals.
 
-Interval m begins with the fast position F_0 and the momentum p that the interval before hands on. Its part of the augmented action is
+Interval m starts with the fast position F_0 and the momentum p at the end of the interval before. Its part of the augmented action is
 
     A_m(S, F) = sum over terms, over their nodes i in this interval:  H w_i term(q(theta_i), qdot(theta_i))
                 - sum_j mu_j . g(q at its control node j) / h        (0 <= j < r)
@@ -14,8 +14,7 @@ for the fast increments and the scaled multipliers mu. It hands on ``F_r`` and `
 
     p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)        g_s = 0 at S_1..S_r
 
-The part of A that slow variables alone enter, such as their own kinetic energy, has no share in an interval: it enters the slow
-equations themselves, once for all intervals.
+Terms of slow variables alone, such as `System.slow_kinetic`, belong to no interval: they enter the slow equations once.
 
 These are the equations of `vmri_jax.schemes.equations`, in the order in which a march over the intervals meets them.
 """
@@ -36,7 +35,7 @@ from vmri_jax.schemes.path import NodeGroup, Nodes, Path, control_nodes, lagrang
 
 
 class IntervalPath(NamedTuple):
-    """The path over one micro interval; n_v of the slow variables are seen in it, see `Intervals`.
+    """The path over one micro interval, with the n_v slow variables on which terms in the interval depend, see `Intervals`.
 
     slow_start, slow: start and increments of the slow control points, of the whole macro step.
     fast_start, fast: start and increments of the fast control points of this interval.
@@ -49,7 +48,7 @@ class IntervalPath(NamedTuple):
 
 
 class Arriving(NamedTuple):
-    """What the intervals before hand on.
+    """The quantities that the intervals before hand on.
 
     q_f, p_f: fast position, and fast momentum times h.
     start, slow: gradients of their actions (times h) by the start and by the increments of the slow path.
@@ -69,10 +68,10 @@ class IntervalUnknowns(NamedTuple):
 
 
 class IntervalNodes:
-    """Quadrature nodes of a term, as many in each of the micro intervals that have them.
+    """Quadrature nodes of a term, the same number in every micro interval that has nodes.
 
     Args:
-        groups: of nodes at the same local coordinates; no two of a row are in the same interval.
+        groups: rows of groups of nodes; the groups of a row lie in different intervals, so that a row has at most one node per interval.
         num_micro, degree: of the scheme.
     """
 
@@ -100,10 +99,10 @@ class IntervalNodes:
 
     @classmethod
     def of(cls, nodes: Nodes) -> "list[IntervalNodes]":
-        """The nodes of a rule: together those that all intervals have, alone each row that only some have.
+        """The nodes of a rule: one entry for all rows with a node in every interval, and one for each row with nodes in some intervals.
 
-        Functions are evaluated nowhere else: a potential may not be defined there, and a rule on the macro step has no node
-        in most intervals.
+        So functions are evaluated at the nodes of their rule alone: a potential may not be defined elsewhere, and a rule on the macro step
+        has no node in most intervals.
         """
         rows: list[list[NodeGroup]] = []
         for group in nodes.groups:
@@ -119,9 +118,9 @@ class IntervalNodes:
         return [cls(part, nodes.num_micro, nodes.degree) for part in parts]
 
     def sample(self, path: IntervalPath, equations: StepEquations, seen: Entries, m, names: tuple[str, ...]) -> list:
-        """By name, of the path at the nodes of interval m: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n).
+        """Values of the path at the k nodes of interval m, by name: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n).
 
-        Slow variables that are not seen stay at the start of the macro step.
+        Slow variables on which no term depends have their values at the start of the macro step.
         """
 
         def values_at_nodes(name: str):
@@ -129,6 +128,7 @@ class IntervalNodes:
                 return equations.t + equations.macro_dt * of_interval(self.theta, m)
             start, increments = (path.slow_start, path.slow) if name[2] == "s" else (path.fast_start, path.fast)
             moved = matmul(of_interval(self.tables[name], m), increments)
+            # q(c) = q_0 + sum_j l_j(c) Delta_j,  v(c) = sum_j l_j'(c) Delta_j / T, with T = H for slow and T = h for fast variables
             if name[0] == "q":
                 values = start + moved
             else:
@@ -139,20 +139,20 @@ class IntervalNodes:
 
 
 def with_unseen(values, name: str, equations: StepEquations, seen: Entries):
-    """(k, n_s) slow positions or velocities, "q_s" or "v_s", of those that are seen (k, n_v); others are at rest at the start."""
-    rest = equations.q_s if name == "q_s" else jnp.zeros_like(equations.q_s)
-    return seen.put(values, jnp.broadcast_to(rest, (len(values), rest.size)))
+    """All slow positions or velocities (k, n_s), "q_s" or "v_s", from the seen ones (k, n_v); the others stay at rest at the start."""
+    at_rest = equations.q_s if name == "q_s" else jnp.zeros_like(equations.q_s)
+    return seen.put(values, jnp.broadcast_to(at_rest, (len(values), at_rest.size)))
 
 
 def _padded(group: NodeGroup, num_micro: int):
-    """(num_micro,) weights of a group, 0 in the intervals without it."""
+    """(num_micro,) weights of a group of nodes, 0 in intervals without a node of the group."""
     if group.step > 1:
         return jnp.zeros(num_micro).at[np.array(group.intervals)].set(group.weights)
     return jnp.pad(jnp.asarray(group.weights), (group.first, num_micro - group.stop))
 
 
 def of_interval(table, m):
-    """The rows of interval m: a constant where all intervals have the same ones."""
+    """The rows of a table for interval m; a constant, without a lookup, if the rows of all intervals are equal."""
     if len(table) == 1 or (isinstance(table, np.ndarray) and np.ptp(table, axis=0).max(initial=0.0) == 0.0):
         return table[0]
     return jnp.asarray(table)[m]
@@ -161,15 +161,15 @@ def of_interval(table, m):
 class Intervals:
     """The equations of the micro intervals of a macro step, and the slow ones.
 
-    The terms on the micro grid may see some of the slow variables alone: of a satellite those of the hub that carries vibrating panels,
-    and not the angles of its wheels. The intervals then exchange nothing that belongs to the others, so that they do not cost more with
-    more slow variables.
+    The terms on the micro grid may depend on only some of the slow variables. In a satellite with vibrating panels they depend on the
+    position of the hub that carries the panels, and not on the angles of its wheels. The intervals then take and hand on quantities of
+    these "seen" slow variables only, so that their cost does not grow with the number of the others.
 
     Args:
         equations: of the macro step.
 
     Attributes:
-        seen: the slow variables that intervals see; all of them where there are forces, which push whatever they like.
+        seen: the slow variables on which terms on the micro grid depend; all of them with forces, which may act on any variable.
     """
 
     def __init__(self, equations: StepEquations):
@@ -180,11 +180,11 @@ class Intervals:
             if isinstance(term, QuadraticKinetic):
                 slow, fast = term.mass.slow_mass, term.mass.fast_mass
                 self._masses = (slow, term.slow_form[1:, 1:]), (fast, term.fast_form[1:, 1:])
-        others = [term for term in terms if isinstance(term, Term) and term.inside.groups]
-        of_slow = [all(name.endswith("_s") for name in term.arguments) for term in others]
-        self._slow_terms = [term for term, alone in zip(others, of_slow, strict=True) if alone]
-        both = (term for term, alone in zip(others, of_slow, strict=True) if not alone)
-        self._terms = [(term, nodes) for term in both for nodes in IntervalNodes.of(term.inside)]
+        inner = [term for term in terms if isinstance(term, Term) and term.inside.groups]
+        of_slow = [all(name.endswith("_s") for name in term.arguments) for term in inner]
+        self._slow_terms = [term for term, alone in zip(inner, of_slow, strict=True) if alone]
+        of_fast = (term for term, alone in zip(inner, of_slow, strict=True) if not alone)
+        self._terms = [(term, nodes) for term in of_fast for nodes in IntervalNodes.of(term.inside)]
         has_force = equations.system.force is not None
         self._force_nodes = IntervalNodes.of(equations.force_nodes) if has_force else []
         self.seen = self._seen()
@@ -197,10 +197,10 @@ class Intervals:
         n_s = equations.q_s.size
 
         def values(slow):
-            """Of all of these functions, by slow positions and velocities one after the other."""
-            at = {"q_s": slow[:n_s], "v_s": slow[n_s:], "q_f": equations.q_f, "v_f": equations.q_f}
-            integrands = [term.integrand(*(at[name] for name in term.arguments)) for term, _ in self._terms]
-            return integrands, system.g(equations.t, at["q_s"], at["q_f"])
+            """Values of all these functions, for slow positions and velocities in one vector (2 n_s,)."""
+            values_of = {"q_s": slow[:n_s], "v_s": slow[n_s:], "q_f": equations.q_f, "v_f": equations.q_f}
+            integrands = [term.integrand(*(values_of[name] for name in term.arguments)) for term, _ in self._terms]
+            return integrands, system.g(equations.t, values_of["q_s"], values_of["q_f"])
 
         if self._force_nodes:
             return Entries.of([True] * n_s)
@@ -208,7 +208,7 @@ class Intervals:
         return Entries.of((marked[:n_s] | marked[n_s:]).tolist())
 
     def evaluate(self, m, x: IntervalUnknowns, arriving: Arriving, slow) -> tuple[IntervalUnknowns, Arriving]:
-        """Residual of interval m, and what it hands on.
+        """Residual of interval m, and the quantities that it hands on.
 
         Args:
             m: number of the interval.
@@ -223,13 +223,14 @@ class Intervals:
         if self._masses is not None:
             mass, form = self._masses[1]
             d_fast += matmul(form, mass.times(x.fast))
+        # h (p + D_{F_0} A_m), then h D_{F_j} A_m, 0 < j <= r; the last one is the momentum that is handed on
         slots = jnp.concatenate([(arriving.p_f + d.fast_start - d_fast.sum(0))[None], d_fast])
         residual = IntervalUnknowns(slots[:-1], self._constraints(path, m, slice(1, None)))
         on = Arriving(arriving.q_f + x.fast[-1], slots[-1], arriving.start + d.slow_start, arriving.slow + d.slow)
         return residual, on
 
     def _action(self, path: IntervalPath, held: IntervalPath, mu, m):
-        """``h A_m`` without the kinetic energy of constant masses; forces, along `held`, act on the displacement of `path`."""
+        """``h A_m`` without the kinetic energy of constant masses, with the work of forces along `held` on displacements of `path`."""
         equations = self.equations
         total = jnp.zeros(())
         for term, nodes in self._terms:
@@ -280,12 +281,12 @@ class Intervals:
     def slow_evaluate(self, slow, multiplier, arriving: Arriving):
         """Residual of the slow equations ((r, n_s), (r, n_gs)), and the slow momentum at the end of the step.
 
-        The end momentum is that of the start plus all impulses. Impulses of potentials that do not see a common shift of the slow
-        variables cancel, so that a momentum that is conserved is so to round-off.
+        The end momentum is computed as the start momentum plus all impulses, ``p_s + D_{S_0} A + ... + D_{S_r} A``. Potentials that are
+        invariant under translations of the slow variables have impulses of sum zero, so that momentum is conserved to round-off.
 
         Args:
             slow, multiplier: (r, n_s) increments, (r, n_gs) scaled multipliers.
-            arriving: what the last micro interval hands on.
+            arriving: quantities that the last micro interval hands on.
         """
         equations = self.equations
         start, d = (
@@ -301,13 +302,14 @@ class Intervals:
         nodes = jnp.concatenate([equations.q_s[None], equations.q_s + slow])
         pull = jax.vjp(lambda q: jax.vmap(equations.system.g_slow)(times[:-1], q), nodes[:-1])[1]
         impulses = pull(multiplier / equations.scheme.num_micro)[0]
+        # h (p_s + D_{S_0} A), h D_{S_i} A, 0 < i < r
         rows = jnp.concatenate([(equations.micro_dt * equations.p_s + start - d.sum(0))[None], d[:-1]]) - impulses
         p_s = equations.p_s + (start - impulses.sum(0)) / equations.micro_dt
         return (rows, jax.vmap(equations.system.g_slow)(times[1:], nodes[1:])), p_s
 
 
 def _where_there_are_nodes(nodes: IntervalNodes, m, function, path):
-    """The sum of a term over the nodes of interval m. A rule on the macro step has none in most intervals: they cost nothing."""
+    """``function(path)``, or zero without evaluation in intervals where the rule has no nodes."""
     if nodes.has_nodes.all():
         return function(path)
     return jax.lax.cond(jnp.asarray(nodes.has_nodes)[m], function, lambda _: jnp.zeros(()), path)

@@ -27,24 +27,26 @@ def control_nodes(degree: int) -> np.ndarray:
     return np.array(lobatto(degree + 1).nodes)
 
 
-def lagrange_basis(degree: int, at) -> np.ndarray:
+def lagrange_basis(degree: int, theta) -> np.ndarray:
     """Values ``l_j(x)`` of the Lagrange polynomials of the control nodes, shape (..., degree + 1).
 
-    By the product formula, which is exactly 0 or 1 at the control nodes.
+    ``l_j(x) = prod_(i != j) (x - c_i) / (c_j - c_i)``: this formula is exactly 0 or 1 at the control nodes.
     """
-    c, x = control_nodes(degree), np.asarray(at, dtype=float)[..., None]
-    others = [np.delete(c, j) for j in range(degree + 1)]
-    return np.stack([np.prod((x - o) / (c[j] - o), axis=-1) for j, o in enumerate(others)], axis=-1)
+    c, x = control_nodes(degree), np.asarray(theta, dtype=float)[..., None]
+    roots = [np.delete(c, j) for j in range(degree + 1)]
+    return np.stack([np.prod((x - c_i) / (c[j] - c_i), axis=-1) for j, c_i in enumerate(roots)], axis=-1)
 
 
-def lagrange_derivative(degree: int, at) -> np.ndarray:
+def lagrange_derivative(degree: int, theta) -> np.ndarray:
     """Derivatives ``l_j'(x)`` of the Lagrange polynomials of the control nodes, shape (..., degree + 1)."""
-    c, x = control_nodes(degree), np.asarray(at, dtype=float)[..., None]
+    c, x = control_nodes(degree), np.asarray(theta, dtype=float)[..., None]
+    # l_j'(x) = sum_(k != j) 1 / (c_j - c_k) prod_(i != j, k) (x - c_i) / (c_j - c_i)
     columns = []
     for j in range(degree + 1):
-        o = np.delete(c, j)
+        roots = np.delete(c, j)
         products = [
-            np.prod((x - np.delete(o, k)) / (c[j] - np.delete(o, k)), axis=-1) / (c[j] - o[k]) for k in range(degree)
+            np.prod((x - np.delete(roots, k)) / (c[j] - np.delete(roots, k)), axis=-1) / (c[j] - roots[k])
+            for k in range(degree)
         ]
         columns.append(sum(products))
     return np.stack(columns, axis=-1)
@@ -110,7 +112,7 @@ class Path(eqx.Module):
 
 @dataclass(frozen=True)
 class NodeGroup:
-    """Nodes at one local coordinate ``c`` of the micro intervals ``first <= m < stop``, of every `step`-th of them."""
+    """Nodes at the local coordinate ``c`` of every `step`-th of the micro intervals ``first <= m < stop``."""
 
     c: float
     first: int
@@ -133,8 +135,8 @@ class NodeGroup:
 class Nodes:
     """Quadrature nodes of one term on the macro interval, sorted into groups of equal local coordinate.
 
-    The grouping keeps everything regular: a group is a slice of the micro intervals, so sampling and
-    pulling back are slices and pads whose cost is linear in num_micro, without gather or scatter.
+    A group is a slice of the micro intervals, so that sampling and its transpose are slices and pads of cost O(num_micro), without
+    gather or scatter.
     """
 
     groups: tuple[NodeGroup, ...]
@@ -143,7 +145,7 @@ class Nodes:
 
     @property
     def weights(self):
-        """Of all nodes, group after group."""
+        """Weights of all nodes, group after group."""
         return jnp.concatenate([jnp.asarray(g.weights) for g in self.groups])
 
     def theta(self, group: NodeGroup) -> np.ndarray:
@@ -151,12 +153,12 @@ class Nodes:
         return (np.array(group.intervals) + group.c) / self.num_micro
 
     def sample(self, path: Path, names: Iterable[str]) -> dict:
-        """By name, of the path at all nodes, group after group: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
+        """Values of the path at all k nodes, group after group, by name: times ``t`` (k,), ``q_s``, ``q_f``, ``v_s``, ``v_f`` (k, n)."""
         together = [tuple(groups) for _, groups in groupby(self.groups, key=lambda g: g.intervals)]
         return {name: jnp.concatenate([self._at(groups, path, name) for groups in together]) for name in names}
 
     def _at(self, groups: tuple[NodeGroup, ...], path: Path, name: str):
-        """One of them at groups on the same micro intervals."""
+        """One quantity of `sample` at groups on the same micro intervals."""
         theta, c = np.concatenate([self.theta(g) for g in groups]), np.array([g.c for g in groups])
         if name == "t":
             return path.t + path.macro_dt * theta
@@ -191,7 +193,7 @@ def velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
 
 
 def slow_velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Nodes:
-    """Nodes of a term that depends on slow positions and velocities alone: those of the rule, once on the macro interval."""
+    """Nodes of a term that depends on slow positions and velocities alone: the nodes of the rule, once on the macro interval."""
     groups = (_on_one_interval(placed.rule, i, num_micro) for i in range(len(placed.rule.nodes)))
     return Nodes(tuple(groups), num_micro, degree)
 
@@ -199,9 +201,9 @@ def slow_velocity_nodes(placed: PlacedRule, num_micro: int, degree: int) -> Node
 def position_nodes(placed: PlacedRule, num_micro: int, degree: int) -> tuple[Any, Nodes, Any]:
     """Nodes of a term that depends on positions only: (weight at 0, nodes inside, weight at 1).
 
-    Nodes at the ends of the macro interval are kicks: they act on given or final momenta and never
-    enter an equation to be solved. Their weight is None where the rule has no such node. Where two
-    copies of the rule meet, the right node of one and the left node of the next are one node.
+    Nodes at the ends of the macro interval are kicks: they shift the momenta before or after the step, and are no part of its
+    equations. Their weight is None if the rule has no such node. Where two copies of the rule meet, the right node of the first copy
+    and the left node of the second are one node.
     """
     rule, size, every = placed.rule, placed.copies(num_micro), placed.every
     has_start, has_end = rule.nodes[0] <= NODE_TOLERANCE, rule.nodes[-1] >= 1 - NODE_TOLERANCE
@@ -232,7 +234,7 @@ def _on_one_interval(rule: Rule, i: int, num_micro: int) -> NodeGroup:
 
 
 def _interval_of(node: float, count: int) -> tuple[int, float]:
-    """The one of `count` equal intervals of [0, 1] that a node is in, and its local coordinate there."""
+    """Number m of the interval that a node lies in, of `count` equal intervals of [0, 1], and its local coordinate there."""
     m = min(int(np.floor(node * count + NODE_TOLERANCE)), count - 1)
     c = node * count - m
     return m, 0.0 if abs(c) <= NODE_TOLERANCE else c
