@@ -33,12 +33,12 @@ class NamedComposition:
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """All of them, c_i = c_{s+1-i}."""
+        """All coefficients, ``c_i = c_{s+1-i}``."""
         return (*self.half, *self.half[-2::-1])
 
 
 def _jump(num_stages: int) -> tuple[float, ...]:
-    """c_1 = ... = c_s but for the middle one, which cancels the sum of the cubes."""
+    """First half of s equal coefficients c with another one in the middle: ``(s - 1) c + c_mid = 1`` and ``(s - 1) c^3 + c_mid^3 = 0``."""
     outer = 1 / (num_stages - 1 - (num_stages - 1) ** (1 / 3))
     return (outer,) * (num_stages // 2) + (1 - (num_stages - 1) * outer,)
 
@@ -92,7 +92,7 @@ COMPOSITIONS = {
         "Kahan and Li (1997)",
     ),
 }
-"""Symmetric compositions by name; with a symmetric scheme of order 2 they have the order in their name."""
+"""Symmetric compositions by name. The number in the name is their order with a symmetric scheme of order 2."""
 
 
 class Composition(eqx.Module):
@@ -101,7 +101,7 @@ class Composition(eqx.Module):
     Make one with `compose`. A macro step counts all micro steps of all stages: ``num_micro = stages scheme.num_micro``.
 
     Args:
-        scheme: what every stage does.
+        scheme: the scheme of every stage.
         coefficients: parts c_i of the macro step, sum 1; may be traced.
     """
 
@@ -125,7 +125,7 @@ class Composition(eqx.Module):
 
     @property
     def micro_times(self):
-        """(num_micro,) ends of the micro steps in units of the macro step; not increasing."""
+        """(num_micro,) ends of the micro steps in units of the macro step; they decrease in stages that go backwards."""
         ends = jnp.cumsum(self.coefficients)
         return (ends[:, None] - self.coefficients[:, None] * (1 - self.scheme.micro_times)).reshape(-1)
 
@@ -149,7 +149,7 @@ class Composition(eqx.Module):
         return Composition(self.scheme.with_num_micro(num_micro), self.coefficients)
 
     def describe(self) -> Description:
-        """As of a `Scheme`; the rules are those of a stage."""
+        """As `Scheme.describe`, for all stages; the rules are the rules of a stage."""
         return self.scheme.describe().repeated(self.num_stages, self.order, self.is_symmetric)
 
 
@@ -192,30 +192,34 @@ def compose(scheme: Scheme | Composition, coefficients: str | Sequence[float]) -
 
 
 def stage_scheme(scheme: Scheme | Composition) -> Scheme:
-    """The scheme of every stage: of a composition the one it is made of, else the scheme itself."""
+    """The scheme of every stage of a composition; a scheme itself."""
     return scheme.scheme if isinstance(scheme, Composition) else scheme
 
 
 def _order(coefficients: np.ndarray, order: int, symmetric: bool) -> int:
-    """Order of the composition of a generic scheme of this order; in power series of H with matrix coefficients."""
+    """Order of the composition of a generic scheme of this order, by power series in H with matrix coefficients.
+
+    A stage with the step c H is ``exp(c H A + (c H)^(p+1) B_1 + ...)`` for random matrices A, B_i (for a symmetric scheme only odd powers).
+    The product of the stages agrees with exp(H A) up to the order of the composition.
+    """
     size, powers = 4, range(order + 10)  # no composition here gains more than 8 orders
     random = np.random.default_rng(0)
     errors = [k for k in powers if k > order and (k % 2 == 1 or not symmetric)]
     fields = {k: random.normal(size=(size, size)) for k in [1, *errors]}
-    one = np.array([np.eye(size) * (k == 0) for k in powers])
+    unit = np.array([np.eye(size) * (k == 0) for k in powers])
 
     def product(a, b):
         return np.array([np.sum(a[: k + 1] @ b[k::-1], axis=0) for k in powers])
 
     def flow(c):
-        field = np.array([c**k * fields.get(k, 0 * one[0]) for k in powers])
-        total = term = one
+        field = np.array([c**k * fields.get(k, 0 * unit[0]) for k in powers])
+        total = term = unit
         for k in powers[1:]:
             term = product(term, field) / k
             total = total + term
         return total
 
-    whole, exact = one, one[0]
+    whole, exact = unit, unit[0]
     for c in coefficients:
         whole = product(flow(c), whole)
     for k in powers[1:]:

@@ -1,26 +1,26 @@
-"""What a scheme promises and what its macro steps cost, in numbers and as a table."""
+"""Properties of a scheme and the cost of its macro steps, in numbers and as a table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 TERMS = ("T", "V", "W", "F", "g", "g_s")
-"""What has a rule: the kinetic energy, the slow and the fast potential, forces, constraints."""
+"""Terms with a rule: the kinetic energy, the slow and the fast potential, forces, constraints."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """What a scheme promises and what a macro step costs. Evaluations are per pass where equations are solved.
+    """Properties of a scheme and the cost of a macro step. Evaluations of implicit schemes are per iteration.
 
-    order, symmetric: of convergence; whether time-reversible.
-    rules: in words, by what they integrate or where it is held: one of `TERMS`, or the name of a potential.
+    order, symmetric: order of convergence; whether the scheme is time-reversible.
+    rules: rules in words, by the term: one of `TERMS`, or the name of a potential.
     stages, num_micro, degree: steps of the scheme per macro step, micro steps per macro step, degree of the path.
-    slow_evaluations, fast_evaluations: gradients of V and of W, and products of their Hessians with a vector, which cost about
-        as much; at a node that two macro steps share, once.
-    solves: systems of equations with constant masses and no constraint or force: none for explicit schemes, one per
-        micro step (of the fast variables of one micro step) where V only kicks, else one per stage. Further potentials on the micro grid
-        are taken to be functions of fast variables alone.
-    constrained_solves: the same with constraints on slow and fast variables together.
-    evaluations: gradients of the further potentials by name, as those of V and W.
+    slow_evaluations, fast_evaluations: number of gradients of V and of W, and of products of their Hessians with a vector, which cost about
+        as much; a node that two macro steps share counts once.
+    solves: number of systems of equations to solve, with constant masses and without constraints and forces: none for explicit schemes,
+        one per micro step (for its fast variables) if V only kicks, else one per stage. Further potentials on the micro grid count as
+        functions of fast variables alone.
+    constrained_solves: number of systems with constraints on slow and fast variables together.
+    evaluations: number of gradients of the further potentials, by name.
     """
 
     order: int
@@ -36,11 +36,11 @@ class Description:
     evaluations: Mapping[str, int] = field(default_factory=dict)
 
     def repeated(self, stages: int, order: int, symmetric: bool) -> "Description":
-        """Of a composition of so many stages."""
+        """The description of a composition with this number of stages."""
         counts = ("num_micro", "slow_evaluations", "fast_evaluations", "solves", "constrained_solves")
-        more = {name: stages * getattr(self, name) for name in counts}
-        more |= {"evaluations": {name: stages * count for name, count in self.evaluations.items()}}
-        return replace(self, order=order, symmetric=symmetric, stages=stages, **more)
+        totals = {name: stages * getattr(self, name) for name in counts}
+        totals |= {"evaluations": {name: stages * count for name, count in self.evaluations.items()}}
+        return replace(self, order=order, symmetric=symmetric, stages=stages, **totals)
 
     def __str__(self) -> str:
         per = "per macro step"

@@ -1,4 +1,4 @@
-"""Schemes and compositions as plain data: dictionaries, lists, texts and numbers, as JSON has them."""
+"""Schemes and compositions as plain data for JSON: dictionaries, lists, texts and numbers."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def from_plain(data: dict[str, Any]) -> Scheme | Composition:
     """The inverse of `to_plain`.
 
     Args:
-        data: from `to_plain`, also by way of JSON.
+        data: from `to_plain`, also after a round trip through JSON.
 
     Raises:
         KeyError, TypeError, ValueError: data that are no scheme.
@@ -38,7 +38,7 @@ def from_plain(data: dict[str, Any]) -> Scheme | Composition:
     if "coefficients" in data:
         scheme = from_plain(data["scheme"])
         if isinstance(scheme, Composition):
-            raise ValueError("from_plain: the stages of a composition must be those of a scheme.")
+            raise ValueError("from_plain: the stages of a composition must be steps of a scheme, not of a composition.")
         return Composition(scheme, np.asarray(data["coefficients"]))
     rules = {name: _placed_rule(data[name]) for name in RULES}
     potentials = {name: _placed_rule(placed) for name, placed in data["potentials"]}

@@ -113,7 +113,7 @@ class Rule(eqx.Module):
 
 
 def _merge(nodes: tuple[float, ...], weights: list) -> Rule:
-    """Rule of all the nodes, equal ones merged and their weights summed in order."""
+    """The rule with all these nodes, where equal nodes are merged and their weights added in order."""
     order = np.argsort(nodes, kind="stable")
     sorted_nodes = np.asarray(nodes)[order]
     first = np.concatenate([[True], np.diff(sorted_nodes) > NODE_TOLERANCE])
@@ -139,6 +139,7 @@ def interpolatory(nodes) -> Rule:
 
 def interpolatory_weights(nodes) -> np.ndarray:
     """The weights of `interpolatory`."""
+    # moments in Legendre polynomials: sum_i w_i P_k(x_i) = 1 for k = 0, else 0
     x = 2 * np.asarray(nodes, dtype=float) - 1
     moments = np.zeros(len(x))
     moments[0] = 1.0
@@ -187,8 +188,8 @@ def affine(alpha) -> Rule:
     """``alpha * left + (1 - alpha) * right``; order 2 for alpha = 1/2, else 1.
 
     Args:
-        alpha: weight of the start of the interval, 1 - alpha is that of its end; may be traced, and then it is not checked. At
-            1/2 it is the trapezoidal rule, at 1 and 0 only one end is left. See `vmri_jax.schemes.scheme` for what this means for a step.
+        alpha: weight of the start of the interval, 1 - alpha is the weight of its end; a traced alpha is not checked. 1/2 is the
+            trapezoidal rule, 1 and 0 have one end alone. `vmri_jax.schemes.scheme` says how alpha changes a step.
 
     Raises:
         ValueError: alpha is not from 0 to 1.
@@ -210,11 +211,11 @@ simpson = (left + 4 * midpoint + right) / 6
 
 
 class PlacedRule(eqx.Module):
-    """A rule and the grid it lives on: once per macro interval, or once per `every` micro intervals.
+    """A rule with its grid: one copy per macro interval, or one copy per `every` micro intervals.
 
     every: micro intervals that one copy of a rule on the micro grid spans.
-    mollified: whether its term is taken at averaged fast positions, see `mollified`.
-    gradient_corrected: whether its term is less a square of its gradient, see `gradient_corrected`.
+    mollified: whether the potential is evaluated at averaged fast positions, see `mollified`.
+    gradient_corrected: whether a square of its gradient is subtracted from the potential, see `gradient_corrected`.
     """
 
     rule: Rule
@@ -224,11 +225,11 @@ class PlacedRule(eqx.Module):
     every: int = eqx.field(static=True, default=1)
 
     def composite(self, num_micro: int) -> Rule:
-        """The rule on the macro interval [0, 1] that this placement amounts to."""
+        """The composite rule of all copies on the macro interval [0, 1]."""
         return self.rule if self.grid == "macro" else self.rule.repeat(self.copies(num_micro))
 
     def copies(self, num_micro: int) -> int:
-        """Copies of the rule on the macro interval."""
+        """Number of copies of the rule on the macro interval."""
         return 1 if self.grid == "macro" else num_micro // self.every
 
     @property
@@ -238,16 +239,16 @@ class PlacedRule(eqx.Module):
 
     @property
     def only_kicks(self) -> bool:
-        """Whether the rule has no nodes but the ends of the macro interval."""
+        """Whether all nodes are ends of the macro interval: kicks at macro nodes alone. Kicks at micro nodes have `only_ends`."""
         return self.grid == "macro" and self.only_ends
 
     @property
     def only_ends(self) -> bool:
-        """Whether every node is an end of the interval the rule is placed on."""
+        """Whether every node is an end of the interval that a copy of the rule spans."""
         return all(min(node, 1 - node) <= NODE_TOLERANCE for node in self.rule.nodes)
 
     def in_words(self) -> str:
-        """The rule by its name, and where it is."""
+        """Name of the rule, and its grid."""
         how = ", at averaged fast positions" if self.mollified else ""
         how += ", corrected by its gradient" if self.gradient_corrected else ""
         if self.every > 1:
@@ -256,7 +257,7 @@ class PlacedRule(eqx.Module):
 
 
 def _name(rule: Rule) -> str:
-    """The name of a rule, else what it consists of."""
+    """The name of a rule, or its nodes and weights if it has none."""
     n = len(rule.nodes)
     known = {"left end": left, "right end": right, "midpoint": midpoint, "trapezoidal rule": trapezoidal}
     known |= {"Simpson's rule": simpson, f"Gauss rule of {n} nodes": gauss(n)}
@@ -280,11 +281,11 @@ def micro(rule: Rule, every: int = 1) -> PlacedRule:
 
     Args:
         rule: on [0, 1].
-        every: micro intervals that one copy of the rule spans: a rate between those of the two grids. ``micro(trapezoidal, every=4)`` has its
-            nodes at every fourth micro node. It must divide `num_micro` of the scheme; ``every=num_micro`` is `macro`.
+        every: micro intervals that one copy of the rule spans: a rate between the rates of the two grids. ``micro(trapezoidal, every=4)`` has
+            its nodes at every fourth micro node. `every` must divide `num_micro` of the scheme; ``every=num_micro`` is `macro`.
 
     Raises:
-        TypeError: no Rule.
+        TypeError: `rule` is no Rule.
         ValueError: `every` is no integer of at least 1.
     """
     whole_number("micro: every", every)
@@ -300,9 +301,9 @@ def _placed(rule: Rule, grid: Literal["macro", "micro"]) -> PlacedRule:
 def mollified(placed: PlacedRule) -> PlacedRule:
     """The same nodes, with the slow potential at averaged fast positions: ``V(q_s, a(q_s, q_f))``.
 
-    The average is that of the fast motion from rest over the macro step (`vmri_jax.steppers.kicked.average_over_fast_motion`). Kicks by V then
-    act through ``a'(q)^T grad V``, which filters out the vibrations that they would excite where a macro step is a
-    multiple of half their period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
+    The average a is the mean of the fast motion from rest over the macro step (`vmri_jax.steppers.kicked.average_over_fast_motion`). Kicks
+    by V then have the force ``a'(q)^T grad V``. Without the filter a', they excite vibrations with a macro step of a multiple of half
+    their period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
     differential equations* (1998), the mollified impulse method with LongAverage.
     """
     if not isinstance(placed, PlacedRule) or placed.grid != "macro" or not placed.only_ends:
@@ -311,13 +312,13 @@ def mollified(placed: PlacedRule) -> PlacedRule:
 
 
 def gradient_corrected(placed: PlacedRule) -> PlacedRule:
-    """The same nodes, with a square of the gradient taken off the potential.
+    """The same nodes, with a square of the gradient subtracted from the potential.
 
     Fast kicks act through ``W - h^2/24 grad W . M^-1 grad W``, slow ones through
     ``V - H^2/24 grad V . M^-1 grad V - h^2/12 grad V . M^-1 grad W``, the last term where W is corrected too. With
     velocity Verlet in between this is the method of Takahashi and Imada, J. Phys. Soc. Jpn. 53 (1984), and Rowlands,
-    J. Comput. Phys. 97 (1991): errors of order 2 are a change of coordinates, of the start and of the result, in which the motion
-    is of order 4. So are, as they are, the frequencies of harmonic vibrations, which no change of the start alters.
+    J. Comput. Phys. 97 (1991). Its order is 2, its effective order 4: a change of coordinates by O(h^2) conjugates it to a method of order
+    4. Frequencies of harmonic vibrations do not depend on coordinates, and are of order 4 without that change.
     """
     if not isinstance(placed, PlacedRule) or not placed.only_ends or placed.mollified or placed.every > 1:
         raise ValueError(

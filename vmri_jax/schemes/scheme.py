@@ -11,10 +11,10 @@ A scheme is data. The reference schemes and the Galerkin family are points in on
 | `takahashi_imada(num_micro)` | gradient_corrected(macro(trapezoidal)) | gradient_corrected(micro(trapezoidal)) | yes | 2, frequencies 4 |
 | `galerkin(num_micro, degree, rule)` | micro(rule) | micro(rule) | no | min(2 degree, rule order) |
 
-**alpha** is the part of a kick that is given at the start of an interval of length T, the rest of it at the end: the rule
-`vmri_jax.schemes.quadrature.affine`, ``T (alpha f(0) + (1 - alpha) f(T))``. At 1/2, the default, it is the trapezoidal rule: of order 2
-and symmetric, as in the methods of Verlet and r-RESPA. At 1 and at 0 there is one kick, before or after the motion: the two symplectic
-Euler methods, of order 1, each the adjoint of the other. Any other number has order 1, too. It may be traced, for sweeps and derivatives.
+**alpha** is the part of a kick at the start of an interval of length T; the part 1 - alpha acts at its end. It is the weight of the rule
+`vmri_jax.schemes.quadrature.affine`, ``T (alpha f(0) + (1 - alpha) f(T))``. The default 1/2 gives the trapezoidal rule: order 2 and
+symmetric, as in the methods of Verlet and r-RESPA. 1 and 0 give one kick, before or after the motion: the two symplectic Euler methods
+of order 1, each the adjoint of the other. Any other alpha also has order 1. alpha may be traced, for sweeps and derivatives.
 """
 
 import math
@@ -160,7 +160,7 @@ class Scheme(eqx.Module):
 
     @property
     def unit(self) -> int:
-        """The smallest number of micro steps that all rules on every k-th micro node fit into."""
+        """The least common multiple of `every` of all rules: num_micro must be a multiple of it."""
         return math.lcm(*(placed.every for placed in (self.slow, self.fast, *self.potentials.values())))
 
     def with_num_micro(self, num_micro: int) -> "Scheme":
@@ -173,10 +173,10 @@ class Scheme(eqx.Module):
             kicks = vm.quadrature.trapezoidal
             vm.fully_explicit(32).with_potentials(bends=vm.micro(kicks, every=8), bonds=vm.micro(kicks))
 
-        Potentials that are placed with ``micro(trapezoidal, every=k)`` kick every k-th micro node; on fast variables alone, with kicks by V
-        and W, that is r-RESPA of any number of levels (Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1992). Where they see slow
-        variables they are implicit in these: the slow path is one polynomial over the macro step. Evaluations per macro step:
-        num_micro / k.
+        A potential with the rule ``micro(trapezoidal, every=k)`` kicks at every k-th micro node. If these potentials depend on fast variables
+        alone, and V and W kick, the scheme is r-RESPA with any number of levels (Tuckerman, Berne and Martyna, J. Chem. Phys. 97, 1992).
+        A potential that depends on slow variables is implicit in them, because the slow path is one polynomial over the macro step.
+        Evaluations per macro step: num_micro / k.
 
         Args:
             rules: placed rules by name of the potential.
@@ -206,7 +206,7 @@ class Scheme(eqx.Module):
         )
 
     def evaluations_of(self, name: str | int) -> int:
-        """Gradients of a potential in `System.potentials` per macro step, at a node that two macro steps share once.
+        """Number of gradients of a potential in `System.potentials` per macro step; a node that two macro steps share counts once.
 
         Args:
             name: of the potential.
@@ -219,18 +219,19 @@ class Scheme(eqx.Module):
     def describe(self) -> Description:
         """Rules, order, symmetry, evaluations and solves per macro step; prints as a table.
 
-        What it does with a system is in ``vm.plan(system, scheme, state).describe()``.
+        ``vm.plan(system, scheme, state).describe()`` describes the scheme applied to a system.
         """
-        others = self.potentials.values()
+        further = self.potentials.values()
         drifts = self.degree == 1 and self.fast.only_ends and self.fast.grid == "micro"
-        drifts = drifts and all(placed.only_ends for placed in others)
-        kicked = self.degree == 1 and self.slow.only_kicks and all(p.grid == "micro" or p.only_ends for p in others)
+        drifts = drifts and all(placed.only_ends for placed in further)
+        kicked = self.degree == 1 and self.slow.only_kicks and all(p.grid == "micro" or p.only_ends for p in further)
+        # solves without constraints: none if V and W only kick, one per micro step if V only kicks, else one of all unknowns
         free = 0 if drifts and kicked else self.num_micro if kicked and self.fast.grid == "micro" else 1
         slow, fast = (
             _evaluations(placed, self.num_micro) * (1 + placed.gradient_corrected) for placed in (self.slow, self.fast)
         )
-        fast *= 1 + self.slow.mollified  # along the motion that is averaged
-        fast += self.slow.gradient_corrected and self.fast.gradient_corrected  # in the term of both
+        fast *= 1 + self.slow.mollified  # a second time along the motion of the average
+        fast += self.slow.gradient_corrected and self.fast.gradient_corrected  # grad V . M^-1 grad W
         placed = self.kinetic, self.slow, self.fast, self.force, self.constraint, self.slow_constraint
         rules = {name: rule.in_words() for name, rule in zip(TERMS, placed, strict=True)}
         rules |= {label(name): rule.in_words() for name, rule in self.potentials.items()}
@@ -246,7 +247,7 @@ def _evaluations(placed: PlacedRule, num_micro: int) -> int:
 
 
 def _on_grid(name: str, placed: PlacedRule, num_micro: int) -> PlacedRule:
-    """A placed rule as it is kept: on the macro grid where one copy of it spans the macro interval."""
+    """The placed rule, moved to the macro grid if one copy of it spans the macro interval."""
     if placed.every > 1 and num_micro % placed.every:
         divisors = [k for k in range(1, num_micro + 1) if num_micro % k == 0]
         raise ValueError(
@@ -289,8 +290,9 @@ def _check_placed(name: str, placed) -> None:
 def fully_implicit(num_micro: int) -> Scheme:
     """V and W at the midpoint of every micro interval. Order 2, symmetric, implicit.
 
-    Evaluations per macro step and Newton iteration: V num_micro, W num_micro. The first choice where springs are stiff: their ``omega h``
-    limits no step. Constraints act at the nodes, as in `fully_explicit`: light links that are pulled tight need ``omega h < 2`` here, too.
+    Evaluations per macro step and Newton iteration: V num_micro, W num_micro. The first choice for stiff springs: their
+    ``omega h`` does not limit the step. Constraint forces act at the nodes, as in `fully_explicit`: a light link under tension vibrates
+    across itself with ``omega = 2 sqrt(force / (mass length))`` and needs ``omega h < 2``.
 
     Args:
         num_micro: micro steps per macro step.
@@ -328,8 +330,8 @@ def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
     """V as a kick at the macro nodes, W as kicks at the micro nodes (impulse method, r-RESPA at alpha = 1/2).
 
     Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints: V once and
-    W num_micro times per macro step, no Newton. Stable only for omega h < 2. The first choice where the fast motion is that of rigid
-    links: there `fully_implicit` has the same limit and gives the same motion.
+    W num_micro times per macro step, no Newton. Stable only for omega h < 2. The first choice if the fast motion is the motion
+    of rigid links: for these `fully_implicit` has the same limit and gives the same motion.
 
     Args:
         num_micro: micro steps per macro step.
@@ -341,11 +343,12 @@ def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
 def takahashi_imada(num_micro: int) -> Scheme:
     """`fully_explicit` with corrected kicks. Order 2, symmetric; frequencies of harmonic vibrations are of order 4.
 
-    What is left at order 2 is a change of coordinates, see `vmri_jax.schemes.quadrature.gradient_corrected`: phases of vibrations stay accurate;
-    where a period depends on the amplitude, it is that of a start which is moved by order 2. With constraints, whose forces the
-    correction leaves out, frequencies are of order 2. Explicit for constant masses, which it needs, without constraints, and stable
-    for ``omega h < 2 sqrt(3)``. Evaluations per macro step: V once and W num_micro times, each with a product of its Hessian, and one
-    such product of W more.
+    The method is conjugate to a method of order 4 by a change of coordinates of O(h^2), see
+    `vmri_jax.schemes.quadrature.gradient_corrected`. So phases of harmonic vibrations stay accurate; a period that depends on the amplitude
+    is off by O(h^2), since the change shifts the amplitude of the start. With constraints frequencies are of order 2: the correction
+    leaves out the constraint forces. It needs constant masses, is explicit without constraints, and is stable for
+    ``omega h < 2 sqrt(3)``. Evaluations per macro step: V once and W num_micro times, each with a product of its Hessian, and one more
+    product of the Hessian of W.
 
     Args:
         num_micro: micro steps per macro step.
@@ -370,7 +373,7 @@ def galerkin(num_micro: int, degree: int, rule: Rule | str = "gauss") -> Scheme:
     Args:
         num_micro: micro steps per macro step.
         degree: r, of the polynomials.
-        rule: "gauss", "lobatto" or a rule of one's own.
+        rule: "gauss", "lobatto", or any `Rule`.
     """
     degree = _positive_integer("degree", degree)
     if isinstance(rule, str):
