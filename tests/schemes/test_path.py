@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from vmri_jax.schemes.path import (
     Path,
-    control_node_groups,
     control_nodes,
     lagrange_basis,
     lagrange_derivative,
@@ -118,8 +117,3 @@ def test_ends_are_kept_apart_only_where_the_rule_has_them():
     start, inside, end = position_nodes(micro(midpoint), 7, 1)
     assert (start, end) == (None, None)
     assert [g.size for g in inside.groups] == [7]
-
-
-def test_control_node_groups_visit_every_node_but_the_last():
-    nodes = control_node_groups(3, 2)
-    assert sorted(np.concatenate([nodes.theta(g) for g in nodes.groups])) == pytest.approx(np.arange(6) / 6)

@@ -1,4 +1,4 @@
-"""Numbers as users give them: real, and float64."""
+"""Checks and conversions of the numbers of users: real, and float64."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -15,10 +15,10 @@ Number: TypeAlias = Float[Numbers, ""] | float
 """A number in annotations, of Python or as an array."""
 
 ADVICE = "give float64: lists of numbers, NumPy arrays by .astype(float), JAX arrays made after vm.configure()"
-"""What to do about numbers of less than 64 bits."""
+"""Advice in messages about floats of less than 64 bits."""
 
 QUICK = {"xla_backend_optimization_level": 0}
-"""Options of the compiler for programs that run for milliseconds: compiled in half the time, at the same speed on small matrices."""
+"""Compiler options for programs that run for milliseconds: they compile in half the time, and run as fast on small matrices."""
 
 
 def is_concrete(tree) -> bool:
@@ -27,19 +27,19 @@ def is_concrete(tree) -> bool:
 
 
 def library(*values):
-    """NumPy, or `jax.numpy` where a value is traced: single calls of JAX take some 20 ms each the first time."""
+    """NumPy, or `jax.numpy` if a value is traced. NumPy is faster outside of programs: the first call of a JAX function takes some 20 ms."""
     return np if is_concrete(values) else jnp
 
 
 def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = ()) -> Callable:
-    """A function that runs a few times, compiled with the options `QUICK`; within a function that JAX stages it is a part of its program.
+    """A function that runs a few times, compiled with the options `QUICK`; inside a traced function it is a part of that program.
 
     Args:
         function: of arrays, and of the arguments that `static_argnames` names.
         static_argnames: as of `jax.jit`.
     """
     quick = jax.jit(function, static_argnames=static_argnames, compiler_options=QUICK)
-    part = jax.jit(function, static_argnames=static_argnames)  # JAX takes options for whole programs alone
+    part = jax.jit(function, static_argnames=static_argnames)  # JAX accepts compiler options for whole programs only
 
     @wraps(function)
     def call(*arguments):
@@ -50,7 +50,7 @@ def quickly_compiled(function: Callable, static_argnames: str | Sequence[str] = 
 
 
 def of_one_type(tree):
-    """A pytree with its numbers as arrays of NumPy, tracers as they are: what differs in kind would be traced anew."""
+    """A pytree with all numbers as NumPy arrays, tracers unchanged: JAX would trace functions anew for each type of number."""
     return jax.tree.map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, tree)
 
 
@@ -71,10 +71,10 @@ def is_short(value) -> bool:
 
 
 def check_precision(name: str, value) -> None:
-    """Refuse floats of less than 64 bits, in lists too: the digits that they lack cannot come back.
+    """Refuse floats of less than 64 bits, also in lists: conversion to float64 does not restore their lost digits.
 
     Raises:
-        ValueError: the 64-bit mode is off, where all arrays of JAX are short; or this array is.
+        ValueError: 64-bit mode is off, so that all JAX arrays are short; or this array is short.
     """
     for leaf in jax.tree.leaves(value):
         if is_short(leaf):
@@ -84,34 +84,45 @@ def check_precision(name: str, value) -> None:
 
 
 def real_array(name: str, value, ndim: int | None = None):
-    """Numbers as users give them as an array of float64, of JAX if they are, else of NumPy.
+    """Numbers of the user as an array of float64: a JAX array if the value is one, else a NumPy array.
 
     Args:
-        name: what they are called in messages.
-        ndim: how many dimensions they must have, None for any.
+        name: name of the value in messages.
+        value: numbers, lists or arrays.
+        ndim: required number of dimensions, None for any.
 
     Raises:
-        TypeError: what is not real.
+        TypeError: values that are no real numbers.
         ValueError: floats of less than 64 bits, or another number of dimensions.
     """
     advice = "give a real number" if ndim == 0 else "give real numbers, an array of float64"
     if is_concrete(value):
         try:
             kind = "f" if is_short(value) else np.asarray(value).dtype.kind
-        except Exception:  # ragged lists, and whatever an object of one's own raises
+        except Exception:  # ragged lists, and errors of the user's own classes
             kind = ""
         if kind not in tuple("biuf"):
             raise TypeError(f"{name} is {value!r}; {advice}.")
     check_precision(name, value)
-    given = isinstance(value, jax.Array) or not is_concrete(value)
-    array = jnp.asarray(value, dtype=float) if given else np.asarray(value, dtype=float)
+    is_jax = isinstance(value, jax.Array) or not is_concrete(value)
+    array = jnp.asarray(value, dtype=float) if is_jax else np.asarray(value, dtype=float)
     if ndim is not None and array.ndim != ndim:
         raise ValueError(f"{name} has shape {array.shape}; {advice}.")
     return array
 
 
-def whole_number(what: str, value, least: int = 1, otherwise: str = "") -> int:
-    """An integer of at least `least`; messages call it `what`, and say what else may be given."""
+def whole_number(name: str, value, least: int = 1, otherwise: str = "") -> int:
+    """An integer of at least `least`.
+
+    Args:
+        name: name of the value in messages.
+        value: of the user.
+        least: smallest allowed integer.
+        otherwise: text in the message on other allowed values, e.g. ", or None".
+
+    Raises:
+        ValueError: another value.
+    """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{what} is {value!r}; it must be an integer of at least {least}{otherwise}.")
+        raise ValueError(f"{name} is {value!r}; it must be an integer of at least {least}{otherwise}.")
     return int(value)

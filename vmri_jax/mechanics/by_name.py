@@ -1,8 +1,8 @@
-"""Configurations as dictionaries of arrays: functions of the user see ``q_f["load"]``, everything else one flat vector.
+"""Configurations as dictionaries of arrays: functions of the user get ``q_f["load"]``, all other code has one flat vector.
 
-A `Layout` says which array stands where in the flat vector. `flat_system` wraps every function of a system once, where its start is
-known (`vmri_jax.Problem`): the function gets dictionaries, and the forces and rows of constraints that it returns as dictionaries become
-vectors. Nothing behind the problem knows of dictionaries.
+A `Layout` gives the place of every array in the flat vector. `vmri_jax.Problem` knows the layouts, and `flat_system` wraps every function
+of its system once: the function gets dictionaries, and forces and constraint rows that it returns as dictionaries become vectors. No
+code behind the problem handles dictionaries.
 """
 
 import math
@@ -19,7 +19,7 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import ARGUMENTS, KineticFunction, System
 
 SLOW, FAST = ("q_s", "v_s"), ("q_f", "v_f")
-"""Arguments of functions that are slow and fast configurations or their velocities."""
+"""Names of the arguments that are slow, and fast, positions or velocities."""
 
 
 @dataclass(frozen=True)
@@ -33,26 +33,26 @@ class Layout:
     shapes: tuple[tuple[str, tuple[int, ...]], ...]
 
     @classmethod
-    def of(cls, what: str, arrays: Mapping[str, Any]) -> "Layout":
+    def of(cls, name: str, arrays: Mapping[str, Any]) -> "Layout":
         """The layout of a dictionary, in its own order.
 
         Args:
-            what: its name in messages.
+            name: name of the dictionary in messages.
             arrays: real numbers by name.
 
         Raises:
             TypeError: a name that is no text, a value that is no array of real numbers.
         """
-        for name in arrays:
-            if not isinstance(name, str) or not name:
+        for body in arrays:
+            if not isinstance(body, str) or not body:
                 raise TypeError(
-                    f"{what} has the key {name!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}."
+                    f"{name} has the key {body!r}; give arrays by names of bodies, {{'load': [0.0, -5.0]}}."
                 )
-        return cls(tuple((name, real_array(f"{what}[{name!r}]", array).shape) for name, array in arrays.items()))
+        return cls(tuple((body, real_array(f"{name}[{body!r}]", array).shape) for body, array in arrays.items()))
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Layout":
-        """The inverse of `dataclasses.asdict`, also of what JSON makes of it."""
+        """The inverse of `dataclasses.asdict`, also after a round trip through JSON."""
         return cls(tuple((name, tuple(shape)) for name, shape in data["shapes"]))
 
     @property
@@ -60,31 +60,31 @@ class Layout:
         """Number of coordinates of each array."""
         return {name: math.prod(shape) for name, shape in self.shapes}
 
-    def flat(self, what: str, arrays: Mapping[str, Any], missing: float | None = None):
+    def flat(self, name: str, arrays: Mapping[str, Any], missing: float | None = None):
         """The vector (n,) of a dictionary of arrays.
 
         Args:
-            what: its name in messages.
+            name: name of the dictionary in messages.
             arrays: by name; a value is repeated over the shape of its body, as NumPy broadcasts.
-            missing: value of the bodies that are left out; None refuses them.
+            missing: value for bodies without an entry; None requires an entry for every body.
 
         Raises:
             ValueError: names or shapes of another configuration.
         """
-        names = dict(self.shapes)
-        unknown = [name for name in arrays if name not in names]
-        absent = [name for name in names if name not in arrays]
+        bodies = dict(self.shapes)
+        unknown = [body for body in arrays if body not in bodies]
+        absent = [body for body in bodies if body not in arrays]
         if unknown or (absent and missing is None):
             raise ValueError(
-                f"{what} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(names) or 'none'}."
+                f"{name} has the keys {', '.join(map(str, arrays)) or 'none'}; give {', '.join(bodies) or 'none'}."
             )
         pieces = []
-        for name, shape in self.shapes:
-            value = real_array(f"{what}[{name!r}]", arrays.get(name, missing))
+        for body, shape in self.shapes:
+            value = real_array(f"{name}[{body!r}]", arrays.get(body, missing))
             try:
                 pieces.append(library(value).broadcast_to(value, shape).reshape(-1))
             except ValueError:
-                raise ValueError(f"{what}[{name!r}] has shape {value.shape}; the body has {shape}.") from None
+                raise ValueError(f"{name}[{body!r}] has shape {value.shape}; the body has {shape}.") from None
         return library(pieces).concatenate([*pieces, library(pieces).zeros(0)])
 
     def by_name(self, vectors) -> dict[str, Any]:
@@ -125,25 +125,25 @@ class ByName:
         return value
 
     def by_name(self, *arguments):
-        """What the function returns, as the user wrote it."""
+        """The value of the user's function, with dictionaries as the user returns them."""
         try:
             return self.function(*map(self._argument, self.arguments, arguments))
         except KeyError as error:
             sides = {"q_s": self.slow, "q_f": self.fast}
-            there = [f"{side} has {', '.join(layout.sizes) or 'none'}" for side, layout in sides.items() if layout]
-            raise KeyError(f"{error.args[0]!r} is not there; {' and '.join(there)}") from error
+            names = [f"{side} has {', '.join(layout.sizes) or 'none'}" for side, layout in sides.items() if layout]
+            raise KeyError(f"{error.args[0]!r} is not there; {' and '.join(names)}") from error
 
     def row_sizes(self, *arguments) -> dict[str, int]:
         """Number of rows of each constraint that the function returns by name, in its order; empty if it returns a vector."""
         sizes: dict[str, int] = {}
 
-        def noted(*arguments):
+        def note_sizes(*arguments):
             value = self.by_name(*arguments)
             if isinstance(value, Mapping):
                 sizes.update({name: jnp.size(rows) for name, rows in value.items()})
             return ()
 
-        jax.eval_shape(noted, *arguments)
+        jax.eval_shape(note_sizes, *arguments)
         return sizes
 
     def _argument(self, name: str, value):
@@ -155,11 +155,11 @@ def flat_system(system: System, slow: Layout | None, fast: Layout | None) -> Sys
     """The same system as functions of flat vectors.
 
     Args:
-        system: with functions of dictionaries, or with such that have been wrapped already.
-        slow, fast: layouts of q_s and q_f; None where these are vectors.
+        system: with functions of dictionaries, wrapped or not.
+        slow, fast: layouts of q_s and q_f; None for vectors.
 
     Raises:
-        ValueError: masses of other bodies.
+        ValueError: masses of bodies that are not in the layouts.
     """
 
     def wrapped(name: str, function):
@@ -183,10 +183,10 @@ def flat_system(system: System, slow: Layout | None, fast: Layout | None) -> Sys
 
 
 def constraint_sizes(function: Callable | None, *arguments) -> dict[str, int]:
-    """Names and numbers of rows of a constraint that returns rows by name; empty of any other.
+    """Names and numbers of rows of a constraint that returns its rows by name; empty for other constraints.
 
     Args:
-        function: as a flat system has it.
+        function: constraint of a flat system, or None.
         arguments: of the function.
     """
     inner = function.function if isinstance(function, TracedOnce) else function

@@ -1,4 +1,4 @@
-"""Checks at the door: bad input is refused before any compute, with what came, what was expected and what to do."""
+"""Checks of user input before any computation; messages name the value, the expected value and a remedy."""
 
 import linecache
 import traceback
@@ -16,7 +16,8 @@ from vmri_jax.mechanics.masses import ConstantMass
 from vmri_jax.mechanics.system import System
 
 CONSTRAINT_TOLERANCE = 1e-6
-"""Largest constraint value, in the constraint's own unit, that counts as kept; more where the Newton tolerance is loose."""
+"""Largest constraint value, in the unit of the constraint, of a constraint that is kept. Loose Newton tolerances raise it. A smaller value would
+refuse starts that are rounded to six digits."""
 
 
 def check_arrays(**arrays):
@@ -46,7 +47,7 @@ def check_number(name: str, value):
 
 
 def check_flags(**flags) -> None:
-    """Refuse what is neither True nor False: an array or a word would count as one of them."""
+    """Refuse values that are neither True nor False: Python would read an array or a text as one of them."""
     for name, value in flags.items():
         if not isinstance(value, bool | np.bool_):
             raise TypeError(f"{name} is {value!r}; it must be True or False.")
@@ -59,7 +60,7 @@ def check_type(name: str, value, kind: type, example: str) -> None:
 
 
 def check_params(params) -> None:
-    """Refuse parameters that are no numbers, or floats of less than 64 bits, naming where they are in the pytree."""
+    """Refuse parameters that are no numbers, or floats of less than 64 bits; the message gives their place in the pytree."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         name = f"System: params{jax.tree_util.keystr(path)}"
         check_precision(name, leaf)
@@ -74,7 +75,7 @@ def check_params(params) -> None:
 
 
 def check_system(system: System, q_s, q_f) -> None:
-    """Check shapes of masses and of what every user function returns for these positions (without evaluating them)."""
+    """Check the shapes of masses, and of the values of every user function at these positions, by tracing alone."""
     n_s, n_f = q_s.shape[0], q_f.shape[0]
     if isinstance(system.kinetic, ConstantMass):
         for name, mass, n in (("slow", system.kinetic.slow_mass, n_s), ("fast", system.kinetic.fast_mass, n_f)):
@@ -116,7 +117,7 @@ def check_system(system: System, q_s, q_f) -> None:
 
 
 def check_closures(system: System, q_s, q_f) -> None:
-    """Refuse functions that use numbers which a transformation of JAX traces: a program compiled with them would be of no use later."""
+    """Refuse functions that close over tracers of a transformation of JAX: a program compiled with them could not be used again."""
 
     def all_functions():
         zero = jnp.zeros(())
@@ -131,16 +132,16 @@ def check_closures(system: System, q_s, q_f) -> None:
         )
 
 
-def shape_of(what: str, function, *args):
-    """What a user's function returns, without its numbers; it must have two derivatives in forward mode, by everything but the params.
+def shape_of(name: str, function, *args):
+    """Shape and type of the value of a user function, by tracing; two derivatives in forward mode, by all arguments but params, must exist.
 
     Args:
-        what: its name, for messages.
-        function: of floats or trees of them, and of params.
-        args: of the function, params the last.
+        name: name of the function in messages.
+        function: of floats or pytrees of floats, and of params.
+        args: of the function, params last.
 
     Raises:
-        ValueError: it cannot be traced, differentiated, or evaluated.
+        ValueError: the function cannot be traced, differentiated, or evaluated.
     """
 
     def differentiated_twice(*args):
@@ -156,28 +157,28 @@ def shape_of(what: str, function, *args):
         shape = jax.eval_shape(differentiated_twice, *args)
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
-            f"{what} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
+            f"{name} cannot be traced{_line_of(error)}: JAX knows shapes there, no numbers. Use jax.numpy (jnp.sin) instead of "
             "numpy and math, jnp.where(condition, a, b) instead of if, and no float(...) or int(...)."
         ) from None
     except Exception as error:
         if "custom_vjp" in str(error) or "custom_lin" in str(error):
             raise ValueError(
-                f"{what} has no derivative in forward mode{_line_of(error)}: implicit steps take second derivatives, "
+                f"{name} has no derivative in forward mode{_line_of(error)}: implicit steps take second derivatives, "
                 "which a jax.custom_vjp does not give. Use jax.custom_jvp, which gives both modes."
             ) from error
         raise ValueError(
-            f"{what} could not be evaluated on arguments of shapes "
+            f"{name} could not be evaluated on arguments of shapes "
             f"{[getattr(a, 'shape', type(a).__name__) for a in args[:-1]]} and {'params=None' if args[-1] is None else 'the params'}"
             f"{_line_of(error)}: {type(error).__name__}: {error}"
         ) from error
-    _check_indices(what, function, args)
+    _check_indices(name, function, args)
     return shape
 
 
-def _check_indices(what: str, function, args) -> None:
-    """Refuse a function that takes ``q[3]`` of three entries: JAX takes the last entry instead, NumPy refuses.
+def _check_indices(name: str, function, args) -> None:
+    """Refuse a function that takes ``q[3]`` of three entries: JAX returns the last entry instead, NumPy raises an IndexError.
 
-    The function is traced once more with arrays of NumPy; other errors are those of operations that NumPy's arrays do not have.
+    The function is traced once more with NumPy arrays. All other errors are ignored: NumPy arrays lack some operations of JAX arrays.
     """
     if isinstance(function, ConstantMass):
         return
@@ -186,12 +187,12 @@ def _check_indices(what: str, function, args) -> None:
     leaves, structure = jax.tree.flatten(args)
     missing = _missing_entry(raw, structure, tuple(np.shape(leaf) for leaf in leaves))
     if missing:
-        raise ValueError(f"{what} takes an entry that is not there{missing}.")
+        raise ValueError(f"{name} takes an entry that is not there{missing}.")
 
 
 @lru_cache(maxsize=1024)
 def _missing_entry(function, structure, shapes: tuple[tuple[int, ...], ...]) -> str:
-    """The line and the words of NumPy's refusal; empty if every entry is there. Remembered, since tracing costs milliseconds."""
+    """Line and message of NumPy's IndexError; empty if every entry exists. Cached, since tracing takes milliseconds."""
     try:
         with np.errstate(all="ignore"):
             jax.eval_shape(lambda: function(*jax.tree.unflatten(structure, [np.zeros(shape) for shape in shapes])))
@@ -203,7 +204,7 @@ def _missing_entry(function, structure, shapes: tuple[tuple[int, ...], ...]) -> 
 
 
 def _line_of(error: Exception) -> str:
-    """The line of the user's own file that an error comes from, in words; nothing if it is in no file of his."""
+    """The line in a file of the user from which an error comes, in words; empty if no file of the user is involved."""
     package = Path(__file__).parents[1]
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         path = Path(frame.filename)
@@ -221,18 +222,18 @@ def _check_float64(name: str, value) -> None:
 
 
 def describe(value) -> str:
-    """Shapes of what a function returned, in words."""
+    """The shapes of the value of a function, in words."""
     if isinstance(value, tuple):
         return "(" + ", ".join(describe(v) for v in value) + ")"
     return f"shape {value.shape}" if hasattr(value, "shape") else type(value).__name__
 
 
 def is_refusal(error: Exception) -> bool:
-    """Whether this package refused: a ValueError, TypeError, or ImportError (no optional package) of one of its own ``raise`` statements.
+    """Whether an error is a refusal: a ValueError, TypeError, or ImportError (missing optional package) from a ``raise`` of this package.
 
-    Errors of other libraries, and those of Python itself (as of ``zip(strict=True)``), are faults.
+    Errors of other libraries, and of Python itself (e.g. of ``zip(strict=True)``), are faults.
     """
     frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
-    own = frame.f_globals.get("__name__", "").partition(".")[0] == "vmri_jax"
+    in_package = frame.f_globals.get("__name__", "").partition(".")[0] == "vmri_jax"
     raised = linecache.getline(frame.f_code.co_filename, line).lstrip().startswith("raise ")
-    return isinstance(error, ValueError | TypeError | ImportError) and own and raised
+    return isinstance(error, ValueError | TypeError | ImportError) and in_package and raised

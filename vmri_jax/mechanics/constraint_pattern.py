@@ -1,4 +1,4 @@
-"""Which constraints share coordinates: the zeros of ``G M^-1 G^T``, found before anything is computed with it."""
+"""Sparsity of ``G M^-1 G^T``, from the coordinates that constraints share; it is determined once, before a run."""
 
 from functools import partial
 
@@ -12,44 +12,47 @@ from vmri_jax.mechanics.arrays import is_concrete
 from vmri_jax.mechanics.masses import ConstantMass, Diagonal
 from vmri_jax.mechanics.system import System
 
-FEW = 80
-"""Rows of constraints up to which the full matrix is taken and no zeros are looked for. Of hinged chains by directors the band takes
-0.9 of the time of the full matrix at 77 rows, and 0.3 of it at 88 (`python -m benchmarks chains --full`). With a larger number short chains take
-longer for a step, with a smaller one the first run of small systems takes some seconds longer."""
-CHANGE = 1e-6
-"""Part of the largest value of a constraint from which a change counts."""
+MOST_ROWS_OF_FULL_MATRIX = 80
+"""Number of constraint rows up to which the full matrix is used, without a search for zeros. For hinged chains in director coordinates the band
+takes 0.9 of the time of the full matrix at 77 rows, and 0.3 of it at 88 (`python -m benchmarks chains --full`). A larger number makes steps of
+short chains slower; a smaller one makes the first run of small systems some seconds longer."""
+LEAST_CHANGE = 1e-6
+"""Least change of a constraint, relative to the largest constraint value, that counts as a dependence. A larger value misses weak dependences, which
+costs iterations; a smaller one takes round-off for a dependence."""
 
 
 def all_rows(system: System, q_s, q_f) -> Sparsity:
-    """Of ``G M^-1 G^T`` with all constraints and all coordinates of these shapes."""
+    """Sparsity of ``G M^-1 G^T`` with all constraints, for coordinates of these shapes."""
     count = sum(system.num_constraints(q_s, q_f))
     diagonal = isinstance(system.kinetic, ConstantMass) and all(
         isinstance(mass, Diagonal) for mass in (system.kinetic.slow_mass, system.kinetic.fast_mass)
     )
-    if count <= FEW or not diagonal:
+    if count <= MOST_ROWS_OF_FULL_MATRIX or not diagonal:
         return Full(count)
     return _shared(system, q_s.shape[0], q_f.shape[0])
 
 
 def fast_rows(system: System, q_s, q_f, degree: int) -> Sparsity:
-    """Of the same with the fast constraints g and the fast coordinates, at the nodes of one interval.
-
-    Only for masses that are diagonal.
-    """
+    """Sparsity of ``G_f M_f^-1 G_f^T`` with the constraints g and the fast coordinates, at the nodes of one interval; for diagonal masses."""
     count = system.num_constraints(q_s, q_f)[0]
-    if count <= FEW:
+    if count <= MOST_ROWS_OF_FULL_MATRIX:
         return Full(degree * count)
     return _shared(system, q_s.shape[0], q_f.shape[0], degree)
 
 
 def _shared(system: System, n_s: int, n_f: int, nodes: int | None = None) -> Sparsity:
-    """From changes of the constraints with each coordinate, at a random position: of g with q_f at `nodes` nodes, else of all.
+    """Sparsity of the matrix: two rows have a common entry if both constraints change with some coordinate, at a random position.
 
-    A change that is missed costs iterations, not accuracy: the matrix is only that of Newton's iteration.
+    A dependence that this test misses costs iterations, not accuracy: the matrix serves Newton's iteration alone.
+
+    Args:
+        system: with constraints.
+        n_s, n_f: numbers of coordinates.
+        nodes: number of nodes, for g with the fast coordinates; None for all constraints with all coordinates.
     """
     rng = np.random.default_rng(0)
-    arrays, rest = eqx.partition(system, eqx.is_array_like)
-    system = eqx.combine(jax.tree.map(partial(_known, rng), arrays), rest)
+    arrays, functions = eqx.partition(system, eqx.is_array_like)
+    system = eqx.combine(jax.tree.map(partial(_known, rng), arrays), functions)
     q, moves = rng.normal(size=n_s + n_f), np.diag(rng.normal(size=n_s + n_f))
     with jax.ensure_compile_time_eval():
         touched, finite = _touched(system, n_s, q, moves if nodes is None else moves[n_s:], nodes is None)
@@ -59,7 +62,7 @@ def _shared(system: System, n_s: int, n_f: int, nodes: int | None = None) -> Spa
 
 @eqx.filter_jit
 def _touched(system: System, n_s: int, q, moves, slow_too: bool):
-    """Which constraints change with each of these moves (k, n), (k, m), and which are finite, (m,)."""
+    """(k, m) whether each of m constraints changes with each of the moves (k, n), and (m,) whether it is finite."""
 
     def constraints(q):
         values = system.constraints if slow_too else system.g
@@ -67,9 +70,9 @@ def _touched(system: System, n_s: int, q, moves, slow_too: bool):
 
     before = constraints(q)
     after = jax.lax.map(lambda move: constraints(q + move), moves)
-    return jnp.abs(after - before) > CHANGE * jnp.max(jnp.abs(before)), jnp.isfinite(before)
+    return jnp.abs(after - before) > LEAST_CHANGE * jnp.max(jnp.abs(before)), jnp.isfinite(before)
 
 
 def _known(rng, leaf):
-    """A leaf as it is, or random numbers where it is traced."""
+    """The leaf itself, or random numbers of its shape if it is traced."""
     return leaf if is_concrete(leaf) else rng.uniform(0.5, 1.5, np.shape(leaf))

@@ -1,4 +1,4 @@
-"""Constraints and masses at one configuration: kept or not, independent or not, regular or not; the nearest positions that keep them."""
+"""Checks of constraints and masses at one configuration (kept, independent, regular), and projection of positions onto the constraints."""
 
 from typing import NamedTuple
 
@@ -11,15 +11,16 @@ from vmri_jax.mechanics.projection import legendre
 from vmri_jax.mechanics.system import System
 
 RANK = 1e-8
-"""Rows of length one are dependent where a singular value is not above this."""
-REGULAR = 1e-12
-"""A mass matrix is singular where an eigenvalue is not above this part of the largest one."""
-TAKES_PART = 1e-6
-"""Smallest coefficient of a row, in dependences of length one, with which it takes part in them."""
-FAST_PART = 1e-12
-"""Part of its length up to which a row of a constraint does not depend on the fast variables."""
+"""Largest singular value of a dependence among rows of length one. A larger value refuses nearly dependent constraints that can be solved."""
+LEAST_EIGENVALUE = 1e-12
+"""Smallest eigenvalue of a regular mass matrix, relative to the largest one. A larger value refuses large mass ratios."""
+LEAST_COEFFICIENT = 1e-6
+"""Smallest coefficient of a row in a dependence of length one with which a message names the row. A larger value leaves rows out."""
+LEAST_FAST_PART = 1e-12
+"""Smallest length of a constraint gradient by fast variables, relative to its whole length, with which the constraint depends on fast variables. A
+larger value refuses weak dependences."""
 PROJECTION_STEPS = 20
-"""Steps of Gauss and Newton onto the constraints."""
+"""Gauss-Newton steps onto the constraints. They converge quadratically from close positions; a larger number takes longer."""
 MICRO_GRID = (
     "A constraint held on the micro grid must be satisfiable by the fast variables: the slow ones have one value per macro step, "
     "so that a slow-only constraint held at every micro node is over-determined (rank deficit num_micro - 1)."
@@ -27,10 +28,10 @@ MICRO_GRID = (
 
 
 class Rank(NamedTuple):
-    """What the rank test found.
+    """Rank of a matrix.
 
     rank: number of independent rows.
-    dependent: numbers of the rows that take part in a linear dependence.
+    dependent: indices of the rows in a linear dependence.
     """
 
     rank: int
@@ -38,20 +39,21 @@ class Rank(NamedTuple):
 
 
 def rank_of(rows) -> Rank:
-    """The rank of rows (k, n), each scaled to length one, and those that are dependent."""
+    """Rank and dependent rows of a matrix (k, n), with each row scaled to length one."""
     rows = np.asarray(rows)
     size = np.linalg.norm(rows, axis=1, keepdims=True)
     left, values, _ = np.linalg.svd(rows / np.where(size > 0, size, 1))
     rank = int(np.count_nonzero(values > RANK))
-    return Rank(rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > TAKES_PART).tolist())
+    return Rank(rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > LEAST_COEFFICIENT).tolist())
 
 
 def is_rank_deficient(rows, others=None, tolerance: float = RANK):
-    """The same test in a compiled program: whether rows (k, n) are dependent; False of no rows, and of NaN.
+    """Whether rows (k, n) are dependent, for compiled programs; False for k = 0, and if an entry is not finite.
 
     Args:
-        others: (k, m) further columns that count for the lengths by which rows are scaled.
-        tolerance: singular values up to it are zero.
+        rows: scaled to length one together with `others`.
+        others: (k, m) further columns, which count for the scaling alone.
+        tolerance: largest singular value of a dependence.
     """
     if rows.shape[0] == 0:
         return jnp.asarray(False)
@@ -76,20 +78,20 @@ def project_positions(system: System, t, q_s, q_f):
     mass = jax.jacfwd(momentum)(jnp.zeros_like(q0))
     directions = jnp.linalg.solve(mass, jax.jacrev(constraints)(q0).T)
 
+    # q <- q - D (G D)^+ g with D = M^-1 G^T at the start
     def corrected(_, q):
         g = constraints(q)
         return q - directions @ jnp.linalg.lstsq(jax.jacrev(constraints)(q) @ directions, g)[0]
 
-    q = jax.lax.fori_loop(
-        0, PROJECTION_STEPS, corrected, q0
-    )  # a loop compiles a fraction of what its passes would one by one
+    # a loop, since its body is compiled once
+    q = jax.lax.fori_loop(0, PROJECTION_STEPS, corrected, q0)
     return q[:n_s], q[n_s:]
 
 
 def check_mass(system: System, q_s, q_f) -> None:
     """Refuse a kinetic energy function whose mass matrix ``d2T/dv2`` is not positive definite at these positions.
 
-    It is taken at generic velocities, since one that is not quadratic may be singular at rest.
+    The matrix is taken at generic velocities: if T is not quadratic, it may be singular at rest.
 
     Raises:
         ValueError: the matrix is not finite or not positive definite; names the coordinates it leaves without mass.
@@ -103,7 +105,10 @@ def check_mass(system: System, q_s, q_f) -> None:
             "System: the mass matrix d2T/dv2 of kinetic is not finite at these positions (a norm at zero?)."
         )
     values, vectors = np.linalg.eigh(mass)
-    without = np.abs(vectors[:, values <= REGULAR * np.abs(values).max()]).max(axis=1, initial=0.0) > TAKES_PART
+    without = (
+        np.abs(vectors[:, values <= LEAST_EIGENVALUE * np.abs(values).max()]).max(axis=1, initial=0.0)
+        > LEAST_COEFFICIENT
+    )
     if without.any():
         n_s = np.size(q_s)
         names = [f"q_s[{i}]" if i < n_s else f"q_f[{i - n_s}]" for i in np.flatnonzero(without)]
@@ -130,9 +135,9 @@ def check_constraints(
 
     Args:
         state: a `State`.
-        what: the words for its positions in messages.
-        tolerance: largest constraint value, in the constraint's own unit, that counts as satisfied.
-        advice: what to do where it is larger.
+        what: name of its positions in messages.
+        tolerance: largest constraint value, in the unit of the constraint, of a satisfied constraint.
+        advice: remedy in the message if a value is larger.
 
     Raises:
         ValueError: constraints that are not finite, not satisfied, too many, or dependent.
@@ -146,7 +151,7 @@ def check_constraints(
     if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
-    slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= FAST_PART * size)
+    slow_only = np.flatnonzero(np.linalg.norm(fast, axis=1) <= LEAST_FAST_PART * size)
     if slow_only.size:
         raise ValueError(
             f"System: row(s) {slow_only.tolist()} of constraint do not depend on the fast variables q_f. {MICRO_GRID} "
@@ -155,7 +160,8 @@ def check_constraints(
         )
     _check_counts(fast, alone)
     if rank_of(alone).dependent or rank_of(fast).dependent:
-        # At a singular configuration (a linkage folded flat) rows are dependent at that place alone: runs pass it.
+        # At a singular configuration (a linkage folded flat) rows are dependent there and nowhere else, and runs pass it: only rows that are
+        # dependent at a generic configuration nearby are refused.
         _, _, fast, alone = _values_and_jacobians(system, state.t, *_nearby(state.q_s, state.q_f))
         _check_rank("slow_constraint", alone, "slow variables.")
         _check_rank("constraint", fast, f"fast variables. {MICRO_GRID}")
@@ -167,7 +173,7 @@ def _values_and_jacobians(system, t, q_s, q_f) -> tuple[np.ndarray, ...]:
 
 @jax.jit
 def _constraint_values(system, t, q_s, q_f):
-    """All constraints, and the Jacobians of g by q_s, of g by q_f and of g_slow by q_s."""
+    """Values of all constraints, and the Jacobians dg/dq_s, dg/dq_f and dg_slow/dq_s."""
     jacobians = *jax.jacrev(system.g, argnums=(1, 2))(t, q_s, q_f), jax.jacrev(system.g_slow, argnums=1)(t, q_s)
     return system.constraints(t, q_s, q_f), *jacobians
 

@@ -1,4 +1,4 @@
-"""The user's functions: Python code that runs once for all programs that they are part of."""
+"""Functions of the user: checks of their arguments, and tracing once for all programs that contain them."""
 
 import dataclasses
 import inspect
@@ -10,31 +10,28 @@ from functools import lru_cache
 import jax
 
 COPIES_UNTIL_WARNING = 5
-"""Functions made of one piece of code, each compiled anew, until the user is warned; a larger value lets more time go by, a smaller one warns about
-a few cases that are meant."""
-
-
+"""Number of functions from one piece of code, each compiled anew, at which the user is warned. A larger number warns late; a smaller one warns about
+programs that define a few variants on purpose."""
 NO_TIME = (
     "Energies and masses that depend on time are out of scope. Take instead a force that depends on time, {force}, or a constraint that "
     "moves with time, {moving}."
 )
-"""What a function of energy that takes the time is told; {force} and {moving} say how these are given."""
+"""Advice for an energy function that takes the time; {force} and {moving} are the signatures of forces and of `Rheonomic` constraints."""
 NO_VELOCITY = (
     "Constraints hold positions; one that moves with time is {moving}. Constraints on velocities (rolling without slip, skates) are out "
     "of scope. Take instead the positions that they hold, where there are such (x - radius * angle of a wheel that rolls along a line), or a "
     "strong damper on the velocity that is forbidden, {force}."
 )
-"""What a constraint that takes the time or velocities is told."""
-NOT_FOR_ALL = ("t", "v_s", "v_f")
-"""Names of arguments that only some functions get."""
+"""Advice for a constraint that takes the time or velocities."""
+TIME_AND_VELOCITIES = ("t", "v_s", "v_f")
+"""Names of arguments that only forces, kinetic energies and `Rheonomic` constraints get."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TracedOnce:
-    """A function of arrays whose Python code runs once per process and shapes of its arguments.
+    """A function of arrays that JAX traces once per process for given shapes of its arguments.
 
-    Programs take over what was traced, operation by operation, as if the function had been called in them. Two of these
-    are equal if their functions are.
+    Later programs inline the traced operations, as if they had called the function. Two instances are equal if their functions are.
     """
 
     function: Callable
@@ -47,7 +44,7 @@ class TracedOnce:
 
 
 class CompiledAgainWarning(UserWarning):
-    """The same function is made anew again and again, and everything that contains it is compiled each time."""
+    """The program creates the same function repeatedly, and JAX compiles every program that contains it again."""
 
 
 @lru_cache(maxsize=1024)
@@ -57,7 +54,7 @@ def _traced(function: Callable) -> Callable:
 
 
 def _count(function: Callable) -> None:
-    """Warn, once for each piece of code, that functions are made of it again and again."""
+    """Count the functions that one piece of code has created, and warn once about `COPIES_UNTIL_WARNING` of them."""
     function = getattr(function, "function", function)  # of `vmri_jax.mechanics.by_name.ByName`
     code = getattr(function, "__code__", None)
     if code is None:
@@ -81,14 +78,14 @@ def traced_once(function: Callable) -> TracedOnce:
     return function if isinstance(function, TracedOnce) else TracedOnce(function)
 
 
-def check_arguments(what: str, function: Callable, arguments: str, instead: str = "") -> None:
-    """Refuse a function of the user that takes other arguments than it is called with, or the same in another order.
+def check_arguments(place: str, function: Callable, arguments: str, instead: str = "") -> None:
+    """Refuse a function of the user whose arguments have other names than the arguments of the call, or another order.
 
     Args:
-        what: the function's place, for messages: "System: constraint".
-        function: of the user; where Python knows no signature of it, nothing is checked.
-        arguments: names of the arguments that it is called with, in order: "q_s, q_f, params".
-        instead: what to do where it takes the time, velocities, or more arguments.
+        place: of the function, for messages: "System: constraint".
+        function: of the user; a function without a signature is not checked.
+        arguments: names of the arguments of the call, in order: "q_s, q_f, params".
+        instead: advice if the function takes the time, velocities, or more arguments.
 
     Raises:
         TypeError: with both lists of arguments.
@@ -98,10 +95,10 @@ def check_arguments(what: str, function: Callable, arguments: str, instead: str 
     except (ValueError, TypeError):
         return
     expected = arguments.split(", ")
-    places = [p for p in signature.parameters.values() if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    required = [p.name for p in places if p.default is p.empty]
-    not_there = [name for name in required if name in NOT_FOR_ALL and name not in expected]
-    moved = [p.name for p, name in zip(places, expected, strict=False) if p.name != name and p.name in expected]
+    positional = [p for p in signature.parameters.values() if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    required = [p.name for p in positional if p.default is p.empty]
+    not_there = [name for name in required if name in TIME_AND_VELOCITIES and name not in expected]
+    moved = [p.name for p, name in zip(positional, expected, strict=False) if p.name != name and p.name in expected]
     try:
         signature.bind(*expected)
         if not not_there and not moved:
@@ -113,7 +110,7 @@ def check_arguments(what: str, function: Callable, arguments: str, instead: str 
     else:
         advice = "Give it all of these arguments in this order, whether it uses them or not."
     name = getattr(function, "__name__", type(function).__name__)
-    raise TypeError(f"{what} is {name}{signature}; it is called with ({arguments}). {advice}")
+    raise TypeError(f"{place} is {name}{signature}; it is called with ({arguments}). {advice}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,10 +119,10 @@ class Rheonomic:
 
         System(..., constraint=Rheonomic(guided))  # guided(t, q_s, q_f, params) -> (n_g,)
 
-    Its hidden constraint is ``G v + dg/dt = 0``. It does work: energy is not kept.
+    The hidden constraint is ``G v + dg/dt = 0``. Constraint forces do work, so that energy is not conserved.
 
     Raises:
-        TypeError: function is no function.
+        TypeError: `function` is not callable.
     """
 
     function: Callable
@@ -136,5 +133,5 @@ class Rheonomic:
 
 
 def with_time(function, t, *arguments):
-    """A constraint as a plain function and its arguments, the time the first of them if it is `Rheonomic`."""
+    """A constraint as a plain function and its arguments, with the time as the first one if the constraint is `Rheonomic`."""
     return (function.function, (t, *arguments)) if isinstance(function, Rheonomic) else (function, arguments)

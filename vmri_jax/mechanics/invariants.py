@@ -1,4 +1,4 @@
-"""What a trajectory keeps: energy, momentum maps, constraints."""
+"""Quantities that a trajectory conserves: energy, momentum maps, constraints."""
 
 from functools import reduce
 from operator import add
@@ -39,7 +39,7 @@ def oscillatory_energies(omega, q_f, p_f):
     """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of unit-mass harmonic oscillators, e.g. the stiff FPU springs.
 
     Args:
-        omega: frequency, of all or of each.
+        omega: frequency of all oscillators, or one frequency for each.
         q_f, p_f: positions and momenta of the oscillators.
     """
     return (p_f**2 + omega**2 * q_f**2) / 2
@@ -49,31 +49,31 @@ def constraint_residual(system: System, state: State):
     """Largest ``|g|`` (position level) and largest ``|G v + dg/dt|`` (velocity level), shape (2,).
 
     Args:
-        system: its constraints, and the rows that they imply; without any both are zero.
+        system: with its constraints and the implied rows; without both the result is zero.
         state: time, positions and momenta.
     """
     levels = all_constraints(system, state)
     if system.implied is not None:
-        at = state.t, state.q_s, state.q_f
+        configuration = state.t, state.q_s, state.q_f
         v = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
-        implied = system.g_implied(*at), system.implied_rates(*at, *v)
+        implied = system.g_implied(*configuration), system.implied_rates(*configuration, *v)
         levels = [jnp.concatenate(rows) for rows in zip(levels, implied, strict=True)]
     return jax.vmap(max_abs)(jnp.stack(levels))
 
 
 def all_constraints(system: System, state: State):
     """Constraints and hidden constraints, ``(g, G v + dg/dt)``, each (n_g + n_gs,): zero on the constraint manifold."""
-    at = state.t, state.q_s, state.q_f
+    configuration = state.t, state.q_s, state.q_f
     v = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
-    return system.constraints(*at), system.constraint_rates(*at, *v)
+    return system.constraints(*configuration), system.constraint_rates(*configuration, *v)
 
 
 def velocity(system: System, q_s, q_f, p_s, p_f):
-    """Velocities ``(v_s, v_f)`` of given momenta (inverse Legendre transform, constraints ignored).
+    """Velocities ``(v_s, v_f)`` of momenta (inverse Legendre transform, constraints ignored).
 
     Args:
-        system: its kinetic energy counts.
-        q_s, q_f: (n_s,) and (n_f,) positions, at which masses that depend on them are taken.
+        system: with its kinetic energy.
+        q_s, q_f: (n_s,) and (n_f,) positions, for masses that depend on them.
         p_s, p_f: (n_s,) and (n_f,) momenta.
     """
     free = system.replace(constraint=None, slow_constraint=None, implied=None)

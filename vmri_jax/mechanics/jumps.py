@@ -1,11 +1,11 @@
-"""Forces that jump, as dry friction does: a step that crosses a jump has no solution, or one that no iteration reaches.
+"""Search for discontinuous forces, such as dry friction: a step across a jump has no solution, or one that no iteration reaches.
 
-The forces ``F + dL/dq`` are followed from a state along two lines: straight ahead, and to the reversed velocities,
+The search evaluates the forces ``F + dL/dq`` along two lines from a state, straight ahead and to the reversed velocities:
 
     t + s,  q + s v,  v + s a,    0 <= s <= duration          t,  q,  v - s v,    0 <= s <= 2
 
-The part of a line with the largest change of a force is cut into pieces again and again: the change of a smooth force shrinks with its
-part, the change of a force that jumps stays.
+It divides the piece of a line with the largest change of a force repeatedly: the change of a smooth force shrinks with the piece, the
+change of a discontinuous force does not.
 """
 
 from typing import NamedTuple
@@ -20,22 +20,27 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
-PIECES = 65  # of a part; odd, since a force like v / |v| is not finite at the middle of the second line, where v = 0
-ROUNDS = 3  # times a part is cut: a change within 65^-3 of a line is a jump; with more rounds, steep forces are none
-KEPT = 0.5  # part of the change over the first piece that a jump keeps; above it, jumps of forces that vary are missed
-OVER_OTHERS = 10.0  # factor by which a jump exceeds all other changes in the last part: those by round-off are alike
-ROUND_OFF = (
-    1e-6  # part of a force up to which its jump may be round-off of positions; above it, small frictions are missed
-)
-COORDINATES = 8  # forces that are followed, those with the most uneven changes; more of them take longer
-AT_ZERO = 1e-4  # part of the largest velocity on a line that counts as zero where a force jumps
+PIECES = 65
+"""Pieces of a division. Odd, since a force such as v / |v| is not finite at the middle of the second line, where v = 0."""
+ROUNDS = 3
+"""Divisions. A change within 65^-3 of a line is a jump; with more divisions, steep smooth forces are not reported."""
+LEAST_KEPT_CHANGE = 0.5
+"""Least change over the last piece of a jump, relative to the change over the first piece. A larger value misses jumps of forces that also vary."""
+LEAST_CONTRAST = 10.0
+"""Least ratio of a jump to all other changes in the last division. A smaller value reports round-off, whose changes are alike."""
+ROUND_OFF = 1e-6
+"""Least jump relative to the force. A smaller value reports round-off of the positions; a larger one misses small friction forces."""
+MOST_COORDINATES = 8
+"""Number of forces that the search follows, those with the most uneven changes. A larger number takes longer."""
+ZERO_VELOCITY = 1e-4
+"""Velocity at a jump, relative to the largest one on the line, that counts as zero. A larger value blames friction for other jumps."""
 
 
 class Jump(NamedTuple):
-    """A force that jumps.
+    """A discontinuity of a force.
 
-    coordinate: its number, slow ones first.
-    before, behind: the force on either side of the jump, in the direction of the motion.
+    coordinate: number of the coordinate of the force, slow coordinates first.
+    before, behind: the force on both sides of the jump, in the direction of the motion.
     reverses: whether the velocity of the coordinate passes zero there.
     """
 
@@ -46,29 +51,29 @@ class Jump(NamedTuple):
 
 
 def jump_ahead(system: System, state: State, duration: float) -> Jump | None:
-    """A force that jumps ahead of a state; None if none does.
+    """A discontinuity of a force ahead of a state; None if the search finds none.
 
     Args:
         system: its potentials, kinetic energy and forces.
         state: where the lines start.
-        duration: time that the line straight ahead takes, and in which velocities may reach zero.
+        duration: length of the line straight ahead, and the time in which a velocity may reach zero.
     """
     now = _motion(system, state)
     v, a = (np.append(*x) for x in ((now.v_s, now.v_f), (now.a_s, now.a_f)))
     every = np.ones(len(v), dtype=bool)
     reached = np.abs(v) <= np.abs(a) * duration
     for (dt, dq, dv), end, may_jump in (((1.0, v, a), duration, every), ((0.0, 0 * v, -v), 2.0, reached)):
-        found = _jump_on_line(system, state, (dt, dq, dv), end, may_jump)
-        if found is not None:
-            return found
+        jump = _jump_on_line(system, state, (dt, dq, dv), end, may_jump)
+        if jump is not None:
+            return jump
     return None
 
 
 def in_words(jump: Jump | None, names: Names) -> str:
-    """Which force jumps, and what to take instead; empty if none does.
+    """A sentence on the force that jumps, and on a smooth replacement; empty without a jump.
 
     Args:
-        jump: ahead of a state.
+        jump: from `jump_ahead`.
         names: of the coordinates.
     """
     if jump is None:
@@ -88,12 +93,12 @@ def in_words(jump: Jump | None, names: Names) -> str:
 
 
 def _jump_on_line(system: System, state: State, line: tuple, end: float, may_jump: np.ndarray) -> Jump | None:
-    """The first force that jumps on a line (rates of t, q and v), among those of the coordinates that may."""
+    """The first discontinuity on a line, given by its rates of t, q and v, among the forces on coordinates that `may_jump` marks."""
     s = np.linspace(0.0, end, PIECES + 1)
     forces, velocities = _along(system, state, line, s)
     changes = _changes(forces)
     uneven = np.where(may_jump, changes.max(axis=0), 0.0) / np.maximum(changes.mean(axis=0), np.finfo(float).tiny)
-    for i in np.argsort(-uneven)[:COORDINATES]:
+    for i in np.argsort(-uneven)[:MOST_COORDINATES]:
         first, part, values, speeds = changes[:, i].max(), s, forces, velocities
         if not (may_jump[i] and first > 0):
             continue
@@ -104,14 +109,14 @@ def _jump_on_line(system: System, state: State, line: tuple, end: float, may_jum
         last = _changes(values)[:, i]
         k = int(last.argmax())
         size = np.abs(values[k : k + 2, i]).max()
-        if last[k] > max(KEPT * first, OVER_OTHERS * np.delete(last, k).max(), ROUND_OFF * size):
-            reverses = abs(speeds[k, i]) <= AT_ZERO * abs(velocities[:, i]).max()
+        if last[k] > max(LEAST_KEPT_CHANGE * first, LEAST_CONTRAST * np.delete(last, k).max(), ROUND_OFF * size):
+            reverses = abs(speeds[k, i]) <= ZERO_VELOCITY * abs(velocities[:, i]).max()
             return Jump(int(i), float(values[k, i]), float(values[k + 1, i]), bool(reverses))
     return None
 
 
 def _changes(forces: np.ndarray) -> np.ndarray:
-    """(pieces, n) what each force changes by over each piece; zero next to values that are not finite."""
+    """(pieces, n) change of each force over each piece; zero next to values that are not finite."""
     with np.errstate(invalid="ignore", over="ignore"):  # of infinities
         changes = np.abs(np.diff(forces, axis=0))
     return np.where(np.isfinite(changes), changes, 0.0)

@@ -1,17 +1,18 @@
-"""Bodies of a tree as functions of few coordinates: what is left of bodies that joints tie.
+"""Bodies of a tree as functions of joint coordinates.
 
-A body b hangs on a body a, or on the ground, by a joint with one coordinate x, or with none. The joint lies at the points X_a and X_b of
-the bodies, and has a triad in each, the rows of F_a and F_b; all are components along the directors, the rows of D. With x = 0 points and
-triads coincide, and x turns b about the axis k of the triad or moves it along. With the centres phi,
+A joint with one coordinate x, or with none, connects a body b to a body a or to the ground. The joint lies at the points X_a and X_b of the
+bodies, and has a triad of unit vectors in each body, the rows of F_a and F_b. Points and triads are given by components along the directors
+of their body, the rows of D. At x = 0 both points and triads coincide; x turns b about the vector k of the triad, or moves b along it. With
+the centres phi, and the rotation T(x) by x about the vector k,
 
     D_b = M D_a,   phi_b = phi_a + r D_a,
-    M = F_b^T T(x) F_a = N + P cos x + S sin x,   r = X_a - X_b M + (way along k) F_a[k]
+    M = F_b^T T(x) F_a,   r = X_a - X_b M + (distance along k) F_a[k]
 
-So the four rows (r, M) are ``C + P cos x + S sin x + E x``, with constants that are computed once. They are multiplied from the roots
-outwards, along all ways to outermost bodies at once (a loop over the depth keeps programs small).
+So the four rows (r, M) are ``C + P cos x + S sin x + E x``, with constants C, P, S, E that are computed once. The rows are multiplied from
+the roots outwards, along the paths to all outermost bodies at once; a loop over the depth keeps programs small.
 
-Joints of several coordinates are chains of such with frames between them. Bodies on no joint, the roots, have their centre and directors
-among the coordinates themselves.
+A joint of several coordinates is a chain of such joints with frames between them. Bodies without a joint, the roots, have their centres and
+directors among the coordinates.
 
 Source: R. Featherstone, Rigid Body Dynamics Algorithms, Springer (2008), chapter 4.
 """
@@ -31,15 +32,15 @@ from vmri_jax.mechanics.rows import Part, Place, Rows, Run
 GROUND = -1
 """The number of the body that does not move."""
 JOINTS = "kinematics"
-"""Where the numbers of joints are in the params of a system."""
+"""Key of the joint constants in the params of a system."""
 MASS = "mass"
-"""Where the masses of the coordinates of bodies are in them, "slow" and "fast"."""
+"""Key of the masses of body coordinates in the params of a system; its entries are "slow" and "fast"."""
 Grid = Literal["s", "f", "sf"]
 """The coordinates that a body depends on: slow ones, fast ones, both."""
 
 
 class Move(NamedTuple):
-    """What one coordinate of a joint does with a triad.
+    """The motion of a triad with one coordinate of a joint.
 
     kind: "turn" about a vector of the triad, "slide" along it, or "screw": both.
     axis: number of the vector.
@@ -54,15 +55,15 @@ class Frames:
     """Bodies that depend on coordinates of one kind, and frames between them; compared by value.
 
     Args:
-        grid: the coordinates.
-        first: number of the first frame among all of the kinematics.
-        roots: what each way starts from: `GROUND` or a number among the roots of the kinematics and then the bodies of `Frames` before
-            these. A way leads from there to an outermost body; those that have a part in common repeat it.
-        coordinates: of the frames that move; None where none does.
-        moving: for each frame the number of its coordinate, -1 where it has none; the first ones of all ways, then the second ones.
-        slides: whether a coordinate moves along its axis.
+        grid: kind of the coordinates.
+        first: number of the first of these frames among all frames of the kinematics.
+        roots: start of each path to an outermost body: `GROUND`, or a number among the roots of the kinematics followed by the bodies of
+            earlier `Frames`. Paths with a common part repeat its frames.
+        coordinates: rows of the moving frames; None if no frame moves.
+        moving: number of the coordinate of each frame, -1 for a fixed frame; the first frames of all paths, then the second ones, and so on.
+        slides: whether some frame moves along its axis.
         bodies: numbers of the frames that are bodies.
-        directors: which directors each body has.
+        directors: numbers of the directors of each body.
     """
 
     grid: Grid
@@ -76,11 +77,11 @@ class Frames:
 
     @property
     def sizes(self) -> list[int]:
-        """Coordinates of each body as a rigid body."""
+        """Number of coordinates of each body: centre and directors."""
         return [3 + 3 * len(kept) for kept in self.directors]
 
     def relative(self, q_s, q_f, joints: dict[str, Any]):
-        """(n, 4, 3) the rows (r, M) of every frame in those it hangs on.
+        """(n, 4, 3) the rows (r, M) of every frame, relative to the frame before it on its path.
 
         Args:
             q_s, q_f: coordinates.
@@ -98,8 +99,8 @@ class Frames:
         """(n, 4, 3) origins and directors of all frames.
 
         Args:
-            rows: (n, 4, 3) those of every frame in the one before it.
-            roots: (ways, 4, 3) those of what the ways start from.
+            rows: (n, 4, 3) rows (r, M) of every frame, relative to the frame before it.
+            roots: (paths, 4, 3) origins and directors of the starts of the paths.
         """
 
         def outwards(inner, rows):
@@ -116,11 +117,11 @@ class Kinematics:
     that depend on fast ones alone, and then with all others.
 
     Args:
-        roots: where the coordinates of bodies that carry others are in q_s and q_f.
-        frames: at most one entry for each of these, in this order: bodies of slow coordinates that carry bodies of fast ones, bodies of fast
-            coordinates, bodies of both, bodies of slow coordinates that carry no other ones.
+        roots: places of the coordinates of root bodies in q_s and q_f.
+        frames: at most four entries, in this order: bodies that depend on q_s and carry bodies that depend on q_f, bodies that depend on q_f,
+            bodies that depend on both, bodies that depend on q_s and carry no body that depends on q_f.
         sizes: (n_s, n_f), numbers of coordinates.
-        num_fast: number of entries of `frames` that Q_f needs, the first ones.
+        num_fast: number of the first entries of `frames` that Q_f needs.
     """
 
     roots: tuple[Place, ...]
@@ -135,7 +136,7 @@ class Kinematics:
 
     @property
     def of_fast(self) -> "Kinematics":
-        """The map from q to Q_f; of Q_s there is what carries these bodies."""
+        """The map from q to Q_f; its Q_s has only the bodies that carry bodies of Q_f."""
         return replace(self, frames=self.frames[: self.num_fast])
 
     def __call__(self, q_s, q_f, joints: dict[str, Any]) -> tuple[Any, Any]:
@@ -159,7 +160,7 @@ class Kinematics:
         return jax.jvp(lambda q_s, q_f: self(q_s, q_f, joints), (q_s, q_f), (v_s, v_f))[1]
 
     def momenta(self, q_s, q_f, v_s, v_f, params: dict[str, Any]):
-        """Momenta of the bodies, their masses times their velocities."""
+        """Momenta of the bodies: masses times velocities."""
         rates = self.velocities(q_s, q_f, v_s, v_f, params[JOINTS])
         return tuple(params[MASS][part] * rate for part, rate in zip(("slow", "fast"), rates, strict=True))
 
@@ -169,61 +170,63 @@ class Kinematics:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Kinematics":
-        """The inverse of `to_dict`, also of what JSON makes of it.
+        """The inverse of `to_dict`, also after a round trip through JSON.
 
         Args:
             data: from `to_dict`.
         """
         frames = []
-        for some in data["frames"]:
-            rows = some["coordinates"]
+        for entry in data["frames"]:
+            rows = entry["coordinates"]
             runs = None if rows is None else tuple(Run(*run) for run in rows["runs"])
-            found: dict[str, Any] = {name: tuple(some[name]) for name in ("roots", "moving", "bodies")}
-            found["coordinates"] = None if rows is None else Rows(**(rows | {"runs": runs}))
-            found["directors"] = tuple(map(tuple, some["directors"]))
-            frames.append(Frames(**(some | found)))
+            fields: dict[str, Any] = {name: tuple(entry[name]) for name in ("roots", "moving", "bodies")}
+            fields["coordinates"] = None if rows is None else Rows(**(rows | {"runs": runs}))
+            fields["directors"] = tuple(map(tuple, entry["directors"]))
+            frames.append(Frames(**(entry | fields)))
         roots = tuple(Place(*root) for root in data["roots"])
         return cls(roots, tuple(frames), tuple(data["sizes"]), data["num_fast"])
 
     @cached_property
     def places(self) -> tuple[Place, ...]:
-        """Where the bodies of the frames are in Q_s and Q_f, in their order."""
-        ends, found = {"s": self.sizes[0], "f": self.sizes[1]}, []
+        """Places of the bodies in Q_s and Q_f, in the order of the frames."""
+        ends, places = {"s": self.sizes[0], "f": self.sizes[1]}, []
         for frames in self.frames:
             part: Part = "s" if frames.grid == "s" else "f"
             for size in frames.sizes:
-                found.append(Place(part, ends[part], size))
+                places.append(Place(part, ends[part], size))
                 ends[part] += size
-        return tuple(found)
+        return tuple(places)
 
     def _roots(self, q_s, q_f) -> dict[int, Any]:
-        """(4, 3) centre and directors of the ground and of the roots by number."""
-        found: dict[int, Any] = {GROUND: jnp.asarray(UNMOVED)}
+        """Centre and directors (4, 3) of the ground and of the roots, by number."""
+        known: dict[int, Any] = {GROUND: jnp.asarray(UNMOVED)}
         for number, (part, start, size) in enumerate(self.roots):
             rows = (q_s if part == "s" else q_f)[start : start + size].reshape(-1, 3)
-            found[number] = jnp.pad(rows, ((0, 4 - len(rows)), (0, 0)))
-        return found
+            known[number] = jnp.pad(rows, ((0, 4 - len(rows)), (0, 0)))
+        return known
 
 
 UNMOVED = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-"""(4, 3) centre and directors of what has not moved."""
+"""(4, 3) centre and directors of the ground."""
 
 
-def after(rows, others):
-    """The rows (r, M) of frames in bodies whose own rows are (s, D): ``(s + r D, M D)``.
+def after(rows, bodies):
+    """Origins and directors of frames with the relative rows (r, M), in bodies with the rows (s, D): ``(s + r D, M D)``.
 
     Args:
-        rows, others: (n, 4, 3).
+        rows: (n, 4, 3) of the frames.
+        bodies: (n, 4, 3).
     """
-    return matmul(rows, others[:, 1:]) + jnp.pad(others[:, :1], ((0, 0), (0, 3), (0, 0)))
+    return matmul(rows, bodies[:, 1:]) + jnp.pad(bodies[:, :1], ((0, 0), (0, 3), (0, 0)))
 
 
 def taken(rows, numbers: Sequence[int], otherwise: Any = None):
-    """Some entries of (n, ...), by slices.
+    """``rows[numbers]`` of an array (n, ...), by slices.
 
     Args:
-        numbers: of the entries.
-        otherwise: what stands where a number is -1.
+        rows: the array.
+        numbers: static indices.
+        otherwise: entry for the index -1.
     """
     if list(numbers) == list(range(len(rows))):
         return rows
@@ -238,7 +241,7 @@ def taken(rows, numbers: Sequence[int], otherwise: Any = None):
 
 
 def _coordinates(rows, frames: Frames):
-    """Coordinates of the bodies among frames, one after the other."""
+    """Coordinates of the frames that are bodies, one body after the other."""
     if any(len(kept) < 3 for kept in frames.directors):
         pieces = [rows[i, [0, *(k + 1 for k in kept)]] for i, kept in zip(frames.bodies, frames.directors, strict=True)]
         return jnp.concatenate(pieces).reshape(-1)

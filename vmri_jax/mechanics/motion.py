@@ -21,7 +21,7 @@ from vmri_jax.mechanics.system import System
 
 
 class Motion(NamedTuple):
-    """How a state moves on.
+    """Velocities, accelerations and multipliers of a state.
 
     v_s, v_f: velocities.
     a_s, a_f: accelerations.
@@ -66,6 +66,7 @@ def motion(system: System, state: State) -> Motion:
     jacobian = jax.jacrev(constraints, argnums=1)(t, q)
     gamma = jax.jvp(rates, (t, q), (jnp.ones_like(t), v))[1]
 
+    # a = free - responses lambda with free = M^-1 forces, responses = M^-1 G^T; G a = -gamma gives lambda
     free, responses = jnp.linalg.solve(mass, forces), jnp.linalg.solve(mass, jacobian.T)
     multipliers = jnp.linalg.lstsq(jacobian @ responses, jacobian @ free + gamma)[0]
     a = free - responses @ multipliers
@@ -73,12 +74,12 @@ def motion(system: System, state: State) -> Motion:
 
 
 def reaction_force(system: System, state: State, rows: Sequence[int]):
-    """Force ``-G^T lambda`` (n_s + n_f,) of some rows of the constraints, and on which coordinates they act, (n_s + n_f,).
+    """Force ``-G^T lambda`` (n_s + n_f,) of some rows of the constraints, and (n_s + n_f,) whether it acts on each coordinate.
 
     Args:
         system: its constraints.
-        state: where they are held.
-        rows: among those of `constraint` and `slow_constraint`, joined.
+        state: time, positions and momenta.
+        rows: indices among the rows of `constraint` and `slow_constraint`, joined.
     """
     chosen = jnp.asarray(rows)
     jacobians = jax.jacrev(system.constraints, argnums=(1, 2))(state.t, state.q_s, state.q_f)
@@ -87,7 +88,7 @@ def reaction_force(system: System, state: State, rows: Sequence[int]):
 
 
 def powers(system: System, state: State):
-    """Power (2,) of the forces, ``F . v``, and of constraints that depend on time, ``lambda . dg/dt``: what changes the energy."""
+    """Powers (2,) that change the energy: of forces, ``F . v``, and of constraints that depend on time, ``lambda . dg/dt``."""
     of_forces = of_constraints = jnp.zeros(())
     if system.force is not None:
         v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
@@ -95,6 +96,6 @@ def powers(system: System, state: State):
         of_forces = jnp.sum(f_s * v_s) + jnp.sum(f_f * v_f)
     if system.is_rheonomic:
         at_rest = jnp.zeros_like(state.q_s), jnp.zeros_like(state.q_f)
-        own = system.constraint_rates(state.t, state.q_s, state.q_f, *at_rest)
-        of_constraints = jnp.sum(motion(system, state).multipliers * own)
+        time_rates = system.constraint_rates(state.t, state.q_s, state.q_f, *at_rest)  # dg/dt at fixed positions
+        of_constraints = jnp.sum(motion(system, state).multipliers * time_rates)
     return jnp.stack([of_forces, of_constraints])

@@ -238,9 +238,3 @@ def _interval_of(node: float, count: int) -> tuple[int, float]:
     m = min(int(np.floor(node * count + NODE_TOLERANCE)), count - 1)
     c = node * count - m
     return m, 0.0 if abs(c) <= NODE_TOLERANCE else c
-
-
-def control_node_groups(num_micro: int, degree: int) -> Nodes:
-    """All micro control nodes but the last as a group each (weights 1): where constraint forces act."""
-    ones = np.ones(num_micro)
-    return Nodes(tuple(NodeGroup(float(c), 0, num_micro, ones) for c in control_nodes(degree)[:-1]), num_micro, degree)
