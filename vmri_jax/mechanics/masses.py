@@ -1,4 +1,4 @@
-"""Masses: a matrix that multiplies velocities, kept as its diagonal where nothing else is in it."""
+"""Constant masses: a mass matrix, stored as its diagonal if it is diagonal."""
 
 from collections.abc import Mapping
 
@@ -12,7 +12,7 @@ from vmri_jax.mechanics.arrays import Numbers, is_concrete, real_array
 
 
 class Diagonal(eqx.Module):
-    """A mass for each coordinate.
+    """A diagonal mass matrix.
 
     Args:
         masses: positive.
@@ -44,7 +44,7 @@ class Diagonal(eqx.Module):
 
 
 class Dense(eqx.Module):
-    """A mass matrix.
+    """A full mass matrix.
 
     Args:
         matrix: symmetric positive definite.
@@ -73,7 +73,7 @@ class Dense(eqx.Module):
 def mass_array(name: str, mass):
     """Masses (n,), or a mass matrix (n, n), as `ConstantMass` takes them: an array of float64.
 
-    It is an array of NumPy where users give lists or arrays of NumPy: these keep all digits before 64-bit mode is on, too.
+    Lists and NumPy arrays become a NumPy array, which keeps all digits even before 64-bit mode is on.
     """
     mass = real_array(f"ConstantMass: {name}", mass)
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
@@ -94,8 +94,8 @@ class ConstantMass(eqx.Module):
     """Kinetic energy ``T = v_s^T M_s v_s / 2 + v_f^T M_f v_f / 2`` with constant masses.
 
     Args:
-        slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix; or, where q_s and q_f are
-            dictionaries, a dictionary with the mass of each body: a number, or an array that is repeated over the shape of the body.
+        slow, fast: (n,) masses per coordinate, or an (n, n) symmetric positive definite mass matrix. If q_s and q_f are dictionaries: a
+            dictionary with the mass of each body, a number or an array that is broadcast to the shape of the body.
 
     Raises:
         TypeError: masses that are not real numbers.

@@ -1,4 +1,4 @@
-"""What coordinates, bodies and constraints are called: for labels, files, and quantities that are asked for by name."""
+"""Names of coordinates, bodies and constraints: for labels, files, and access to quantities by name."""
 
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,21 +18,21 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Names:
-    """Names of what follows one another in q_s and q_f, and in the values of the constraints, each with its size.
+    """Names and sizes of the bodies in q_s and q_f, and of the constraints in the values of the constraint functions, in order.
 
         Names(slow={"trolley": 1}, fast={"hook": 2, "load": 2}, constraint={"rope": 1})
 
     Args:
         slow, fast: bodies, or single coordinates, in the order of q_s and q_f, with their numbers of coordinates.
         constraint, slow_constraint: constraints in the order of the values of these functions, with their numbers of rows.
-        numbered: bodies whose coordinates are general ones: they are called "name[0]", "name[1]", not "name x", "name y".
+        numbered: bodies with generalised coordinates: these have the names "name[0]", "name[1]", not "name x", "name y".
         rigid: bodies whose coordinates are a centre and directors: "name x", "name y", "name z", "name d1 x" and so on.
-        carried: bodies that are functions of the coordinates, by name their places in Q_s and Q_f.
-        kinematics: the map to these, see `vmri_jax.mechanics.kinematics`; None without such bodies.
-        layouts: of q_s and of q_f where the user gave dictionaries of arrays, None where vectors; a run shows its positions alike.
+        carried: places in Q_s and Q_f of the bodies that are functions of the coordinates, by name.
+        kinematics: the map from q_s, q_f to Q_s, Q_f, see `vmri_jax.mechanics.kinematics`; None without such bodies.
+        layouts: of q_s and of q_f if the user gave dictionaries of arrays, None for vectors; a run returns its positions in the same form.
 
     Raises:
-        TypeError: no mapping from names to whole numbers.
+        TypeError: an argument that is no mapping from names to whole numbers.
         ValueError: a body that is slow and fast.
     """
 
@@ -50,12 +50,12 @@ class Names:
         return hash((*map(tuple, (self.slow, self.fast, self.constraint, self.slow_constraint)), self.layouts))
 
     def __post_init__(self):
-        for what in ("slow", "fast", "constraint", "slow_constraint"):
-            sizes = getattr(self, what)
+        for field_name in ("slow", "fast", "constraint", "slow_constraint"):
+            sizes = getattr(self, field_name)
             named = isinstance(sizes, Mapping) and all(isinstance(name, str) for name in sizes)
             if not (named and all(isinstance(size, int) and size > 0 for size in sizes.values())):
                 raise TypeError(
-                    f"Names: {what} is {sizes!r}; give a dictionary of names and sizes in the order of the coordinates or "
+                    f"Names: {field_name} is {sizes!r}; give a dictionary of names and sizes in the order of the coordinates or "
                     "rows, e.g. {'hook': 2, 'load': 2}."
                 )
         both = sorted(set(self.slow) & set(self.fast))
@@ -71,10 +71,10 @@ class Names:
         }
 
     def shaped(self, part: Part, vectors) -> Any:
-        """Vectors (..., n) as the user gave the start: a dictionary of arrays by name, or the vectors themselves.
+        """Vectors (..., n) in the form of the start: a dictionary of arrays by name, or the vectors themselves.
 
         Args:
-            part: whether they are slow or fast.
+            part: slow or fast.
             vectors: positions, velocities or momenta.
         """
         layout = self.layouts[part == "f"]
@@ -91,22 +91,22 @@ class Names:
         return self._coordinates(self.fast)
 
     def positions(self, part: Part) -> list[int]:
-        """Which entries of q_s or q_f are positions: all but the directors of rigid bodies."""
-        found = []
+        """Indices of positions in q_s or q_f: of all entries but the directors of rigid bodies."""
+        indices = []
         for name, place in self.bodies.items():
             if place.part == part:
-                found += range(place.start, place.start + (len(AXES) if name in self.rigid else place.size))
-        return found
+                indices += range(place.start, place.start + (len(AXES) if name in self.rigid else place.size))
+        return indices
 
     @property
     def rows(self) -> dict[str, list[int]]:
-        """Where the values of every constraint are among all of them, those of `constraint` first."""
-        found: dict[str, list[int]] = {}
+        """Indices of the values of every constraint among the values of `constraint` followed by `slow_constraint`."""
+        rows: dict[str, list[int]] = {}
         total = sum(self.constraint.values())
         for first, sizes in ((0, self.constraint), (total, self.slow_constraint)):
             for name, start, size in _one_after_another(sizes):
-                found.setdefault(name, []).extend(range(first + start, first + start + size))
-        return found
+                rows.setdefault(name, []).extend(range(first + start, first + start + size))
+        return rows
 
     def place(self, body: str) -> Place:
         """The place of a body.
@@ -127,10 +127,10 @@ class Names:
         return self.carried[body] if body in self.carried else self.place(body)
 
     def of(self, system: System, n_s: int, n_f: int) -> "Names":
-        """The same with plain names for coordinates and constraints of a system that have none.
+        """These names, completed by plain names for coordinates and constraints of a system without a name.
 
         Args:
-            system: what has the constraints.
+            system: with its constraints.
             n_s, n_f: numbers of slow and fast coordinates.
 
         Raises:
@@ -142,22 +142,22 @@ class Names:
         return replace(self.of_coordinates(n_s, n_f), constraint=constraint, slow_constraint=slow_constraint)
 
     def of_coordinates(self, n_s: int, n_f: int) -> "Names":
-        """The same with plain names for coordinates that have none.
+        """These names, completed by plain names for coordinates without a name.
 
         Args:
-            n_s, n_f: their numbers.
+            n_s, n_f: numbers of slow and fast coordinates.
 
         Raises:
-            ValueError: sizes that do not add up to these.
+            ValueError: sizes that do not add up to these numbers.
         """
         slow, fast = self._completed("slow", "q_s", n_s), self._completed("fast", "q_f", n_f)
         return replace(self, slow=slow, fast=fast, numbered=(*self.numbered, "q_s", "q_f"))
 
-    def _completed(self, what: str, plain: str, number: int) -> dict[str, int]:
-        sizes = dict(getattr(self, what)) or ({plain: number} if number else {})
+    def _completed(self, field_name: str, plain: str, number: int) -> dict[str, int]:
+        sizes = dict(getattr(self, field_name)) or ({plain: number} if number else {})
         if sum(sizes.values()) != number:
             raise ValueError(
-                f"Names: {what} is {sizes}, which names {sum(sizes.values())}; the system has {number}. The sizes must add up "
+                f"Names: {field_name} is {sizes}, which names {sum(sizes.values())}; the system has {number}. The sizes must add up "
                 "to that."
             )
         return sizes
@@ -166,7 +166,9 @@ class Names:
         names, shapes = [], {name: shape for layout in self.layouts if layout for name, shape in layout.shapes}
         for name, size in sizes.items():
             *rows, columns = shapes.get(name, (size,)) or (1,)
-            if rows:  # an array of points, as of all atoms: "atoms[3] x"; of anything else its indices
+            if (
+                rows
+            ):  # entries of an array of points, e.g. of atoms, are called "atoms[3] x"; of other arrays "name[i,j]"
                 are_points = columns <= len(AXES)
                 for index in np.ndindex(*rows, *([] if are_points else [columns])):
                     entry = f"{name}[{','.join(map(str, index))}]"
@@ -183,50 +185,50 @@ class Names:
         return names
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain data, which keep their order in JSON."""
+        """As plain data for JSON, in the same order."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Names":
-        """The inverse of `to_dict`, also of what JSON makes of it.
+        """The inverse of `to_dict`, also after a round trip through JSON.
 
         Args:
-            data: from `to_dict`; what is absent there has its default.
+            data: from `to_dict`; absent fields have their defaults.
         """
-        found = dict(data)
-        found["carried"] = {name: Place(*place) for name, place in data.get("carried", {}).items()}
+        fields = dict(data)
+        fields["carried"] = {name: Place(*place) for name, place in data.get("carried", {}).items()}
         if data.get("kinematics") is not None:
-            found["kinematics"] = Kinematics.from_dict(data["kinematics"])
+            fields["kinematics"] = Kinematics.from_dict(data["kinematics"])
         layouts = data.get("layouts", (None, None))
-        found["layouts"] = tuple(None if layout is None else Layout.from_dict(layout) for layout in layouts)
-        return cls(**found)
+        fields["layouts"] = tuple(None if layout is None else Layout.from_dict(layout) for layout in layouts)
+        return cls(**fields)
 
 
 def unknown(kind: str, name: Any, known: Iterable[str]) -> str:
-    """The sentence that there is none of that name, with the near miss.
+    """The sentence that a name is unknown, with the most similar known name.
 
     Args:
-        kind: what has names.
-        name: the one that was given.
-        known: those there are.
+        kind: of the objects with names, e.g. "body".
+        name: the unknown name.
+        known: all known names.
     """
     known = list(known)
     return f"there is no {kind} {name!r}.{near(name, known)} There are {', '.join(known) or 'none'}."
 
 
 def near(name: Any, known: Iterable[str]) -> str:
-    """A question with the known name that is most like it; empty if none is.
+    """A question with the most similar known name; empty if no name is similar.
 
     Args:
-        name: the one that was given.
-        known: those there are.
+        name: the unknown name.
+        known: all known names.
     """
     close = difflib.get_close_matches(str(name), list(known), n=1)
     return f" Did you mean {close[0]}?" if close else ""
 
 
 def _one_after_another(sizes: Mapping[str, int]) -> list[tuple[str, int, int]]:
-    """(name, start, size) of each."""
+    """(name, start, size) of every entry, one after the other."""
     starts, end = [], 0
     for name, size in sizes.items():
         starts.append((name, end, size))

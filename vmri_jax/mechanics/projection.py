@@ -1,4 +1,4 @@
-"""Momenta on the hidden constraints ``G v + dg/dt = 0``, and the velocities that belong to them."""
+"""Projection of momenta onto the hidden constraints ``G v + dg/dt = 0``, with the velocities of the projected momenta."""
 
 from functools import partial
 
@@ -11,11 +11,14 @@ from vmri_jax.mechanics.structure import has_constant_hessian
 from vmri_jax.mechanics.system import System
 
 MAX_ITERATIONS = 50
-"""Newton's iterations for the velocities of a kinetic energy that is not quadratic."""
+"""Most Newton iterations for the velocities of a kinetic energy that is not quadratic. A larger number makes failures slower."""
+SMALL_STEP = 1e-9
+"""Newton step, relative to the velocities, at which the line search ends: the two further steps bring it to round-off. A smaller value costs steps."""
 ON_CONSTRAINTS = 1e-9
-"""Part of the velocities by which Newton's iterates may miss the hidden constraints when they are compared."""
-CONVERGED = 1e-6
-"""Part of the velocities that the last of two more steps may change at most."""
+"""Largest violation of the hidden constraints, relative to the velocities, of an iterate whose energy is compared. A larger value compares energies of
+velocities that violate the constraints."""
+LARGEST_LAST_STEP = 1e-6
+"""Largest last Newton step, relative to the velocities, of a converged iteration. A larger value accepts iterates that have not converged."""
 
 
 def legendre(system: System, q_s, q_f, v_s, v_f):
@@ -28,14 +31,14 @@ def legendre(system: System, q_s, q_f, v_s, v_f):
 def project_momentum(system: System, state, guess=None, sparsity: Sparsity | None = None):
     """Momenta projected onto the hidden constraints, ``p <- p - G^T mu`` with ``G v + dg/dt = 0``, and their velocities.
 
-    v is the velocity of the projected momentum, ``p - G^T mu = dT/dv``: of all v with ``G v + dg/dt = 0`` the one that
-    minimises ``T(v) - p . v``. For a kinetic energy that is quadratic in the velocities that is one linear solve. Else it is Newton's
-    iteration with a line search, and the kinetic energy must be convex in the velocities.
+    The velocity v of the projected momentum, ``p - G^T mu = dT/dv``, minimises ``T(v) - p . v`` over all v with ``G v + dg/dt = 0``. If T is
+    quadratic in v, that takes one linear solve. Else it takes Newton's iteration with a line search, and T must be convex in v.
 
     Args:
+        system: with its kinetic energy and constraints.
         state: a `State`: time, positions and momenta.
-        guess: velocities (v_s, v_f) where Newton's iteration starts, by default at rest.
-        sparsity: of ``G M^-1 G^T``, for constant masses; full by default.
+        guess: velocities (v_s, v_f) from which Newton's iteration starts, by default zero.
+        sparsity: of ``G M^-1 G^T``, for constant masses; by default the matrix is full.
 
     Returns:
         (p_s, p_f, v_s, v_f); NaN where Newton's iteration does not converge.
@@ -56,7 +59,7 @@ def _by_one_solve(system: System, t, q_s, q_f, p_s, p_f, sparsity: Sparsity | No
         products = jax.vmap(lambda seed: push(*velocity(*pull(seed))))(sparsity.seeds)  # with G M^-1 G^T
         rates = push(*velocity(p_s, p_f))
         if system.is_rheonomic:
-            rates = rates + _own_rates(system, t, q_s, q_f)
+            rates = rates + _time_rates(system, t, q_s, q_f)
         mu = sparsity.solve(products, rates)
         pull_s, pull_f = pull(mu)
         p_s, p_f = p_s - pull_s, p_f - pull_f
@@ -66,54 +69,57 @@ def _by_one_solve(system: System, t, q_s, q_f, p_s, p_f, sparsity: Sparsity | No
 def _by_newton(system: System, t, q_s, q_f, p_s, p_f, guess):
     n_s = q_s.shape[0]
     jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
-    own = _own_rates(system, t, q_s, q_f)
+    rates = _time_rates(system, t, q_s, q_f)
     p = jnp.concatenate([p_s, p_f])
-    v = _velocity(system, q_s, q_f, jacobian, own, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
+    v = _velocity(system, q_s, q_f, jacobian, rates, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
     v_s, v_f = v[:n_s], v[n_s:]
     if jacobian.shape[0]:
         p_s, p_f = legendre(system, q_s, q_f, v_s, v_f)
     return p_s, p_f, v_s, v_f
 
 
-def _own_rates(system: System, t, q_s, q_f):
+def _time_rates(system: System, t, q_s, q_f):
     """``dg/dt`` of all constraints (n_g + n_gs,) at fixed positions."""
     if not system.is_rheonomic:
         return jnp.zeros(sum(system.num_constraints(q_s, q_f)))
     return system.constraint_rates(t, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
 
 
-def _velocity(system: System, q_s, q_f, jacobian, own, p, guess):
-    """The v that minimises ``T(v) - p . v`` over ``jacobian v + own = 0``; NaN where Newton's iteration does not converge."""
+def _velocity(system: System, q_s, q_f, jacobian, rates, p, guess):
+    """The v that minimises ``T(v) - p . v`` over ``jacobian v + rates = 0``; NaN if Newton's iteration does not converge."""
 
     def kinetic(system, q_s, q_f, v):
         return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
 
-    def direction(at, v):
-        system, q_s, q_f, jacobian, own, p = at
+    # Newton direction d:  [T'', G^T; G, 0] (d, mu) = (p - T'(v), -(G v + rates))
+    def direction(data, v):
+        system, q_s, q_f, jacobian, rates, p = data
         hessian, gradient = (d(lambda v: kinetic(system, q_s, q_f, v))(v) for d in (jax.hessian, jax.grad))
         matrix = kernels.saddle(hessian, jacobian.T, jacobian)
-        rows = jnp.concatenate([p - gradient, -(jacobian @ v + own)])
+        rows = jnp.concatenate([p - gradient, -(jacobian @ v + rates)])
         return kernels.solve(matrix, rows[:, None])[: v.size, 0]
 
     def search(carry):
         v, k, _ = carry
-        system, q_s, q_f, jacobian, own, p = fixed
-        d = direction(fixed, v)
-        small = kernels.max_abs(d) <= 1e-9 * kernels.max_abs(v)  # the two steps at the end do the rest
+        system, q_s, q_f, jacobian, rates, p = constants
+        d = direction(constants, v)
+        small = kernels.max_abs(d) <= SMALL_STEP * kernels.max_abs(v)
+        # line search: the longest step that decreases T - p . v; off the constraints every finite step is a progress
         merit = jax.vmap(lambda v: kinetic(system, q_s, q_f, v) - p @ v)(v + fractions[:, None] * d)
-        on_constraints = kernels.max_abs(jacobian @ v + own) <= ON_CONSTRAINTS * kernels.max_abs(v)
+        on_constraints = kernels.max_abs(jacobian @ v + rates) <= ON_CONSTRAINTS * kernels.max_abs(v)
         better = jnp.isfinite(merit) & ((merit < merit[-1]) | ~on_constraints)
         stop = small | ~jnp.any(better)
         return jnp.where(stop, v, v + fractions[jnp.argmax(better)] * d), k + 1, stop
 
-    at = (system, q_s, q_f, jacobian, own, p)
+    data = (system, q_s, q_f, jacobian, rates, p)
     if has_constant_hessian(lambda v: kinetic(system, q_s, q_f, v), guess):
-        return direction(at, jnp.zeros_like(p))  # T is quadratic in v: Newton's first step is the solution
-    fixed, guess = jax.lax.stop_gradient((at, guess))
+        return direction(data, jnp.zeros_like(p))  # T is quadratic in v: Newton's first step is the solution
+    constants, guess = jax.lax.stop_gradient((data, guess))
     fractions = jnp.append(0.5 ** jnp.arange(12.0), 0.0)
     start = (guess, 0, jnp.asarray(False))
     v = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < MAX_ITERATIONS), search, start)[0]
-    for _ in range(2):  # Newton's map is flat at its fixed point: these two carry first and second derivatives
-        d = direction(at, v)
+    # Newton's map has the derivative zero by v at its fixed point: two steps outside of the loop carry first and second derivatives
+    for _ in range(2):
+        d = direction(data, v)
         v = v + d
-    return jnp.where(kernels.max_abs(d) <= CONVERGED * kernels.max_abs(v) + 1e-300, v, jnp.nan)
+    return jnp.where(kernels.max_abs(d) <= LARGEST_LAST_STEP * kernels.max_abs(v) + 1e-300, v, jnp.nan)

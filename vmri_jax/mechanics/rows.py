@@ -19,7 +19,7 @@ class Place(NamedTuple):
 
 
 class Run(NamedTuple):
-    """`count` bodies that follow one another in q_part, or (`same`) one body `count` times."""
+    """A run of neighbours: `count` bodies that follow one another in q_part, or, if `same`, one body `count` times."""
 
     part: Part
     start: int
@@ -41,17 +41,13 @@ class Entries:
 
     @classmethod
     def of(cls, marked: Sequence[bool]) -> "Entries":
-        """The entries that are marked.
-
-        Args:
-            marked: one for each entry.
-        """
+        """The entries with a True in `marked` (n,)."""
         ends = [i for i, (a, b) in enumerate(pairwise([False, *marked, False])) if a != b]
         return cls(tuple(zip(ends[::2], ends[1::2], strict=True)), len(marked))
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of the entries."""
         return sum(stop - start for start, stop in self.runs)
 
     def take(self, vectors):
@@ -60,15 +56,15 @@ class Entries:
             return vectors
         return jnp.concatenate([vectors[..., :0], *(vectors[..., start:stop] for start, stop in self.runs)], axis=-1)
 
-    def put(self, entries, others):
-        """Vectors (..., n) with these entries (..., count), and the rest from others (..., n)."""
+    def put(self, entries, vectors):
+        """Vectors (..., n) with these entries replaced by `entries` (..., count)."""
         if self.count == self.size:
             return entries
         pieces, end, taken = [], 0, 0
         for start, stop in self.runs:
-            pieces += [others[..., end:start], entries[..., taken : taken + stop - start]]
+            pieces += [vectors[..., end:start], entries[..., taken : taken + stop - start]]
             end, taken = stop, taken + stop - start
-        return jnp.concatenate([*pieces, others[..., end:]], axis=-1)
+        return jnp.concatenate([*pieces, vectors[..., end:]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -88,8 +84,8 @@ class Rows:
         """The rows at these places.
 
         Args:
-            places: a single one gives a vector (size,), more give (n, size).
-            size: number of coordinates that are taken of each; None for all.
+            places: of the bodies; `take` returns a vector (size,) for a single place, else (n, size).
+            size: number of coordinates to take of each body; None for all.
         """
         stride, runs = places[0].size, []
         for part, start, _ in places:
@@ -103,13 +99,13 @@ class Rows:
         return cls(size or stride, stride, tuple(runs), len(places) == 1)
 
     def within(self, sizes: tuple[int, int]) -> bool:
-        """Whether they are among the first (n_s, n_f) coordinates."""
+        """Whether all rows are among the first (n_s, n_f) coordinates."""
         most = {"s": sizes[0], "f": sizes[1]}
         ends = [(run.part, run.start + self.stride * (1 if run.same else run.count)) for run in self.runs]
         return all(end <= most[part] for part, end in ends)
 
     def take(self, q_s, q_f):
-        """The rows of these vectors, positions or velocities."""
+        """The rows of q_s and q_f, which may also be velocities."""
         pieces = []
         for part, start, count, same in self.runs:
             q = q_s if part == "s" else q_f
@@ -126,24 +122,24 @@ class Rows:
         """The transpose of `take`.
 
         Args:
-            rows: one for each place, or one for all.
+            rows: one row for each place, or one row for all places.
             n_s, n_f: lengths of q_s and q_f.
 
         Returns:
             Vectors (n_s,), (n_f,) with the rows added at their places.
         """
-        rows, at = jnp.broadcast_to(rows, (sum(run.count for run in self.runs), self.size)), 0
+        rows, first = jnp.broadcast_to(rows, (sum(run.count for run in self.runs), self.size)), 0
         sums = {"s": jnp.zeros(n_s), "f": jnp.zeros(n_f)}
         for part, start, count, same in self.runs:
-            piece = rows[at : at + count]
+            piece = rows[first : first + count]
             piece = jnp.sum(piece, axis=0) if same else self._whole(piece).reshape(-1)
             after = sums[part].shape[0] - start - piece.shape[0]
             sums[part] += jnp.pad(piece, (start, after))
-            at += count
+            first += count
         return tuple(sums.values())
 
     def _first(self, piece, count: int):
-        """The first coordinates of bodies that follow one another, flat."""
+        """The first `size` coordinates of `count` neighbouring bodies, as a vector."""
         return piece if self.size == self.stride else piece.reshape(count, self.stride)[:, : self.size].reshape(-1)
 
     def _whole(self, rows):

@@ -1,4 +1,4 @@
-"""States: time, positions and momenta on the constraint manifold, and how a run gets its first one."""
+"""States (time, positions and momenta on the constraint manifold), and the start of a run: `initial_state` and `Problem`."""
 
 import warnings
 from collections.abc import Mapping
@@ -21,13 +21,16 @@ from vmri_jax.mechanics.projection import legendre, project_momentum
 from vmri_jax.mechanics.summary import coordinates, has_values, listed, numbers, summary
 from vmri_jax.mechanics.system import System
 
-NOTICED, REFUSED = 1e-6, 1e-2
-"""Part of the velocities (in the norm of the kinetic energy) that violates the constraints: above the first a warning, above the second an error.
-Smaller values refuse starts that are rounded, larger ones pass over mistakes."""
+REPORTED_VIOLATION = 1e-6
+"""Violation of the constraints by the velocities, relative to their norm (of the kinetic energy), above which a warning is given. A smaller value
+warns about rounded starts, a larger one passes over mistakes."""
+REFUSED_VIOLATION = 1e-2
+"""Violation, as in REPORTED_VIOLATION, above which a start is refused. A smaller value refuses rounded starts, a larger one passes over mistakes."""
+REPORTED_PROJECTION = 0.85
+"""Violation, as in REPORTED_VIOLATION, above which a warning is given even with ``project=True``: a projection that removes most of the velocities
+is hardly intended. A larger value passes over mistakes."""
 Layouts = tuple[by_name.Layout | None, by_name.Layout | None]
-"""Of q_s and of q_f, None where these are vectors."""
-LARGEST_PROJECTED = 0.85
-"""Part of the velocities that may be projected away without a word where that is asked for: more is hardly meant."""
+"""Layouts of q_s and of q_f, None for vectors."""
 
 
 class State(eqx.Module):
@@ -52,11 +55,12 @@ def initial_state(
     """Consistent state from positions and velocities: ``p = dT/dv``, projected onto the hidden constraints.
 
     Args:
+        system: masses, potentials, constraints and forces.
         q_s, q_f, v_s, v_f: (n_s,), (n_f,) arrays of float64.
         t: start time.
-        project: move positions onto the constraints instead of refusing them, and take away what of the velocities points
-            against them.
-        tolerance: largest constraint value, in the constraint's own unit, that counts as satisfied.
+        project: move positions onto the constraints instead of refusing them, and project velocities onto the hidden constraints
+            without a warning.
+        tolerance: largest constraint value, in the unit of the constraint, of a satisfied constraint.
 
     Raises:
         ValueError: float32 data or 64-bit mode off, wrong shapes, not finite, positions that violate a constraint (with
@@ -102,45 +106,45 @@ def initial_state(
 
 
 def tell_of_velocities(what: str, taken: float, project: bool, constraints: str = "the constraints") -> None:
-    """Say which part of the velocities does not fit the constraints, at rest or moving, and refuse a large one.
+    """Warn about velocities that violate the hidden constraints, and refuse a large violation.
 
     Args:
-        what: who says so.
-        taken: the part, in the norm of the kinetic energy.
-        project: whether the nearest velocities that fit are meant.
-        constraints: what they do not fit.
+        what: name of the caller in the message.
+        taken: violation, the part that the projection removes, relative to the velocities in the norm of the kinetic energy.
+        project: whether the user wants the projected velocities.
+        constraints: name of the constraints in the message.
     """
     message = (
         f"{what}: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit {constraints}"
     )
     scenes = "of a scene, with_rates({joint: rate}) finds all that belong to the rate of a joint"
-    if project and taken > LARGEST_PROJECTED:
+    if project and taken > REPORTED_PROJECTION:
         warnings.warn(f"{message}, and project=True has taken them away; {scenes}.", stacklevel=3)
     if project:
         return
-    if taken > REFUSED:
+    if taken > REFUSED_VIOLATION:
         raise ValueError(f"{message}. Correct the velocities, or pass project=True for the nearest that fit; {scenes}.")
-    if taken > NOTICED:
+    if taken > REPORTED_VIOLATION:
         warnings.warn(f"{message}; the nearest that fit are taken. Pass project=True if that is meant.", stacklevel=3)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A system with initial positions and velocities, which are kept as vectors; at rest by default.
+    """A system with initial positions and velocities.
 
     Positions may be dictionaries, an array of any shape for each body, ``q_f={"hook": [3.0, -4.0], "load": [3.0, -5.0]}``. The functions of
-    the system then get such dictionaries, ``q_f["load"] - q_f["hook"]``, a force may return them (bodies left out have none), and a
-    constraint may return its rows by name, ``{"rope": ...}``. The problem makes vectors of them once, in the order of the dictionaries;
+    the system then get such dictionaries, ``q_f["load"] - q_f["hook"]``; a force may return a dictionary (a body without an entry has no
+    force), and a constraint may return its rows by name, ``{"rope": ...}``. The problem stores vectors, in the order of the dictionaries;
     a run returns dictionaries again, ``run.q_f["load"]``.
 
     Args:
-        system: what moves.
+        system: the `System` that moves.
         q_s, q_f: (n_s,), (n_f,) positions, or dictionaries of arrays.
-        v_s, v_f: velocities alike; None at rest. Of dictionaries bodies at rest may be left out.
+        v_s, v_f: velocities, in the form of the positions; None for zero. A dictionary may leave out bodies at rest.
         t: start time.
-        drawing: what it looks like, plain data for `vmri_jax.animation.Drawing`; None if that is not known.
+        drawing: appearance of the system, plain data for `vmri_jax.animation.Drawing`, or None.
         project: whether `state` projects positions and velocities onto the constraints, see `initial_state`.
-        names: of bodies and constraints of vectors, `Names` or None; runs, figures and files are labelled by them. Dictionaries have them.
+        names: `Names` of bodies and constraints, or None; runs, figures and files have them as labels. Dictionaries give the names of bodies.
 
     Raises:
         TypeError, ValueError: arrays as `initial_state` refuses them; names that do not add up to coordinates and constraints.
@@ -180,7 +184,7 @@ class Problem:
             self.names.of(self.system, self.q_s.size, self.q_f.size)
 
     def _make_flat(self) -> "Layouts":
-        """Vectors in place of dictionaries, velocities in place of None; and the layouts of q_s and of q_f."""
+        """Replace dictionaries by vectors and missing velocities by zeros; returns the layouts of q_s and of q_f."""
         known, layouts = (self.names or Names()).layouts, []
         for part, layout in zip("sf", known, strict=True):
             position, velocity = (getattr(self, f"{kind}_{part}") for kind in "qv")
@@ -201,7 +205,7 @@ class Problem:
         return layouts[0], layouts[1]
 
     def _names_of(self, layouts: "Layouts") -> Names:
-        """The names of the problem, with those of the dictionaries."""
+        """The names of the problem, with the names of bodies and rows in the dictionaries."""
         names, system, t = self.names or Names(), self.system, jnp.zeros(())
         arguments = {"constraint": (self.q_s, self.q_f), "slow_constraint": (self.q_s,)}
         sizes = {}
@@ -228,38 +232,38 @@ class Problem:
         )
 
     def state(self, project: bool | None = None) -> State:
-        """The consistent initial `State` (see `initial_state`); None for `project` of the problem."""
+        """The consistent initial `State`, see `initial_state`; with None, `project` is the one of the problem."""
         project = self.project if project is None else project
         return initial_state(self.system, self.q_s, self.q_f, self.v_s, self.v_f, self.t, project=project)
 
 
 class HasProblem(Protocol):
-    """What can be made a problem, as a scene."""
+    """An object with a method ``problem()``, such as a scene."""
 
     def problem(self) -> Problem: ...
 
 
 Movable = System | Problem | HasProblem
-"""What can be simulated: a system needs a state as well."""
+"""Objects that can be simulated; a system needs a state as well."""
 
 
-def opened(given):
-    """The problem of a scene; anything else as it is."""
-    return given.problem() if callable(getattr(given, "problem", None)) else given
+def opened(movable):
+    """The problem of a scene; any other object unchanged."""
+    return movable.problem() if callable(getattr(movable, "problem", None)) else movable
 
 
-def problem_of(what: str, given: Problem | HasProblem) -> Problem:
+def problem_of(what: str, movable: Problem | HasProblem) -> Problem:
     """The problem of a scene, or the problem itself.
 
     Args:
-        what: the function that was called, for messages.
-        given: what it was called with.
+        what: name of the calling function in the message.
+        movable: its argument.
 
     Raises:
-        TypeError: something else.
+        TypeError: an argument that is neither.
     """
     require_x64()
-    problem = opened(given)
+    problem = opened(movable)
     if not isinstance(problem, Problem):
         raise TypeError(
             f"{what}: problem is {type(problem).__name__}; give a vmri_jax.Problem or a Scene. A System needs a start: "
@@ -269,15 +273,15 @@ def problem_of(what: str, given: Problem | HasProblem) -> Problem:
 
 
 def start_of(what: str, system, state=None) -> tuple[System, State]:
-    """The system and the state of what is to move.
+    """The system and the start of a run.
 
     Args:
-        what: the function that was called, for messages.
-        system: a `System`, a `Problem`, or anything whose ``problem()`` is one, as a scene's.
-        state: where it starts; None for the start of the problem.
+        what: name of the calling function in the message.
+        system: a `System`, a `Problem`, or an object with a method ``problem()``, such as a scene.
+        state: start; None for the start of the problem.
 
     Raises:
-        TypeError: something else; a system without a state.
+        TypeError: another object; a system without a state.
     """
     require_x64()
     system = opened(system)
@@ -297,13 +301,17 @@ def start_of(what: str, system, state=None) -> tuple[System, State]:
 
 @jax.jit
 def _consistent(system, t, q_s, q_f, v_s, v_f):
-    """The state with consistent momenta, and the part of the velocities that constraints take away; what functions return is checked while tracing."""
+    """The state with projected momenta, and the violation ``|v - v'| / |v|`` of the hidden constraints in the norm of the kinetic energy.
+
+    The values of the user's functions are checked while JAX traces this function.
+    """
     check_system(system, q_s, q_f)
-    given = legendre(system, q_s, q_f, v_s, v_f)
-    p_s, p_f, *velocities = project_momentum(system, State(t, q_s, q_f, *given), (v_s, v_f))
-    v, kept, p, kept_p = (jnp.concatenate(a) for a in ((v_s, v_f), velocities, given, (p_s, p_f)))
+    momenta = legendre(system, q_s, q_f, v_s, v_f)
+    p_s, p_f, *velocities = project_momentum(system, State(t, q_s, q_f, *momenta), (v_s, v_f))
+    v, projected_v, p, projected_p = (jnp.concatenate(a) for a in ((v_s, v_f), velocities, momenta, (p_s, p_f)))
+    # |v - v'|^2 / |v|^2 with |v|^2 = v . p
     size = v @ p
-    part = jnp.where(size > 0, (v - kept) @ (p - kept_p) / jnp.where(size > 0, size, 1.0), 0.0)
+    part = jnp.where(size > 0, (v - projected_v) @ (p - projected_p) / jnp.where(size > 0, size, 1.0), 0.0)
     return State(t, q_s, q_f, p_s, p_f), jnp.sqrt(jnp.maximum(part, 0.0))
 
 

@@ -1,8 +1,7 @@
-"""What a function's jaxpr tells about it: what depends on what, and the structure of its Hessian.
+"""Structure of functions from their jaxprs: dependence of outputs on inputs, and the structure of Hessians.
 
-All answers are structural and conservative: what is called dependent may happen not to be (``0 * x`` counts), what is
-called independent, constant or diagonal is so. An operation that is not known here mixes all that it is given, and nothing is
-known about functions with effects.
+The answers are structural and conservative. "Independent", "constant" and "diagonal" are certain; "dependent" may be wrong (``0 * x``
+depends on x). Outputs of an operation that is unknown here depend on all its inputs, and nothing is known about functions with effects.
 """
 
 from collections.abc import Callable
@@ -24,7 +23,7 @@ CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_v
 
 
 def called(eqn) -> tuple[Any, Any] | None:
-    """(jaxpr, consts) of what an equation of a jaxpr calls, None if it is no call."""
+    """(jaxpr, consts) of the function that an equation of a jaxpr calls, None if the equation is no call."""
     inner = eqn.params.get("jaxpr") or eqn.params.get("call_jaxpr")
     if eqn.primitive.name not in CALLS or inner is None:
         return None
@@ -32,7 +31,7 @@ def called(eqn) -> tuple[Any, Any] | None:
 
 
 def reached(eqn, inputs: list[bool]) -> list[bool]:
-    """Which outputs of an equation of a jaxpr some of its inputs can change: those marked."""
+    """Whether each output of an equation of a jaxpr can depend on an input that is marked in `inputs`."""
     rule, inner = _LOOPS.get(eqn.primitive.name), called(eqn)
     if rule is not None:
         return rule(eqn, inputs)
@@ -40,7 +39,7 @@ def reached(eqn, inputs: list[bool]) -> list[bool]:
 
 
 def _everything(eqn, inputs: list[bool]) -> list[bool]:
-    """The answer where nothing is known."""
+    """All outputs depend on all inputs: the rule for unknown operations."""
     return [any(inputs)] * len(eqn.outvars)
 
 
@@ -53,7 +52,7 @@ def _outputs_reached(jaxpr, inputs: list[bool]) -> list[bool]:
 
 
 def _by_while(eqn, inputs: list[bool]) -> list[bool]:
-    """Everything where the end of the loop is."""
+    """While loop: if the condition depends on a marked input, all outputs do."""
     try:
         of_cond, of_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
         cond, body = eqn.params["cond_jaxpr"].jaxpr, eqn.params["body_jaxpr"].jaxpr
@@ -69,7 +68,7 @@ def _by_while(eqn, inputs: list[bool]) -> list[bool]:
 
 
 def _by_scan(eqn, inputs: list[bool]) -> list[bool]:
-    """What is scanned over, or stacked, has one axis more outside than inside: so the carry is told from it."""
+    """Scan: shapes tell the carry, since scanned inputs and stacked outputs have one more axis outside of the loop than inside."""
     inner = eqn.params["jaxpr"].jaxpr
     num_carry = sum(a.aval.shape == b.aval.shape for a, b in zip(eqn.outvars, inner.outvars, strict=True))
     num_xs = sum(a.aval.shape != b.aval.shape for a, b in zip(eqn.invars, inner.invars, strict=True))
@@ -80,13 +79,13 @@ def _by_scan(eqn, inputs: list[bool]) -> list[bool]:
 
 
 def _over_and_over(once: Callable, carry: list[bool]) -> list[bool]:
-    """The state of a loop: what is marked at its start, and what that reaches."""
-    found = [a or b for a, b in zip(carry, once(carry), strict=True)]
-    return carry if found == carry else _over_and_over(once, found)
+    """The marks of the carry of a loop after any number of turns: the fixed point of `once`."""
+    marks = [a or b for a, b in zip(carry, once(carry), strict=True)]
+    return carry if marks == carry else _over_and_over(once, marks)
 
 
 def _by_cond(eqn, inputs: list[bool]) -> list[bool]:
-    """Everything where the choice is."""
+    """Branches: if the index depends on a marked input, all outputs do."""
     index, *operands = inputs
     cases = [_outputs_reached(branch.jaxpr, operands) for branch in eqn.params["branches"]]
     return [index or any(case) for case in zip(*cases, strict=True)]
@@ -133,7 +132,7 @@ def is_linear(function: Callable, q) -> bool:
 
 
 def has_diagonal_hessian(function: Callable, q) -> bool:
-    """Whether ``function(q) -> ()`` is a sum over the elements of the vector q: each gradient entry sees its own alone."""
+    """Whether ``function(q) -> ()`` is a sum over the entries of the vector q: entry i of the gradient depends on q_i alone."""
     jaxpr = jax.make_jaxpr(jax.grad(function))(q).jaxpr
     return not jaxpr.effects and _classes(jaxpr, [_ELEMENT])[0] <= _ELEMENT
 
@@ -141,24 +140,25 @@ def has_diagonal_hessian(function: Callable, q) -> bool:
 def curved_directions(function: Callable, q) -> np.ndarray:
     """L (d, n) of rank d, with the Hessian of ``function(q) -> ()`` of the form ``L^T w(q) L`` everywhere.
 
-    A potential of the distance of two points is curved along their difference alone. L is found in the product of the Hessian with a
-    vector: combinations of its entries with known coefficients are followed to where anything else is done to them.
+    For a potential of the distance of two points, L takes the difference of their positions. The rows of L are read from the jaxpr of the
+    product of the Hessian with a vector: linear combinations of its entries with known coefficients are followed up to the first operation
+    that is not linear in this sense.
     """
 
     def product(q, direction):
         return jax.jvp(jax.grad(function), (q,), (direction,))[1]
 
-    found: list[np.ndarray] = []
+    used: list[np.ndarray] = []
     jaxpr, n = jax.make_jaxpr(product)(q, q).jaxpr, q.size
     if jaxpr.effects:
         return np.eye(n)
-    found += _combinations(n, jaxpr, [np.zeros((n, n)), np.eye(n)], jaxpr.outvars, found)
-    rows = [np.zeros((1, n)), *(a.reshape(-1, n) for a in found if a is not None)]
+    used += _combinations(n, jaxpr, [np.zeros((n, n)), np.eye(n)], jaxpr.outvars, used)
+    rows = [np.zeros((1, n)), *(a.reshape(-1, n) for a in used if a is not None)]
     return _independent(np.unique(np.concatenate(rows), axis=0))
 
 
 def _independent(rows: np.ndarray) -> np.ndarray:
-    """As many of the rows (k, n) as are independent, those with few entries first; or single entries where they are as many."""
+    """A basis of the span of the rows (k, n), of rows with few entries; of unit vectors if the basis is as large as the number of entries."""
     kept = np.zeros((0, rows.shape[1]))
     for row in sorted(rows, key=np.count_nonzero):
         if np.linalg.matrix_rank(more := np.concatenate([kept, row[None]])) == len(more):
@@ -167,13 +167,15 @@ def _independent(rows: np.ndarray) -> np.ndarray:
     return np.eye(rows.shape[1])[entries] if len(kept) == entries.sum() else kept
 
 
-def _combinations(n: int, jaxpr, inputs: list, wanted: list, found: list) -> list:
-    """The outputs as coefficients (..., n) of n numbers, None where they are no known combination of them.
+def _combinations(n: int, jaxpr, inputs: list, wanted: list, used: list) -> list:
+    """The outputs of a jaxpr as linear combinations of n numbers: coefficients (..., n), None for an output that is no known combination.
 
     Args:
-        inputs: of the jaxpr, the same.
-        wanted: those of its outputs that are looked at.
-        found: takes the combinations that anything else is done to.
+        n: number of the numbers.
+        jaxpr: its known operations are those in `_LINEAR`.
+        inputs: of the jaxpr, as coefficients or None.
+        wanted: variables of the outputs that matter.
+        used: gets the combinations that enter any other operation.
     """
     known = dict(zip(map(id, jaxpr.invars), inputs, strict=True))
     eqns, needed = _needed(jaxpr, wanted)
@@ -183,19 +185,19 @@ def _combinations(n: int, jaxpr, inputs: list, wanted: list, found: list) -> lis
         if not any(a is None or a.any() for a in parts):
             continue
         if inner is not None:
-            looked_at = [v for v, outer in zip(inner[0].outvars, eqn.outvars, strict=True) if id(outer) in needed]
-            outputs = _combinations(n, inner[0], parts, looked_at, found)
+            inner_wanted = [v for v, outer in zip(inner[0].outvars, eqn.outvars, strict=True) if id(outer) in needed]
+            outputs = _combinations(n, inner[0], parts, inner_wanted, used)
         elif linear is not None and all(a is not None for a in parts):
             outputs = linear(eqn, *parts)
         else:
-            found += parts
+            used += parts
             outputs = [None] * len(eqn.outvars)
         known.update(zip(map(id, eqn.outvars), outputs if isinstance(outputs, list) else [outputs], strict=True))
     return [known.get(id(v), np.zeros((*v.aval.shape, n))) for v in jaxpr.outvars]
 
 
 def _needed(jaxpr, wanted) -> tuple[list, set[int]]:
-    """The equations of a jaxpr, and its variables by their id, that some of its outputs need."""
+    """The equations of a jaxpr on which the variables `wanted` depend, and the ids of the variables on which they depend."""
     needed, eqns = {id(v) for v in wanted}, []
     for eqn in reversed(jaxpr.eqns):
         if any(id(v) in needed for v in eqn.outvars):
@@ -210,7 +212,7 @@ def _shape(eqn) -> tuple[int, ...]:
 
 def _sliced(eqn, a):
     ends = eqn.params["start_indices"], eqn.params["limit_indices"], eqn.params["strides"] or (1,) * len(_shape(eqn))
-    return a[tuple(slice(*at) for at in zip(*ends, strict=True))]
+    return a[tuple(slice(*bounds) for bounds in zip(*ends, strict=True))]
 
 
 def _padded(eqn, a, _):
@@ -251,7 +253,7 @@ _CONSTANT, _ELEMENT, _MIXED = range(3)
 
 
 def _classes(jaxpr, classes: list[int]) -> list[int]:
-    """How each output sees the input vector: not at all, element by element, or otherwise."""
+    """The dependence of each output on the input vector: none, entry by entry, or mixed."""
     known = dict(zip(map(id, jaxpr.invars), classes, strict=True))
     for eqn in jaxpr.eqns:
         inputs = [known.get(id(v), _CONSTANT) for v in eqn.invars]

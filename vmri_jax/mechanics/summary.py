@@ -10,16 +10,16 @@ import numpy as np
 from vmri_jax.mechanics.arrays import is_concrete
 
 MOST_LISTED = 6
-"""Names or numbers that a line lists; of more the first ones and the last one."""
+"""Most names or numbers in a line; of a longer list the first ones and the last one are shown. A larger number makes lines longer."""
 MOST_PARAMETERS = 12
-"""Entries of `params` that a line lists."""
+"""Most entries of `params` in a line. A larger number makes lines longer."""
 
 
 def summary(title: str, lines: Mapping[str, str]) -> str:
     """A title and a line for each name, indented; names without text are left out.
 
     Args:
-        title: what it is.
+        title: name of the object.
         lines: texts by name.
     """
     shown = {name: text for name, text in lines.items() if text}
@@ -28,7 +28,7 @@ def summary(title: str, lines: Mapping[str, str]) -> str:
 
 
 def has_values(tree) -> bool:
-    """Whether a pytree has leaves, and all are numbers or arrays that can be read: no tracers, placeholders or donated arrays."""
+    """Whether a pytree has leaves, and all are readable numbers or arrays: no tracers, placeholders or donated arrays."""
     leaves = jax.tree.leaves(tree)
     kinds = (np.ndarray, np.generic, jax.Array, int, float)
     return (
@@ -40,14 +40,14 @@ def has_values(tree) -> bool:
 
 
 def listed(items: Sequence[str]) -> str:
-    """Items with commas between them, in the middle of many of them dots."""
+    """Items with commas between them; dots stand for the middle of a long list."""
     if len(items) > MOST_LISTED:
         items = [*items[: MOST_LISTED - 1], "...", items[-1]]
     return ", ".join(items)
 
 
 def numbers(values) -> str:
-    """The numbers of a vector in a line, with their names if they have some; of a matrix, a tracer or anything else its shape."""
+    """The numbers of a vector in a line, with names if it is a mapping; of a matrix, a tracer or another object its shape."""
     if isinstance(values, Mapping):
         return listed([f"{name} {numbers(value)}" for name, value in values.items()]) or "none"
     if not has_values(values) or np.ndim(values) > 1:
@@ -56,14 +56,14 @@ def numbers(values) -> str:
 
 
 def coordinates(names: Sequence[str]) -> str:
-    """How many coordinates there are, and their names."""
+    """Number and names of coordinates, in words."""
     if not names:
         return "none"
     return f"{len(names)} coordinate{'s' if len(names) > 1 else ''}: {listed(names)}"
 
 
 def name_of(function) -> str:
-    """What a function of a system is called; its class, where it has no name."""
+    """The name of a function of a system; the name of its class if the function has none."""
     inner = function
     while hasattr(inner, "function"):  # `TracedOnce`, `Rheonomic`, `KineticFunction`, `ByName`
         inner = inner.function

@@ -33,12 +33,12 @@ ARGUMENTS = {
 }
 """Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
 RESERVED = ("kinetic", "T", "T_s", "V", "W", "F", "g", "g_s", "path", "order", "solves")
-"""Names of other terms and of rows of a scheme's description, which no potential in `System.potentials` may have."""
+"""Names that potentials in `System.potentials` must not have: those of other terms, and of rows in the description of a scheme."""
 FAST_ALONE = (
     "It sees fast variables alone: whatever a stiff spring joins is fast, also a heavy body, and stands in q_f. Or give the function as "
     "potentials={{'fast': W}}, which may join slow and fast variables on the micro grid."
 )
-"""What a fast potential of slow variables is told."""
+"""Advice for a fast potential that takes slow variables."""
 _INSTEAD = {
     "force": "force(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)",
     "moving": "Rheonomic(function), whose function gets t first",
@@ -50,7 +50,7 @@ class KineticFunction(eqx.Module):
 
     Args:
         function: T.
-        slow: T_s, that of what depends on slow variables alone; None where T is all of it.
+        slow: T_s, the part that depends on slow variables alone; None without such a part.
     """
 
     function: TracedOnce = eqx.field(static=True)
@@ -74,13 +74,13 @@ class System(eqx.Module):
         force: ``F(t, q_s, q_f, v_s, v_f, params) -> (F_s, F_f)``, not derived from a potential.
         params: any pytree of arrays, handed to every function; traced, so that sweeps and gradients over it
             never recompile.
-        implied: ``g_i(q_s, q_f, params) -> (n_i,)``, rows that follow from the constraints and would be too many among them,
-            scaled to order one; or a `Rheonomic` function. They are not solved for, and get no multipliers. A run watches them
-            at its saved nodes: they count in `constraint_residual`, and where one is not zero the run ends as `NOT_IMPLIED`.
-        slow_kinetic: ``T_s(q_s, v_s, params) -> ()``, a part of the kinetic energy that slow variables alone have, besides the function
-            `kinetic`. Schemes evaluate it on the macro grid, see `vmri_jax.schemes.discrete_lagrangian`; kept in `kinetic`.
-        potentials: further potentials ``V_i(q_s, q_f, params) -> ()`` by name, each with a rate of its own: a scheme says for each name which
-            rule it has, `vmri_jax.Scheme.with_potentials`. The names "slow" and "fast" have the rules of V and of W unless the scheme says
+        implied: ``g_i(q_s, q_f, params) -> (n_i,)``, redundant rows that follow from the constraints, scaled to order one; or a
+            `Rheonomic` function. Steps do not solve for them, and they have no multipliers. A run checks them at its saved nodes: they
+            count in `constraint_residual`, and if one of them is not zero the run ends as `NOT_IMPLIED`.
+        slow_kinetic: ``T_s(q_s, v_s, params) -> ()``, the part of the kinetic energy that depends on slow variables alone, besides the
+            function `kinetic`. Schemes evaluate it on the macro grid, see `vmri_jax.schemes.discrete_lagrangian`. It is stored in `kinetic`.
+        potentials: further potentials ``V_i(q_s, q_f, params) -> ()`` by name, each with a rate of its own: a scheme has a rule for each
+            name, see `vmri_jax.Scheme.with_potentials`. The names "slow" and "fast" have the rules of V and of W unless the scheme says
             otherwise, so that ``{"fast": V_1}`` is a potential on the micro grid that may join slow and fast variables. The name k, a
             whole number, has the trapezoidal rule on every k-th micro node. Kept as pairs of a name and a function.
 
@@ -145,7 +145,7 @@ class System(eqx.Module):
         return summary("System", self.terms())
 
     def terms(self) -> dict[str, str]:
-        """Its terms in words by name, empty where there is none; for summaries."""
+        """The terms in words by name, for summaries; empty for absent terms."""
         kinetic = self.kinetic
         if isinstance(kinetic, ConstantMass):
             mass = f"masses, slow {numbers(kinetic.slow)}; fast {numbers(kinetic.fast)}"
@@ -177,7 +177,7 @@ class System(eqx.Module):
         return system
 
     def all_potentials(self, q_s, q_f) -> dict:
-        """Values of V ("slow"), of W ("fast") and of `potentials` by name; zero without V or W, and those of one name together."""
+        """Values of V ("slow"), of W ("fast") and of `potentials` by name; zero without V or W. A potential named "slow" or "fast" is added."""
         zero = jnp.zeros(())
         values: dict[str | int, Any] = {
             "slow": zero if self.slow_potential is None else self.slow_potential(q_s, q_f, self.params),
@@ -188,25 +188,25 @@ class System(eqx.Module):
         return values
 
     def g(self, t, q_s, q_f):
-        """Values of `constraint`, shape (n_g,); n_g = 0 where there is none."""
+        """Values of `constraint`, shape (n_g,); n_g = 0 without a constraint."""
         return _constrain(self.constraint, t, q_s, q_f, self.params)
 
     def g_slow(self, t, q_s):
-        """Values of `slow_constraint`, shape (n_gs,); n_gs = 0 where there is none."""
+        """Values of `slow_constraint`, shape (n_gs,); n_gs = 0 without a slow constraint."""
         return _constrain(self.slow_constraint, t, q_s, self.params)
 
     def g_implied(self, t, q_s, q_f):
-        """Values of `implied`, shape (n_i,); n_i = 0 where there is none."""
+        """Values of `implied`, shape (n_i,); n_i = 0 without implied rows."""
         return _constrain(self.implied, t, q_s, q_f, self.params)
 
     @property
     def has_constant_mass(self) -> bool:
-        """Whether the kinetic energy is that of constant masses."""
+        """Whether the kinetic energy is a `ConstantMass`."""
         return isinstance(self.kinetic, ConstantMass)
 
     @property
     def slow_kinetic(self) -> TracedOnce | None:
-        """The part T_s of the kinetic energy, None where there is none."""
+        """The part T_s of the kinetic energy, None without such a part."""
         return None if isinstance(self.kinetic, ConstantMass) else self.kinetic.slow
 
     @property
@@ -225,7 +225,7 @@ class System(eqx.Module):
         return self.force is None and not self.is_rheonomic
 
     def forces(self, t, q_s, q_f, v_s, v_f):
-        """Values of `force`, ``(F_s, F_f)``; zero where there is none."""
+        """Values of `force`, ``(F_s, F_f)``; zero without a force."""
         if self.force is None:
             return jnp.zeros_like(q_s), jnp.zeros_like(q_f)
         return self.force(t, q_s, q_f, v_s, v_f, self.params)
@@ -253,7 +253,7 @@ class System(eqx.Module):
 
 
 def _checked(name: str, function):
-    """A function of the system as it is kept, or None."""
+    """The function as `TracedOnce` or `Rheonomic`, after checks; None for None."""
     if function is None:
         return None
     if isinstance(function, Rheonomic) and name in ("constraint", "slow_constraint", "implied"):
@@ -268,12 +268,12 @@ def _checked(name: str, function):
 
 
 def label(name: str | int) -> str:
-    """What a potential in `System.potentials` is called in texts: its name, of one on every k-th micro node V_k."""
+    """The name of a potential of `System.potentials` in texts; V_k for the name k."""
     return f"V_{name}" if isinstance(name, int) else name
 
 
 def _named_potentials(potentials) -> tuple[tuple[str | int, TracedOnce], ...]:
-    """Pairs of a name and a function, from a mapping or from such pairs."""
+    """Pairs of a name and a function, from a mapping or from pairs."""
     try:
         named = dict(potentials)
     except (TypeError, ValueError):
@@ -307,7 +307,7 @@ def _constrain(function, t, *arguments):
 
 
 def _check_function(name: str, function, before: str = "") -> None:
-    """Refuse a function without a hash, or that takes other arguments than those of its place, with `before` before them."""
+    """Refuse a function without a hash, or whose arguments are not `before` and then `ARGUMENTS` of its name."""
     try:
         hash(function)
     except TypeError:
