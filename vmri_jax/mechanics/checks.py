@@ -54,7 +54,7 @@ def check_flags(**flags) -> None:
 
 
 def check_type(name: str, value, kind: type, example: str) -> None:
-    """Refuse objects of another class; `example` says in the message what to give."""
+    """Refuse objects of another class; `example` in the message names a right object."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} is {type(value).__name__}; give {example}.")
 

@@ -47,17 +47,17 @@ def rank_of(rows) -> Rank:
     return Rank(rank, np.flatnonzero(np.linalg.norm(left[:, rank:], axis=1) > LEAST_COEFFICIENT).tolist())
 
 
-def is_rank_deficient(rows, others=None, tolerance: float = RANK):
+def is_rank_deficient(rows, scaled_with=None, tolerance: float = RANK):
     """Whether rows (k, n) are dependent, for compiled programs; False for k = 0, and if an entry is not finite.
 
     Args:
-        rows: scaled to length one together with `others`.
-        others: (k, m) further columns, which count for the scaling alone.
+        rows: scaled to length one together with `scaled_with`.
+        scaled_with: (k, m) further columns, which count for the scaling alone.
         tolerance: largest singular value of a dependence.
     """
     if rows.shape[0] == 0:
         return jnp.asarray(False)
-    whole = rows if others is None else jnp.concatenate([rows, others], axis=1)
+    whole = rows if scaled_with is None else jnp.concatenate([rows, scaled_with], axis=1)
     size = jnp.linalg.norm(whole, axis=1, keepdims=True)
     values = jnp.linalg.svd(rows / jnp.where(size > 0, size, 1), compute_uv=False)
     too_many = rows.shape[0] > rows.shape[1]
@@ -127,7 +127,7 @@ def _mass_matrix(system, q_s, q_f, v_s, v_f):
 def check_constraints(
     system: System,
     state,
-    what: str,
+    place: str,
     tolerance: float = CONSTRAINT_TOLERANCE,
     advice: str = "start from initial_state(...).",
 ) -> None:
@@ -135,7 +135,7 @@ def check_constraints(
 
     Args:
         state: a `State`.
-        what: name of its positions in messages.
+        place: name of the positions in messages.
         tolerance: largest constraint value, in the unit of the constraint, of a satisfied constraint.
         advice: remedy in the message if a value is larger.
 
@@ -145,9 +145,9 @@ def check_constraints(
     if not system.is_constrained:
         return
     values, slow, fast, alone = _values_and_jacobians(system, state.t, state.q_s, state.q_f)
-    _check_values(values, what, tolerance, advice)
+    _check_values(values, place, tolerance, advice)
     if system.implied is not None:
-        _check_implied(np.asarray(_implied_values(system, state.t, state.q_s, state.q_f)), what)
+        _check_implied(np.asarray(_implied_values(system, state.t, state.q_s, state.q_f)), place)
     if not (np.isfinite(slow).all() and np.isfinite(fast).all() and np.isfinite(alone).all()):
         raise ValueError("System: the Jacobian of the constraints is not finite at these positions (a norm at zero?).")
     size = np.linalg.norm(np.concatenate([slow, fast], axis=1), axis=1)
@@ -178,13 +178,13 @@ def _constraint_values(system, t, q_s, q_f):
     return system.constraints(t, q_s, q_f), *jacobians
 
 
-def _check_values(values, what: str, tolerance: float, advice: str) -> None:
+def _check_values(values, place: str, tolerance: float, advice: str) -> None:
     if not np.isfinite(values).all():
-        raise ValueError(f"{what}: the constraints are {values} there, which is not finite.")
+        raise ValueError(f"{place}: the constraints are {values} there, which is not finite.")
     worst = np.abs(values).max()
     if worst > tolerance:
         raise ValueError(
-            f"{what} violate the constraints by {worst:.3e} (row {np.abs(values).argmax()} of {values.size}, tolerance "
+            f"{place} violate the constraints by {worst:.3e} (row {np.abs(values).argmax()} of {values.size}, tolerance "
             f"{tolerance:.0e}); {advice}"
         )
 
@@ -194,11 +194,11 @@ def _implied_values(system, t, q_s, q_f):
     return system.g_implied(t, q_s, q_f)
 
 
-def _check_implied(values, what: str) -> None:
+def _check_implied(values, place: str) -> None:
     opened = np.flatnonzero(~(np.abs(values) <= CONSTRAINT_TOLERANCE))
     if opened.size:
         raise ValueError(
-            f"System: implied does not follow from the constraints: {what} keep these, and row(s) {opened.tolist()} of implied are "
+            f"System: implied does not follow from the constraints: {place} keep these, and row(s) {opened.tolist()} of implied are "
             f"{values[opened]} there (tolerance {CONSTRAINT_TOLERANCE:.0e}). Take parameters for which they follow, or hold them "
             "as constraint."
         )

@@ -105,18 +105,16 @@ def initial_state(
     return state
 
 
-def tell_of_velocities(what: str, taken: float, project: bool, constraints: str = "the constraints") -> None:
+def tell_of_velocities(caller: str, taken: float, project: bool, constraints: str = "the constraints") -> None:
     """Warn about velocities that violate the hidden constraints, and refuse a large violation.
 
     Args:
-        what: name of the caller in the message.
+        caller: name of the caller in the message.
         taken: violation, the part that the projection removes, relative to the velocities in the norm of the kinetic energy.
         project: whether the user wants the projected velocities.
         constraints: name of the constraints in the message.
     """
-    message = (
-        f"{what}: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit {constraints}"
-    )
+    message = f"{caller}: {min(taken, 1.0):.2%} of the velocities (in the norm of the kinetic energy) do not fit {constraints}"
     scenes = "of a scene, with_rates({joint: rate}) finds all that belong to the rate of a joint"
     if project and taken > REPORTED_PROJECTION:
         warnings.warn(f"{message}, and project=True has taken them away; {scenes}.", stacklevel=3)
@@ -252,11 +250,11 @@ def opened(movable):
     return movable.problem() if callable(getattr(movable, "problem", None)) else movable
 
 
-def problem_of(what: str, movable: Problem | HasProblem) -> Problem:
+def problem_of(caller: str, movable: Problem | HasProblem) -> Problem:
     """The problem of a scene, or the problem itself.
 
     Args:
-        what: name of the calling function in the message.
+        caller: name of the calling function in the message.
         movable: its argument.
 
     Raises:
@@ -266,17 +264,17 @@ def problem_of(what: str, movable: Problem | HasProblem) -> Problem:
     problem = opened(movable)
     if not isinstance(problem, Problem):
         raise TypeError(
-            f"{what}: problem is {type(problem).__name__}; give a vmri_jax.Problem or a Scene. A System needs a start: "
+            f"{caller}: problem is {type(problem).__name__}; give a vmri_jax.Problem or a Scene. A System needs a start: "
             "Problem(system, q_s, q_f, v_s, v_f)."
         )
     return problem
 
 
-def start_of(what: str, system, state=None) -> tuple[System, State]:
+def start_of(caller: str, system, state=None) -> tuple[System, State]:
     """The system and the start of a run.
 
     Args:
-        what: name of the calling function in the message.
+        caller: name of the calling function in the message.
         system: a `System`, a `Problem`, or an object with a method ``problem()``, such as a scene.
         state: start; None for the start of the problem.
 
@@ -289,12 +287,12 @@ def start_of(what: str, system, state=None) -> tuple[System, State]:
         system, state = system.system, system.state() if state is None else state
     if not isinstance(system, System):
         raise TypeError(
-            f"{what}: system is {type(system).__name__}; give a vmri_jax.Problem or a Scene, or a System and a State."
+            f"{caller}: system is {type(system).__name__}; give a vmri_jax.Problem or a Scene, or a System and a State."
         )
     if not isinstance(state, State):
         got = "a System has no start" if state is None else f"state is {type(state).__name__}"
         raise TypeError(
-            f"{what}: {got}; give a State, e.g. from initial_state(...), or a Problem(system, q_s, q_f, v_s, v_f) alone."
+            f"{caller}: {got}; give a State, e.g. from initial_state(...), or a Problem(system, q_s, q_f, v_s, v_f) alone."
         )
     return system, state
 

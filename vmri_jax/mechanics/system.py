@@ -1,4 +1,4 @@
-"""The physics: what a user writes, as plain JAX functions of slow and fast variables."""
+"""The physics of a system: plain JAX functions of slow and fast variables, written by the user."""
 
 import dataclasses
 from functools import partial
@@ -33,7 +33,7 @@ ARGUMENTS = {
 }
 """Arguments of the functions of a system; a `Rheonomic` constraint gets t before them."""
 RESERVED = ("kinetic", "T", "T_s", "V", "W", "F", "g", "g_s", "path", "order", "solves")
-"""Names that potentials in `System.potentials` must not have: those of other terms, and of rows in the description of a scheme."""
+"""Names that potentials in `System.potentials` must not have: names of other terms, and of rows in the description of a scheme."""
 FAST_ALONE = (
     "It sees fast variables alone: whatever a stiff spring joins is fast, also a heavy body, and stands in q_f. Or give the function as "
     "potentials={{'fast': W}}, which may join slow and fast variables on the micro grid."

@@ -4,7 +4,7 @@ A composition runs a scheme Phi over parts of the macro step,
 
     Psi_H = Phi_{c_s H} o ... o Phi_{c_1 H},        c_1 + ... + c_s = 1,
 
-and chooses the c_i such that the leading errors cancel. It keeps what the scheme keeps (symplecticity, momentum maps,
+and chooses the c_i such that the leading errors cancel. It keeps the properties of the scheme (symplecticity, momentum maps,
 constraints), needs no new equations, and stays explicit if the scheme is. Beyond order 2 some c_i are negative (Sheng
 1989, Suzuki 1991). Source of the coefficients and of the theory: Hairer, Lubich, Wanner, *Geometric Numerical
 Integration* (2006), V.3.2.

@@ -142,7 +142,7 @@ class StepEquations(eqx.Module):
         return self.evaluate(x)[0]
 
     def guess(self, v_s, v_f, multiplier, slow_multiplier) -> Unknowns:
-        """Straight motion at the given velocities, with the given (physical) multipliers throughout."""
+        """Straight motion at these velocities, with these (physical) multipliers at all nodes."""
         n, c = self.scheme.num_micro, control_nodes(self.scheme.degree)[1:, None]
         scale, slow_scale = multiplier_scales(self.scheme, self.macro_dt)
         return Unknowns(

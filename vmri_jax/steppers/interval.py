@@ -84,11 +84,11 @@ class DiagonalMatrix(NamedTuple):
     last: Float[Array, "r n_f"]
 
     def solve(self, rows):
-        """The increments (r, n_f) for given rows (r, n_f)."""
+        """The increments ``K^-1 rows`` (r, n_f) for rows (r, n_f)."""
         return jnp.sum(self.inverse * rows[None], axis=1)
 
     def outgoing(self, increments):
-        """Change (n_f,) of the last slot with the increments."""
+        """Change (n_f,) of the momentum at the end, times h, with the increments."""
         return jnp.sum(self.last * increments, axis=0)
 
 
@@ -99,11 +99,11 @@ class FullMatrix(NamedTuple):
     last: Float[Array, "n_f r*n_f"]
 
     def solve(self, rows):
-        """The increments (r, n_f) for given rows (r, n_f)."""
+        """The increments ``K^-1 rows`` (r, n_f) for rows (r, n_f)."""
         return matvec(self.inverse, rows.reshape(-1)).reshape(rows.shape)
 
     def outgoing(self, increments):
-        """Change (n_f,) of the last slot with the increments."""
+        """Change (n_f,) of the momentum at the end, times h, with the increments."""
         return matvec(self.last, increments.reshape(-1))
 
 

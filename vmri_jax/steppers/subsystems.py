@@ -74,14 +74,14 @@ class ConstraintOfFast:
 
 
 def slow_part(
-    system: System, scheme: Scheme, potential: Callable | None, others: Sequence[PlacedPotential], num_fast: int
+    system: System, scheme: Scheme, potential: Callable | None, further: Sequence[PlacedPotential], num_fast: int
 ) -> tuple[System, Scheme]:
     """The system of the slow variables, and the scheme of their step over the macro interval.
 
     Args:
         system, scheme: of the whole system.
         potential: V; None if it only kicks.
-        others: further potentials of slow variables alone, with nodes inside the macro interval.
+        further: further potentials of slow variables alone, with nodes inside the macro interval.
         num_fast: number of fast variables of the whole system.
     """
     alone = System(
@@ -89,20 +89,20 @@ def slow_part(
         fast_potential=None if potential is None else PotentialOfSlow(potential, num_fast),
         constraint=None if system.slow_constraint is None else Rheonomic(ConstraintOfSlow(system.slow_constraint)),
         params=system.params,
-        potentials={other.name: FurtherOfSlow(other.function, num_fast) for other in others},
+        potentials={item.name: FurtherOfSlow(item.function, num_fast) for item in further},
     )
-    return alone, _single(PlacedRule(scheme.slow.rule, scheme.slow.grid), others)
+    return alone, _single(PlacedRule(scheme.slow.rule, scheme.slow.grid), further)
 
 
 def fast_part(
-    system: System, scheme: Scheme, potential: Callable | None, others: Sequence[PlacedPotential], num_slow: int
+    system: System, scheme: Scheme, potential: Callable | None, further: Sequence[PlacedPotential], num_slow: int
 ) -> tuple[System, Scheme]:
     """The system of the fast variables, and the scheme of a step of k micro intervals.
 
     Args:
         system, scheme: of the whole system.
         potential: W; None if its rule does not span k micro intervals.
-        others: further potentials of fast variables alone whose rules span k micro intervals.
+        further: further potentials of fast variables alone whose rules span k micro intervals.
         num_slow: number of slow variables of the whole system.
     """
     alone = System(
@@ -110,9 +110,9 @@ def fast_part(
         fast_potential=potential,
         constraint=None if system.constraint is None else Rheonomic(ConstraintOfFast(system.constraint, num_slow)),
         params=system.params,
-        potentials={other.name: FurtherOfFast(other.function, num_slow) for other in others},
+        potentials={item.name: FurtherOfFast(item.function, num_slow) for item in further},
     )
-    return alone, _single(replace(scheme.fast, every=1), others)
+    return alone, _single(replace(scheme.fast, every=1), further)
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,8 @@ def frozen_slow(system: System, scheme: Scheme, q_s) -> tuple[System, Scheme]:
     return alone, Scheme(1, scheme.degree, kinetic=rule, slow=rule, fast=scheme.fast)
 
 
-def _single(fast: PlacedRule, others: Sequence[PlacedPotential]) -> Scheme:
+def _single(fast: PlacedRule, further: Sequence[PlacedPotential]) -> Scheme:
     """A scheme of fast variables alone on one interval."""
     drift = micro(midpoint)
-    potentials = {other.name: micro(other.placed.rule) for other in others}
+    potentials = {item.name: micro(item.placed.rule) for item in further}
     return Scheme(1, kinetic=drift, slow=drift, fast=fast, potentials=potentials)

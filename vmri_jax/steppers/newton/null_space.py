@@ -10,7 +10,7 @@ those where it ends. With bases P_0, P_1 of the null spaces, ``G_0 P_0 = 0`` and
 
     (P_0^T A P_1) z = -P_0^T (r - A W_1 g)        dmu = W_0^T (A dq + r)
 
-The multipliers follow, and are not part of what is solved. A is a mass matrix up to order h^2, and so is its projection: its
+The multipliers follow afterwards, and are no unknowns of the linear system. A is a mass matrix up to order h^2, and so is its projection: its
 condition number does not depend on the step. With multipliers it grows like 1 / h^2, unless they are scaled as they are in
 `vmri_jax.schemes.equations`. At the root ``P_0^T r = 0``: the discrete null space method.
 
