@@ -1,4 +1,4 @@
-"""The whole step of a stepper or solver of one's own: kicks and the projection of momenta, where it leaves them out, and its shapes."""
+"""The whole step of a user's stepper or solver: adds kicks and the projection of momenta if these are missing, and checks its shapes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from vmri_jax.steppers.stepper import StepInfo, Stepper
 
 @dataclass(frozen=True)
 class Projecting(Stepper):
-    """A stepper that has no `project`, with the projection of momenta onto the hidden constraints."""
+    """A stepper without a method `project`, with the projection of momenta onto the hidden constraints added."""
 
     inner: Stepper
     system: System
@@ -49,20 +49,22 @@ class Projecting(Stepper):
 def whole_step(
     made: Stepper | Solver, system: System, scheme: Scheme, state: State, average: Callable | None, reverse_only: bool
 ) -> Kicked:
-    """The step with all that a run needs.
+    """The stepper of a run, made of a user's stepper or solver.
 
-    The equations that a `Solver` and `Solved` solve are those between the kicks, so that the kicks of the scheme are put around them;
-    any other stepper makes the whole step. With constraints every step ends with momenta on the hidden ones.
+    A `Solver` or a `Solved` stepper solves the equations between the kicks, so that the kicks of the scheme are added before and after; any
+    other stepper takes the whole step. With constraints every step ends with a projection of the momenta onto the hidden constraints.
 
     Args:
-        made: what the function of `Custom` returned.
-        system, scheme, state: scheme of a stage; of the state only the shapes matter.
+        made: value of the function of `Custom`.
+        system: of the run.
+        scheme: of a stage.
+        state: only its shapes matter.
         average: of mollified kicks, see `Kicked`.
         reverse_only: see `Solved`.
 
     Raises:
-        TypeError: neither a stepper nor a solver.
-        ValueError: results of other shapes than the state and the scheme have.
+        TypeError: `made` is neither a stepper nor a solver.
+        ValueError: shapes of the end state or of the record that do not fit the system and the scheme.
     """
     if isinstance(made, Solver):
         made = Solved(system, scheme, made, all_rows(system, state.q_s, state.q_f), reverse_only)
@@ -79,7 +81,7 @@ def whole_step(
 
 
 def _check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State) -> None:
-    """Refuse results of other shapes than those of a step."""
+    """Refuse a stepper whose end state or record has wrong shapes."""
     (n_g, n_gs), n_f, r = system.num_constraints(state.q_s, state.q_f), state.q_f.size, scheme.degree
 
     def step(state: State):
@@ -92,10 +94,10 @@ def _check_shapes(stepper: Stepper, system: System, scheme: Scheme, state: State
     expected |= {"StepInfo.q_f_micro": (micro, n_f), "StepInfo.multiplier": (micro, r, n_g)}
     expected |= {"StepInfo.slow_multiplier": (r, n_gs)}
     for name, shape in expected.items():
-        of, field = name.split(".")
-        came = np.shape(getattr(end if of == "State" else info, field))
-        if came != shape:
+        owner, field = name.split(".")
+        returned = np.shape(getattr(end if owner == "State" else info, field))
+        if returned != shape:
             raise ValueError(
-                f"plan: advance of the stepper of solvers.Custom returns {name} of shape {came}; it must be {shape} for num_micro = {micro}, "
+                f"plan: advance of the stepper of solvers.Custom returns {name} of shape {returned}; it must be {shape} for num_micro = {micro}, "
                 f"degree = {r}, {n_g} constraints and {n_gs} slow ones."
             )
