@@ -98,7 +98,7 @@ SHAPES: dict[str, Callable[[int, Coordinates], Scene]] = {"chain": chain, "star"
 
 def measure(shape: str, bodies: int, coordinates: Coordinates, few: int, repeats: int) -> Measured:
     """One step of kicks and RATTLE, or of kicks and free motion in joint coordinates; a band where there are more than `few` rows."""
-    before, constraint_pattern.FEW = constraint_pattern.FEW, few
+    before, constraint_pattern.MOST_ROWS_OF_FULL_MATRIX = constraint_pattern.FEW, few
     engine.cache_clear()  # another limit is another program of the same scene
     try:
         begin, seconds = CLOCK(), {}
@@ -112,7 +112,7 @@ def measure(shape: str, bodies: int, coordinates: Coordinates, few: int, repeats
             run(num_steps=steps)
             seconds[steps] = min(seconds_per_call(partial(run, num_steps=steps), 1, CLOCK) for _ in range(repeats))
     finally:
-        constraint_pattern.FEW = before
+        constraint_pattern.MOST_ROWS_OF_FULL_MATRIX = before
         engine.cache_clear()
     return Measured((seconds[LONG] - seconds[SHORT]) / (LONG - SHORT) * 1e6, first)
 
@@ -128,7 +128,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         rows = 11 * number + 6 * (not is_chain)  # five of each hinge, six of each body: those of the hub on top
         row: dict = {"shape": shape, "bodies": number, "rows": rows}
         with_joint = not is_chain or number in size.joint
-        in_full = rows <= constraint_pattern.FEW  # what `vm.simulate` takes
+        in_full = rows <= constraint_pattern.MOST_ROWS_OF_FULL_MATRIX  # what `vm.simulate` takes
         by_directors: Measured | None = None
         if is_chain or not in_full:
             by_directors = measure(shape, number, "directors", 0, size.repeats)

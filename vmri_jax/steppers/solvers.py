@@ -28,6 +28,7 @@ from vmri_jax.mechanics.arrays import is_concrete, real_array
 from vmri_jax.steppers.results import RUNNING, Result
 
 if TYPE_CHECKING:
+    from vmri_jax.steppers.solved import Solver
     from vmri_jax.steppers.stepper import Stepper
 
 
@@ -134,9 +135,9 @@ class Custom(Newton):
     """
 
     method = "custom"
-    stepper: Callable[..., "Stepper"] = eqx.field(static=True, kw_only=True)
+    stepper: Callable[..., "Stepper | Solver"] = eqx.field(static=True, kw_only=True)
 
-    def __init__(self, stepper: Callable[..., "Stepper"], tolerance: float = 1e-12):
+    def __init__(self, stepper: Callable[..., "Stepper | Solver"], tolerance: float = 1e-12):
         if not callable(stepper):
             raise TypeError(
                 f"Custom: stepper is {stepper!r}; give a function of (system, scheme) that makes a Stepper."
