@@ -98,7 +98,7 @@ SHAPES: dict[str, Callable[[int, Coordinates], Scene]] = {"chain": chain, "star"
 
 def measure(shape: str, bodies: int, coordinates: Coordinates, few: int, repeats: int) -> Measured:
     """One step of kicks and RATTLE, or of kicks and free motion in joint coordinates; a band where there are more than `few` rows."""
-    before, constraint_pattern.MOST_ROWS_OF_FULL_MATRIX = constraint_pattern.FEW, few
+    before, constraint_pattern.MOST_ROWS_OF_FULL_MATRIX = constraint_pattern.MOST_ROWS_OF_FULL_MATRIX, few
     engine.cache_clear()  # another limit is another program of the same scene
     try:
         begin, seconds = CLOCK(), {}
