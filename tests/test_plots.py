@@ -25,9 +25,9 @@ from vmri_jax.study import (
     WorkRow,
     families,
 )
-from vmri_jax.study.advisor import Setting
 from vmri_jax.study.cost_figures import draw_num_micro, draw_shares
 from vmri_jax.study.cost_report import Answer, _draw_stairs, _fastest_that_keep
+from vmri_jax.study.search import Setting
 from vmri_jax.study.staircase import Stair
 
 

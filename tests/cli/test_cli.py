@@ -343,7 +343,7 @@ def test_tune_prints_a_command_that_keeps_its_promise(vmri, short_menu, tmp_path
 
 
 def test_tune_that_reaches_nothing_keeps_the_runs(vmri, short_menu, tmp_path, monkeypatch):
-    monkeypatch.setattr("vmri_jax.study.advisor.MAX_STEPS", 16)
+    monkeypatch.setattr("vmri_jax.study.search.MAX_STEPS", 16)
     code, text = vmri("tune", "user.py:my_problem", "--error", "1e-9", "--t-end", "1", "--out", "runs.json")
     assert code == 1
     assert "no setting reached 1e-09" in text

@@ -20,7 +20,9 @@ from vmri_jax.study import (
     tune,
     work_precision,
 )
-from vmri_jax.study.advisor import NUM_MICRO, NothingReached, Search, another_start
+from vmri_jax.study.advisor import NothingReached
+from vmri_jax.study.another_start import another_start
+from vmri_jax.study.search import NUM_MICRO, Search
 
 SHORT_MENU = [family for family in families() if family.name in ("fully explicit", "fully explicit, suzuki4")]
 
@@ -138,7 +140,7 @@ def test_refuses_what_the_reference_cannot_tell(reference):
 
 
 def test_nothing_reached_hands_back_the_runs(reference, monkeypatch):
-    monkeypatch.setattr("vmri_jax.study.advisor.LONGEST", 0.2)
+    monkeypatch.setattr("vmri_jax.study.search.MAX_RUN_SECONDS", 0.2)
     wrong = dataclasses.replace(reference, q=reference.q + 1.0)
     with pytest.raises(NothingReached, match=r"no setting reached 0\.0001") as caught:
         tune(PROBLEM, 1e-4, 1.0, menu=SHORT_MENU[:1], reference=wrong, verify=False)

@@ -90,7 +90,7 @@ def test_cost_reports_keep_their_runs_while_the_page_is_drawn(monkeypatch, tmp_p
     module = import_module("vmri_jax.study.cost_report")
     monkeypatch.setattr(module, "reference_solution", lambda *_, **__: reference)
     monkeypatch.setattr(module, "_draw", drawing)
-    monkeypatch.setattr("vmri_jax.study.advisor.NUM_MICRO", (1,))
+    monkeypatch.setattr("vmri_jax.study.search.NUM_MICRO", (1,))
     menu = [replace(of_order_2(vm.fully_explicit), first=1)]
     with pytest.raises(vm.Interrupted) as caught:
         cost_report(one_coordinate(), "mass", tmp_path, t_end=T_END, errors=[1e-3], menu=menu)

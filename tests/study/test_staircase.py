@@ -10,11 +10,11 @@ import vmri_jax as vm
 from tests.small_systems import no_constraint
 from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.study import reference_solution, work_precision
-from vmri_jax.study.advisor import Search
 from vmri_jax.study.cost_report import bound_of
 from vmri_jax.study.peers import can_run_dopri8, dopri8_stairs
 from vmri_jax.study.prices import FAST, REST, SLOW, prices, shares
 from vmri_jax.study.reference_solution import ReferenceSolution
+from vmri_jax.study.search import Search
 from vmri_jax.study.staircase import (
     COMPOSED,
     INTERVALS,
@@ -69,7 +69,7 @@ def test_confirmed_runs_and_shares_of_a_search():
     problem = no_constraint()
     kicks = of_order_2(vm.fully_explicit)
     search = Search(problem, 1.0, [kicks], reference_solution(problem, 1.0, num_saves=1))
-    single, many = search.at(kicks, 1, 100), search.at(kicks, 20, 100)
+    single, many = search.run(kicks, 1, 100), search.at(kicks, 20, 100)
     assert not any(staircases(search.rows().rows).values())
     confirm(search)
     assert {s.num_steps for s in search.settings.values()} == {100, 150}
@@ -82,7 +82,7 @@ def test_single_steps_are_tried_beside_micro_steps():
     problem = no_constraint()
     kicks = of_order_2(vm.fully_explicit)
     search = Search(problem, 1.0, [kicks], reference_solution(problem, 1.0, num_saves=1))
-    search.at(kicks, 5, 40)
+    search.run(kicks, 5, 40)
     confirm(search)
     assert {(s.num_micro, s.num_steps) for s in search.settings.values()} == {(5, 40), (5, 60), (1, 200), (1, 300)}
 

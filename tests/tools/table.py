@@ -68,7 +68,7 @@ class Cell:
             module = import_module(f"vmri_jax.study.{name}")
             self.patch.setattr(module, "families", lambda: MENU)
             self.patch.setattr(module, "reference_solution", reference)
-        self.patch.setattr("vmri_jax.study.advisor.NUM_MICRO", (1,))
+        self.patch.setattr("vmri_jax.study.search.NUM_MICRO", (1,))
 
 
 @cache

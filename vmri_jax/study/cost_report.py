@@ -1,4 +1,4 @@
-"""One page on what accuracy costs for a system: which scheme to take for which error, and where the time goes."""
+"""A page on the cost of accuracy for a system: the cheapest scheme for each of a few errors, and where the time goes."""
 
 import math
 import warnings
@@ -18,32 +18,38 @@ from vmri_jax.mechanics.state import HasProblem, Problem, problem_of
 from vmri_jax.running.files import make_writable_folder
 from vmri_jax.running.progress import Progress, part, shows_progress
 from vmri_jax.steppers.results import SimulationError
-from vmri_jax.study.advisor import MARGIN, Search, Setting, round_off, stopwatch
+from vmri_jax.study.advisor import MIN_ERROR_OVER_REFERENCE, round_off
 from vmri_jax.study.cost_figures import draw_num_micro, draw_shares
 from vmri_jax.study.html import embedded, write_page
 from vmri_jax.study.peers import can_run_dopri8, dopri8_stairs
 from vmri_jax.study.prices import FAST, SLOW, prices, shares
 from vmri_jax.study.program import Program
 from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.search import Search, Setting, stopwatch
 from vmri_jax.study.staircase import MICRO, SINGLE, Stair, confirm, confirmed, staircases, with_shares
 from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.work import WorkPrecision, WorkRow, duration, work_row
 
 TEMPLATE = Path(__file__).parent / "cost.html.j2"
 PERIODS = 30
-"""Simulated by default: so many periods of the fastest vibration."""
+"""Default t_end in periods of the fastest vibration; a larger number shows slower effects and takes longer."""
 RELATIVE_ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
-"""Errors asked for by default, relative to how far the system moves."""
+"""Default errors, relative to how far the system moves; further entries take longer."""
 BUDGET = 75.0
-"""Seconds of search after which no more schemes are compiled, see `stopwatch`. The first error may take half of them, for all are new to it, the
-next one half of what is then left."""
+"""Seconds of search, see `stopwatch`, after which no more schemes are compiled; a larger value tries more schemes. Each error may take
+half of the time that is left, since schemes compiled for one error serve the next ones."""
 REPEATS = 5
-"""Samples of the time of the run that `accuracy=` chooses."""
+"""Samples of the time of the run that `accuracy=` chooses; more samples make their median surer."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The cheapest setting for an error, None if nothing reached it, and all others that keep it, the fastest first."""
+    """The cheapest setting for an error.
+
+    error: largest accepted error of the positions at t_end.
+    setting: the cheapest setting; None if no setting keeps the error.
+    all: all settings that the search found to keep the error, the fastest first.
+    """
 
     error: float
     setting: Setting | None
@@ -52,20 +58,20 @@ class Answer:
 
 @dataclass(frozen=True)
 class Extras:
-    """What a page has besides the search.
+    """Runs on a page that are not from the search.
 
-    accuracy: the run that ``simulate(..., accuracy=...)`` takes for the error in the middle; None where it takes none.
-    asked: that error.
-    peers: staircases of other programs.
+    accuracy: the run that ``simulate(..., accuracy=accuracy_error)`` takes; None where it refuses the error or fails.
+    accuracy_error: the middle one of the errors of the page.
+    peers: staircases of other programs by name.
     """
 
     accuracy: WorkRow | None = None
-    asked: float = math.nan
+    accuracy_error: float = math.nan
     peers: dict[str, list[Stair]] = field(default_factory=dict)
 
 
 class PageFailed(RuntimeError):
-    """The search came to its end, but its page could not be drawn or written; what was found is in `.report` and in cost.csv."""
+    """The search came to its end, but its page could not be drawn or written; its results are in `.report` and in cost.csv."""
 
     def __init__(self, report: "CostReport"):
         self.report = report
@@ -75,20 +81,23 @@ class PageFailed(RuntimeError):
 
 
 def _of_setting(form: Callable[[WorkRow], str]) -> Callable[[Answer], str]:
-    """The text of the setting of an answer, empty if there is none."""
+    """The text of a column: `form` of the run of the setting, empty if no setting keeps the error."""
     return lambda answer: "" if answer.setting is None else form(answer.setting.row)
 
 
 @dataclass(frozen=True)
 class CostReport(ResultTable):
-    """What was found, and where the page lies; its table has a line per answer.
+    """The answers of a search for several errors, and the path of their page; its table has a line per answer.
 
+    path: of the page, cost.html; its figures and runs lie beside it.
+    name: of the system.
+    t_end: simulated time.
     answers: by error, the largest first.
     runs: every run of the search.
-    shares: parts of the time of the middle answer by what it is spent on.
-    not_tried: schemes that the search had no time to compile.
-    stairs: what each kind of schemes reaches, see `vmri_jax.study.staircase`.
-    extras: what is measured when the search is over.
+    shares: parts of the time of the middle answer by function, see `vmri_jax.study.prices.shares`.
+    not_tried: families that the search had no time to compile.
+    stairs: the staircase of each kind of schemes, see `vmri_jax.study.staircase`.
+    extras: runs that are made when the search is over.
     """
 
     columns = (
@@ -106,7 +115,7 @@ class CostReport(ResultTable):
     shares: dict[str, float]
     not_tried: tuple[str, ...] = ()
     stairs: dict[str, list[Stair]] = field(default_factory=dict)
-    extras: "Extras" = field(default_factory=lambda: Extras())
+    extras: Extras = field(default_factory=Extras)
 
     @property
     def rows(self) -> tuple[Answer, ...]:
@@ -115,20 +124,21 @@ class CostReport(ResultTable):
 
     @property
     def caption(self) -> str:
-        """The simulated time, and the errors that the reference solution lets be told: smaller ones are not asked for by default."""
-        least = self.runs.reference.error_q
-        told = (
-            f" The reference solution is good to {least:.0e}: errors below {MARGIN * least:.0e} cannot be told."
-            if least
-            else ""
-        )
-        return " ".join(
-            filter(None, (f"Runs to t = {self.t_end:g}, with errors of the positions there.{told}", self.cut_short))
-        )
+        """The simulated time, the smallest error that the reference solution can tell, and the schemes that were not tried."""
+        sentences = [f"Runs to t = {self.t_end:g}, with errors of the positions there."]
+        known_to = self.runs.reference.error_q
+        if known_to:
+            least = MIN_ERROR_OVER_REFERENCE * known_to
+            sentences.append(
+                f"The reference solution is good to {known_to:.0e}: errors below {least:.0e} cannot be told."
+            )
+        if self.cut_short:
+            sentences.append(self.cut_short)
+        return " ".join(sentences)
 
     @property
     def cut_short(self) -> str:
-        """Which schemes the search had no time to compile; empty if it tried all."""
+        """A sentence on the schemes that the search had no time to compile; empty if it tried all."""
         if not self.not_tried:
             return ""
         return (
@@ -137,7 +147,7 @@ class CostReport(ResultTable):
         )
 
     def records(self) -> list[dict[str, Any]]:
-        """Errors and the runs that answer them."""
+        """A dictionary for each answer: the error and the columns of its run."""
         return [{"error": a.error, **(asdict(a.setting.row) if a.setting else {})} for a in self.answers]
 
 
@@ -163,19 +173,19 @@ def cost_report(
 ) -> CostReport:
     """Search for the cheapest settings for a few errors and write ``cost.html``, ``cost.png`` and ``cost.csv``.
 
-    The page is rewritten after every error, so that what is found is kept whatever happens later.
+    The page is rewritten after every error, so that a later failure loses no answer.
 
     Args:
         problem: system and start; a `Problem` or a scene.
         name: of the system, for the title and the commands: a built-in one or ``my_file.py:my_problem``.
         out: folder, made if it does not exist.
         t_end: simulated time, by default `default_t_end`.
-        errors: largest ``|q - q_ref|`` at t_end; by default a ladder relative to how far the system moves.
-        menu: families to choose from.
-        progress: True for a bar, or a function (what, done, total) that is told what is running.
+        errors: largest accepted ``|q - q_ref|`` at t_end; by default `RELATIVE_ERRORS` times how far the system moves.
+        menu: families to choose from, by default `families()`.
+        progress: True for a bar, or a function (what, done, total) that is told about every run.
 
     Raises:
-        ValueError: errors that are not positive; none are asked for, and the system does not move.
+        ValueError: errors that are not positive; no errors are passed, and the system does not move.
         SimulationError: no reference solution could be computed.
         Interrupted: Ctrl-C; the page has the errors that were searched for before.
         PageFailed: the page could not be drawn or written; carries the report.
@@ -193,19 +203,21 @@ def cost_report(
         )
     search = Search(problem, t_end, families() if menu is None else menu, reference)
     answers, elapsed = [], stopwatch()
-    with search.kept():  # while the page is drawn, too
+    with search.interruptible():  # around the drawing as well, so that Ctrl-C there keeps the runs, too
         for i, error in enumerate(sorted(errors, reverse=True)):
-            left = BUDGET - elapsed()
-            settings = search.cheapest(error, part(progress, i, len(errors)), budget=left / 2)
+            seconds_left = BUDGET - elapsed()
+            settings = search.cheapest(error, part(progress, i, len(errors)), budget=seconds_left / 2)
             answers.append(Answer(error, settings[0] if settings else None, tuple(settings)))
-            with suppress(PageFailed):  # the page is drawn again, and its failure told, when all is known
+            with suppress(PageFailed):  # the last call below raises it
                 _write(search, answers, problem, name, out)
         progress("runs with smaller steps", 1, 1)
         confirm(search)
         progress("measuring times", 1, 1)
-        chosen = [a.setting.row.scheme for a in _confirmed(search, answers) if a.setting is not None]
+        # times of runs that were made minutes apart differ with the load of the machine: time all schemes that the page shows again
+        answer_schemes = [a.setting.row.scheme for a in _confirmed(search, answers) if a.setting is not None]
         stairs = staircases(search.rows().rows)
-        search.time_again({*chosen, *(stair.row.scheme for of_kind in stairs.values() for stair in of_kind)})
+        stair_schemes = [stair.row.scheme for of_kind in stairs.values() for stair in of_kind]
+        search.time_again({*answer_schemes, *stair_schemes})
         answers = _confirmed(search, answers)
         progress("shares of errors", 1, 1)
         stairs = with_shares(search, staircases(search.rows().rows))
@@ -215,24 +227,23 @@ def cost_report(
 
 
 def _extras(search: Search, answers: Sequence[Answer], progress: Progress) -> Extras:
-    """The choice of `accuracy=`, and other programs."""
-    asked = answers[len(answers) // 2].error
-    progress(f"accuracy {asked:.0e}", 1, 1)
-    chosen = _of_accuracy(search, asked)
+    """The run of ``simulate(..., accuracy=...)`` for the middle error, and runs of diffrax where it can run the problem."""
+    middle_error = answers[len(answers) // 2].error
+    progress(f"accuracy {middle_error:.0e}", 1, 1)
+    extras = Extras(_of_accuracy(search, middle_error), middle_error)
     if not can_run_dopri8(search.problem):
-        return Extras(chosen, asked)
+        return extras
     progress("diffrax", 1, 1)
     least = min(answer.error for answer in answers)
-    return Extras(
-        chosen, asked, {"diffrax Dopri8": dopri8_stairs(search.problem, search.t_end, search.reference, least)}
-    )
+    stairs = dopri8_stairs(search.problem, search.t_end, search.reference, least)
+    return replace(extras, peers={"diffrax Dopri8": stairs})
 
 
 def _of_accuracy(search: Search, error: float) -> WorkRow | None:
     """The run that ``simulate(problem, accuracy=error)`` takes; None where it refuses the error, or finds no run."""
     problem, t_end, saves = search.problem, search.t_end, search.reference.num_saves
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of runs that miss the accuracy: the page shows their error
+        warnings.simplefilter("ignore")  # they say that a run misses the accuracy: the page shows its error
         try:
             best, settings = with_accuracy(problem, None, None, None, error, t_end=problem.t + t_end, num_saves=saves)
         except (ValueError, SimulationError):
@@ -243,13 +254,13 @@ def _of_accuracy(search: Search, error: float) -> WorkRow | None:
 
 
 def _default_errors(problem: Problem, reference: ReferenceSolution, t_end: float) -> list[float]:
-    """RELATIVE_ERRORS of how far the system moves, those that the reference and round-off let be told.
+    """RELATIVE_ERRORS times a power of ten near how far the system moves, without errors too near round-off or the error of the reference.
 
     Raises:
-        ValueError: there is none, as where nothing moves.
+        ValueError: no error remains, as where nothing moves.
     """
     moved = float(np.abs(reference.q[-1] - reference.q[0]).max())
-    least = max(MARGIN * reference.error_q, round_off(problem)[1])
+    least = max(MIN_ERROR_OVER_REFERENCE * reference.error_q, round_off(problem)[1])
     motion = 10.0 ** math.floor(math.log10(max(moved, 1e-300)))
     errors = [motion * error for error in RELATIVE_ERRORS if motion * error > least]
     if not errors:
@@ -270,15 +281,20 @@ def _write(
     stairs: dict[str, list[Stair]] | None = None,
     extras: Extras | None = None,
 ) -> CostReport:
-    """The page of what is known so far."""
+    """Write the page of the answers so far, and hand back its report."""
     answers = _fastest_that_keep(answers)
     runs, middle = search.rows(), answers[len(answers) // 2].setting
     price = prices(problem) if middle is not None else {}
-    spent = shares(price, middle.row) if middle is not None else {}
-    not_tried = tuple(search.not_tried())
-    stairs = staircases(runs.rows) if stairs is None else stairs
     report = CostReport(
-        out / "cost.html", name, search.t_end, tuple(answers), runs, spent, not_tried, stairs, extras or Extras()
+        path=out / "cost.html",
+        name=name,
+        t_end=search.t_end,
+        answers=tuple(answers),
+        runs=runs,
+        shares=shares(price, middle.row) if middle is not None else {},
+        not_tried=tuple(search.not_tried()),
+        stairs=staircases(runs.rows) if stairs is None else stairs,
+        extras=extras or Extras(),
     )
     runs.to_csv(out / "cost.csv")
     try:
@@ -289,28 +305,30 @@ def _write(
 
 
 def _confirmed(search: Search, answers: Sequence[Answer]) -> list[Answer]:
-    """The answers by runs whose error is confirmed by smaller steps; those that no such run keeps stay as they are."""
-    known = {(s.row.scheme, s.num_steps): s for s in search.settings.values()}
+    """The answers with the fastest setting whose confirmed error keeps the error; an answer without such a setting stays as it is."""
+    settings = {(s.row.scheme, s.num_steps): s for s in search.settings.values()}
     stairs = confirmed([s.row for s in search.settings.values()])
-    made = []
+    confirmed_answers = []
     for answer in answers:
-        keep = [stair for stair in stairs if stair.error <= answer.error]
-        best = min(keep, key=lambda stair: stair.seconds, default=None)
-        made.append(answer if best is None else replace(answer, setting=known[best.row.scheme, best.row.num_steps]))
-    return made
+        keeping = [stair for stair in stairs if stair.error <= answer.error]
+        if keeping:
+            row = min(keeping, key=lambda stair: stair.seconds).row
+            answer = replace(answer, setting=settings[row.scheme, row.num_steps])
+        confirmed_answers.append(answer)
+    return confirmed_answers
 
 
 def _fastest_that_keep(answers: Sequence[Answer]) -> list[Answer]:
-    """The answers, the largest error first, none slower than that for a smaller error: its setting keeps the larger error as well.
+    """The answers, the largest error first; each takes the setting of a smaller error where this is faster: it keeps the larger error as well.
 
-    Schemes that are compiled for a small error are not tried again at the larger ones before it.
+    Such settings exist because the search compiles some schemes only for a smaller error, after it has answered the larger ones.
     """
-    best, made = None, []
+    best, fastest = None, []
     for answer in reversed(answers):
-        known = [setting for setting in (answer.setting, best) if setting is not None]
-        best = min(known, key=lambda setting: setting.row.seconds, default=None)
-        made.append(replace(answer, setting=best))
-    return made[::-1]
+        candidates = [setting for setting in (answer.setting, best) if setting is not None]
+        best = min(candidates, key=lambda setting: setting.row.seconds, default=None)
+        fastest.append(replace(answer, setting=best))
+    return fastest[::-1]
 
 
 def _draw(report: CostReport, problem: Problem, price: dict[str, float]) -> None:
@@ -337,23 +355,28 @@ def _draw(report: CostReport, problem: Problem, price: dict[str, float]) -> None
 
 
 def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme: plots.Theme) -> plots.NotebookFigure:
-    """What each kind of schemes reaches, with the answers, the choice of `accuracy=`, other programs, and the bound."""
+    """The staircases with marks for the answers and the choice of `accuracy=`, other programs, and the bound."""
     rows = [answer.setting.row for answer in report.answers if answer.setting is not None]
     errors = {(s.row.scheme, s.row.num_steps): s.error for of_kind in report.stairs.values() for s in of_kind}
-    marked = []
-    for row in rows:
-        marked.append(plots.Marked("answers", row.seconds, errors.get((row.scheme, row.num_steps), row.error_q)))
+    marked = [
+        plots.Marked("answers", row.seconds, errors.get((row.scheme, row.num_steps), row.error_q)) for row in rows
+    ]
     chosen = report.extras.accuracy
     if chosen is not None:
-        marked.append(plots.Marked(f"accuracy={report.extras.asked:.0e}", chosen.seconds, chosen.error_q, star=True))
+        label = f"accuracy={report.extras.accuracy_error:.0e}"
+        marked.append(plots.Marked(label, chosen.seconds, chosen.error_q, star=True))
     known_to = report.runs.reference.error_q
     bound = bound_of(report.stairs, price)
     return plots.plot_staircases(report.stairs, report.extras.peers, marked, bound, known_to, title, theme)
 
 
 def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.Bound | None:
-    """The least time of micro steps, for their largest number on the staircase; None where the slow force is not dearer than the fast one, or has further
-    potentials beside it."""
+    """The least time of micro steps over the time of single steps, if time is spent on gradients alone.
+
+    N single steps evaluate both gradients, ``N (v + w)`` with v and w the prices of the gradients of V and W; one macro step of N
+    micro steps takes ``v + N w``. N is the largest num_micro on the staircase of micro steps. None where V is not dearer than W, where
+    the system has constraints or further potentials, or where a staircase is empty.
+    """
     if price.keys() != {SLOW, FAST} or price[SLOW] <= price[FAST] or not (stairs.get(MICRO) and stairs.get(SINGLE)):
         return None
     n, v, w = max(stair.row.num_micro for stair in stairs[MICRO]), price[SLOW], price[FAST]
@@ -361,7 +384,7 @@ def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.B
 
 
 def _growth(reached: Sequence[Answer]) -> float:
-    """Factor in time for a hundredth of the error, the geometric mean over the answers; NaN for less than two."""
+    """Factor in time for a hundredth of the error, the geometric mean over the answers; NaN for fewer than two answers."""
     if len(reached) < 2:
         return math.nan
     first, last = reached[0], reached[-1]
@@ -370,7 +393,7 @@ def _growth(reached: Sequence[Answer]) -> float:
 
 
 def _multirate(report: CostReport) -> list[tuple[float, str, int, float]]:
-    """By error: the family of the answer, its best num_micro, and how much faster than one micro step that is."""
+    """For each answer: its error, family and num_micro, and the time of the family with one micro step over the time of the answer."""
     gains = []
     for answer in report.answers:
         if answer.setting is None:
