@@ -25,7 +25,7 @@ def test_cost_report(tmp_path):
     assert setting.command("spring") in text.replace("&#34;", '"')
     assert sum(report.shares.values()) == pytest.approx(1)
     assert report.extras.accuracy is not None
-    assert report.extras.accuracy.error_q <= report.extras.asked
+    assert report.extras.accuracy.error_q <= report.extras.accuracy_error
     shares = [stair.fast_share for stairs in report.stairs.values() for stair in stairs]
     assert all(0 <= share <= 1 for share in shares if not np.isnan(share))
     assert not all(np.isnan(share) for share in shares)

@@ -12,7 +12,7 @@ from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.study import reference_solution, work_precision
 from vmri_jax.study.cost_report import bound_of
 from vmri_jax.study.peers import can_run_dopri8, dopri8_stairs
-from vmri_jax.study.prices import FAST, REST, SLOW, prices, shares
+from vmri_jax.study.prices import FAST, REMAINDER, SLOW, prices, shares
 from vmri_jax.study.reference_solution import ReferenceSolution
 from vmri_jax.study.search import Search
 from vmri_jax.study.staircase import (
@@ -58,7 +58,7 @@ def test_kinds():
     }
     problem = no_constraint()
     study = work_precision(problem, schemes, 1.0, num_steps=(10,), reference=EXACT, repeats=1)
-    assert [kind_of(each) for each in study.rows] == list(schemes)
+    assert [kind_of(row) for row in study.rows] == list(schemes)
 
 
 EXACT = ReferenceSolution(np.zeros((2, 1)), np.zeros((2, 1)))
@@ -69,7 +69,7 @@ def test_confirmed_runs_and_shares_of_a_search():
     problem = no_constraint()
     kicks = of_order_2(vm.fully_explicit)
     search = Search(problem, 1.0, [kicks], reference_solution(problem, 1.0, num_saves=1))
-    single, many = search.run(kicks, 1, 100), search.at(kicks, 20, 100)
+    single, many = search.run(kicks, 1, 100), search.run(kicks, 20, 100)
     assert not any(staircases(search.rows().rows).values())
     confirm(search)
     assert {s.num_steps for s in search.settings.values()} == {100, 150}
@@ -122,7 +122,7 @@ def test_tables_list_further_potentials(tmp_path):
     parts = shares(price, one)
     assert sum(parts.values()) == pytest.approx(1)
     assert parts["gradient of bends"] > 0
-    assert REST in parts
+    assert REMAINDER in parts
 
 
 def test_tables_without_further_potentials_have_no_column_for_them():

@@ -6,8 +6,7 @@ The error of a run is the largest difference over all saved nodes and all coordi
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -27,26 +26,30 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Method, Result
 from vmri_jax.steppers.solvers import Newton
+from vmri_jax.study.cases import Case, cases_of
 from vmri_jax.study.program import Program
-from vmri_jax.study.reference_solution import ReferenceSolution, reference_solution
+from vmri_jax.study.reference_solution import ReferenceSolution
 from vmri_jax.study.table import Column, ResultTable
 
-FLOOR_FACTOR = 100.0
-"""Errors below this many times the error of the reference say nothing about the scheme and are not fitted."""
+MIN_ERROR_OVER_REFERENCE = 100.0
+"""Least ratio of an error that is fitted to the error of the reference, which changes the error of the scheme by 1 % then; a larger
+ratio fits fewer runs."""
 
 
 @dataclass(frozen=True)
 class ConvergenceRow:
-    """One run: how wrong it is, what it keeps, how it went.
+    """One run: its errors, its invariants and its iterations.
 
     case: label of the parameters, "" if there is one set only.
-    error_q, error_p: of positions and momenta.
-    energy_error, energy_drift, energy_band: largest error of the energy; change over the run of the straight line fitted to this
-        error; largest distance from that line. The error is the change since the start where the system keeps its energy; where forces or
-        moving constraints do work, it is the difference from the energy of the reference.
+    error_q, error_p: largest error of positions and of momenta over nodes and coordinates.
+    energy_error: largest error of the energy: its change since the start where the system keeps its energy; its difference from the
+        energy of the reference where forces or moving constraints do work.
+    energy_drift: change, over the run, of the straight line fitted to the error of the energy.
+    energy_band: largest distance of the error of the energy from this line.
     momentum_error: largest change of a momentum map since the start.
     constraint_residual: largest constraint value, of positions or velocities.
-    iterations, method, result: most Newton iterations of a step, costliest `Method`, `Result`.
+    iterations: most Newton iterations of a step.
+    method, result: names of the costliest `Method` and of the `Result`.
     """
 
     scheme: str
@@ -77,8 +80,8 @@ class SchemeSummary:
     @property
     def finest(self) -> ConvergenceRow | None:
         """The run with the smallest step that did not fail."""
-        ran = [row for row in self.runs if np.isfinite(row.error_q)]
-        return min(ran, key=lambda row: row.macro_dt, default=None)
+        finished = [row for row in self.runs if np.isfinite(row.error_q)]
+        return min(finished, key=lambda row: row.macro_dt, default=None)
 
     @property
     def failures(self) -> str:
@@ -88,19 +91,20 @@ class SchemeSummary:
 
 
 def _order(fit: OrderFit) -> str:
+    """The text of an observed order with its uncertainty."""
     if not np.isfinite(fit.order):
         return "-"
     return f"{fit.order:.2f}" + (f" ± {fit.half_width:.2f}" if np.isfinite(fit.half_width) else "")
 
 
 def _of_finest(name: str, form: str = ".1e") -> Callable[[SchemeSummary], str]:
-    """The text of a number of the finest run."""
+    """A function that formats the attribute `name` of the finest run of a summary."""
     return lambda summary: "-" if summary.finest is None else format(getattr(summary.finest, name), form)
 
 
 @dataclass(frozen=True)
 class ConvergenceStudy(ResultTable):
-    """Rows of a convergence study, schemes one after the other, then cases, and macro steps as given.
+    """Rows of a convergence study, sorted by scheme, then by case, then by macro step in the order of the call.
 
     The column "energy" of its table is the error of the energy, see `ConvergenceRow`, at the smallest step.
 
@@ -145,16 +149,16 @@ class ConvergenceStudy(ResultTable):
         return np.array([row.macro_dt for row in rows]), np.array([getattr(row, f"error_{quantity}") for row in rows])
 
     def usable(self, scheme: str, quantity: str = "q", case: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """`errors` of the runs that did not fail and lie well above the error of the reference."""
+        """`errors` without failed runs and without errors too near the error of the reference."""
         macro_dt, errors = self.errors(scheme, quantity, case)
         floor = getattr(self.references[self.cases[0] if case is None else case], f"error_{quantity}")
-        usable = np.isfinite(errors) & (errors > FLOOR_FACTOR * floor)
+        usable = np.isfinite(errors) & (errors > MIN_ERROR_OVER_REFERENCE * floor)
         return macro_dt[usable], errors[usable]
 
     def fit(self, scheme: str, quantity: str = "q", points: int = 4, case: str | None = None) -> OrderFit:
-        """Slope of log error over log step through the last `points` usable errors, and how certain it is.
+        """Slope of log error over log step through the last `points` usable errors, with its uncertainty.
 
-        NaN where fewer than two runs can be used.
+        NaN where fewer than two errors are usable.
         """
         macro_dt, errors = self.usable(scheme, quantity, case)
         if len(errors) < 2:
@@ -162,7 +166,7 @@ class ConvergenceStudy(ResultTable):
         return diagnostics.fit_order(macro_dt[-points:], errors[-points:])
 
     def order(self, scheme: str, quantity: str = "q", points: int = 4, case: str | None = None) -> float:
-        """Observed order: that of `fit`."""
+        """Observed order: the slope of `fit`."""
         return self.fit(scheme, quantity, points, case).order
 
     def shown(self) -> list[SchemeSummary]:
@@ -174,7 +178,7 @@ class ConvergenceStudy(ResultTable):
         return SchemeSummary(runs, self.fit(scheme, "q", case=case), self.fit(scheme, "p", case=case))
 
     def content(self) -> dict[str, Any]:
-        """The rows, and how accurate the references are."""
+        """The rows, and the errors of the references."""
         references = {case: {"error_q": r.error_q, "error_p": r.error_p} for case, r in self.references.items()}
         return {"references": references, **super().content()}
 
@@ -192,9 +196,9 @@ class ConvergenceStudy(ResultTable):
         data: dict[str, Any] = {name: np.full(shape, np.nan) for name in (*names, "constraint_residual", "iterations")}
         data |= {name: np.full(shape, "", dtype="U24") for name in ("method", "result")}
         for row in self.rows:
-            at = tuple(values.index(getattr(row, axis)) for axis, values in axes.items())
+            index = tuple(values.index(getattr(row, axis)) for axis, values in axes.items())
             for name, array in data.items():
-                array[at] = getattr(row, name)
+                array[index] = getattr(row, name)
         return xarray.Dataset({name: (tuple(axes), array) for name, array in data.items()}, coords=axes)
 
 
@@ -227,13 +231,14 @@ def convergence_study(
         params: parameters of the system by label, if there are several sets; positions and velocities at the start are
             those of `problem`.
         momentum_maps: infinitesimal generators of symmetries, see `vmri_jax.diagnostics.momentum_map`.
-        reference: compare with this (by label of the parameters if there are several); by default `reference_solution`.
+        reference: the solution that errors are measured against, by label of the parameters if there are several; by default
+            `reference_solution`.
         solver: how implicit equations are solved.
         executor: where runs are computed, as of `vmri_jax.ensemble`; None for this process.
         progress: True for a bar, or a function (what, done, total) that is told about every run before it starts.
 
     Raises:
-        ValueError: no scheme, a step that does not divide `t_end` as above, a reference of another shape.
+        ValueError: no scheme, a step that does not divide `t_end` into a multiple of `num_saves` steps, a reference of another shape.
         Interrupted: Ctrl-C; carries the study of the runs that were done.
     """
     problem = problem_of("convergence_study", problem)
@@ -244,11 +249,12 @@ def convergence_study(
     steps = [_num_steps(t_end, dt, num_saves) for dt in macro_dt]
     if not steps:
         raise ValueError("convergence_study: macro_dt is empty; give the macro steps to run.")
-    cases = _cases(problem, params)
     total = len(schemes) * len(steps)
-    references = _references(cases, reference, t_end, num_saves, progress, total)
+    told = lambda message, *_: progress(message, 0, total)  # noqa: E731
+    cases = cases_of(problem, params, reference, t_end, num_saves, told)
+    problems = [case.problem for case in cases]
 
-    problems = list(cases.values())
+    # one task for each scheme and step, which runs all cases side by side
     labels = [(label, num_steps) for label in schemes for num_steps in steps]
     stopped = None
     try:
@@ -261,45 +267,25 @@ def convergence_study(
         )
     except Interrupted as interrupted:
         runs, stopped = interrupted.done, interrupted
-    done = {label: run for label, run in zip(labels, runs, strict=True) if run is not None}
-    energies = {case: _energies(changed, references[case]) for case, changed in cases.items()}
+    done = {label: trajectories for label, trajectories in zip(labels, runs, strict=True) if trajectories is not None}
     rows = [
-        _row(
-            label,
-            case,
-            scheme,
-            t_end / num_steps,
-            changed.system,
-            momentum_maps,
-            done[label, num_steps][k],
-            references[case],
-            energies[case],
-        )
+        _row(label, scheme, t_end / num_steps, case, momentum_maps, done[label, num_steps][k])
         for label, scheme in schemes.items()
-        for k, (case, changed) in enumerate(cases.items())
+        for k, case in enumerate(cases)
         for num_steps in steps
         if (label, num_steps) in done
     ]
-    study = ConvergenceStudy(tuple(rows), references)
+    study = ConvergenceStudy(tuple(rows), {case.label: case.reference for case in cases})
     if stopped is not None:
         raise Interrupted(study, len(study.rows), None, "runs") from None
     progress("done", total, total)
     return study
 
 
-def _cases(problem: Problem, params: Mapping[str, Any] | None) -> dict[str, Problem]:
-    """The problem with every set of parameters, by label."""
-    if params is None:
-        return {"": problem}
-    if not params:
-        raise ValueError("convergence_study: params is empty; give a set of parameters by label, or leave it out.")
-    return {case: replace(problem, system=problem.system.replace(params=p)) for case, p in params.items()}
-
-
 def _runs(
     problems: Sequence[Problem], scheme, num_steps: int, t_end: float, num_saves: int, solver
 ) -> list[Trajectory]:
-    """A trajectory of each problem."""
+    """A trajectory of each problem; several problems run as one batch."""
     if len(problems) == 1:
         return [Program(problems[0], scheme, t_end, num_saves, solver)(num_steps)]
     states = jax.tree.map(lambda *a: jnp.stack(a), *(problem.state() for problem in problems))
@@ -318,34 +304,8 @@ def _runs(
     return [jax.tree.map(lambda a, i=i: a[i], batch) for i in range(len(problems))]
 
 
-def _references(cases, reference, t_end, num_saves, progress, total) -> dict[str, Any]:
-    """A reference of the right shape for every case."""
-    if reference is None:
-
-        def told(what: str, *_) -> None:
-            progress(what, 0, total)
-
-        return {
-            case: reference_solution(problem, t_end, num_saves=num_saves, progress=told)
-            for case, problem in cases.items()
-        }
-    references: dict[str, Any] = dict(reference if isinstance(reference, Mapping) else dict.fromkeys(cases, reference))
-    if set(references) != set(cases) or (len(cases) > 1 and not isinstance(reference, Mapping)):
-        raise ValueError(
-            f"convergence_study: params has the labels {list(cases)}, so reference must be a mapping with the same ones."
-        )
-    for case, problem in cases.items():
-        shape = (num_saves + 1, problem.q_s.size + problem.q_f.size)
-        found = references[case]
-        if found.q.shape != shape or found.p.shape != shape:
-            raise ValueError(
-                f"convergence_study: reference has q of shape {found.q.shape} and p of shape {found.p.shape}; both "
-                f"must be {shape}: num_saves + 1 nodes from the start to t_end, slow coordinates first."
-            )
-    return references
-
-
 def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
+    """The number of macro steps up to `t_end`."""
     num_steps = round(t_end / macro_dt) if macro_dt > 0 else 0
     if num_steps < 1 or abs(num_steps * macro_dt - t_end) > 1e-9 * t_end or num_steps % num_saves:
         raise ValueError(
@@ -356,30 +316,30 @@ def _num_steps(t_end: float, macro_dt: float, num_saves: int) -> int:
     return num_steps
 
 
-def _energies(problem: Problem, reference: ReferenceSolution) -> np.ndarray | None:
-    """(num_saves + 1,) energies of a reference; None where the system keeps its energy, so that the start tells it."""
-    if problem.system.keeps_energy:
-        return None
-    phase = [part for both in (reference.q, reference.p) for part in np.split(both, [problem.q_s.size], axis=1)]
-    return np.asarray(jax.jit(jax.vmap(partial(diagnostics.energy, problem.system)))(*phase))
-
-
-def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, reference, energies) -> ConvergenceRow:
-    error_q, error_p = reference.errors(trajectory)
+def _row(
+    label: str,
+    scheme: Scheme | Composition,
+    macro_dt: float,
+    case: Case,
+    momentum_maps: Sequence[Callable],
+    trajectory: Trajectory,
+) -> ConvergenceRow:
+    """The row of one run."""
+    error_q, error_p = case.reference.errors(trajectory)
     energy = np.asarray(trajectory.energy)
-    off = energy - (energy[0] if energies is None else energies)
-    drift, band = _drift_and_band(np.asarray(trajectory.t), off)
+    energy_error = energy - (energy[0] if case.energies is None else case.energies)
+    drift, band = _drift_and_band(np.asarray(trajectory.t), energy_error)
     _, *phase = vars(trajectory.states).values()
     maps = [np.asarray(jax.vmap(lambda *z, xi=xi: diagnostics.momentum_map(xi, *z))(*phase)) for xi in momentum_maps]
     return ConvergenceRow(
         scheme=label,
-        case=case,
+        case=case.label,
         num_micro=scheme.num_micro,
         degree=scheme.degree,
         macro_dt=macro_dt,
         error_q=error_q,
         error_p=error_p,
-        energy_error=float(np.abs(off).max()),
+        energy_error=float(np.abs(energy_error).max()),
         energy_drift=drift,
         energy_band=band,
         momentum_error=float(max((np.abs(m - m[0]).max() for m in maps), default=0.0)),
@@ -390,10 +350,9 @@ def _row(label, case, scheme, macro_dt, system, momentum_maps, trajectory, refer
     )
 
 
-def _drift_and_band(t: np.ndarray, energy: np.ndarray) -> tuple[float, float]:
-    """Change over the run of the line fitted to an error of the energy, and the largest distance from it."""
-    if not np.isfinite(energy).all():
+def _drift_and_band(t: np.ndarray, energy_error: np.ndarray) -> tuple[float, float]:
+    """Change over the run of the straight line fitted to the error of the energy, and the largest distance from the line."""
+    if not np.isfinite(energy_error).all():
         return float("nan"), float("nan")
-    line = np.polynomial.Polynomial.fit(t, energy, 1)
-    fitted = line(t)
-    return float(fitted[-1] - fitted[0]), float(np.abs(energy - fitted).max())
+    line = np.polynomial.Polynomial.fit(t, energy_error, 1)(t)
+    return float(line[-1] - line[0]), float(np.abs(energy_error - line).max())

@@ -24,12 +24,16 @@ from vmri_jax.study.timing import interleaved
 class CostRow:
     """One program: its size and its times.
 
-    method: what ``vm.solvers.named(method)(=...)`` was told.
-    solved_by: name of the `Method` that took the steps, as ``run.info.method`` says it: "auto" chooses one.
+    label: of the system or the scheme, as passed to `cost_study`.
+    method: name of the solver, as in ``vm.solvers.named(method)()``.
     num_unknowns: unknowns of one macro step, ``r n_s + r n_gs + num_micro r (n_f + n_g)``.
+    num_steps: macro steps of the timed run.
     seconds_per_unit: computing time per unit of simulated time; the figures of the reference paper up to a constant.
-    us_per_micro_step: the same per micro step, in microseconds.
-    first_call_seconds: the first call: tracing, compiling and one macro step; in no other column.
+    us_per_micro_step: computing time per micro step, in microseconds.
+    first_call_seconds: tracing, compiling and one macro step; not part of the other times.
+    iterations: most Newton iterations of a step.
+    solved_by: name of the `Method` that took the steps, which "auto" chooses, as in ``run.info.method``.
+    result: name of the `Result` of the run.
     """
 
     label: str
@@ -47,7 +51,7 @@ class CostRow:
 
 @dataclass(frozen=True)
 class CostStudy(ResultTable):
-    """Rows of one or several cost studies; each is a run of ``simulate(..., solver=vm.solvers.named(row.method)())``."""
+    """Rows of one or several cost studies; each row is a run of ``simulate(..., solver=vm.solvers.named(row.method)())``."""
 
     columns = (
         Column("what", lambda row: row.label),
@@ -99,15 +103,15 @@ def cost_study(
 ) -> CostStudy:
     """Time ``scheme(n)`` for every n in `num_micro` with every method of Newton's iteration, over the same simulated time.
 
-    "auto" is what `simulate` takes by itself, and "dense" what the reference paper took; every method is that of
-    ``simulate(..., solver=vm.solvers.Dense())`` and of ``vmri simulate --method dense``.
+    "auto" is the default of `simulate`, and "dense" is the method of the reference paper. A method "dense" here is
+    ``solver=vm.solvers.Dense()`` of `simulate` and ``--method dense`` of ``vmri simulate``.
 
-    Where `t_end` is not a whole number of macro steps their number is rounded, and times are given per simulated unit
-    and per micro step. A timed call is one compiled program, started once; take `t_end` long enough (thousands of micro
-    steps for small systems) for its start not to count.
+    The number of macro steps is rounded if `t_end` is not a multiple of one; times are per unit of simulated time and
+    per micro step. A timed call starts one compiled program; choose `t_end` long enough (thousands of micro steps for
+    small systems) that the start takes a negligible part of it.
 
-    With several threads in the linear algebra times scatter: set OPENBLAS_NUM_THREADS=1 before the first simulation.
-    Programs take turns in every repeat, so that a slow moment of the machine hits all of them; the median is kept.
+    Times scatter if the linear algebra has several threads: set OPENBLAS_NUM_THREADS=1 before the first simulation.
+    Programs take turns in every repeat, so that a slow moment of the machine hits all of them; a row has the median.
 
     Args:
         problem: system and start; a `Problem` or a scene.
@@ -119,12 +123,13 @@ def cost_study(
         repeats: timed runs of each program.
         min_seconds: runs shorter than this are called several times and averaged.
         label: name of this scheme or system in the rows.
-        progress: True for a bar, or a function (what, done, total) that is told about every program before it is compiled, and before times are measured.
+        progress: True for a bar, or a function (what, done, total) that is told about every program before it is compiled, and once
+            before times are measured.
         clock: `time.process_time` where other processes share the core.
 
     Raises:
         ValueError: an empty or bad argument.
-        Interrupted: Ctrl-C; carries the programs that were run, with times where they were measured.
+        Interrupted: Ctrl-C; carries the rows of the programs that were run, with NaN for times not measured yet.
     """
     problem = problem_of("cost_study", problem)
     if not num_micro or not methods or repeats < 1 or not (micro_dt > 0 and t_end > 0):
@@ -151,8 +156,7 @@ def cost_study(
         calls = {str(i): program.timed(n) for i, (_, program, n, run) in enumerate(runs) if run.success}
         seconds = interleaved(calls, repeats, min_seconds, clock=clock)
     except KeyboardInterrupt:
-        done = study()
-        raise Interrupted(done, len(done.rows), None, "runs") from None
+        raise Interrupted(study(), len(runs), None, "runs") from None
     progress("done", total, total)
     return study()
 
@@ -160,7 +164,7 @@ def cost_study(
 def _row(
     label: str, method: str, program: Program, num_steps: int, trajectory: Trajectory, seconds: Sequence[float]
 ) -> CostRow:
-    """The row of a run with the median of its samples."""
+    """The row of a run with the median of its samples of seconds."""
     scheme, state, median = program.scheme, program.state, float(np.median(seconds))
     n_g, n_gs = program.problem.system.num_constraints(state.q_s, state.q_f)
     return CostRow(

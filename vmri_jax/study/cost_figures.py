@@ -1,5 +1,6 @@
-"""Figures of the page of cost: staircases, times against num_micro, parts of the time."""
+"""Figures of the page of `cost_report`: times against num_micro, and the parts of the time of a run."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -7,30 +8,34 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from vmri_jax import plots
-from vmri_jax.study.prices import REST
+from vmri_jax.study.prices import REMAINDER
 
-CURVES = 4
-"""Families whose times against num_micro are drawn."""
+MAX_CURVES = 4
+"""Families per panel of `draw_num_micro`; more curves cover each other."""
+MIN_POINTS = 3
+"""Least numbers of micro steps in a curve; families with fewer are not drawn."""
+MIN_LABELLED_SHARE = 0.06
+"""Parts of a bar below this share of the time have no room for a label."""
 
 
 def draw_num_micro(answers: Sequence[Any], theme: plots.Theme) -> Figure:
-    """Time against num_micro of the families that were varied, at each error, one panel per error.
+    """Time against num_micro, one panel per error, with a curve for each family that keeps the error with several num_micro.
 
     Args:
-        answers: of a `CostReport`.
+        answers: the answers of a `CostReport`.
         theme: colours.
     """
     answers = [answer for answer in answers if answer.all]
     varied = [
-        [name for name in {s.family.name: None for s in answer.all} if _numbers(answer, name) >= 3][:CURVES]
+        [name for name, count in Counter(s.family.name for s in answer.all).items() if count >= MIN_POINTS][:MAX_CURVES]
         for answer in answers
     ]
-    names = list(dict.fromkeys(name for of_answer in varied for name in of_answer))
+    names = list(dict.fromkeys(name for panel_names in varied for name in panel_names))
     looks = {name: plots.curve_look(i, theme) for i, name in enumerate(names)}
     with plots.new_figure(7.2, 3.2, "", theme) as figure:
         panels = figure.subplots(1, max(1, len(answers)), sharey=True, squeeze=False)[0]
-        for axes, answer, of_answer in zip(panels, answers, varied, strict=False):
-            for name in of_answer:
+        for axes, answer, panel_names in zip(panels, answers, varied, strict=False):
+            for name in panel_names:
                 settings = sorted((s for s in answer.all if s.family.name == name), key=lambda s: s.num_micro)
                 x, y = [s.num_micro for s in settings], plots.positive([s.row.seconds for s in settings])
                 axes.loglog(x, y, label=name, markersize=3.5, linewidth=1.2, **looks[name])
@@ -44,25 +49,20 @@ def draw_num_micro(answers: Sequence[Any], theme: plots.Theme) -> Figure:
     return figure
 
 
-def _numbers(answer: Any, name: str) -> int:
-    """Numbers of micro steps of a family that keep the error of an answer."""
-    return sum(s.family.name == name for s in answer.all)
-
-
 def draw_shares(shares: Mapping[str, float], theme: plots.Theme) -> Figure:
-    """One bar, cut by what the time is spent on.
+    """One bar for the time of a run, cut into the parts that functions of the system take.
 
     Args:
-        shares: parts of the time, by their names.
+        shares: parts of the time by name, from `vmri_jax.study.prices.shares`; they sum to 1.
         theme: colours.
     """
     with plots.new_figure(7.2, 1.1, "", theme) as figure:
         axes = figure.subplots()
         left = 0.0
         for color, (name, share) in zip(theme.curves, shares.items(), strict=False):
-            last = name == REST
+            last = name == REMAINDER
             axes.barh([0], [share], left=left, color=theme.faint if last else color)
-            if share > 0.06:
+            if share > MIN_LABELLED_SHARE:
                 ink = theme.ink if last else theme.paper
                 axes.text(left + share / 2, 0, f"{name}\n{share:.0%}", ha="center", va="center", fontsize=8, color=ink)
             left += share

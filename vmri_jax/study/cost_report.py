@@ -132,9 +132,7 @@ class CostReport(ResultTable):
             sentences.append(
                 f"The reference solution is good to {known_to:.0e}: errors below {least:.0e} cannot be told."
             )
-        if self.cut_short:
-            sentences.append(self.cut_short)
-        return " ".join(sentences)
+        return " ".join(filter(None, (*sentences, self.cut_short)))
 
     @property
     def cut_short(self) -> str:
@@ -156,8 +154,7 @@ def default_t_end(problem: Problem) -> float:
     frequency = float(diagnostics.frequencies(problem)[0])
     if not frequency > 0:
         return 1.0
-    t_end = PERIODS * 2 * math.pi / frequency
-    return float(f"{t_end:.0e}")
+    return float(f"{PERIODS * 2 * math.pi / frequency:.0e}")
 
 
 @shows_progress
@@ -308,14 +305,13 @@ def _confirmed(search: Search, answers: Sequence[Answer]) -> list[Answer]:
     """The answers with the fastest setting whose confirmed error keeps the error; an answer without such a setting stays as it is."""
     settings = {(s.row.scheme, s.num_steps): s for s in search.settings.values()}
     stairs = confirmed([s.row for s in search.settings.values()])
-    confirmed_answers = []
-    for answer in answers:
+
+    def confirmed_answer(answer: Answer) -> Answer:
         keeping = [stair for stair in stairs if stair.error <= answer.error]
-        if keeping:
-            row = min(keeping, key=lambda stair: stair.seconds).row
-            answer = replace(answer, setting=settings[row.scheme, row.num_steps])
-        confirmed_answers.append(answer)
-    return confirmed_answers
+        row = min(keeping, key=lambda stair: stair.seconds).row if keeping else None
+        return answer if row is None else replace(answer, setting=settings[row.scheme, row.num_steps])
+
+    return [confirmed_answer(answer) for answer in answers]
 
 
 def _fastest_that_keep(answers: Sequence[Answer]) -> list[Answer]:
@@ -361,13 +357,11 @@ def _draw_stairs(report: CostReport, price: dict[str, float], title: str, theme:
     marked = [
         plots.Marked("answers", row.seconds, errors.get((row.scheme, row.num_steps), row.error_q)) for row in rows
     ]
-    chosen = report.extras.accuracy
+    extras, chosen = report.extras, report.extras.accuracy
     if chosen is not None:
-        label = f"accuracy={report.extras.accuracy_error:.0e}"
-        marked.append(plots.Marked(label, chosen.seconds, chosen.error_q, star=True))
-    known_to = report.runs.reference.error_q
-    bound = bound_of(report.stairs, price)
-    return plots.plot_staircases(report.stairs, report.extras.peers, marked, bound, known_to, title, theme)
+        marked.append(plots.Marked(f"accuracy={extras.accuracy_error:.0e}", chosen.seconds, chosen.error_q, star=True))
+    known_to, bound = report.runs.reference.error_q, bound_of(report.stairs, price)
+    return plots.plot_staircases(report.stairs, extras.peers, marked, bound, known_to, title, theme)
 
 
 def bound_of(stairs: dict[str, list[Stair]], price: dict[str, float]) -> plots.Bound | None:

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: one style, figures embedded in light and dark, the machine in words."""
+"""Self-contained HTML pages in one style, with embedded figures for light and dark screens, and a footer that names the machine."""
 
 import base64
 import os
@@ -16,12 +16,12 @@ from matplotlib.figure import Figure
 from vmri_jax import plots
 from vmri_jax.study.timing import processor
 
-HERE = Path(__file__).parent
+STYLE_FOLDER = Path(__file__).parent
 
 
 def write_page(path: Path, template: Path, **values) -> None:
-    """Render a template, which may include ``style.css``; it also knows the date, the machine and the versions."""
-    loader = jinja2.FileSystemLoader([template.parent, HERE])
+    """Render a template to `path`. The template may include ``style.css``; it gets `values`, and date, machine and versions."""
+    loader = jinja2.FileSystemLoader([template.parent, STYLE_FOLDER])
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     text = environment.get_template(template.name).render(
         date=datetime.now().strftime("%-d %B %Y, %H:%M"),
@@ -33,7 +33,7 @@ def write_page(path: Path, template: Path, **values) -> None:
 
 
 def embedded(draw: Callable[[plots.Theme], Figure]) -> tuple[str, str]:
-    """A figure as two data addresses, drawn light and dark."""
+    """A figure as two data URLs, the light one and the dark one."""
     images = [svg(draw(theme), theme) for theme in (plots.LIGHT, plots.DARK)]
     light, dark = (f"data:image/svg+xml;base64,{base64.b64encode(image).decode()}" for image in images)
     return light, dark
@@ -48,6 +48,7 @@ def svg(figure: Figure, theme: plots.Theme) -> bytes:
 
 
 def _machine() -> str:
+    """The processor, the system and the threads, in words."""
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "all")
     return (
         f"{processor()}, {os.cpu_count()} cores, {platform.system()}, JAX on {jax.default_backend()}, linear algebra on "

@@ -1,4 +1,4 @@
-"""Another program on the same problem: adaptive Runge-Kutta steps of diffrax, where it is installed and the problem is an equation ``q'' = f(q)``."""
+"""Another program on the same problem: adaptive Runge-Kutta steps of diffrax, if installed, for problems ``q'' = f(q)``."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,15 +18,15 @@ from vmri_jax.study.staircase import Stair, confirmed, front
 from vmri_jax.study.work import SLOWEST, WorkRow
 
 LARGEST_POWER = 43
-"""Tolerances go down to ``2^-43``, about 1e-13: round-off of float64 makes a smaller one as dear as it is useless."""
+"""Bound of the powers: tolerances stay above ``2^-43``, about 1e-13. Below, round-off of float64 lets errors fall no further."""
 STRIDE = 3
-"""From one power of two of the tolerances to the next."""
+"""Step from one power to the next, so that each tolerance is an eighth of the one before; a larger step leaves a coarser staircase."""
 MAX_STEPS = 200_000
-"""Steps after which diffrax gives up; more only lengthen runs that are too slow to be compared."""
+"""Steps after which diffrax gives up; a larger number lengthens only runs that are too slow to be compared."""
 
 
 def can_run_dopri8(problem: Problem) -> bool:
-    """Whether diffrax is installed, and masses are constant, with neither constraints nor forces besides potentials."""
+    """Whether diffrax is installed and the system has constant masses, no constraints, and no forces besides potentials."""
     system = problem.system
     plain = isinstance(system.kinetic, ConstantMass) and system.force is None
     return plain and not any(system.num_constraints(problem.q_s, problem.q_f)) and find_spec("diffrax") is not None
@@ -36,9 +36,9 @@ def dopri8_runs(problem: Problem, t_end: float, stride: int = STRIDE) -> Iterato
     """Runs of Dopri8 with smaller and smaller tolerances ``2^-power``: the power, and a function that gives q at the end, slow coordinates first.
 
     Args:
-        problem: one that `can_run_dopri8`.
+        problem: a problem that `can_run_dopri8`.
         t_end: simulated time.
-        stride: from one power to the next.
+        stride: step from one power to the next.
     """
     import diffrax  # pyright: ignore[reportMissingImports]
 
@@ -77,13 +77,13 @@ def dopri8_runs(problem: Problem, t_end: float, stride: int = STRIDE) -> Iterato
 
 
 def dopri8_stairs(problem: Problem, t_end: float, reference: ReferenceSolution, least: float) -> list[Stair]:
-    """What Dopri8 reaches at the end, down to an error.
+    """The staircase of Dopri8: confirmed errors of q at t_end and times over falling tolerances.
 
     Args:
-        problem: one that `can_run_dopri8`.
+        problem: a problem that `can_run_dopri8`.
         t_end: simulated time.
-        reference: with the positions at the end.
-        least: error below which no smaller tolerance is tried.
+        reference: the solution that errors are measured against.
+        least: smallest error of interest; tolerances fall until an error is a tenth of it, so that smaller steps confirm it.
     """
     runs, errors = {}, {}
     for power, run in dopri8_runs(problem, t_end):
@@ -93,14 +93,15 @@ def dopri8_stairs(problem: Problem, t_end: float, reference: ReferenceSolution, 
             break
     seconds = interleaved(runs, 3)
     rows = [
-        # steps of order 8 for a tolerance 2^-power, which diffrax chooses, are about 2^(power / 8); each rung of the ladder counts as a doubling here
-        replace(NOTHING, num_steps=2 ** (power // STRIDE), error_q=error).timed(seconds[str(power)])
+        # diffrax chooses its steps, so that the row needs a stand-in for their number: it doubles with each tolerance, and
+        # each run then confirms the one before
+        replace(DOPRI8_ROW, num_steps=2 ** (power // STRIDE), error_q=error).timed(seconds[str(power)])
         for power, error in errors.items()
     ]
     return front(confirmed(rows))
 
 
-NOTHING = WorkRow(
+DOPRI8_ROW = WorkRow(
     scheme="diffrax Dopri8",
     num_micro=1,
     order=8,
@@ -119,4 +120,4 @@ NOTHING = WorkRow(
     method="",
     result="",
 )
-"""A row without what runs of another program do not tell."""
+"""A run of Dopri8 without its error and its time; diffrax counts no gradients and no solves."""

@@ -1,4 +1,4 @@
-"""Prices of the functions of a system, and the parts of a run that they take."""
+"""Prices: seconds of one evaluation of each function of a system, and the parts of the time of a run that they take."""
 
 from collections.abc import Callable
 
@@ -11,12 +11,13 @@ from vmri_jax.running.timing import seconds_each
 from vmri_jax.study.work import WorkRow
 
 SLOW, FAST, CONSTRAINTS = "gradient of V", "gradient of W", "constraints"
-REST = "everything else"
-"""Names of parts of a run; further potentials have names of their own."""
+"""Names of functions whose evaluations take time; `gradient_of` names the gradients of further potentials."""
+REMAINDER = "everything else"
+"""Name of the time outside of these functions: moving, solving, and starting the run."""
 
 
 def functions(problem: Problem) -> dict[str, Callable]:
-    """Gradients of the potentials and the constraints with their Jacobian, each a function of all positions, by name; those that a system has."""
+    """The functions of positions that the system has, by name: gradients of the potentials; constraints with their Jacobian, summed."""
     system, n_s = problem.system, problem.q_s.size
     terms: dict[str, Callable] = {}
     if system.slow_potential is not None:
@@ -40,13 +41,13 @@ def gradient_of(name: str | int) -> str:
 
 
 def prices(problem: Problem) -> dict[str, float]:
-    """Seconds of each of `functions`, each on its own in a compiled loop."""
+    """Seconds of one evaluation of each of `functions`, each timed in a compiled loop of its own."""
     q = jnp.concatenate([jnp.asarray(problem.q_s), jnp.asarray(problem.q_f)])
     return {name: seconds_each(function, q) for name, function in functions(problem).items()}
 
 
 def shares(price: dict[str, float], row: WorkRow) -> dict[str, float]:
-    """Parts of the time of a run, by what it is spent on; they sum to 1.
+    """Parts of the time of a run by function: evaluations times price over the time of the run; with the remainder they sum to 1.
 
     Args:
         price: seconds of each function, from `prices`.
@@ -54,8 +55,8 @@ def shares(price: dict[str, float], row: WorkRow) -> dict[str, float]:
     """
     counts = {SLOW: row.slow_evaluations, FAST: row.fast_evaluations}
     counts |= {gradient_of(name): count for name, count in row.evaluations.items()}
-    counts[CONSTRAINTS] = row.fast_evaluations or row.slow_evaluations
+    counts[CONSTRAINTS] = row.fast_evaluations or row.slow_evaluations  # about one evaluation for each fast gradient
     parts = {name: seconds * counts.get(name, 0) / row.seconds for name, seconds in price.items()}
-    total = sum(parts.values())
+    total = sum(parts.values())  # above 1 where functions cost less in the run than in loops of their own
     parts = {name: part / max(total, 1.0) for name, part in parts.items()}
-    return parts | {REST: max(0.0, 1.0 - total)}
+    return parts | {REMAINDER: max(0.0, 1.0 - total)}

@@ -1,4 +1,4 @@
-"""One problem under one scheme, compiled once for every number of steps: what studies run and time."""
+"""Programs, which studies run and time: one problem under one scheme, compiled once for all numbers of steps."""
 
 import time
 from dataclasses import replace
@@ -20,8 +20,8 @@ from vmri_jax.steppers.solvers import Newton
 class Program:
     """``program(num_steps)`` simulates `problem` over `t_end` in num_steps macro steps.
 
-    It is a `vmri_jax.prepare` whose step size follows from the number of steps, compiled when first called, once for all
-    problems of the same structure. A run that fails is seen in the trajectory; nothing is raised.
+    A program is a run of `vmri_jax.prepare` whose step size follows from the number of steps. The first call compiles it, once
+    for all problems of the same structure. A run that fails raises nothing: its trajectory has the result.
 
     Args:
         problem: system and start.
@@ -29,7 +29,7 @@ class Program:
         t_end: simulated time.
         num_saves: saved nodes, equally spaced; numbers of steps must be multiples of it.
         solver: how implicit equations are solved.
-        fallback: whether "auto" may take its second method where the first one fails, which takes long to compile.
+        fallback: whether "auto" may take its second method, which takes long to compile, where the first one fails.
 
     Attributes:
         compile_seconds: time of compiling, NaN before the first call.
@@ -59,6 +59,7 @@ class Program:
         return replace(run, may_fall_back=self.fallback)
 
     def _steps(self, num_steps: int) -> dict:
+        """The arguments of a run with this number of steps."""
         if num_steps < 1 or num_steps % self.num_saves:
             raise ValueError(f"Program: num_steps is {num_steps}; it must be a positive multiple of {self.num_saves}.")
         return {"macro_dt": self.t_end / num_steps, "num_steps": num_steps}
@@ -72,16 +73,16 @@ class Program:
         return self._run(**self._steps(num_steps), throw=False)
 
     def timed(self, num_steps: int):
-        """A function without arguments that runs and waits, for a clock; takes the fallback if the run needs it."""
+        """A function without arguments for a clock: it makes a run and waits for its end, with the fallback if the run needs it."""
         return self._run.timed(**self._steps(num_steps))
 
     def seconds(self, num_steps: int, repeats: int, min_seconds: float = MIN_SECONDS) -> list[float]:
-        """So many samples of the time of a run, see `interleaved`."""
+        """`repeats` samples of the time of a run, in seconds; runs shorter than `min_seconds` are averaged, see `interleaved`."""
         return interleaved({"": self.timed(num_steps)}, repeats, min_seconds)[""]
 
 
 def joined(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """q and p of the saved nodes, slow coordinates first."""
+    """q and p, each (num_saves + 1, n_s + n_f), at the saved nodes, slow coordinates first."""
     return (
         np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=-1),
         np.concatenate([trajectory.states.p_s, trajectory.states.p_f], axis=-1),

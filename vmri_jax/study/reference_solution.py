@@ -1,4 +1,4 @@
-"""Reference solutions: what runs are compared with, and how accurate it is itself."""
+"""Reference solutions: fine solutions that the errors of runs are measured against, with their own errors."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +14,17 @@ from vmri_jax.schemes.scheme import galerkin
 from vmri_jax.study.program import Program, joined
 
 ROUNDOFF = 1e-13
-"""Differences of two runs below this, relative to the solution, are round-off."""
+"""Difference of two runs, relative to the largest coordinate, that counts as round-off; a larger value ends with coarser steps."""
 MAX_STEPS = 2**17
+"""Number of macro steps from which steps are not halved any more; a larger number lets failing systems take longer to fail."""
 
 
 @dataclass(frozen=True)
 class ReferenceSolution:
-    """What runs are compared with: q and p, shape (num_saves + 1, n_s + n_f), slow coordinates first.
+    """Positions and momenta at the saved nodes, which errors of runs are measured against.
 
-    error_q, error_p: how accurate they are; errors near them are not fitted.
+    q, p: (num_saves + 1, n_s + n_f), slow coordinates first.
+    error_q, error_p: largest errors of q and p, estimated; errors of runs near these are not fitted.
     """
 
     q: np.ndarray
@@ -41,17 +43,17 @@ class ReferenceSolution:
         return float(np.abs(q - self.q).max()), float(np.abs(p - self.p).max())
 
     def save(self, path: str | Path) -> None:
-        """Write it to a .npz file."""
+        """Write a .npz file."""
         with Path(path).open("wb") as file:
             np.savez_compressed(file, q=self.q, p=self.p, error_q=self.error_q, error_p=self.error_p)
 
     @classmethod
     def load(cls, path: str | Path) -> "ReferenceSolution":
-        """Read what `save` wrote.
+        """Read a file written by `save`.
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: something else is in it.
+            ValueError: a file that `save` did not write.
         """
         try:
             with np.load(path, allow_pickle=False) as data:
@@ -78,16 +80,17 @@ def reference_solution(
         problem: system and start; a `Problem` or a scene.
         t_end: time simulated.
         num_saves: saved nodes, equally spaced over `t_end`.
-        num_steps: steps of the coarser of the two runs, a multiple of `num_saves`; by default steps are halved until
-            two runs agree to round-off or no longer come closer.
+        num_steps: steps of the coarser of two runs, a multiple of `num_saves`; by default the step is halved until
+            the difference of two runs is round-off or no longer falls.
         degree: polynomial degree of the path, with Gauss quadrature on every term.
         progress: True for a bar, or a function (what, done, total) that is told about every run.
 
     Returns:
-        The finer of the two runs that agree best; its errors are the largest differences between them.
+        The finer of the two successive runs with the least difference in q; error_q and error_p are the largest
+        differences between these two.
 
     Raises:
-        SimulationError: runs failed with every number of steps; the last one is in it.
+        SimulationError: runs failed with every number of steps; carries the last run.
     """
     problem = problem_of("reference_solution", problem)
     program = Program(problem, galerkin(1, degree, "gauss"), t_end, num_saves)
@@ -102,6 +105,7 @@ def reference_solution(
             error_q, error_p = (float(np.abs(a - b).max()) for a, b in zip(coarse, fine, strict=True))
             if best is None or error_q < best.error_q:
                 best = ReferenceSolution(*fine, error_q, error_p)
+            # a difference that no longer falls has reached round-off or the floor of a chaotic motion; above 1e-6 the steps may still be too large
             settled = error_q > last_error / 2 and error_q < 1e-6 * max(1.0, np.abs(fine[0]).max())
             if fixed or settled or error_q <= ROUNDOFF * np.abs(fine[0]).max():
                 return best
