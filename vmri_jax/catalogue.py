@@ -28,7 +28,7 @@ from vmri_jax.schemes.scheme import (
 
 @dataclass(frozen=True)
 class NamedSystem:
-    """A built-in system: its factory and what its variables are."""
+    """A built-in system: its factory, its title, and descriptions of its slow and fast variables."""
 
     factory: Callable[..., Problem]
     title: str
@@ -38,7 +38,7 @@ class NamedSystem:
 
 @dataclass(frozen=True)
 class NamedScheme:
-    """A built-in scheme: its factory, its order and what it does."""
+    """A built-in scheme: its factory, its order, and a title that says where potentials are evaluated."""
 
     factory: Callable[..., Scheme]
     order: str
@@ -46,7 +46,7 @@ class NamedScheme:
 
     @property
     def options(self) -> list[str]:
-        """What the factory takes besides num_micro."""
+        """Names of the arguments of the factory besides num_micro."""
         return [name for name in inspect.signature(self.factory).parameters if name != "num_micro"]
 
 
@@ -72,16 +72,18 @@ SYSTEMS = {
 }
 
 DEFAULT_NAMES = ("scene", "problem")
-"""What a file alone stands for, if it has several problems and one of these names."""
+"""Names that are taken, in this order, from a file with several problems if the user names only the file."""
 
-KICKED = "2 at alpha = 1/2, else 1"
+ORDER_OF_KICKS = "2 at alpha = 1/2, else 1"
 SCHEMES = {
     "fully-implicit": NamedScheme(fully_implicit, "2", "V and W at the micro midpoints"),
-    "explicit-slow": NamedScheme(explicit_slow, KICKED, "V as kicks at the macro nodes, W at micro midpoints"),
+    "explicit-slow": NamedScheme(explicit_slow, ORDER_OF_KICKS, "V as kicks at the macro nodes, W at micro midpoints"),
     "mollified-impulse": NamedScheme(
-        mollified_impulse, KICKED, "explicit-slow with V at averaged fast positions: no impulse resonance"
+        mollified_impulse, ORDER_OF_KICKS, "explicit-slow with V at averaged fast positions: no impulse resonance"
     ),
-    "fully-explicit": NamedScheme(fully_explicit, KICKED, "V as kicks at the macro nodes, W at the micro nodes"),
+    "fully-explicit": NamedScheme(
+        fully_explicit, ORDER_OF_KICKS, "V as kicks at the macro nodes, W at the micro nodes"
+    ),
     "takahashi-imada": NamedScheme(
         takahashi_imada,
         "2, of frequencies 4",
@@ -92,52 +94,54 @@ SCHEMES = {
 
 
 MODELS = (".xml", ".mjcf", ".urdf")
-"""Files that MuJoCo reads."""
+"""Endings of the files that MuJoCo reads."""
 
 
 def find_problem(name: str) -> Problem:
-    """A built-in problem by name, or one of your own: in a file, ``my_file.py:my_problem``, in a package that is installed,
-    ``my_package.my_module:my_problem``, or a model of MuJoCo, ``model.xml``.
+    """A problem by name: a built-in one, ``my_file.py:my_problem``, ``my_package.my_module:my_problem`` of an installed package, or
+    a model of MuJoCo, ``model.xml``.
 
-    In the file it is a `Problem`, a `Scene`, or a function without arguments making one; ``my_file.py`` alone stands for
-    the one that it has, or for its ``scene`` or ``problem``, and then says so.
+    The name in the file stands for a `Problem`, a `Scene`, or a function without arguments that returns one of these. A file
+    name alone, ``my_file.py``, stands for the only problem in the file; in a file with several it stands for ``scene`` or
+    ``problem``, and a line on the error stream tells which one is taken.
 
     Raises:
-        ValueError: an unknown name; a file that does not exist, fails to run, or has no such name; no Problem there.
+        ValueError: an unknown name; a file that does not exist, fails to run, or lacks the name; a value that is no problem.
     """
     if name in SYSTEMS:
         return SYSTEMS[name].factory()
-    found = _find_own(name)
+    scene_or_problem = _user_problem(name)
     try:
-        return found.problem() if isinstance(found, Scene) else found
+        return scene_or_problem.problem() if isinstance(scene_or_problem, Scene) else scene_or_problem
     except Exception as error:
         raise ValueError(f"{name} is a scene that makes no system: {type(error).__name__}: {error}") from error
 
 
 def find_scene_or_problem(name: str) -> Scene | Problem:
-    """The scene of a name, before it is made a problem; or the problem, as of `find_problem`.
+    """The scene with this name, from which `find_problem` makes a problem, or the problem where there is no scene.
 
     Raises:
-        ValueError: as of `find_problem`.
+        ValueError: as in `find_problem`.
     """
-    return SYSTEMS[name].factory() if name in SYSTEMS else _find_own(name)
+    return SYSTEMS[name].factory() if name in SYSTEMS else _user_problem(name)
 
 
 def find_scene(name: str) -> Scene:
-    """The scene in your own file, ``my_file.py:my_scene``, or ``my_file.py`` as in `find_problem`.
+    """The scene in a file of the user, ``my_file.py:my_scene``, or ``my_file.py`` as in `find_problem`.
 
     Raises:
-        ValueError: as of `find_problem`; a system that is no scene.
+        ValueError: as in `find_problem`; a system that is no scene.
     """
-    found = SYSTEMS[name] if name in SYSTEMS else _find_own(name)
-    if not isinstance(found, Scene):
+    scene = SYSTEMS[name] if name in SYSTEMS else _user_problem(name)
+    if not isinstance(scene, Scene):
         raise ValueError(
             f"{name} is a system of functions, not a scene; give a vmri_jax.scene.Scene, my_file.py:my_scene."
         )
-    return found
+    return scene
 
 
-def _find_own(name: str) -> Problem | Scene:
+def _user_problem(name: str) -> Problem | Scene:
+    """The problem or scene in a file, a package or a model of MuJoCo."""
     file_name, colon, attribute = name.partition(":")
     if Path(name).suffix.lower() in MODELS:
         try:
@@ -149,16 +153,16 @@ def _find_own(name: str) -> Problem | Scene:
             raise ValueError(
                 f"{_unknown('system', name, SYSTEMS)} Your own: my_file.py:my_problem, or my_package.my_module:my_problem."
             )
-        return _found_in(_import(file_name), file_name, attribute)
+        return _problem_in(_import(file_name), file_name, attribute)
     path = Path(file_name)
     if not path.is_file():
         raise ValueError(f"the file {file_name} does not exist (looked in {path.resolve().parent}).")
     module = _run_file(path)
-    return _found_in(module, str(path), attribute or _only_name(module, file_name))
+    return _problem_in(module, str(path), attribute or _only_name(module, file_name))
 
 
 def _only_name(module, file_name: str) -> str:
-    """The problem that a file alone stands for; where it has others, one line says which was taken."""
+    """The name that a file name alone stands for; a line on the error stream names the other problems of the file."""
     names = _problems_in(module)
     named = [name for name in DEFAULT_NAMES if hasattr(module, name)]
     if len(names) == 1 and not named:
@@ -168,14 +172,14 @@ def _only_name(module, file_name: str) -> str:
             f"it has {', '.join(f'{file_name}:{name}' for name in names)}" if names else f"e.g. {file_name}:my_problem"
         )
         raise ValueError(f"{file_name}: say which problem in that file; {listed}.")
-    others = [f"{file_name}:{name}" for name in names if name != named[0]]
-    if others:
-        print(f"{file_name}: taking {named[0]}; there is also {', '.join(others)}.", file=sys.stderr)
+    not_taken = [f"{file_name}:{name}" for name in names if name != named[0]]
+    if not_taken:
+        print(f"{file_name}: taking {named[0]}; there is also {', '.join(not_taken)}.", file=sys.stderr)
     return named[0]
 
 
 def _problems_in(module) -> list[str]:
-    """Names of the problems and scenes of a module, those that it imported from elsewhere too."""
+    """Names of the problems and scenes in a module, imported ones included."""
     return [name for name, value in vars(module).items() if isinstance(value, Problem | Scene) and name[0] != "_"]
 
 
@@ -185,37 +189,38 @@ def find_scheme(name: str, num_micro: int, compose: str | None = None, **options
     Args:
         name: one of `SCHEMES`.
         num_micro: micro steps per macro step.
-        compose: name of a composition of it, see `vmri_jax.compose`.
+        compose: name of the composition of the scheme, see `vmri_jax.compose`; None for the scheme alone.
         options: alpha, degree, rule, where the scheme has them.
 
     Raises:
-        ValueError: an unknown name, or an option the scheme does not have.
-        TypeError: an option that is needed.
+        ValueError: an unknown name, an option that the scheme does not have, or no degree for galerkin.
     """
     if _dashed(name) not in SCHEMES:
         raise ValueError(_unknown("scheme", name, SCHEMES))
     name, scheme = _dashed(name), SCHEMES[_dashed(name)]
-    given = {key: value for key, value in options.items() if value is not None}
-    for key in given:
+    arguments = {key: value for key, value in options.items() if value is not None}
+    for key in arguments:
         if key not in scheme.options:
-            takers = [other for other, entry in SCHEMES.items() if key in entry.options]
+            takers = [label for label, entry in SCHEMES.items() if key in entry.options]
             raise ValueError(f"the scheme {name} has no {key}; leave --{key} out or use {' or '.join(takers)}.")
-    if name == "galerkin" and "degree" not in given:
+    if name == "galerkin" and "degree" not in arguments:
         raise ValueError("the scheme galerkin needs the degree of its path; give e.g. --degree 2.")
-    made = scheme.factory(num_micro, **given)
+    made = scheme.factory(num_micro, **arguments)
     return made if compose is None else composition.compose(made, compose)
 
 
 def _unknown(kind: str, name: str, known: Collection[str]) -> str:
+    """The message for a name that is not among the known ones."""
     return f"there is no {kind} {name!r}.{near(_dashed(name), known)} There are {', '.join(known)}."
 
 
 def _dashed(name: str) -> str:
-    """A name as it is listed: fully_explicit and Fully-Explicit are fully-explicit."""
+    """The spelling of the tables: fully_explicit and Fully-Explicit become fully-explicit."""
     return name.lower().replace("_", "-")
 
 
 def _run_file(path: Path):
+    """The module of a Python file of the user."""
     name = f"vmri_user_{path.stem}"  # not the bare stem, which may be the name of a module
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -245,10 +250,10 @@ def _import(name: str):
 
 
 def imported(name: str):
-    """What a name of a file or of a package stands for: ``my_file.py:name``, ``my_package.my_module:name``.
+    """The value of ``my_file.py:name`` or ``my_package.my_module:name``.
 
     Raises:
-        ValueError: no such file or package, or no such name in it.
+        ValueError: the file or package does not exist, or does not have the name.
     """
     where, _, attribute = name.partition(":")
     if not where.endswith(".py"):
@@ -259,15 +264,17 @@ def imported(name: str):
 
 
 def _attribute(module, where: str, attribute: str):
-    found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
-    if attribute not in found:
+    """A public value of a module; `where` names the module in messages."""
+    public = {name: value for name, value in vars(module).items() if not name.startswith("_")}
+    if attribute not in public:
         problems = _problems_in(module)
         listed = f" Problems in it: {', '.join(problems)}." if problems else ""
-        raise ValueError(f"{where} has no name {attribute!r}.{near(attribute, found)}{listed}")
-    return found[attribute]
+        raise ValueError(f"{where} has no name {attribute!r}.{near(attribute, public)}{listed}")
+    return public[attribute]
 
 
-def _found_in(module, path: str, attribute: str) -> Problem | Scene:
+def _problem_in(module, path: str, attribute: str) -> Problem | Scene:
+    """The problem or scene with this name in a module; functions are called."""
     problem = _attribute(module, path, attribute)
     if callable(problem) and not isinstance(problem, Problem | Scene):
         try:

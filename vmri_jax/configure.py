@@ -1,6 +1,6 @@
-"""What a program says first: `configure`, the settings of JAX that have to be made before it starts.
+"""`configure`: the settings of JAX that have to be made before JAX starts.
 
-Nothing here happens at import. The command line and the benchmarks configure themselves; a program of your own starts with
+Importing this module changes no setting. The command line and the benchmarks call `configure`; other programs start with
 
     import vmri_jax as vm
 
@@ -21,14 +21,17 @@ FAST_LOOPS = (
     "--xla_cpu_prefer_vector_width=512",
     "--xla_disable_hlo_passes=dot-library-rewriter",
 )
-"""A loop whose buffers are below 100 MB, instead of a few kB, becomes one kernel (3 to 8 times as fast); a load in it is traced
-further back to the store it could be replaced by (short chains 1.4 times); vector registers are filled (long chains 1.3); and
-sums over many lanes stay in the kernel, where a library would do them (batches of high order 2.6). XLA ignores names of passes
-that it does not know."""
+"""Options of XLA for loops of many small operations, with measured gains in speed:
+- loops with buffers below 100 MB, instead of a few kB, become one kernel (3 to 8 times as fast);
+- LLVM searches further back for the store whose value can replace a load (short chains 1.4 times);
+- instructions fill the vector registers (long chains 1.3 times);
+- sums over many lanes stay in the kernel instead of calling a library (batches of high order 2.6 times).
+XLA ignores names of passes that it does not know."""
 SECONDS_WORTH_KEEPING = 0.2
-"""Time to compile from which a program is kept in the cache on disk: reading a file takes some milliseconds. A larger value leaves
-more programs to be compiled by every process, a smaller one fills the folder with programs that are compiled as fast as read."""
-LATER = "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made."
+"""Seconds of compilation from which JAX keeps a program in the cache on disk, well above the milliseconds that reading it takes.
+With a larger value every process compiles more programs itself; a smaller value fills the folder with programs that compile as fast
+as they are read."""
+ALREADY_STARTED = "configure: JAX has already started, its settings can no longer change; call vm.configure() before any array is made."
 
 
 class NotConfiguredWarning(UserWarning):
@@ -39,25 +42,25 @@ def configure(*, fast_loops: bool = True, devices: int | None = None, cache: str
     """Set up JAX for this toolkit: 64-bit floats, and loops that are compiled into one kernel.
 
     Args:
-        fast_loops: compile loops into one kernel. They have many small operations here, and to call a kernel for each costs
-            more than the operation: without, a macro step of a small system takes 2 to 5 times as long. Programs then also
-            run in the thread that calls them, which saves some ten microseconds per call.
+        fast_loops: compile each loop into one kernel. The loops of steppers have many small operations, and a call of a kernel
+            costs more than such an operation: without this option a macro step of a small system takes 2 to 5 times as long.
+            Programs also run in the thread that calls them, which saves some ten microseconds per call.
         devices: number of CPU devices, for `simulate_batch(..., devices=...)`; one device uses one core.
-        cache: folder in which compiled programs are kept between processes; True for `cache_folder()`, unless JAX has a folder
-            already; False or None to leave it as it is. The folder grows with every new program; it may be deleted at any time.
+        cache: folder in which JAX keeps compiled programs between processes; True for `cache_folder()`, unless JAX has a folder
+            already; False or None leave the setting of JAX. The folder grows with every new program; it may be deleted at any time.
 
     Raises:
         RuntimeError: JAX has already started without these settings.
     """
     if fast_loops and not loops_are_fast():
         if _has_started():
-            raise RuntimeError(LATER)
+            raise RuntimeError(ALREADY_STARTED)
         flags = os.environ.get("XLA_FLAGS", "")
-        wanted = [flag for flag in FAST_LOOPS if flag.split("=")[0] not in flags]  # the user's own stay
-        os.environ["XLA_FLAGS"] = " ".join([flags, *wanted]).strip()
+        added = [flag for flag in FAST_LOOPS if flag.split("=")[0] not in flags]  # options that the user has set stay
+        os.environ["XLA_FLAGS"] = " ".join([flags, *added]).strip()
     if devices is not None and devices != _devices():
         if _has_started():
-            raise RuntimeError(LATER)
+            raise RuntimeError(ALREADY_STARTED)
         jax.config.update("jax_num_cpu_devices", devices)
     jax.config.update("jax_enable_x64", True)
     if fast_loops:
@@ -94,22 +97,22 @@ def cache_folder() -> Path:
 
 
 def processor() -> str:
-    """A name of this kind of processor and what it can do: compiled programs serve processors of one kind."""
+    """A name for processors with this instruction set: compiled programs run on processors of one kind only."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        about = sorted({line for line in lines if line.startswith(("model name", "flags", "CPU part", "Features"))})
+        features = sorted({line for line in lines if line.startswith(("model name", "flags", "CPU part", "Features"))})
     except OSError:
-        about = [platform.processor()]
-    return f"{platform.machine()}-{hashlib.sha256(repr(about).encode()).hexdigest()[:8]}"
+        features = [platform.processor()]
+    return f"{platform.machine()}-{hashlib.sha256(repr(features).encode()).hexdigest()[:8]}"
 
 
 def _devices() -> int:
-    """The number of CPU devices that JAX is told to have, -1 if that is not decided."""
+    """The configured number of CPU devices, -1 if none is configured."""
     return jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _has_started() -> bool:
-    """Whether JAX has a backend: it then refuses another number of devices."""
+    """Whether JAX has started a backend: only then JAX refuses another number of devices."""
     devices = _devices()
     try:
         jax.config.update("jax_num_cpu_devices", max(devices, 0) + 1)

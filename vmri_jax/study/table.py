@@ -1,4 +1,4 @@
-"""Result tables: the base of everything that a study, a stability map or a check hands back as rows."""
+"""Result tables: the base class of results with rows, of studies, stability maps and checks."""
 
 import csv
 import json
@@ -17,7 +17,7 @@ from vmri_jax.running.printed import PrintedTable
 
 @dataclass(frozen=True)
 class Column:
-    """One column that a reader sees: its heading, the text of a row in it, and whether it is flush right."""
+    """A column of a printed table: its heading, the function that gives the text of a row, and whether it is flush right."""
 
     name: str
     text: Callable[[Any], str | Text]
@@ -27,8 +27,8 @@ class Column:
 class ResultTable:
     """Rows that can be shown, and written as CSV, JSON and Markdown.
 
-    A subclass is a frozen dataclass with a field `rows`, whose items are dataclasses. It says which `columns` a reader
-    sees; a column that is empty in all rows is left out. Files hold every field of every row.
+    A subclass is a frozen dataclass with a field `rows`, whose items are dataclasses, and with the `columns` of the printed
+    table; a column that is empty in all rows is left out. Files hold every field of every row.
     """
 
     rows: Any
@@ -36,11 +36,11 @@ class ResultTable:
 
     @property
     def caption(self) -> str:
-        """Printed below the table."""
+        """The text below the printed table."""
         return ""
 
     def shown(self) -> Sequence[Any]:
-        """What `table` and `markdown` show, one item per line: the rows, unless a subclass chooses among them."""
+        """The items that `table` and `markdown` print, one per line: the rows, unless a subclass chooses among them."""
         return self.rows
 
     def records(self) -> list[dict[str, Any]]:
@@ -48,11 +48,11 @@ class ResultTable:
         return [asdict(row) for row in self.rows]
 
     def lines(self) -> list[dict[str, Any]]:
-        """The lines of the CSV file: the records, unless a subclass needs longer lists."""
+        """The lines of the CSV file: the records, unless a subclass writes several lines per row."""
         return self.records()
 
     def content(self) -> dict[str, Any]:
-        """What the JSON file holds; a subclass adds what it knows besides the rows."""
+        """The content of the JSON file: the rows; a subclass adds its further fields."""
         return {"rows": self.records()}
 
     def table(self) -> Table:
@@ -73,11 +73,11 @@ class ResultTable:
         return str(self)
 
     def _repr_mimebundle_(self, include=(), exclude=(), **kwargs) -> dict[str, str]:
-        """What notebooks show: the table."""
+        """The representation in notebooks: the table."""
         return self.table()._repr_mimebundle_(include, exclude, **kwargs)
 
     def markdown(self) -> str:
-        """The same table in Markdown."""
+        """The table in Markdown."""
         return markdown_table(self.columns, self.shown())
 
     def to_csv(self, path: str | Path) -> None:
@@ -95,7 +95,7 @@ class ResultTable:
 
 
 def rich_table(columns: Sequence[Column], rows: Sequence[Any], caption: str = "", ruled: bool = False) -> Table:
-    """Rows as a `rich.table.Table`, with lines between them if it is `ruled`."""
+    """Rows as a `rich.table.Table`, with lines between the rows if `ruled`."""
     columns, cells = _filled(columns, rows)
     table = PrintedTable(header_style="bold", caption=caption or None, show_lines=ruled)
     if not ruled:
@@ -124,7 +124,7 @@ def _filled(columns: Sequence[Column], rows: Sequence[Any]) -> tuple[list[Column
 
 
 def _plain(value: Any) -> Any:
-    """The same with nothing that JSON does not know."""
+    """The value in types that JSON knows: NaN becomes None, infinite numbers become strings."""
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""What is reported of run times: ratios with their spread, and the machine that they belong to."""
+"""Reports of run times: ratios with their spread, and the machine on which they were measured."""
 
 import os
 import platform
@@ -28,7 +28,7 @@ class Ratio:
 
     @property
     def inverse(self) -> "Ratio":
-        """The other way around."""
+        """The ratio of the second time to the first."""
         return Ratio(1 / self.value, 1 / self.high, 1 / self.low)
 
 
@@ -47,14 +47,15 @@ def ratio(above: Sequence[float], below: Sequence[float]) -> Ratio:
 def steps_for(run: Callable[[int], object], seconds: float, unit: int = 1, most: int = 10**9) -> int:
     """A multiple of `unit`, at most `most`, for which ``run(steps)`` takes about `seconds`.
 
-    The first call, which compiles, is not counted; and so is what a call costs besides its steps.
+    The first call, which compiles, is not counted. Steps are added until the time of a call is several times the time of a
+    call with `unit` steps, so that the fixed cost of a call does not count either.
     """
     steps = unit
     jax.block_until_ready(run(steps))
-    none = seconds_per_call(lambda: run(unit), 2)
+    shortest = seconds_per_call(lambda: run(unit), 2)
     while True:
         taken = seconds_per_call(lambda n=steps: run(n), 1)
-        if (taken >= seconds / 8 and taken > 3 * none) or taken >= seconds or steps * 4 > most:
+        if (taken >= seconds / 8 and taken > 3 * shortest) or taken >= seconds or steps * 4 > most:
             break
         steps *= 4
     return max(1, min(round(steps * seconds / taken), most) // unit) * unit

@@ -1,4 +1,4 @@
-"""Work and precision: what an error costs in time and in evaluations, run by run, and the best of all runs."""
+"""Work and precision: errors of runs against their time and their evaluations, and the Pareto front of all runs."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -22,22 +22,30 @@ from vmri_jax.study.table import Column, ResultTable
 from vmri_jax.study.timing import interleaved, machine
 
 FINEST_ERROR = 1e-10
-"""Ladders of steps end below this error, or where the reference is no better."""
+"""Error of positions below which a ladder of steps ends; a smaller value adds finer runs, which round-off may spoil."""
 SLOWEST = 2.0
-"""Ladders of steps end with a run of so many seconds."""
+"""Seconds of a run after which a ladder of steps ends; a larger value adds slower runs."""
+RESOLVED_ERROR = 1e-6
+"""Error of positions from which a ladder ends when errors stop falling; a larger value may end it at steps that resolve nothing yet."""
+LEAST_GAIN = 1.5
+"""Ratio of the least error so far to the next error below which errors have stopped falling; a larger ratio ends ladders earlier."""
 
 
 @dataclass(frozen=True)
 class WorkRow:
-    """One run: its error and what it costs.
+    """One run: its errors, its time and its evaluations.
 
+    scheme: label.
     error_q, error_p: largest error over the compared nodes, see `ReferenceSolution`.
-    seconds, low, high: median and quartiles of the wall time of the run, compiled before.
-    compile_seconds: of the program, which all runs of the scheme share.
-    slow_evaluations, fast_evaluations, solves: gradients of V and of W and systems of equations in the whole run, one
-        pass of a solve evaluating once; counted from the scheme and the passes that the run reports.
-    stages, degree: of the scheme.
-    evaluations: gradients of the further potentials of the system by name.
+    seconds, low, high: median and quartiles of the wall time of the run, without compiling.
+    compile_seconds: time to compile the program that all runs of the scheme share.
+    slow_evaluations, fast_evaluations: evaluations of the gradients of V and of W in the whole run, counted from the scheme
+        and the Newton passes that the run reports, one evaluation per pass.
+    solves: systems of equations solved in the whole run.
+    iterations: most Newton iterations of a step.
+    method, result: names of the costliest `Method` and of the `Result`.
+    stages, degree: stages of the composition, and degree of the path.
+    evaluations: evaluations of the gradients of further potentials, by name.
     """
 
     scheme: str
@@ -62,13 +70,13 @@ class WorkRow:
     evaluations: Mapping[str | int, int] = field(default_factory=dict)
 
     def timed(self, seconds: Sequence[float]) -> "WorkRow":
-        """The same with the median and the quartiles of these samples."""
+        """The row with the median and the quartiles of these samples."""
         low, middle, high = (float(x) for x in np.quantile(seconds, (0.25, 0.5, 0.75)))
         return replace(self, seconds=middle, low=low, high=high)
 
 
 def duration(seconds: float) -> str:
-    """With a unit: 12 µs, 3.4 ms, 1.2 s."""
+    """A time with its unit: 12 µs, 3.4 ms, 1.2 s."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"
@@ -77,7 +85,7 @@ def duration(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class WorkPrecision(ResultTable):
-    """Rows of one comparison and the reference they were held against; its table is the Pareto front."""
+    """Rows of one comparison, with the reference solution that errors are measured against; its table is the Pareto front."""
 
     columns = (
         Column("scheme", lambda row: row.scheme),
@@ -116,7 +124,7 @@ class WorkPrecision(ResultTable):
         return front
 
     def cheapest(self, error: float, scheme: str | None = None) -> WorkRow | None:
-        """The fastest run (of a scheme) with at most this error of the positions, None if there is none."""
+        """The fastest run (of one scheme) with at most this error of the positions; None if no run keeps it."""
         rows = [r for r in self.rows if r.error_q <= error and scheme in (None, r.scheme)]
         return min(rows, key=lambda row: row.seconds, default=None)
 
@@ -145,7 +153,7 @@ def _record(row: WorkRow) -> dict[str, Any]:
 
 
 def work_row(name: str, program: Program, num_steps: int, reference: ReferenceSolution) -> WorkRow:
-    """Run the program and say what it gave and cost; not timed."""
+    """Run the program; the row has its errors and evaluations, and NaN for its time."""
     trajectory, scheme = program(num_steps), program.scheme
     error_q, error_p = reference.errors(trajectory)
     cost, passes = scheme.describe(), np.maximum(np.asarray(trajectory.info.iterations), 1)
@@ -196,27 +204,28 @@ def work_precision(
 ) -> WorkPrecision:
     """Error against wall time and evaluations for every scheme over a ladder of macro steps.
 
-    Every scheme is compiled once. The errors of all runs are found first; then the runs take turns on the clock, so that
-    a slow moment of the machine hits all of them, and the median is kept. A run that fails is a row of NaN.
+    Every scheme is compiled once. All runs are made once for their errors; then they take turns on the clock, so that a
+    slow moment of the machine hits all of them; a row has the median. A run that fails is a row of NaN.
 
     Args:
         problem: system and start; a `Problem` or a scene.
         schemes: schemes by label.
         t_end: simulated time.
-        num_steps: numbers of macro steps, multiples of `num_saves`; by default doubled from the step at which the fastest
-            vibration begins to be seen until the error falls no more or is below 1e-10, or a run takes two seconds.
+        num_steps: numbers of macro steps, multiples of `num_saves`; by default the first has micro steps of
+            ``degree / omega`` with the fastest angular frequency omega, and the number doubles until the error no longer falls
+            or is below 1e-10, or a run takes two seconds.
         num_saves: nodes compared, equally spaced.
-        reference: compare with this; by default `reference_solution`.
+        reference: the solution that errors are measured against; by default `reference_solution`.
         solver: how implicit equations are solved.
         repeats: timed samples of every run.
-        executor: where runs are computed and timed, a task for each scheme, as of `vmri_jax.ensemble`. Times are then those
-            of the workers, and only runs of one scheme take turns: for times give each worker a core of its own. None for
-            this process.
+        executor: where runs are computed and timed, a task for each scheme, as of `vmri_jax.ensemble`; None for this
+            process. Workers measure the times on their machines, and only runs of one scheme take turns: each worker
+            needs a core of its own for its times to count.
         progress: True for a bar, or a function (what, done, total) that is told about every run.
 
     Raises:
         ValueError: no scheme, or numbers of steps that are no multiples of num_saves.
-        Interrupted: Ctrl-C; carries the runs that were done, with the time of one call where their turn had not come.
+        Interrupted: Ctrl-C; carries the runs that were done; a run whose turn had not come has the time of one call.
     """
     problem = problem_of("work_precision", problem)
     if not schemes:
@@ -236,13 +245,13 @@ def work_precision(
         if executor is None:
             for i, ladder in enumerate(ladders):
                 for run in _climbed(ladder, lambda n, i=i: progress(f"{ladders[i].label}, {n} steps", i, total)):
-                    runs.append(run)
+                    runs.append(run)  # one by one, so that Ctrl-C keeps the runs of an unfinished ladder
             progress("measuring times", len(schemes), total)
             rows = timed_in_turn(runs, repeats)
         else:
-            timed = [(ladder, repeats) for ladder in ladders]
-            told = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
-            rows = [row for part in mapped("work_precision", _timed, timed, executor, told) for row in part]
+            tasks = [(ladder, repeats) for ladder in ladders]
+            report = lambda done, i: progress(ladders[i].label, done, total)  # noqa: E731
+            rows = [row for part in mapped("work_precision", _timed, tasks, executor, report) for row in part]
     except Interrupted as stopped:
         rows = [row for part in stopped.done if part is not None for row in part]
         raise Interrupted(WorkPrecision(tuple(rows), t_end, reference), len(rows), None, "runs") from None
@@ -254,7 +263,7 @@ def work_precision(
 
 
 class _Ladder(NamedTuple):
-    """Runs of one scheme with fewer and with more steps."""
+    """A ladder of runs of one scheme over numbers of macro steps; `num_steps` None doubles them until `_goes_on` ends it."""
 
     problem: Problem
     label: str
@@ -267,35 +276,37 @@ class _Ladder(NamedTuple):
     frequency: float
 
 
-def _climbed(ladder: _Ladder, told: Callable[[int], None] = lambda _: None) -> Iterator[tuple[Program, WorkRow]]:
-    """All runs of a ladder, one after the other, with the time of one call each."""
+def _climbed(ladder: _Ladder, report: Callable[[int], None] = lambda _: None) -> Iterator[tuple[Program, WorkRow]]:
+    """All runs of a ladder, one after the other, each with the time of one call; `report` gets their numbers of steps."""
     program = Program(ladder.problem, ladder.scheme, ladder.t_end, ladder.num_saves, ladder.solver)
     per_save = ladder.frequency * ladder.t_end / ladder.scheme.num_micro / ladder.scheme.degree / ladder.num_saves
-    left, seen = list(ladder.num_steps or [ladder.num_saves * max(1, int(per_save))]), []
-    while left:
-        n = left.pop(0)
-        told(n)
+    queue, rows = list(ladder.num_steps or [ladder.num_saves * max(1, int(per_save))]), []
+    while queue:
+        n = queue.pop(0)
+        report(n)
         seconds = program.seconds(n, 1, 0.0)
-        seen.append(work_row(ladder.label, program, n, ladder.reference).timed(seconds))
-        yield program, seen[-1]
-        if ladder.num_steps is None and _goes_on(seen, ladder.reference):
-            left = [2 * n]
+        rows.append(work_row(ladder.label, program, n, ladder.reference).timed(seconds))
+        yield program, rows[-1]
+        if ladder.num_steps is None and _goes_on(rows, ladder.reference):
+            queue = [2 * n]
 
 
 def _timed(ladder: _Ladder, repeats: int) -> list[WorkRow]:
-    """The rows of a ladder."""
+    """The rows of a ladder, timed in turn."""
     return timed_in_turn(list(_climbed(ladder)), repeats)
 
 
 def timed_in_turn(runs: Sequence[tuple[Program, WorkRow]], repeats: int) -> list[WorkRow]:
-    """The rows, those that did not fail with the times of runs that took turns."""
+    """The rows with the medians of `repeats` runs that took turns; a row of a failed run stays as it is."""
     calls = {str(i): program.timed(row.num_steps) for i, (program, row) in enumerate(runs) if np.isfinite(row.error_q)}
     samples = interleaved(calls, repeats)
     return [row.timed(samples[str(i)]) if str(i) in samples else row for i, (_, row) in enumerate(runs)]
 
 
 def _goes_on(rows: Sequence[WorkRow], reference: ReferenceSolution) -> bool:
-    """Whether twice the steps of the last run may bring something."""
-    last, before = rows[-1], [row.error_q for row in rows[:-1] if np.isfinite(row.error_q)]
-    stands = before and min(before) < 1e-6 and not last.error_q < min(before) / 1.5
-    return not (last.error_q < max(FINEST_ERROR, reference.error_q) or last.seconds > SLOWEST or stands)
+    """Whether twice the steps of the last run may give a smaller error in acceptable time."""
+    last, errors = rows[-1], [row.error_q for row in rows[:-1] if np.isfinite(row.error_q)]
+    least = min(errors, default=np.inf)
+    stopped_falling = least < RESOLVED_ERROR and not last.error_q < least / LEAST_GAIN  # true for NaN, too
+    reached = last.error_q < max(FINEST_ERROR, reference.error_q)
+    return not (reached or last.seconds > SLOWEST or stopped_falling)
