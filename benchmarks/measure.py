@@ -1,14 +1,53 @@
 """Before anything is measured: the process keeps to one core, and JAX is told how to compile."""
 
 import os
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from vmri_jax.configure import cache_folder, configure
 from vmri_jax.study.timing import Ratio, Tell, interleaved, machine, ratio, silent, steps_for
 
-__all__ = ["Ratio", "Tell", "interleaved", "machine", "pin", "prepare", "quartiles", "ratio", "silent", "steps_for"]
+__all__ = [
+    "Ratio",
+    "Size",
+    "Tell",
+    "interleaved",
+    "machine",
+    "pin",
+    "prepare",
+    "quartiles",
+    "ratio",
+    "silent",
+    "steps_for",
+]
+
+
+Case = TypeVar("Case")
+
+
+@dataclass(frozen=True)
+class Size(Generic[Case]):
+    """The cases of a benchmark, and the clock of its times.
+
+    shared: other processes share the core, so that times are processor times, not wall times.
+    """
+
+    cases: list[Case]
+    shared: bool = False
+
+    @property
+    def clock(self) -> Callable[[], float]:
+        """The clock, in seconds."""
+        return time.process_time if self.shared else time.perf_counter
+
+    @property
+    def clock_name(self) -> str:
+        """The kind of times, for reports."""
+        return "processor time" if self.shared else "wall time"
 
 
 def quartiles(samples: Sequence[float], scale: float = 1.0) -> Ratio:

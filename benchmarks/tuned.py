@@ -1,6 +1,5 @@
 """What a run of an accuracy costs over the best setting that the search over all schemes finds for the same error."""
 
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 import vmri_jax as vm
 from benchmarks import errors
 from benchmarks.dear.systems import molecules
-from benchmarks.measure import Tell, ratio, silent
+from benchmarks.measure import Size, Tell, ratio, silent
 from benchmarks.report import Claim, Report
 from vmri_jax.accuracy.companions import UncertifiedWarning
 from vmri_jax.accuracy.steps import AccuracyNotReached
@@ -56,15 +55,7 @@ class Case:
     menu: tuple[str, ...] | None = None
 
 
-@dataclass(frozen=True)
-class Size:
-    """Cases, and whether times are those of the processor."""
-
-    cases: list[Case]
-    shared: bool = False
-
-
-def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size:
+def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size[Case]:
     """ "quick": two systems and four families of schemes; "full": eight systems and all families.
 
     Args:
@@ -98,14 +89,13 @@ def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size:
     return Size(cases, shared)
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(size: Size[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each case."""
-    clock = time.process_time if size.shared else time.perf_counter
     rows, notes = [], []
     for case in size.cases:
         tell(f"{case.system}, {case.error:g}")
         try:
-            rows.append(_row(case, clock))
+            rows.append(_row(case, size.clock))
         except (NothingReached, ValueError) as refused:
             notes.append(f"{case.system}, {case.error:g}: {refused}")
         ratios = [row["ratio"] for row in rows]
@@ -118,7 +108,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
                     at_most=AT_MOST,
                 )
             )
-        about = {"clock": "processor time" if size.shared else "wall time"}
+        about = {"clock": size.clock_name}
         yield Report("tuned", name, list(rows), claims, list(notes), about=about)
 
 

@@ -1,4 +1,4 @@
-"""The whole method on one page: variational multirate integration as in a textbook, without any speed.
+"""The whole method on one page: variational multirate integration as in a textbook, written for reading, not for speed.
 
 A macro step of length H carries a slow polynomial of degree r, and one fast polynomial of degree r on each of its ``num_micro``
 micro intervals. Both go through control points at Gauss-Lobatto nodes, S_0..S_r and F_0..F_{num_micro r}. The discrete
@@ -6,7 +6,8 @@ Lagrangian is a sum over the terms of the Lagrangian, each at the nodes of its o
 
     L_d(S, F) = sum over terms, over nodes i:  H w_i term(q(theta_i), qdot(theta_i)),
 
-and constraints are held at the control nodes by multipliers, which have absorbed their weights, in the augmented action
+and multipliers hold the constraints at the control nodes. With the quadrature weights absorbed in the multipliers the augmented
+action is
 
     A = L_d - sum_j lambda_j . g(node j) - sum_i nu_i . g_s(S_i)              (all control nodes but the last).
 
@@ -14,9 +15,9 @@ A step solves, from the momenta p at its start,
 
     p + D_first A = 0,    D_inner A = 0,    g = 0 and g_s = 0 at all control nodes but the first,
 
-and ends with ``p+ = D_last A``, projected onto the hidden constraints ``G v + dg/dt = 0``. Kicks (rules with nodes at the ends of the
-step), forces and compositions need nothing else. The steppers that `vmri_jax.simulate` takes solve the same equations faster;
-they are tested against this page. Source: Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991.
+and ends with ``p+ = D_last A``, projected onto the hidden constraints ``G v + dg/dt = 0``. Kicks are rules with nodes at the ends of
+the step; forces enter by their virtual work, and a composition is a sequence of steps. The steppers of `vmri_jax.simulate` solve the
+same equations faster; tests compare them with this page. Source: Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991.
 """
 
 from collections.abc import Callable
@@ -36,7 +37,11 @@ from vmri_jax.schemes.scheme import Scheme
 
 
 class Unknowns(NamedTuple):
-    """Unknowns of a step: control points but the first, (r, n_s) and (num_micro r, n_f), and as many multipliers."""
+    """Unknowns of a step: all control points but the first, and the multipliers at all control nodes but the last.
+
+    slow, fast: (r, n_s) and (num_micro r, n_f).
+    multiplier, slow_multiplier: (num_micro r, n_g) and (r, n_gs).
+    """
 
     slow: Any
     fast: Any
@@ -45,7 +50,7 @@ class Unknowns(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Position and velocity of the path at the nodes of a rule, and the weights (k,) of the nodes."""
+    """Positions and velocities (k, n) of the path at the k nodes theta of a rule, and the weights (k,) of the nodes."""
 
     theta: Any
     q_s: Any
@@ -65,7 +70,7 @@ def lagrange_polynomials(scheme: Scheme) -> list[Polynomial]:
 def quadrature_nodes(placed: PlacedRule, num_micro: int):
     """Nodes theta_i in [0, 1], the micro interval in which each lies, and weights.
 
-    A node where two micro intervals meet belongs to both of them: there the fast velocity has two values.
+    Where two micro intervals meet, each copy of a rule on the micro grid has a node of its own, because the fast velocity has two values there.
     """
     nodes = np.array(placed.rule.nodes)
     if placed.grid == "macro":
@@ -83,12 +88,14 @@ def sample(scheme: Scheme, placed: PlacedRule, slow, fast, macro_dt) -> Samples:
     r, n, basis = scheme.degree, scheme.num_micro, lagrange_polynomials(scheme)
     theta, interval, weights = quadrature_nodes(placed, n)
     local = theta * n - interval
-    points = fast[interval[:, None] * r + np.arange(r + 1)]  # (k, r + 1, n_f): those of the micro interval of each node
+    # (k, r + 1, n_f): fast control points of the micro interval in which each node lies
+    points = fast[interval[:, None] * r + np.arange(r + 1)]
     slopes = [polynomial.deriv() for polynomial in basis]
 
-    def values(polynomials, at):
-        return np.stack([polynomial(at) for polynomial in polynomials], axis=1)
+    def values(polynomials, arguments):
+        return np.stack([polynomial(arguments) for polynomial in polynomials], axis=1)
 
+    # q_s(theta) = sum_j l_j(theta) S_j and its derivative by t = H theta; the fast path alike, on intervals of length H / num_micro
     return Samples(
         theta,
         values(basis, theta) @ slow,
@@ -109,12 +116,12 @@ def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
     """
 
     def action(placed, term):
-        at = sample(scheme, placed, slow, fast, macro_dt)
-        return macro_dt * jnp.sum(at.weights * jax.vmap(term)(at.q_s, at.q_f, at.v_s, at.v_f))
+        path = sample(scheme, placed, slow, fast, macro_dt)
+        return macro_dt * jnp.sum(path.weights * jax.vmap(term)(path.q_s, path.q_f, path.v_s, path.v_f))
 
     slow_potential, fast_potential = potentials(system, scheme, macro_dt)
     T, T_s = system.kinetic, system.slow_kinetic
-    if T_s is not None:  # on the macro grid
+    if T_s is not None:  # T_s(q_s, v_s) has a rule on the macro grid; T.function is the kinetic energy without it
         T = T.function
     kinetic = action(scheme.kinetic, lambda q_s, q_f, v_s, v_f: T(q_s, q_f, v_s, v_f, system.params))
     if T_s is not None:
@@ -127,7 +134,12 @@ def discrete_lagrangian(system: System, scheme: Scheme, slow, fast, macro_dt):
 
 
 def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Callable]:
-    """V and W as functions of (q_s, q_f); a corrected one is less a square of gradients, see `quadrature.gradient_corrected`."""
+    """V and W as functions of (q_s, q_f), corrected where their rules are, see `quadrature.gradient_corrected`:
+
+        V - H^2 / 24 V_q M^-1 V_q - h^2 / 12 V_q M^-1 W_q,    W - h^2 / 24 W_q M^-1 W_q,
+
+    where the mixed term appears only if both rules are corrected.
+    """
     micro_dt = macro_dt / scheme.num_micro
 
     def V(q_s, q_f):
@@ -152,9 +164,10 @@ def potentials(system: System, scheme: Scheme, macro_dt) -> tuple[Callable, Call
 
 def virtual_work(system: System, scheme: Scheme, path, along, t, macro_dt):
     """Lagrange-d'Alembert: ``sum H w_i F(t_i, q_i, v_i) . q_i``, with the forces along one path and q_i on another."""
-    at, q = (sample(scheme, scheme.force, slow, fast, macro_dt) for slow, fast in (along, path))
-    f_s, f_f = jax.vmap(system.forces)(t + macro_dt * at.theta, at.q_s, at.q_f, at.v_s, at.v_f)
-    return macro_dt * (jnp.sum(q.weights[:, None] * f_s * q.q_s) + jnp.sum(q.weights[:, None] * f_f * q.q_f))
+    known, varied = (sample(scheme, scheme.force, slow, fast, macro_dt) for slow, fast in (along, path))
+    f_s, f_f = jax.vmap(system.forces)(t + macro_dt * known.theta, known.q_s, known.q_f, known.v_s, known.v_f)
+    weights = varied.weights[:, None]
+    return macro_dt * (jnp.sum(weights * f_s * varied.q_s) + jnp.sum(weights * f_f * varied.q_f))
 
 
 def constraints(system: System, scheme: Scheme, slow, fast, t, macro_dt):
@@ -166,9 +179,10 @@ def constraints(system: System, scheme: Scheme, slow, fast, t, macro_dt):
 
 
 def solver(residual: Callable, guess, max_iterations: int = 50):
-    """The root of ``residual(x)`` with shapes as x, by Newton's method; NaN where it does not converge.
+    """The root of ``residual(x)``, with the shapes of `guess`, by Newton's method; NaN where the method does not converge.
 
-    Goes on until a change is below 1e-9 of x, and then once more, to round-off. Differentiable by the implicit function theorem.
+    The method iterates until a change is below 1e-9 of x, and then once more, which reaches round-off. The root can be
+    differentiated, by the implicit function theorem.
     """
     start, unravel = ravel_pytree(guess)
 
@@ -178,7 +192,7 @@ def solver(residual: Callable, guess, max_iterations: int = 50):
     def solve(residual, x):
         def iteration(carry):
             x, _, last_change, k = carry
-            change = jnp.linalg.solve(jax.jacfwd(residual)(x), residual(x))
+            change = jnp.linalg.solve(jax.jacfwd(residual)(x), residual(x))  # full Jacobian, at every x
             size = jnp.max(jnp.abs(change)) / (jnp.max(jnp.abs(x)) + 1e-300)
             return x - change, last_change, size, k + 1
 
@@ -203,6 +217,7 @@ def project(system: System, state: State, v_s, v_f):
     t, q_s, q_f = state.t, state.q_s, state.q_f
     values, pull = jax.vjp(lambda q_s, q_f: system.constraints(t, q_s, q_f), q_s, q_f)
 
+    # unknowns v and mu:  dT/dv(q, v) + G^T mu = p,    G v + dg/dt = 0
     def residual(x):
         v_s, v_f, mu = x
         p_s, p_f = jax.grad(system.kinetic, argnums=(2, 3))(q_s, q_f, v_s, v_f, system.params)
@@ -219,8 +234,9 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
     """One macro step; the state is NaN where Newton's method does not converge.
 
     Args:
-        system, scheme: what moves, and how.
-        state: a consistent state, from `vmri_jax.initial_state` or a former step.
+        system: the mechanical system.
+        scheme: the scheme, or a composition, whose stages are steps one after the other.
+        state: a consistent state, from `vmri_jax.initial_state` or an earlier step.
         macro_dt: length H of the macro step.
 
     Raises:
@@ -237,7 +253,7 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
         return jnp.concatenate([state.q_s[None], x.slow]), jnp.concatenate([state.q_f[None], x.fast])
 
     def action(path, along, x: Unknowns):
-        """A times h, which keeps Newton's matrix of the size of masses and constraint Jacobians whatever the step size."""
+        """A times h: Newton's matrix then has entries of the size of masses and constraint Jacobians at every step size."""
         slow, fast = path
         g, g_slow = constraints(system, scheme, slow, fast, t, macro_dt)
         free = discrete_lagrangian(system, scheme, slow, fast, macro_dt)
@@ -245,9 +261,10 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
         return micro_dt * free - jnp.sum(x.multiplier * g[:-1]) - jnp.sum(x.slow_multiplier * g_slow[:-1])
 
     def slots(x: Unknowns):
-        """h D A by every slow and by every fast control point."""
+        """h D A: derivatives by every slow and every fast control point, with the forces of the path held fixed."""
         return jax.grad(action)(path(x), path(x), x)
 
+    # h (p + D_first A) = 0,    h D_inner A = 0,    g = 0 and g_s = 0 at all control nodes but the first
     def residual(x: Unknowns) -> Unknowns:
         d_slow, d_fast = slots(x)
         g, g_slow = constraints(system, scheme, *path(x), t, macro_dt)
@@ -259,6 +276,7 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
         np.array(rule.nodes)[1:, None] for rule in (scheme.constraint.composite(n), scheme.slow_constraint.rule)
     )
     n_g, n_gs = system.num_constraints(state.q_s, state.q_f)
+    # Newton's method starts from uniform motion, with the velocity that belongs to p
     straight = state.q_s + macro_dt * slow_theta * v_s, state.q_f + macro_dt * theta * v_f
     x = solver(residual, Unknowns(*straight, jnp.zeros((n * r, n_g)), jnp.zeros((r, n_gs))))
     d_slow, d_fast = slots(x)
@@ -267,7 +285,7 @@ def step(system: System, scheme: Scheme | Composition, state: State, macro_dt) -
 
 
 def check(system: System, scheme: Scheme) -> None:
-    """Refuse what this page leaves out."""
+    """Refuse schemes that this page leaves out."""
     if scheme.slow.mollified:
         raise ValueError(
             "textbook.step: the slow potential of this scheme is mollified, which the textbook leaves out; "
@@ -287,4 +305,4 @@ def simulate(system: System, scheme: Scheme | Composition, state: State, macro_d
         return state, state
 
     later = jax.lax.scan(go_on, state, length=num_steps)[1]
-    return jax.tree.map(lambda first, rest: jnp.concatenate([jnp.asarray(first)[None], rest]), state, later)
+    return jax.tree.map(lambda start, ends: jnp.concatenate([jnp.asarray(start)[None], ends]), state, later)

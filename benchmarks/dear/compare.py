@@ -15,7 +15,7 @@ from benchmarks.dear.figures import draw_errors, draw_gains
 from benchmarks.dear.peers import FIXED_STEPS, PEERS, chosen
 from benchmarks.dear.spacecraft import spacecraft
 from benchmarks.dear.systems import MIDDLE, molecules, teacher
-from benchmarks.measure import Ratio, Tell, silent
+from benchmarks.measure import Ratio, Size, Tell, silent
 from benchmarks.report import Claim, Report
 from benchmarks.savings import ratio_at
 from vmri_jax import plots
@@ -68,15 +68,7 @@ class Case:
     peers: bool = True
 
 
-@dataclass(frozen=True)
-class Size:
-    """Cases, and whether times are those of the processor."""
-
-    cases: list[Case]
-    shared: bool = False
-
-
-def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size:
+def sizes(name: str, only: Sequence[str] = (), shared: bool = False) -> Size[Case]:
     """ "quick": 8 molecules, and the spacecraft in a field of degree 20; "full": 8 to 256 molecules, the teacher, and the spacecraft.
 
     Args:
@@ -131,9 +123,9 @@ class Gain:
     bound: float
 
 
-def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
+def run(size: Size[Case], name: str, tell: Tell = silent) -> Iterator[Report]:
     """A report after each system."""
-    clock = time.process_time if size.shared else time.perf_counter
+    clock = size.clock
     rows, claims, notes, curves, gains = [], [], [], {}, []
     for case in size.cases:
         problem = case.problem()
@@ -156,7 +148,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         for suffix, theme in (("", plots.LIGHT), ("_dark", plots.DARK)):
             figures[f"dear{suffix}"] = partial(draw_errors, dict(curves), list(gains), TARGET, theme)
             figures[f"dear_gain{suffix}"] = partial(draw_gains, list(gains), theme)
-        about = {"clock": "processor time" if size.shared else "wall time", "gains": [vars(gain) for gain in gains]}
+        about = {"clock": size.clock_name, "gains": [vars(gain) for gain in gains]}
         yield Report("dear", name, list(rows), list(claims), list(notes), figures, about)
 
 

@@ -7,11 +7,11 @@ from vmri_jax.mechanics.names import Names
 from vmri_jax.mechanics.state import Problem
 from vmri_jax.mechanics.system import ConstantMass, System
 
-TETRAHEDRON = np.sqrt(np.array([1 / 3, 1 / 12, 2 / 3]))  # for unit edges: radius, inradius of a face; height
+TETRAHEDRON = np.sqrt(np.array([1 / 3, 1 / 12, 2 / 3]))  # with unit edges: circumradius and inradius of a face, height
 
 
 def length_change(a, b, length):
-    """Change of the distance of two atoms, or of each of some pairs (n, 3)."""
+    """Distance of atoms a and b less `length`, for one pair (3,) or for n pairs (n, 3)."""
     return jnp.linalg.norm(b - a, axis=-1) - length
 
 
@@ -47,7 +47,7 @@ def simple_atomic_model(
 ) -> Problem:
     """Simple atomic model in R^3: (q_1, q_2) slow, (q_3, ..., q_6) fast; hanging, atoms 2 to 5 a regular tetrahedron.
 
-    The initial velocities are given before their projection onto the bonds.
+    The velocities of this problem do not satisfy the bonds: `Problem.state` projects them.
 
     Args:
         masses: of the six atoms.
@@ -56,7 +56,7 @@ def simple_atomic_model(
         gravity: acceleration along -z.
     """
     radius, inradius, height = length * TETRAHEDRON
-    top = -2 * length - height  # of the face 3-4-5 below atom 2
+    top = -2 * length - height  # z of the face 3-4-5, below atom 2
     q_s = np.array([0.0, 0.0, -length, 0.0, 0.0, -2 * length])
     q_f = np.array(
         [
