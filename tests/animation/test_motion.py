@@ -9,6 +9,7 @@ import pytest
 import vmri_jax as vm
 from tests.animation.support import PENDULUM, swinging, trajectory
 from vmri_jax.animation import Drawing, motion
+from vmri_jax.scene import Body, Scene, Spring
 
 LINE = Drawing.from_dict(
     {"bodies": [{"name": "a", "coordinates": [["s", 0]]}, {"name": "b", "coordinates": [["f", 0]]}]}
@@ -54,6 +55,18 @@ def test_nodes_are_met_and_times_beyond_the_ends_are_held():
     np.testing.assert_allclose(moved.at([-1.0, 99.0]), moved.points[[0, -1]], atol=1e-14)
     assert np.abs(moved.energy).max() == pytest.approx(5e-4, rel=1e-2)
     assert moved.relative
+
+
+def test_scenes_and_problems_stand_for_their_drawings():
+    scene = Scene([Body("bob", 1.0, [1.0, 0.0])], [Spring(("bob", ("ground", [0.0, 0.0])), 10.0)])
+    run = vm.simulate(scene, vm.fully_implicit(1), macro_dt=0.01, num_steps=2)
+    drawing = Drawing.from_dict(scene.drawing())
+    for shown in (scene, scene.problem(), scene.drawing(), drawing):
+        assert motion(run, shown).drawing.bodies == drawing.bodies
+    unseen = dataclasses.replace(scene.problem(), drawing=None)
+    assert [body.name for body in motion(run, unseen).drawing.bodies] == ["bob x", "bob y"]
+    with pytest.raises(TypeError, match="drawing is int; give the scene or the problem of the run, or a Drawing"):
+        motion(run, 3)  # pyright: ignore[reportArgumentType]
 
 
 def test_micro_nodes_are_nodes_where_the_run_kept_all_of_them():

@@ -161,9 +161,33 @@ def test_molecules(capsys):
     assert bool(scope["runs"].success.all())
 
 
-def test_an_effect_of_ones_own(capsys):
-    exec(next(program for program in PROGRAMS if "def magnet" in program), {})
-    assert re.search(r"the ball is at 0\.\d\d", capsys.readouterr().out)
+def test_effects_of_ones_own(capsys):
+    """A function, then a class, in one namespace: they print what the page says."""
+    page = (ROOT / "docs/how_to/effects.md").read_text()
+    scope = {"__name__": "effects"}
+    for program, shown in zip(
+        programs("docs/how_to/effects.md"), re.findall(r"```text\n(.*?)```", page, re.DOTALL), strict=True
+    ):
+        exec(program, scope)
+        assert capsys.readouterr().out == shown
+
+
+def test_the_error_of_a_point(capsys):
+    """The program of the page on accuracy with a hinge: it prints what the page says."""
+    page = (ROOT / "docs/how_to/accuracy.md").read_text()
+    exec(next(program for program in programs("docs/how_to/accuracy.md") if "hinge" in program), {"vm": vm})
+    assert f"`{capsys.readouterr().out.strip()}`" in page
+
+
+def test_a_run_of_a_scene_is_animated(tmp_path, monkeypatch):
+    """The second program of the page on scenes, beside the first one in a file; with a tenth of the steps."""
+    scene, animation = programs("docs/how_to/scenes.md")[:2]
+    (tmp_path / "my_scene.py").write_text(scene)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    exec(animation.replace("num_steps=300", "num_steps=30"), {})
+    assert (tmp_path / "run.html").stat().st_size > 50_000
+    assert (tmp_path / "run.png").stat().st_size > 10_000
 
 
 MADE = ("gallery/", "tutorials/0")

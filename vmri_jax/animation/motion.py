@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +11,10 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from vmri_jax import diagnostics
-from vmri_jax.animation.bars import with_bars
+from vmri_jax.animation.bars import bars, with_bars
 from vmri_jax.animation.drawing import Drawing
 from vmri_jax.mechanics.checks import check_type
+from vmri_jax.mechanics.state import HasProblem, Problem, opened
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.trajectory import Trajectory
@@ -98,8 +100,10 @@ class Motion:
         )
 
 
-def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = None) -> Motion:
-    """The motion of a drawing along a run, up to a failure of the run.
+def motion(
+    trajectory: Trajectory, drawing: Drawing | Problem | HasProblem | dict, system: System | None = None
+) -> Motion:
+    """The motion of a drawing along a run, up to a failure of the run: ``write_html(motion(run, scene), "run.html")``.
 
     Velocities at the nodes follow from the momenta if the system is known, else from central differences. If the run kept the
     micro nodes of all its macro steps, they are nodes as well; without the system, fast velocities are then the derivatives of a
@@ -107,7 +111,8 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
 
     Args:
         trajectory: one run, of at least one node.
-        drawing: of the system that was simulated.
+        drawing: of the system that was simulated. A scene or a problem stands for its drawing, a problem without a drawing for a bar
+            for each coordinate, a dictionary for `Drawing.from_dict` of it.
         system: the system that was simulated; None for the system that the run carries, if it does.
 
     Raises:
@@ -117,12 +122,7 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
         raise ValueError(
             f"motion: the trajectory is a batch of shape {np.shape(trajectory.t)[:-1]}; give one run of it."
         )
-    check_type(
-        "motion: drawing",
-        drawing,
-        Drawing,
-        "a Drawing, e.g. Drawing.from_dict(problem.drawing), or scene.drawing() in place of problem.drawing",
-    )
+    drawing = _drawing(trajectory, drawing)
     system = system or (trajectory.origin.system() if trajectory.origin.knows_system else None)
     q_s, q_f, t = (np.asarray(a, dtype=float) for a in (trajectory.states.q_s, trajectory.states.q_f, trajectory.t))
     finite = np.isfinite(np.concatenate([q_s, q_f, t[:, None]], axis=1)).all(axis=1)
@@ -153,6 +153,17 @@ def motion(trajectory: Trajectory, drawing: Drawing, system: System | None = Non
         np.stack([np.interp(t, nodes, column) for column in residual.T], axis=1),
         _ending(trajectory, count),
     )
+
+
+def _drawing(trajectory: Trajectory, shown: Any) -> Drawing:
+    """The drawing of a scene, a problem, or plain data; of a problem without a drawing, a bar for each coordinate."""
+    shown = opened(shown)
+    if isinstance(shown, Problem):
+        shown = shown.drawing or bars(trajectory)
+    if isinstance(shown, dict):
+        shown = Drawing.from_dict(shown)
+    check_type("motion: drawing", shown, Drawing, "the scene or the problem of the run, or a Drawing")
+    return shown
 
 
 def _energies(trajectory: Trajectory, count: int, system: System | None) -> tuple[dict[str, np.ndarray], bool]:
