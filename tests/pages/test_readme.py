@@ -69,7 +69,7 @@ def test_scenes_run():
     """Points and springs, then rigid bodies and a hinge, one after the other as they stand there."""
     scope = {}
     for start in ("from vmri_jax.scene import Anchor", "from vmri_jax.scene import Box"):
-        exec(next(program for program in PROGRAMS if program.startswith(start)), scope)
+        exec(next(program for program in programs("docs/how_to/scenes.md") if program.startswith(start)), scope)
     for name, places in (("scene", {"hook": "s", "bell": "f"}), ("satellite", {"hub": "s", "panel": "f"})):
         scene = scope[name]
         assert {body: scene.places[body].part for body in places} == places
