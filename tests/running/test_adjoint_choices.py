@@ -39,16 +39,16 @@ def test_stored_steps_have_second_derivatives():
 
 
 def test_what_auto_chooses(monkeypatch):
-    choose = partial(adjoints.chosen, "auto")
-    assert choose(vm.fully_implicit(2), adjoints.SHORT, False) == "stored"
-    assert choose(vm.fully_implicit(2), adjoints.SHORT + 1, False) == "reversible"
-    assert choose(vm.fully_implicit(2), adjoints.SHORT + 1, True) == "checkpoint"
-    assert choose(UNSYMMETRIC, adjoints.SHORT + 1, False) == "checkpoint"
-    monkeypatch.setattr(adjoints, "SHORT", 5)
+    choose = partial(adjoints.chosen_adjoint, "auto")
+    assert choose(vm.fully_implicit(2), adjoints.LONGEST_STORED_RUN, False) == "stored"
+    assert choose(vm.fully_implicit(2), adjoints.LONGEST_STORED_RUN + 1, False) == "reversible"
+    assert choose(vm.fully_implicit(2), adjoints.LONGEST_STORED_RUN + 1, True) == "checkpoint"
+    assert choose(UNSYMMETRIC, adjoints.LONGEST_STORED_RUN + 1, False) == "checkpoint"
+    monkeypatch.setattr(adjoints, "LONGEST_STORED_RUN", 5)
     with pytest.warns(UserWarning, match="6 steps are taken by adjoint='reversible'"):
         chosen = simple_gradient("auto")(simple_cost("auto")[1])
     np.testing.assert_allclose(chosen, simple_gradient("stored")(simple_cost("stored")[1]), rtol=1e-11, atol=1e-12)
-    monkeypatch.setattr(adjoints, "GAP", 0.0)
+    monkeypatch.setattr(adjoints, "REPORTED_GAP", 0.0)
     with pytest.warns(UserWarning, match="missed the one before by"):
         jax.block_until_ready(simple_gradient("auto")(simple_cost("auto")[1]))
 
@@ -61,7 +61,7 @@ def test_bad_adjoints():
 
 
 def test_forward_by_many_numbers_is_said(monkeypatch):
-    monkeypatch.setattr(adjoints, "MANY", 0)
+    monkeypatch.setattr(adjoints, "MOST_TANGENTS", 0)
     cost, at = simple_cost("forward")
     with pytest.warns(UserWarning, match=f"each of the {at.size} numbers"):
         jax.eval_shape(jax.grad(cost), at)

@@ -104,8 +104,8 @@ def test_every_node_saved_needs_no_step_back():
 
 @pytest.fixture
 def three_parts_a_level(monkeypatch):
-    monkeypatch.setattr(loops, "WIDTH", 3)
-    monkeypatch.setattr(engine, "WHOLE", 1)
+    monkeypatch.setattr(loops, "PARTS_PER_LEVEL", 3)
+    monkeypatch.setattr(engine, "MOST_STORED_STEPS", 1)
     engine.engine.cache_clear()  # programs with other levels
     yield
     engine.engine.cache_clear()

@@ -11,8 +11,8 @@ from vmri_jax.running.progress import Working, progress_shown
 @pytest.fixture
 def quick(monkeypatch):
     """Lines after 50 ms instead of 2 s."""
-    monkeypatch.setattr(progress, "SECONDS", 0.05)
-    monkeypatch.setattr(progress, "LOOKS", 0.01)
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN_LINES", 0.05)
+    monkeypatch.setattr(progress, "POLL_SECONDS", 0.01)
     time.sleep(0.6)  # the thread may still sleep for its usual time
 
 

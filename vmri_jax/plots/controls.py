@@ -1,4 +1,4 @@
-"""Figures of optimal control: the controls, the motion that they make, and how they were found."""
+"""Figures of optimal control: the controls, the motion under them, and the convergence of the iteration."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ from vmri_jax.plots.theme import LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, l
 
 
 def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
-    """Controls with their bounds, slow and fast positions against time, and what the iterations left.
+    """Controls with their bounds, slow and fast positions against time, and update, gaps and misses of every iteration.
 
     Args:
-        optimum: of `vmri_jax.control.minimize`.
-        title: over the figure.
+        optimum: result of `vmri_jax.control.minimize`.
+        title: title above the panels.
         theme: colours.
     """
     t, panels = np.asarray(optimum.trajectory.t), position_panels(optimum.trajectory)
@@ -29,16 +29,16 @@ def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> Note
         above.set(ylabel="controls $u$")
         limit_times(above, t)
         legend_beside(above)
-        for axes, (values, labels, what, _) in zip(middle, panels, strict=True):
+        for axes, (values, labels, quantity, _) in zip(middle, panels, strict=True):
             coordinates(axes, t, values, labels, theme)
-            axes.set(ylabel=what)
+            axes.set(ylabel=quantity)
             limit_times(axes, t)
         (middle or [above])[-1].set_xlabel("time $t$")
         for name, color in zip(("update", "gap", "miss", "over"), theme.curves, strict=False):
-            values = np.array([told[name] for told in optimum.history])
+            values = np.array([iteration[name] for iteration in optimum.history])
             if np.any(values > 0):
-                at = 1 + np.arange(len(values))
-                below.semilogy(at, np.maximum(values, ROUNDOFF_FLOOR), ".-", color=color, label=MEANING[name])
+                numbers = 1 + np.arange(len(values))
+                below.semilogy(numbers, np.maximum(values, ROUNDOFF_FLOOR), ".-", color=color, label=MEANING[name])
         below.set(
             xlabel="iteration",
             ylabel="left",
@@ -50,4 +50,4 @@ def plot_control(optimum: Any, *, title: str = "", theme: Theme = LIGHT) -> Note
 
 
 MEANING = {"update": "update", "gap": "gaps of steps", "miss": "goal", "over": "limits"}
-"""What the history of an optimisation calls them, and the figure."""
+"""Names in the legend, by the keys in the history of an optimisation."""

@@ -23,12 +23,16 @@ if TYPE_CHECKING:
     import xarray
 
 COORDINATES = ("slow", "fast", "level", "quantile", "node")
-"""Dimensions of what is kept of a single run."""
+"""Dimensions of the results of a single run; all other dimensions are parameters."""
 STATUS = ("result", "failed_at")
 BANDS = (0.05, 0.25, 0.5, 0.75, 0.95)
-MOST_CURVES, MOST_PANELS = 6, 12
-DECADES = 30.0
-"""Values that span more than this are shown on a logarithmic scale."""
+"""Quantiles that are drawn: a band of nine tenths of the runs, a band of half of them, and the median."""
+MOST_CURVES = 6
+"""Most curves of a figure over one axis, the number of colours; more are drawn as bands."""
+MOST_PANELS = 12
+"""Most panels of a figure; more are refused, since they would be too small to read."""
+LOGARITHMIC_RATIO = 30.0
+"""Ratio of the largest to the smallest positive value above which an axis or a colour scale is logarithmic."""
 
 
 def plot_ensemble(
@@ -40,18 +44,18 @@ def plot_ensemble(
     title: str = "",
     theme: Theme = LIGHT,
 ) -> NotebookFigure:
-    """What an ensemble gave, over its parameters.
+    """A result of an ensemble over its parameters.
 
-    Over two axes it is a map in colours, with a panel for each value of a third and fourth one; runs that failed are grey.
-    Over one axis it is curves, or bands where there are too many. Over a column of a table or of draws it is a cloud of points.
-    Without parameters it is a histogram. What is kept of all saved nodes is drawn against time, with the bands that hold
+    The figure over two axes is a map in colours, with a panel for each value of a third and a fourth axis; failed runs are grey.
+    The figure over one axis has curves, or bands if there are more than six curves. Over a column of a table or of random draws it is a
+    scatter plot, and without parameters a histogram. A quantity of all saved nodes is drawn against time, with the bands that hold
     half and nine tenths of the runs that did not fail.
 
     Args:
         data: from `vmri_jax.open_ensemble`, or a selection of it.
-        quantity: what is drawn; if None the last one that is a single number per run, else the last one of a number per saved node.
+        quantity: name of the result; if None the last result with a single number per run, else the last one with a number per saved node.
         x, y: names of axes or columns; the two longest axes if both are None and the design has axes.
-        title: over the figure.
+        title: title above the panels.
         theme: colours.
 
     Raises:
@@ -86,11 +90,12 @@ def plot_ensemble(
 
 
 def _failed(data: "xarray.Dataset", values):
-    """Which runs did not come to their end."""
+    """Whether a run failed, for every run."""
     return data.result > int(Result.CONVERGED_AT_ROUNDOFF) if "result" in data else values.isnull()
 
 
 def _quantity(data: "xarray.Dataset", name: str | None) -> str:
+    """The name of the quantity to draw, see `plot_ensemble`."""
     if name is not None:
         if name not in data:
             raise ValueError(f"plot_ensemble: there is no {name!r}; there are {', '.join(map(str, data.data_vars))}.")
@@ -114,24 +119,24 @@ def _label(array) -> str:
 
 
 def _panels(values, drawn: Sequence[str]) -> list[tuple[str, Any]]:
-    """The array for each value of the axes that are not drawn, with their names and values."""
-    others = [d for d in values.dims if d not in drawn]
-    count = int(np.prod([values.sizes[d] for d in others], dtype=int))
+    """For each combination of values of the axes that are not drawn: a title with these values, and the array."""
+    panel_axes = [d for d in values.dims if d not in drawn]
+    count = int(np.prod([values.sizes[d] for d in panel_axes], dtype=int))
     if count > MOST_PANELS:
         raise ValueError(
-            f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, others))} with {count} combinations of values; "
-            f"select some, data.sel({others[-1]}=...)."
+            f"plot_ensemble: besides {', '.join(drawn)} there are {', '.join(map(str, panel_axes))} with {count} combinations of values; "
+            f"select some, data.sel({panel_axes[-1]}=...)."
         )
-    found = []
-    for place in np.ndindex(*(values.sizes[d] for d in others)):
-        at = dict(zip(others, place, strict=True))
-        named = "\n".join(_named(d, values[d].values[i]) for d, i in at.items())
-        found.append((named, values.isel(at)))
-    return found
+    panels = []
+    for numbers in np.ndindex(*(values.sizes[d] for d in panel_axes)):
+        indices = dict(zip(panel_axes, numbers, strict=True))
+        title = "\n".join(_named(d, values[d].values[i]) for d, i in indices.items())
+        panels.append((title, values.isel(indices)))
+    return panels
 
 
 def _named(axis: str, value) -> str:
-    """A value of an axis in words; labels speak for themselves."""
+    """A value with the name of its axis; a value that is a string stands alone."""
     if isinstance(value, str):
         return value
     return f"{axis} = {value:.4g}" if isinstance(value, float | np.floating) else f"{axis} = {value}"
@@ -167,16 +172,16 @@ def _plot_maps(values, failed, x: str, y: str, title: str, theme: Theme) -> Note
 
 def _plot_curves(values, x: str, title: str, theme: Theme) -> NotebookFigure:
     values = values.compute()
-    others = [d for d in values.dims if d != x]
+    curve_axes = [d for d in values.dims if d != x]
     with new_figure(7.0, 3.8, title, theme) as figure:
         axes = figure.subplots()
-        if int(np.prod([values.sizes[d] for d in others], dtype=int)) <= MOST_CURVES:
+        if int(np.prod([values.sizes[d] for d in curve_axes], dtype=int)) <= MOST_CURVES:
             for name, curve in _panels(values, (x,)):
                 axes.plot(values[x], curve, label=name.replace("\n", ", ") or None)
-            if others:
+            if curve_axes:
                 legend_beside(axes)
         else:
-            _fill_bands(axes, values[x].values, values.quantile(BANDS, dim=others, skipna=True).values, theme)
+            _fill_bands(axes, values[x].values, values.quantile(BANDS, dim=curve_axes, skipna=True).values, theme)
             legend_beside(axes)
         _scale(axes, values[x], values)
         axes.set(xlabel=_label(values[x]), ylabel=_label(values))
@@ -219,7 +224,7 @@ def _plot_histogram(values, title: str, theme: Theme) -> NotebookFigure:
 def _plot_bands(data, values, title: str, theme: Theme) -> NotebookFigure:
     """Median and bands of all runs against time, a panel for each coordinate."""
     runs = [d for d in values.dims if d not in COORDINATES]
-    others = [str(d) for d in values.dims if d in COORDINATES and d != "node"]
+    has_coordinates = any(d in COORDINATES and d != "node" for d in values.dims)
     time = data.node_t.mean(runs, skipna=True).values if "node_t" in data else np.arange(values.sizes["node"])
     values = values.chunk(dict.fromkeys(runs, -1)) if runs else values
     bands = (
@@ -231,7 +236,7 @@ def _plot_bands(data, values, title: str, theme: Theme) -> NotebookFigure:
         grid = panel_grid(figure, len(panels), columns)
         for axes, (name, panel) in zip(grid, panels, strict=True):
             _fill_bands(axes, time, panel.transpose("quantile", "node").values, theme)
-            axes.set_title(name if others else _label(values))
+            axes.set_title(name if has_coordinates else _label(values))
         for axes in grid[-columns:]:
             axes.set(xlabel="time")
         legend_below(figure)
@@ -248,7 +253,7 @@ def _fill_bands(axes: Axes, along: np.ndarray, bands: np.ndarray, theme: Theme) 
 
 def _is_wide(values: np.ndarray) -> bool:
     finite = values[np.isfinite(values)]
-    return finite.size > 0 and finite.min() > 0 and finite.max() > DECADES * finite.min()
+    return finite.size > 0 and finite.min() > 0 and finite.max() > LOGARITHMIC_RATIO * finite.min()
 
 
 def _norm(values: np.ndarray) -> Normalize:
@@ -256,13 +261,13 @@ def _norm(values: np.ndarray) -> Normalize:
     if finite.size == 0:
         return Normalize(0.0, 1.0)
     positive = finite[finite > 0]
-    if positive.size and finite.min() >= 0 and positive.max() > DECADES * np.quantile(positive, 0.02):
+    if positive.size and finite.min() >= 0 and positive.max() > LOGARITHMIC_RATIO * np.quantile(positive, 0.02):
         return LogNorm(np.quantile(positive, 0.02), np.quantile(positive, 0.98), clip=True)
     return Normalize(finite.min(), finite.max())
 
 
 def _scale(axes: Axes, x, y) -> None:
-    """Logarithmic axes where values span decades."""
+    """Make an axis logarithmic if its values are positive and span more than `LOGARITHMIC_RATIO`."""
     for values, axis, set_scale in ((x, axes.xaxis, axes.set_xscale), (y, axes.yaxis, axes.set_yscale)):
         numbers = np.asarray(values)
         if _is_wide(numbers.ravel()):

@@ -1,4 +1,4 @@
-"""Figures of fits: what is left of the measurements, and how the parameters are correlated."""
+"""Figures of fits: residuals of the measurements and correlations of the parameters."""
 
 from typing import Any
 
@@ -7,16 +7,16 @@ from scipy import stats
 
 from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, new_figure
 
-INSIDE = 1.96
-"""Standard deviations that hold 95 %."""
+DEVIATIONS_OF_95_PERCENT = 1.96
+"""Half width of the interval that holds 95 % of a normal distribution, in standard deviations."""
 
 
 def plot_fit(fit: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
-    """Misses over time, how they are distributed, and the correlations of the parameters.
+    """Residuals against time, their distribution, and the correlations of the parameters.
 
     Args:
-        fit: of `vmri_jax.fit`.
-        title: over the figure.
+        fit: result of `vmri_jax.fit`.
+        title: title above the panels.
         theme: colours.
     """
     with new_figure(11, 3.6, title, theme) as figure:
@@ -28,13 +28,13 @@ def plot_fit(fit: Any, *, title: str = "", theme: Theme = LIGHT) -> NotebookFigu
             misses[is_number] = fit.residuals[first : first + is_number.sum()]
             first += int(is_number.sum())
             over_time.plot(m.t, misses, ".", markersize=2, color=f"C{number}")
-        over_time.axhspan(-INSIDE, INSIDE, alpha=0.12)
+        over_time.axhspan(-DEVIATIONS_OF_95_PERCENT, DEVIATIONS_OF_95_PERCENT, alpha=0.12)
         over_time.set(xlabel="t", ylabel="miss / sigma", title="misses, and where 95 % of them belong")
 
         width = max(4.0, float(np.abs(fit.residuals).max()))
-        at = np.linspace(-width, width, 200)
+        x = np.linspace(-width, width, 200)
         spread.hist(fit.residuals, bins=40, range=(-width, width), density=True, alpha=0.6)
-        spread.plot(at, stats.norm.pdf(at))
+        spread.plot(x, stats.norm.pdf(x))
         spread.set(xlabel="miss / sigma", title="their distribution", yticks=[])
 
         errors = np.sqrt(np.diag(fit.covariance))

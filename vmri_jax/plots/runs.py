@@ -1,7 +1,7 @@
 """Figures of runs: positions, energies, constraints against time."""
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -9,50 +9,31 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 
 from vmri_jax.mechanics.invariants import oscillatory_energies
-from vmri_jax.mechanics.names import Names
 from vmri_jax.plots.theme import DARK, LIGHT, ROUNDOFF_FLOOR, NotebookFigure, Theme, legend_beside, new_figure
+from vmri_jax.running.saved_run import SavedRun
 
 MOST_NAMED = 12
-"""Most curves of a panel that the legend names; of more curves this number is named, evenly chosen."""
-BAND = 0.25
-"""Opacity of bands of errors; more opaque ones hide the curves of other coordinates."""
-ROUNDOFF = 1e-13
-"""Axes span this part of the values at least."""
+"""Most curves of a panel that the legend names; of more curves it names this number, evenly chosen. A larger number makes the legend higher
+than the panel."""
+BAND_OPACITY = 0.25
+"""Opacity of the bands of errors; a larger value hides the curves of other coordinates."""
+LEAST_SPAN = 1e-13
+"""Least span of an axis of energies, as a part of the largest value; a smaller one magnifies round-off to the height of the panel."""
 
 
-class Run(Protocol):
-    """Saved nodes of a run, (k,) and (k, n), and what is known of it, see `vmri_jax.Trajectory`."""
-
-    @property
-    def states(self) -> Any: ...
-    @property
-    def t(self) -> Any: ...
-    @property
-    def energy(self) -> Any: ...
-    @property
-    def constraint_residual(self) -> Any: ...
-    @property
-    def error(self) -> Any: ...
-    @property
-    def names(self) -> Names: ...
-    @property
-    def keeps_energy(self) -> bool | None: ...
-    def work(self) -> Any: ...
-
-
-def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+def plot_trajectory(trajectory: SavedRun, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Slow and fast positions, energy and, where there are constraints, their residual, against time.
 
-    Of rigid bodies it shows the centres of mass.
+    Rigid bodies are drawn by their centres of mass. Curves have the units of the system.
 
-    A run with an estimated error has bands of it about its positions, and a panel of the largest error and its shares.
+    A run with an estimated error has bands of this error about its positions, and a panel of the largest error and its shares.
 
-    The energy of a system that keeps it is shown as an error. Of one with forces or moving constraints the figure shows its
-    change, their work, and what is left of the balance.
+    If the system keeps its energy, the figure shows the error of the energy; if forces or moving constraints do work, it shows the change
+    of the energy, the work, and their difference.
 
     Args:
-        trajectory: a run; nodes after a failure are left out by matplotlib since they are NaN.
-        title: over the figure.
+        trajectory: a run; nodes after a failure are NaN, which matplotlib leaves out.
+        title: title above the panels.
         theme: colours.
 
     Raises:
@@ -65,13 +46,13 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
     constrained = bool(np.any(residual > 0))
     positions = position_panels(trajectory)
     driven = trajectory.keeps_energy is False
-    has_error = getattr(trajectory, "error", None) is not None
+    has_error = trajectory.error is not None
     count = len(positions) + has_error + (2 if driven else 1) + constrained
     with new_figure(7.2, 0.4 + 1.85 * count, title, theme) as figure:
         axes = figure.subplots(count, sharex=True, squeeze=False)[:, 0]
-        for panel, (values, labels, what, error) in zip(axes, positions, strict=False):
+        for panel, (values, labels, quantity, error) in zip(axes, positions, strict=False):
             coordinates(panel, t, values, labels, theme, error)
-            panel.set_ylabel(what)
+            panel.set_ylabel(quantity)
         below = axes[len(positions) :]
         if has_error:
             _position_error(below[0], t, trajectory.error, theme)
@@ -92,13 +73,13 @@ def plot_trajectory(trajectory: Run, title: str = "", theme: Theme = LIGHT) -> N
     return figure
 
 
-def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
+def plot_oscillatory_energies(trajectory: SavedRun, omega, title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
     """Energies ``I_i = (p_fi^2 + omega^2 q_fi^2) / 2`` of the stiff springs and their sum, the adiabatic invariant.
 
     Args:
         trajectory: a run of a system whose fast variables are oscillators of unit mass.
-        omega: their frequency.
-        title: over the figure.
+        omega: their angular frequency.
+        title: title above the panel.
         theme: colours.
     """
     t = np.asarray(trajectory.t)
@@ -113,13 +94,15 @@ def plot_oscillatory_energies(trajectory: Run, omega, title: str = "", theme: Th
     return figure
 
 
-def position_panels(run: Run) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
-    """Slow and fast positions with their names, what they are called, and their errors; of rigid bodies the centres, without directors.
+def position_panels(run: SavedRun) -> list[tuple[np.ndarray, list[str], str, np.ndarray | None]]:
+    """For slow and fast positions, as far as there are any: values (k, n), names, label of the axis, and errors (k, n) or None.
+
+    Directors of rigid bodies are left out.
 
     Args:
-        run: one run.
+        run: one run, not a batch.
     """
-    names, error = run.names, getattr(run, "error", None)
+    names, error = run.names, run.error
     slow, fast = (None, None) if error is None else (error.q_s, error.q_f)
     panels = (
         (run.states.q_s, names.positions("s"), names.slow_coordinates, r"slow positions $q_s$", slow),
@@ -129,23 +112,23 @@ def position_panels(run: Run) -> list[tuple[np.ndarray, list[str], str, np.ndarr
         (
             np.asarray(values)[:, shown],
             [labels[i] for i in shown],
-            what,
-            None if wrong is None else np.asarray(wrong)[:, shown],
+            quantity,
+            None if errors is None else np.asarray(errors)[:, shown],
         )
-        for values, shown, labels, what, wrong in panels
+        for values, shown, labels, quantity, errors in panels
         if shown
     ]
 
 
 def limit_times(axes: Axes, t) -> None:
-    """Limits of a time axis: the first and the last node that was reached; matplotlib's own where there is one node only."""
+    """Set the limits of a time axis to the first and the last node reached; leave the default limits if these are the same node."""
     reached = t[np.isfinite(t)]
     if reached.size and reached[0] < reached[-1]:
         axes.set_xlim(reached[0], reached[-1])
 
 
 def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error=None) -> None:
-    """One line per coordinate with its name beside the panel; of very many every so manieth is named. About each a band of its error."""
+    """One curve for each coordinate, with a band of its error, and names beside the panel, at most `MOST_NAMED` of them."""
     n = values.shape[1]
     colors: Any = theme.curves
     if n > len(theme.curves):
@@ -153,22 +136,24 @@ def coordinates(axes: Axes, t, values, names: Sequence[str], theme: Theme, error
         colors = matplotlib.colormaps["viridis"](np.linspace(low, high, n))
     named = range(n) if n <= MOST_NAMED else np.linspace(0, n - 1, MOST_NAMED).round().astype(int)
     for i in range(n):
-        label = names[i] if i in named else f"_{names[i]}"  # which legends leave out
+        label = names[i] if i in named else f"_{names[i]}"  # legends leave out labels with an underscore
         axes.plot(t, values[:, i], color=colors[i], linewidth=_thin(t), label=label)
         if error is not None:
             half = np.abs(error[:, i])
-            axes.fill_between(t, values[:, i] - half, values[:, i] + half, color=colors[i], alpha=BAND, linewidth=0)
+            axes.fill_between(
+                t, values[:, i] - half, values[:, i] + half, color=colors[i], alpha=BAND_OPACITY, linewidth=0
+            )
     if n:
         legend_beside(axes, f"{len(named)} of {n}" if n > MOST_NAMED else None, 9.0 if n <= len(theme.curves) else 6.5)
 
 
 def _thin(t) -> float:
-    """Line width for a number of nodes: oscillations must not run into a solid band."""
+    """Line width: thinner for many nodes, so that oscillations do not fill a solid band."""
     return 1.2 if len(t) <= 300 else 0.7
 
 
 def _position_error(axes: Axes, t, error: Any, theme: Theme) -> None:
-    """Largest error of a position and its shares; where no error is certified, a shaded part."""
+    """Largest error of a position and its shares; times without a certified error are shaded."""
     curves = {"error": error.positions, "slow share": error.slow, "fast share": error.fast}
     for (name, values), look in zip(curves.items(), ("-", "--", ":"), strict=True):
         if np.isfinite(values).any():
@@ -179,11 +164,11 @@ def _position_error(axes: Axes, t, error: Any, theme: Theme) -> None:
     legend_beside(axes)
 
 
-def _energy_error(axes: Axes, trajectory: Run, theme: Theme) -> None:
-    """Relative to the start, or absolute if the start is zero; a mere change if the system is not known."""
+def _energy_error(axes: Axes, trajectory: SavedRun, theme: Theme) -> None:
+    """Energy minus the energy at the start, divided by the latter unless it is zero; called a change if the system is not known."""
     t, energy = np.asarray(trajectory.t), np.asarray(trajectory.energy)
-    what = "error" if trajectory.keeps_energy else "change"
-    error, label = energy - energy[0], rf"energy {what} $\Delta E$"
+    kind = "error" if trajectory.keeps_energy else "change"
+    error, label = energy - energy[0], rf"energy {kind} $\Delta E$"
     if abs(energy[0]) > 1e-12:
         error, label = error / abs(energy[0]), rf"{label[:-1]} / |E_0|$"
     axes.plot(t, error, color=theme.curves[0], linewidth=_thin(t))
@@ -191,8 +176,8 @@ def _energy_error(axes: Axes, trajectory: Run, theme: Theme) -> None:
     _not_below_roundoff(axes.yaxis, error)
 
 
-def _energy_balance(above: Axes, below: Axes, trajectory: Run, theme: Theme) -> None:
-    """Energy and work since the start, and under them what is left of the balance."""
+def _energy_balance(above: Axes, below: Axes, trajectory: SavedRun, theme: Theme) -> None:
+    """Energy and work since the start, and in the panel below the change of the energy minus the work."""
     t, energy, work = np.asarray(trajectory.t), np.asarray(trajectory.energy), trajectory.work()
     curves = {"energy": energy - energy[0], "forces": work.forces, "moving constraints": work.constraints}
     for (name, values), color in zip(curves.items(), theme.curves, strict=False):
@@ -210,12 +195,12 @@ def _energy_balance(above: Axes, below: Axes, trajectory: Run, theme: Theme) -> 
 
 
 def _not_below_roundoff(axis: Axis, values) -> None:
-    """Limits that do not blow up round-off: they span `ROUNDOFF` of the values at least."""
+    """Widen the limits of an axis to `LEAST_SPAN` of the largest value, so that round-off is not magnified."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return
     middle, size = finite.mean(), np.abs(finite).max()
     low, high = axis.get_view_interval()
-    half = ROUNDOFF * max(size, 1.0) / 2
+    half = LEAST_SPAN * max(size, 1.0) / 2
     if high - low < 2 * half:
         axis.set_view_interval(middle - half, middle + half, ignore=True)

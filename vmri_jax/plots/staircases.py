@@ -1,4 +1,4 @@
-"""What each kind of schemes reaches, as staircases of error against time."""
+"""Staircases of error against computing time: the least error that each kind of schemes reaches in a time."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
@@ -11,7 +11,7 @@ from matplotlib.ticker import EngFormatter
 from vmri_jax.plots.theme import LIGHT, NotebookFigure, Theme, legend_below, log_ticks, new_figure, positive
 
 MARKERS = ("s", "o", "D", "P")
-"""Of the kinds of schemes, in their order."""
+"""Markers of the kinds of schemes, in the order of the kinds."""
 
 
 class Step(Protocol):
@@ -26,10 +26,12 @@ class Step(Protocol):
 
 
 class Marked(NamedTuple):
-    """A run that is marked.
+    """A run that gets a mark of its own.
 
-    label: in the legend.
-    star: whether as a star; else as a ring.
+    label: name in the legend.
+    seconds: computing time.
+    error: largest error of a position.
+    star: whether the mark is a star; else it is a ring.
     """
 
     label: str
@@ -39,11 +41,11 @@ class Marked(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """The least time that micro steps can take: that of single steps, of which N become a macro step.
+    """Lower bound of the time with N micro steps per macro step: the time of the same steps as single steps, less their slow forces.
 
-    label: in the legend.
-    kind: of the staircase whose times are multiplied.
-    factor: ``(v + N w) / (N (v + w))`` of the prices v and w of the slow and of the fast force.
+    label: name in the legend.
+    kind: kind of schemes with single steps, whose times are multiplied by `factor`.
+    factor: ``(v + N w) / (N (v + w))`` with the seconds v and w of an evaluation of the slow and of the fast force.
     """
 
     label: str
@@ -60,15 +62,17 @@ def plot_staircases(
     title: str = "",
     theme: Theme = LIGHT,
 ) -> NotebookFigure:
-    """The error that each kind of schemes reaches in a time, a staircase each; corners in the colour of the larger share of the error, slow or fast.
+    """Staircases of the error that each kind of schemes reaches in a computing time.
+
+    The colour of a corner is mixed from the colours of the slow and the fast share of its error.
 
     Args:
-        kinds: staircases by kind, the fastest run first, at most four; a kind without runs keeps its look for other figures.
-        peers: staircases of other programs.
+        kinds: staircases by kind, the fastest run first, at most four; a kind without runs reserves its colour and marker.
+        peers: staircases of other programs, by name.
         marked: runs to mark.
-        bound: of the times of micro steps.
+        bound: lower bound of the times with micro steps.
         known_to: error of the reference solution.
-        title: over the figure.
+        title: title above the panel.
         theme: colours.
     """
     blue, orange, green, purple, gold, pale = theme.curves
@@ -113,18 +117,18 @@ def plot_staircases(
 
 
 def _steps(axes: Axes, stairs: Sequence[Step], **look) -> None:
-    """The staircase itself."""
+    """Draw a staircase."""
     axes.step([s.seconds for s in stairs], positive([s.error for s in stairs]), where="post", **look)
 
 
 def _mixed(slow: str, fast: str, share: float) -> str:
-    """Colour between that of slow and that of fast."""
+    """The colour ``(1 - share) slow + share fast``, channel by channel."""
     red, green, blue = ((1 - share) * a + share * b for a, b in zip(to_rgb(slow), to_rgb(fast), strict=True))
     return to_hex((red, green, blue))
 
 
 def _limits(axes: Axes, kinds: Mapping[str, Sequence[Step]], known_to: float, theme: Theme) -> None:
-    """Ticks, and a line at the error of the reference if it is among the errors."""
+    """Set the ticks, and draw a line at the error of the reference if it lies within the axes."""
     if known_to > axes.get_ylim()[0]:
         axes.axhline(known_to, color=theme.ink, linewidth=0.8, linestyle=":")
         above = {"ha": "right", "va": "bottom", "fontsize": 7.5, "transform": axes.get_yaxis_transform()}

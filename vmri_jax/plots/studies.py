@@ -22,7 +22,10 @@ from vmri_jax.plots.theme import (
 
 
 class ConvergenceErrors(Protocol):
-    """Errors by scheme and quantity, "q" or "p": macro steps and errors, those worth a fit, and the order they show."""
+    """Errors by scheme and quantity, "q" or "p".
+
+    `errors` returns macro steps and errors, `usable` the same without the round-off plateau, `order` the observed order.
+    """
 
     @property
     def schemes(self) -> Sequence[str]: ...
@@ -36,12 +39,12 @@ def plot_convergence(
 ) -> NotebookFigure:
     """Errors of positions and of momenta against the macro step, with guide triangles of the given slopes.
 
-    The legend says the observed orders of both.
+    The legend has the observed orders of both.
 
     Args:
         study: e.g. of `vmri_jax.study.convergence_study`.
         orders: slopes to draw for comparison.
-        title: over the figure.
+        title: title above the panels.
         theme: colours.
     """
     with new_figure(7.6, 3.7, title, theme) as figure:
@@ -69,8 +72,8 @@ def _orders(study: ConvergenceErrors, scheme: str) -> str:
     orders = {quantity: study.order(scheme, quantity) for quantity in ("q", "p")}
     if not np.isfinite([*orders.values()]).any():
         return "failed"
-    seen = (f"{order:.2f} ({q})" if np.isfinite(order) else f"failed ({q})" for q, order in orders.items())
-    return "order " + ", ".join(seen)
+    observed = (f"{order:.2f} ({q})" if np.isfinite(order) else f"failed ({q})" for q, order in orders.items())
+    return "order " + ", ".join(observed)
 
 
 WORK = {
@@ -79,11 +82,11 @@ WORK = {
     "fast_evaluations": r"evaluations of $\nabla W$",
     "solves": "systems of equations solved",
 }
-"""What `plot_work_precision` has on its axis, by the name in the rows."""
+"""Labels of the axis of work in `plot_work_precision`, by the names of the attributes of the rows."""
 
 
 class RunsByWork(Protocol):
-    """Runs by scheme and the best of all: rows with `error_q`, `num_steps` and every kind of `WORK`."""
+    """Runs by scheme, and their Pareto front: rows with the attributes `error_q`, `num_steps` and every key of `WORK`."""
 
     @property
     def schemes(self) -> Sequence[str]: ...
@@ -100,12 +103,12 @@ def plot_work_precision(
 
     Args:
         study: e.g. of `vmri_jax.study.work_precision`, or the runs of a recommendation.
-        title: over the figure.
+        title: title above the panel.
         work: "seconds", "slow_evaluations", "fast_evaluations" or "solves".
         theme: colours.
 
     Raises:
-        ValueError: another kind of work.
+        ValueError: work is another string.
     """
     if work not in WORK:
         raise ValueError(f"plot_work_precision: work is {work!r}; it must be one of {', '.join(WORK)}.")
@@ -133,7 +136,7 @@ def plot_work_precision(
 
 
 class CostCurves(Protocol):
-    """By label and method: num_micro and microseconds per micro step."""
+    """Curves by label and method: `curve` returns numbers of micro steps, and microseconds per micro step."""
 
     @property
     def curves(self) -> Sequence[tuple[str, str]]: ...
@@ -151,7 +154,7 @@ def plot_cost(
     Args:
         studies: by the title of their panel, e.g. of `vmri_jax.study.cost_study`.
         paper_minima: num_micro to mark, by the title of the panel.
-        title: over the figure.
+        title: title above the panels.
         theme: colours.
     """
     columns = 2 if len(studies) == 4 else min(3, len(studies))
@@ -191,7 +194,7 @@ def _cost_panel(axes: Axes, study: CostCurves, paper_minimum: int | None, theme:
 
 
 def _guide_triangle(axes: Axes, study: ConvergenceErrors, quantity: str, order: int, theme: Theme) -> None:
-    """Triangle of slope `order` right below the most accurate curve of about that order."""
+    """Draw a triangle of slope `order` just below the most accurate curve whose order is within 0.5 of it."""
     lowest = None
     for scheme in study.schemes:
         macro_dt, errors = study.usable(scheme, quantity)

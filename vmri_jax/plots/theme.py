@@ -34,11 +34,11 @@ DARK = Theme(
 )
 MARKERS = ("o", "s", "^", "D", "v", "P")
 LINES = ("-", "--", ":", "-.", (0, (7, 1.5, 1, 1.5, 1, 1.5)))
-"""Styles of lines: one for each turn of the cycle of colours, so that 30 curves differ."""
+"""Styles of lines: the style changes after each pass through the colours, so that 30 curves differ."""
 ROUNDOFF_FLOOR = 1e-17
-"""Least value on a logarithmic axis of residuals, which zeros are drawn at: below it is round-off of numbers of order one."""
+"""Value at which a logarithmic axis of residuals draws zeros, below the round-off of numbers of order one; a smaller value stretches the axis."""
 DPI = 150
-"""Of figures that are saved by their own method."""
+"""Dots per inch of a figure saved by its method `savefig` outside of `style`; a larger value makes larger files."""
 
 
 class NotebookFigure(Figure):
@@ -99,8 +99,8 @@ def new_figure(width: float, height: float, title: str, theme: Theme) -> Iterato
     """A figure to fill within the context, in its style; the title is set at the end.
 
     Args:
-        width, height: in inches.
-        title: over the figure.
+        width, height: size in inches.
+        title: title above the panels.
         theme: colours.
     """
     with style(theme):
@@ -110,12 +110,12 @@ def new_figure(width: float, height: float, title: str, theme: Theme) -> Iterato
 
 
 def panel_grid(figure: Figure, count: int, columns: int) -> np.ndarray:
-    """So many axes in rows of `columns`; cells of the grid that are left over stay empty.
+    """`count` axes in rows of `columns`; the cells left over in the last row stay empty.
 
     Args:
-        figure: to draw on.
+        figure: figure to draw on.
         count: number of panels.
-        columns: of the grid.
+        columns: columns of the grid.
     """
     axes = figure.subplots(math.ceil(count / columns), columns, squeeze=False).reshape(-1)
     for empty in axes[count:]:
@@ -124,16 +124,16 @@ def panel_grid(figure: Figure, count: int, columns: int) -> np.ndarray:
 
 
 def save(figure: Figure, path, theme: Theme = LIGHT) -> None:
-    """Write a figure in the format of the file's ending.
+    """Write a figure in the format that the suffix of the path names.
 
     Args:
-        figure: of any function here.
-        path: of the file.
-        theme: the colours that the figure was made in.
+        figure: a figure of any function of this package.
+        path: path of the file.
+        theme: the colours of the figure.
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: an ending that matplotlib does not know.
+        ValueError: matplotlib does not know the suffix.
     """
     with style(theme):
         figure.savefig(path)
@@ -156,13 +156,13 @@ def curve_look(i: int, theme: Theme) -> dict[str, Any]:
 
 
 def legend_below(figure: Figure, size: float = 9.0) -> None:
-    """Names of all curves under the panels, each once, in as many columns as there is room for.
+    """Names of all curves under the panels, each name once, in as many columns as fit.
 
-    The figure grows by the height of the legend, so that the panels keep theirs.
+    The figure grows by the height of the legend, so that the panels keep their height.
 
     Args:
-        figure: with its panels drawn.
-        size: of the letters, in points.
+        figure: a figure with its panels drawn.
+        size: size of the letters, in points.
     """
     curves: dict[str, Any] = {}
     for axes in figure.axes:
@@ -186,27 +186,29 @@ def legend_beside(axes: Axes, title: str | None = None, size: float = 9.0) -> No
 
     Args:
         axes: the panel.
-        title: over the names.
-        size: of the letters, in points.
+        title: title above the names.
+        size: size of the letters, in points.
     """
     look = {"handlelength": 1.2, "fontsize": size, "title_fontsize": size, "labelspacing": 0.3}
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title=title, **look)
 
 
 def positive(values: Any) -> np.ndarray:
-    """Values for a logarithmic axis: NaN, which is not drawn, where they are not positive."""
+    """Values for a logarithmic axis: values that are not positive become NaN, which is not drawn."""
     values = np.asarray(values, dtype=float)
     return np.where(values > 0, values, np.nan)
 
 
 def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
-    """A logarithmic axis with labels at powers of ten, or at 1, 2, 5 if only one of them or little more is among the values.
+    """Make an axis logarithmic, with labels at powers of ten; or at 1, 2, 5 times powers of ten if the values span less than a factor of 30.
 
     Args:
-        axis: of a panel with or without curves.
-        values: numbers that are drawn along the axis.
+        axis: an axis of a panel with or without curves.
+        values: numbers drawn along the axis.
     """
-    if axis.get_scale() != "log":  # no curve has made it so yet, and ticks of logarithms refuse the limits 0 and 1
+    if (
+        axis.get_scale() != "log"
+    ):  # a panel without curves is still linear, and logarithmic ticks refuse its limits 0 and 1
         (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
     finite = [value for value in values if np.isfinite(value) and value > 0]
     axis.set_minor_formatter(NullFormatter())

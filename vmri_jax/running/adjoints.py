@@ -1,12 +1,12 @@
-"""Derivatives of runs: what is kept of the steps, and what is computed again.
+"""Derivatives of runs: which states are stored for reverse mode, and which are computed again.
 
-The derivative of a step is that of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse mode goes through the
-steps from the last one to the first, and needs where each of them started:
+The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse mode visits
+the steps from the last to the first and needs the state at which each step started. Four adjoints provide this state:
 
-* *stored*: it was kept, with the solution of the step; in all modes and orders that JAX has;
-* *checkpoint*: the starts of some steps were kept, those between are computed again, see `Recursive`;
-* *reversible*: the step with -H of a symmetric scheme leads back to it, from one saved node to the one before;
-* *forward*: not needed, since forward mode is taken instead: one run beside the run for each number that is differentiated by.
+* *stored*: the run keeps the start of every step and the solution of its equations; works in all modes and orders of JAX;
+* *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Recursive`;
+* *reversible*: the step of -H of a symmetric scheme leads back to the start of a step, from one saved node to the node before;
+* *forward*: no start is needed: forward mode computes one tangent run for each number that is differentiated by.
 """
 
 import warnings
@@ -31,16 +31,17 @@ from vmri_jax.steppers.newton.implicit import only_once
 from vmri_jax.steppers.results import Result
 
 ADJOINTS = ("auto", "stored", "checkpoint", "reversible", "forward")
-SHORT = 10_000
-"""Steps up to which "auto" stores them all."""
-GAP = 1e-6
-"""What the reversed run may miss a saved node by, relative to the largest position or momentum, without a warning."""
-MANY = 100
-"""Numbers to differentiate by, from which on "forward" warns."""
+LONGEST_STORED_RUN = 10_000
+"""Macro steps of the longest run for which "auto" stores the start of every step; a larger value takes more memory."""
+REPORTED_GAP = 1e-6
+"""Distance between the reversed run and a saved node, relative to the largest position or momentum, above which the user is warned;
+with a larger value inexact gradients pass in silence."""
+MOST_TANGENTS = 100
+"""Numbers to differentiate by, above which "forward" warns: it computes a tangent run for each. A larger value warns later."""
 
 
 def check_adjoint(adjoint: str, scheme: Scheme | Composition) -> None:
-    """Refuse an adjoint that there is none of, or that the scheme does not allow."""
+    """Refuse an unknown adjoint, and "reversible" with a scheme that is not symmetric."""
     if adjoint not in ADJOINTS:
         raise ValueError(f"simulate: adjoint is {adjoint!r}; it must be one of {', '.join(map(repr, ADJOINTS))}.")
     if adjoint == "reversible" and is_concrete(scheme) and not scheme.is_symmetric:
@@ -50,26 +51,26 @@ def check_adjoint(adjoint: str, scheme: Scheme | Composition) -> None:
         )
 
 
-def chosen(adjoint: str, scheme: Scheme | Composition, num_steps: int, has_force: bool) -> str:
-    """What "auto" stands for: short runs are stored, long ones reversed if they are symmetric and without forces.
+def chosen_adjoint(adjoint: str, scheme: Scheme | Composition, num_steps: int, has_force: bool) -> str:
+    """The adjoint that "auto" stands for: "stored" for short runs, "reversible" for long runs of symmetric schemes without forces.
 
-    Friction, run backwards, blows errors up.
+    All other long runs get "checkpoint". Runs with forces are not reversed: friction, run backwards, amplifies errors.
     """
     if adjoint != "auto":
         return adjoint
-    if num_steps <= SHORT:
+    if num_steps <= LONGEST_STORED_RUN:
         return "stored"
     return "reversible" if is_concrete(scheme) and scheme.is_symmetric and not has_force else "checkpoint"
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def telling(kind: str, num_steps: int, arrays):
-    """Return the arrays, and warn once which adjoint was chosen if somebody differentiates by them."""
+def announced(kind: str, num_steps: int, arrays):
+    """Return the arrays; whoever differentiates by them is warned once which adjoint was chosen."""
     return arrays
 
 
-@telling.defjvp
-def _told(kind: str, num_steps: int, primals, tangents):
+@announced.defjvp
+def _announce(kind: str, num_steps: int, primals, tangents):
     warnings.warn(
         f"simulate: derivatives of these {num_steps} steps are taken by adjoint={kind!r}, in reverse mode and once. Name one to "
         "choose it: 'stored' for other modes and second derivatives, 'checkpoint', 'reversible', or 'forward' for few parameters.",
@@ -78,14 +79,14 @@ def _told(kind: str, num_steps: int, primals, tangents):
     return primals[0], tangents[0]
 
 
-def one_or_other(first: Callable, other: Callable, arrays) -> Trajectory:
-    """``first(arrays)``, or ``other(arrays)`` if that fails; their derivatives are in reverse mode only."""
-    of_real, real = _apart(arrays)
-    return _one_or_other(of_real(first), of_real(other), real)
+def with_fallback(first: Callable, fallback: Callable, arrays) -> Trajectory:
+    """``first(arrays)``, or ``fallback(arrays)`` if the first run fails; with derivatives in reverse mode only."""
+    of_real, real = _real_leaves(arrays)
+    return _with_fallback(of_real(first), of_real(fallback), real)
 
 
-def _apart(arrays) -> tuple[Callable, dict]:
-    """The real ones among the leaves by their number, and what makes a function of the arrays one of those."""
+def _real_leaves(arrays) -> tuple[Callable, dict]:
+    """``of_real, real``: `real` has the floating-point leaves by number, ``of_real(run)`` is the run as a function of `real`."""
     leaves, structure = jax.tree.flatten(arrays)
 
     def of_real(run):
@@ -95,54 +96,58 @@ def _apart(arrays) -> tuple[Callable, dict]:
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _one_or_other(first: Callable, other: Callable, real) -> Trajectory:
-    found = first(real)
-    return jax.lax.cond(found.failed_at < 0, lambda: found, lambda: other(real))
+def _with_fallback(first: Callable, fallback: Callable, real) -> Trajectory:
+    trajectory = first(real)
+    return jax.lax.cond(trajectory.failed_at < 0, lambda: trajectory, lambda: fallback(real))
 
 
-def _the_one_that_worked(first: Callable, other: Callable, real):
-    found, pull = jax.vjp(first, real)
-    works = found.failed_at < 0
-    return jax.lax.cond(works, lambda: found, lambda: other(real)), (works, pull, real)
+def _fallback_forward(first: Callable, fallback: Callable, real):
+    trajectory, pull = jax.vjp(first, real)
+    works = trajectory.failed_at < 0
+    return jax.lax.cond(works, lambda: trajectory, lambda: fallback(real)), (works, pull, real)
 
 
-def _its_derivative(first: Callable, other: Callable, kept, cotangent: Trajectory):
-    works, pull, real = kept
-    return (jax.lax.cond(works, lambda: pull(cotangent), lambda: jax.vjp(other, real)[1](cotangent))[0],)
+def _fallback_backward(first: Callable, fallback: Callable, residuals, cotangent: Trajectory):
+    works, pull, real = residuals
+    # The fallback runs again here: to keep its residuals would make every run pay for them.
+    return (jax.lax.cond(works, lambda: pull(cotangent), lambda: jax.vjp(fallback, real)[1](cotangent))[0],)
 
 
-_one_or_other.defvjp(_the_one_that_worked, _its_derivative)
+_with_fallback.defvjp(_fallback_forward, _fallback_backward)
 
 
-def by_the_other(first: Callable, other: Callable, arrays) -> Trajectory:
-    """``first(arrays)``, with the derivative of ``other(arrays)``, which finds the same; in reverse mode only."""
-    of_real, real = _apart(arrays)
-    return _by_the_other(of_real(first), of_real(other), real)
+def differentiated_by(exact: Callable, run: Callable, arrays) -> Trajectory:
+    """``run(arrays)``; where it is differentiated, in reverse mode only, value and derivative of ``exact(arrays)`` instead.
+
+    Both runs solve the same equations to the tolerance of the solver.
+    """
+    of_real, real = _real_leaves(arrays)
+    return _differentiated_by(of_real(exact), of_real(run), real)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _by_the_other(first: Callable, other: Callable, real) -> Trajectory:
-    return first(real)
+def _differentiated_by(exact: Callable, run: Callable, real) -> Trajectory:
+    return run(real)
 
 
-def _other_run(first: Callable, other: Callable, real):
-    return jax.vjp(other, real)
+def _exact_forward(exact: Callable, run: Callable, real):
+    return jax.vjp(exact, real)
 
 
-def _other_derivative(first: Callable, other: Callable, pull, cotangent: Trajectory):
+def _exact_backward(exact: Callable, run: Callable, pull, cotangent: Trajectory):
     return pull(cotangent)
 
 
-_by_the_other.defvjp(_other_run, _other_derivative)
+_differentiated_by.defvjp(_exact_forward, _exact_backward)
 
 
 class _Interval(NamedTuple):
-    """From one saved node to the next: the states there, and cotangents of the node at its end and of its micro nodes."""
+    """From one saved node to the next: the states at both, and cotangents of the node at the end and of its micro nodes."""
 
     start: State
     end: State
-    at_end: tuple
-    q_f_micro: jax.Array
+    by_end: tuple
+    by_micro: jax.Array
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
@@ -151,7 +156,8 @@ def reversible(run, engine: Engine, save_every: int, arrays) -> Trajectory:
 
     Args:
         run: a run of `engine` from (leaves, start, macro_dt).
-        engine: its `stepper` goes back.
+        engine: its `stepper` takes the steps of -H.
+        save_every: macro steps from one saved node to the next.
     """
     return run(arrays)
 
@@ -161,9 +167,9 @@ def _run_and_nodes(run, engine: Engine, save_every: int, arrays):
     return trajectory, (arrays, trajectory.states)
 
 
-def _stepped_back(run, engine: Engine, save_every: int, kept, cotangent: Trajectory):
+def _stepped_back(run, engine: Engine, save_every: int, residuals, cotangent: Trajectory):
     """Cotangents of (leaves, start, macro_dt)."""
-    (leaves, _, macro_dt), nodes = only_once(kept)
+    (leaves, _, macro_dt), nodes = only_once(residuals)
     at_nodes = (*vars(cotangent.states).values(), cotangent.energy, cotangent.constraint_residual)
     by_real, by_state, by_dt = _back(engine, save_every, leaves, macro_dt, nodes, at_nodes, cotangent.micro)
     by_leaves = [by_real[i] if i in by_real else _no_cotangent(leaf) for i, leaf in enumerate(leaves)]
@@ -172,9 +178,9 @@ def _stepped_back(run, engine: Engine, save_every: int, kept, cotangent: Traject
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_nodes, at_micro):
-    """All steps back: cotangents of the real ones among the leaves by their number, of the start, and of the step.
+    """All steps back: cotangents of the floating-point leaves by number, of the start, and of the macro step.
 
-    A program of its own, so that gradients that are not compiled as a whole do not compile it each time.
+    Jitted for itself: a gradient outside of `jax.jit` would compile these loops at every call.
     """
     real = {i: jnp.asarray(leaf) for i, leaf in enumerate(leaves) if _is_real(leaf)}
 
@@ -193,30 +199,32 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_no
 
     back = engine.stepper(leaves, jax.tree.map(lambda a: a[0], nodes))
 
-    def interval(carry, at: _Interval):
+    def interval_back(carry, interval: _Interval):
         by_real, by_state, by_dt = carry
-        by_real, by_state = _plus((by_real, by_state), jax.vjp(node, real, at.end)[1](at.at_end))
+        # The saved node at the end contributes its own cotangent before the steps that lead to it.
+        by_real, by_state = _plus((by_real, by_state), jax.vjp(node, real, interval.end)[1](interval.by_end))
 
-        def one(number, carry):
+        def step_back(number, carry):
             (state, memory), by_real, by_state, by_dt = carry
-            if save_every == 1:
-                state = at.start
+            if save_every == 1:  # the start of the step is a saved node: nothing has to be reversed
+                state = interval.start
             else:
                 state, info, memory = back.step(state, memory, -macro_dt)
                 state, memory = back.project(state, memory)
                 state = _where_solved(info.result, state)
-            by_micro = jnp.where(number == 0, at.q_f_micro, 0.0)
-            more, by_state, more_dt = jax.vjp(step, real, state, macro_dt)[1]((by_state, by_micro))
-            return (state, memory), *_plus((by_real,), (more,)), by_state, by_dt + more_dt
+            by_micro = jnp.where(number == 0, interval.by_micro, 0.0)  # micro nodes are those of the last step
+            by_real_of_step, by_state, by_dt_of_step = jax.vjp(step, real, state, macro_dt)[1]((by_state, by_micro))
+            return (state, memory), *_plus((by_real,), (by_real_of_step,)), by_state, by_dt + by_dt_of_step
 
-        carry = (at.end, back.init(at.end, -macro_dt)), by_real, by_state, by_dt
-        (state, _), *carry = jax.lax.fori_loop(0, save_every, one, carry)
-        return tuple(carry), _distance(state, at.start)
+        carry = (interval.end, back.init(interval.end, -macro_dt)), by_real, by_state, by_dt
+        (state, _), *carry = jax.lax.fori_loop(0, save_every, step_back, carry)
+        return tuple(carry), _distance(state, interval.start)
 
     times = back.scheme.micro_times
     by_micro = jnp.zeros((engine.num_saves, len(times), nodes.q_f.shape[1]))
     by_dt = jnp.zeros(())
     if at_micro is not None:
+        # t_micro = t_end - macro_dt (1 - c) with the micro times c: its cotangent goes to the node's time and to macro_dt.
         t_micro, by_micro = at_micro
         at_nodes = (at_nodes[0].at[1:].add(t_micro.sum(1)), *at_nodes[1:])
         by_dt -= jnp.sum(t_micro * (1 - times))
@@ -224,8 +232,8 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_no
     xs = _Interval(before, after, tuple(a[1:] for a in at_nodes), by_micro)
     first = jax.tree.map(lambda a: a[0], nodes)
     carry = jax.tree.map(jnp.zeros_like, (real, first)), by_dt
-    (by_real, by_state, by_dt), gaps = jax.lax.scan(interval, (*carry[0], by_dt), xs, reverse=True)
-    _say_gap(jnp.max(gaps), jnp.argmax(gaps), engine.num_saves)
+    (by_real, by_state, by_dt), gaps = jax.lax.scan(interval_back, (*carry[0], by_dt), xs, reverse=True)
+    _warn_of_gap(jnp.max(gaps), jnp.argmax(gaps), engine.num_saves)
     by_real, by_state = _plus((by_real, by_state), jax.vjp(node, real, first)[1](tuple(a[0] for a in at_nodes)))
     return by_real, by_state, by_dt
 
@@ -243,29 +251,22 @@ def _where_solved(result, state: State) -> State:
 
 
 def _distance(a: State, b: State):
-    """Largest difference of positions, and of momenta, relative to the largest of them."""
+    """Larger of two differences: of positions relative to the largest position, and of momenta relative to the largest momentum."""
 
     def relative(a, b):
         scale = jnp.max(jnp.abs(b), initial=0.0)
         return jnp.max(jnp.abs(a - b), initial=0.0) / jnp.where(scale > 0, scale, 1.0)
 
-    positions, momenta = ([jnp.concatenate(pair(s)) for s in (a, b)] for pair in (_positions, _momenta))
+    positions = [jnp.concatenate([state.q_s, state.q_f]) for state in (a, b)]
+    momenta = [jnp.concatenate([state.p_s, state.p_f]) for state in (a, b)]
     return jnp.maximum(relative(*positions), relative(*momenta))
 
 
-def _positions(state: State):
-    return state.q_s, state.q_f
+def _warn_of_gap(gap, interval, intervals: int) -> None:
+    """Warn where the reversed run missed a saved node of the run."""
 
-
-def _momenta(state: State):
-    return state.p_s, state.p_f
-
-
-def _say_gap(gap, interval, intervals: int) -> None:
-    """Warn where a run that was reversed did not come back to where it had been."""
-
-    def say(gap, interval):
-        if not gap <= GAP:
+    def warn(gap, interval):
+        if not gap <= REPORTED_GAP:
             warnings.warn(
                 f"adjoint='reversible': the steps back from saved node {int(interval) + 1} of {intervals} missed the one before "
                 f"by {float(gap):.1e} (relative), so that the derivative is as inexact. Save more nodes (a smaller save_every), "
@@ -273,22 +274,22 @@ def _say_gap(gap, interval, intervals: int) -> None:
                 stacklevel=2,
             )
 
-    jax.debug.callback(say, gap, interval)
+    jax.debug.callback(warn, gap, interval)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def forward(run, arrays) -> Trajectory:
-    """``run(arrays)``, whose derivative in reverse mode is made by forward mode, for all numbers that are differentiated by."""
+    """``run(arrays)``, whose derivative in reverse mode is the Jacobian of forward mode, transposed."""
     return run(arrays)
 
 
 def _run_and_jacobian(run, arrays):
-    """The trajectory; the arrays, and for each that is differentiated by the derivatives of all real outputs by its numbers."""
+    """The trajectory, and for reverse mode: the arrays, the rows of each array in the Jacobian, the Jacobian of all real outputs."""
     marked, structure = jax.tree.flatten(arrays, is_leaf=lambda leaf: hasattr(leaf, "perturbed"))
     values = [leaf.value for leaf in marked]
     wanted = {i: jnp.asarray(leaf.value) for i, leaf in enumerate(marked) if leaf.perturbed and _is_real(leaf.value)}
-    flat, apart = ravel_pytree(wanted)
-    if flat.size > MANY:
+    flat, unravel = ravel_pytree(wanted)
+    if flat.size > MOST_TANGENTS:
         warnings.warn(
             f"adjoint='forward' runs beside the run for each of the {flat.size} numbers that are differentiated by; "
             "'checkpoint' and 'reversible' cost the same for any number of them.",
@@ -300,24 +301,26 @@ def _run_and_jacobian(run, arrays):
         return list(filter(_is_real, jax.tree.leaves(trajectory))), trajectory
 
     def directional_derivative(direction):
-        _, tangents, trajectory = jax.jvp(real_outputs, (wanted,), (apart(direction),), has_aux=True)
+        _, tangents, trajectory = jax.jvp(real_outputs, (wanted,), (unravel(direction),), has_aux=True)
         return tangents, trajectory
 
     derivatives, trajectory = jax.vmap(directional_derivative, out_axes=(0, None))(jnp.eye(flat.size))
-    by_leaf = apart(jnp.arange(flat.size, dtype=float))
-    places = [by_leaf[i].astype(int) if i in by_leaf else None for i in range(len(values))]
-    return trajectory, (jax.tree.unflatten(structure, values), places, derivatives)
+    by_leaf = unravel(jnp.arange(flat.size, dtype=float))
+    rows_of_leaves = [by_leaf[i].astype(int) if i in by_leaf else None for i in range(len(values))]
+    return trajectory, (jax.tree.unflatten(structure, values), rows_of_leaves, derivatives)
 
 
-def _contracted(run, kept, cotangent: Trajectory):
-    arrays, places, derivatives = kept
+def _contracted(run, residuals, cotangent: Trajectory):
+    arrays, rows_of_leaves, derivatives = residuals
     real = [
         jnp.zeros(d.shape[1:]) if isinstance(c, SymbolicZero) else c
         for c, d in zip(filter(_is_real, jax.tree.leaves(cotangent)), derivatives, strict=True)
     ]
     flat = jnp.sum(jnp.stack([jnp.tensordot(d, c, c.ndim) for c, d in zip(real, derivatives, strict=True)]), axis=0)
     values, structure = jax.tree.flatten(arrays)
-    by_values = [_no_cotangent(v) if at is None else flat[at] for v, at in zip(values, places, strict=True)]
+    by_values = [
+        _no_cotangent(v) if rows is None else flat[rows] for v, rows in zip(values, rows_of_leaves, strict=True)
+    ]
     return (jax.tree.unflatten(structure, by_values),)
 
 

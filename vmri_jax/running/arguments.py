@@ -1,4 +1,4 @@
-"""Arguments of runs: bad ones are refused, with what came, what was expected and what to do."""
+"""Checks of the arguments of runs; a message names the argument, its value, the value expected, and what to change."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,13 +12,14 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
 
-WHOLE = 1e-9
-"""Part by which a number of steps may miss a whole number."""
+WHOLE_NUMBER_TOLERANCE = 1e-9
+"""Relative distance from a whole number up to which ``(t_end - t) / macro_dt`` counts as one. The end of a run misses t_end by at most this
+part of its length; a larger value lets runs end visibly beside t_end."""
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps of a run as they are asked for, see `vmri_jax.simulate`: exactly one of macro_dt and micro_dt, one of num_steps and t_end."""
+    """The arguments of `vmri_jax.simulate` for step size and length: one of macro_dt and micro_dt, one of num_steps and t_end, as the user gave them."""
 
     macro_dt: Any = None
     micro_dt: Any = None
@@ -53,10 +54,10 @@ def check_run(system, scheme, state, solver, steps: Steps):
 
 
 def nothing_fast(scheme: Scheme | Composition, num_fast: int) -> str:
-    """What to do about several micro steps for a scene without fast bodies; empty where there is nothing to say.
+    """Advice where a scene without fast bodies takes several micro steps; empty for any other scene.
 
     Args:
-        scheme: of a composition, the micro steps of a stage count.
+        scheme: its micro steps count; of a composition the micro steps of a stage.
         num_fast: number of fast coordinates, or of fast bodies.
     """
     if num_fast or stage_scheme(scheme).num_micro == 1:
@@ -78,7 +79,7 @@ def steps_until(t_end, t, macro_dt) -> int:
         raise ValueError(
             f"simulate: t_end is {t_end:g}, less than a macro step of {macro_dt:g} after the start at {t:g}."
         )
-    if abs(steps - whole) > WHOLE * whole:
+    if abs(steps - whole) > WHOLE_NUMBER_TOLERANCE * whole:
         raise ValueError(
             f"simulate: from {t:g} to t_end = {t_end:g} there are {steps:.6g} macro steps of {macro_dt:g}, no whole number. "
             f"Take macro_dt = {float(t_end - t) / np.ceil(steps):.10g}, or give num_steps."
@@ -87,7 +88,7 @@ def steps_until(t_end, t, macro_dt) -> int:
 
 
 def check_step_size(scheme: Scheme | Composition, macro_dt, micro_dt):
-    """Exactly one step size is given, and it is positive; returns macro_dt."""
+    """Refuse two step sizes, none, or one that is not positive; returns macro_dt."""
     if (macro_dt is None) == (micro_dt is None):
         got = "neither" if macro_dt is None else "both"
         raise ValueError(f"simulate: got {got} of macro_dt and micro_dt; give exactly one of them.")
@@ -98,7 +99,7 @@ def check_step_size(scheme: Scheme | Composition, macro_dt, micro_dt):
 
 
 def check_counts(num_steps, save_every) -> tuple[int, int]:
-    """Whole numbers of steps, the last of which is saved, as integers of Python."""
+    """Refuse counts that are no whole numbers, or a last step that is not saved; returns (num_steps, save_every) as Python integers."""
     num_steps = whole_number("simulate: num_steps", num_steps)
     save_every = whole_number("simulate: save_every", save_every)
     if num_steps % save_every:
@@ -110,7 +111,7 @@ def check_counts(num_steps, save_every) -> tuple[int, int]:
 
 
 def check_vectors(state: State) -> None:
-    """Positions and momenta are finite vectors of float64 that fit together."""
+    """Refuse positions and momenta that are not finite vectors of float64 of matching lengths."""
     vectors = {name: getattr(state, name) for name in ("q_s", "q_f", "p_s", "p_f")}
     q_s, q_f, p_s, p_f = arrays = [np.asarray(a) for a in vectors.values()]
     fits = q_s.shape == p_s.shape and q_f.shape == p_f.shape

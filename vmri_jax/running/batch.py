@@ -1,4 +1,4 @@
-"""Batches of runs: many starts, step sizes or parameters of one system, lane by lane independent."""
+"""Batches of runs: a lane for each start, step size or parameter set of one system; lanes do not influence each other."""
 
 import warnings
 from functools import lru_cache
@@ -23,14 +23,17 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton
 
-WORKING_SET = 4096
-"""Fast and slow variables at all nodes of a macro step that the lanes of a chunk may have together, 32 kB."""
-FEWEST_LANES, MOST_LANES = 64, 1024
-"""Lanes of a chunk. With fewer of them a lane takes longer, even where 64 do not fit into the cache."""
+NUMBERS_PER_CHUNK = 4096
+"""Positions at all nodes of a macro step, summed over the lanes of a chunk: 32 kB of float64, the first-level cache of a core. Chunks with
+more of them wait for slower memory."""
+FEWEST_LANES = 64
+"""Fewest lanes of a chunk, even where they exceed `NUMBERS_PER_CHUNK`: with fewer lanes the fixed cost of an operation outweighs the cache."""
+MOST_LANES = 1024
+"""Most lanes of a chunk; more make the chunk of a small batch mostly padding."""
 
 
 class FailedLanesWarning(UserWarning):
-    """Lanes of a batch failed: they are NaN from a step on, and the others are right."""
+    """Lanes of a batch failed: they are NaN after the failing step; all other lanes are right."""
 
 
 def simulate_batch(
@@ -52,13 +55,14 @@ def simulate_batch(
 ) -> Trajectory:
     """Simulate a batch of states, each lane as `simulate` would; the arrays returned have a leading batch axis.
 
-    Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike `simulate` it never raises because of a
-    step: a lane that fails is NaN from there on and has its status in ``.result`` and ``.failed_at``, and others do not notice. A
-    `FailedLanesWarning` says how many there are. Lanes that the nested march does not solve are run again with the exact arrowhead,
-    which is compiled for the first of them.
+    Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike `simulate`, a failed step never raises: its
+    lane is NaN after the step and has its status in ``.result`` and ``.failed_at``; other lanes do not change. A
+    `FailedLanesWarning` says how many lanes failed. Lanes that the nested march does not solve are run again with the exact arrowhead,
+    whose program is compiled at the first such lane.
 
     Args:
-        system, scheme: what moves, a `System`, `Problem` or scene, and how.
+        system: a `System`, `Problem` or scene.
+        scheme: a scheme or composition.
         states: a `State` whose arrays have a leading batch axis, e.g. ``jax.vmap(make)(q_s, ...)`` or
             ``jax.tree.map(lambda *a: jnp.stack(a), *list_of_states)``.
         macro_dt, micro_dt: step size, a number or one per lane; exactly one of them.
@@ -109,13 +113,13 @@ def simulate_batch(
     unsolved = (np.asarray(trajectory.failed_at) >= 0) & (np.asarray(trajectory.result) != Result.NOT_IMPLIED)
     failed = np.flatnonzero(unsolved)
     if failed.size and run.plan.has_fallback:
-        # rooms of a few sizes, so that few programs serve all numbers of failures
-        rooms = 2 ** int(failed.size - 1).bit_length()
-        filled = failed[np.minimum(np.arange(rooms), failed.size - 1)]
+        # Failed lanes are padded to a power of two with copies of the last one, so that few programs serve all numbers of failures.
+        padded_size = 2 ** int(failed.size - 1).bit_length()
+        padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
         with Working(
             f"simulate_batch: {failed.size} of {lanes} lanes, which the first method does not solve, with exact matrices"
         ):
-            again = _in_chunks(run, run.exact_engine, jax.tree.map(lambda a: a[filled], batch), width, devices)
+            again = _in_chunks(run, run.exact_engine, jax.tree.map(lambda a: a[padded], batch), width, devices)
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)
     if warn:
         _warn_of_failures(trajectory)
@@ -123,7 +127,7 @@ def simulate_batch(
 
 
 def _warn_of_failures(trajectory: Trajectory) -> None:
-    """Warn about lanes that failed, and say how the first of them did."""
+    """Warn about failed lanes, with the failing step and the status of the first one."""
     failed_at = np.asarray(trajectory.failed_at)
     failed = np.flatnonzero(failed_at >= 0)
     if failed.size:
@@ -145,12 +149,12 @@ def _first(dt):
 
 
 def _check_params(system: System, params, lanes: int) -> None:
-    """Refuse parameters that are not those of the system with a batch axis."""
+    """Refuse parameters of another structure than ``system.params``, or without a batch axis."""
     check_params(params)
-    own, given = jax.tree.structure(system.params), jax.tree.structure(params)
-    if own != given:
+    expected, structure = jax.tree.structure(system.params), jax.tree.structure(params)
+    if expected != structure:
         raise ValueError(
-            f"simulate_batch: params is {given}; give the pytree of system.params, {own}, with a batch axis."
+            f"simulate_batch: params is {structure}; give the pytree of system.params, {expected}, with a batch axis."
         )
     wanted = [(lanes, *np.shape(leaf)) for leaf in jax.tree.leaves(system.params)]
     shapes = [np.shape(leaf) for leaf in jax.tree.leaves(params)]
@@ -186,14 +190,14 @@ def _check_devices(devices, chunk) -> None:
 
 
 def lanes_at_once(run: Simulation) -> int:
-    """The chunk that is chosen, a power of two: lanes that fit into the working set, but not too few."""
+    """Lanes of a chunk where the user gives none: the largest power of two that fits into the cache, between the two limits."""
     nodes = run.scheme.num_micro * stage_scheme(run.scheme).degree
-    size = nodes * (run.state.q_s.size + run.state.q_f.size)
-    return 2 ** int(np.log2(np.clip(WORKING_SET / size, FEWEST_LANES, MOST_LANES)))
+    numbers_per_lane = nodes * (run.state.q_s.size + run.state.q_f.size)
+    return 2 ** int(np.log2(np.clip(NUMBERS_PER_CHUNK / numbers_per_lane, FEWEST_LANES, MOST_LANES)))
 
 
 def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices: int) -> Trajectory:
-    """All lanes, `width` at a time; the last chunk is filled up with copies of its last lane, so that one program computes all chunks."""
+    """All lanes, `width` at a time; the last chunk is padded with copies of its last lane, so that one program computes all chunks."""
     lanes = len(batch["state"][0])
     width = min(width, -(-lanes // devices) * devices)
     program = _side_by_side(engine, batch["params"] is not None, batch["macro_dt"] is not None, devices)
@@ -203,24 +207,28 @@ def _in_chunks(run: Simulation, engine: Engine, batch: dict, width: int, devices
         piece = jax.tree.map(lambda a, index=index: a[index], batch)
         macro_dt = run.macro_dt if piece["macro_dt"] is None else piece["macro_dt"]
         num_params = 0 if piece["params"] is None else len(piece["params"])
-        leaves = run.arrays.model
+        leaves = run.arrays.model  # the parameters come last, see `Arrays`
         shared = leaves[: len(leaves) - num_params]
         pieces.append(program(shared, piece["params"] or [], piece["state"], macro_dt, run.save_every))
     return from_arrays([jnp.asarray(np.concatenate(parts)[:lanes]) for parts in zip(*pieces, strict=True)])
 
 
 @lru_cache(maxsize=32)
-def _side_by_side(engine: Engine, own_params: bool, own_steps: bool, devices: int):
-    """``program(leaves, params, state, macro_dt, save_every)``: the runs of `engine`, a lane each."""
+def _side_by_side(engine: Engine, varies_params: bool, varies_steps: bool, devices: int):
+    """``program(leaves, params, state, macro_dt, save_every)``: a run of `engine` for each lane.
+
+    Args:
+        varies_params, varies_steps: whether each lane has its own parameters, its own macro step.
+    """
 
     def lane(leaves, params, state, macro_dt, save_every):
         return jax.tree.leaves(engine.trajectory(Arrays(leaves + params, state, macro_dt), save_every))
 
-    lanes = (False, own_params, True, own_steps, False)
-    program = jax.vmap(lane, [0 if own else None for own in lanes])
+    has_lanes = (False, varies_params, True, varies_steps, False)
+    program = jax.vmap(lane, [0 if has_axis else None for has_axis in has_lanes])
     if devices > 1:
         mesh = jax.sharding.Mesh(np.array(jax.devices()[:devices]), ("lanes",))
         spread = PartitionSpec("lanes")
-        specs = tuple(spread if own else PartitionSpec() for own in lanes)
+        specs = tuple(spread if has_axis else PartitionSpec() for has_axis in has_lanes)
         program = jax.shard_map(program, mesh=mesh, in_specs=specs, out_specs=spread, check_vma=False)
     return jax.jit(program)

@@ -1,4 +1,8 @@
-"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure."""
+"""The engine of all runs: a loop of macro steps inside a loop over saved nodes, compiled once per structure.
+
+Names: `save_every` macro steps lie between two saved nodes; `num_saves` saved intervals fit into the arrays of an engine; a call computes
+the first `saves` of them.
+"""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -16,7 +20,7 @@ from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE
 from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
-from vmri_jax.running.loops import PLAIN, WHOLE, Loops, Recursive, Stored
+from vmri_jax.running.loops import MOST_STORED_STEPS, PLAIN, Loops, Recursive, Stored
 from vmri_jax.running.saved import Node, Saved
 from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
 from vmri_jax.schemes.composition import Composition
@@ -27,7 +31,7 @@ from vmri_jax.steppers.solvers import Newton
 
 
 class Model(NamedTuple):
-    """All that decides how a run goes on from a state: how equations are solved, the scheme, the system."""
+    """Solver, scheme and system: everything but state and macro step that the motion depends on."""
 
     solver: Newton
     scheme: Scheme | Composition
@@ -35,11 +39,12 @@ class Model(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """The numbers that a run is computed from, as bare arrays: JAX flattens a system in Python, which would take longer than a short run.
+    """The numbers that a run is computed from, flattened once: to flatten a system at every call would take longer than a short run.
 
-    model: leaves of a `Model`, those of the parameters of the system last.
-    state: of the start, its five arrays.
-    macro_dt: H.
+    model: leaves of a `Model`. `system` is its last field and `params` the last field of a `System` with leaves, so that the leaves of the
+        parameters come last.
+    state: the five arrays of the state at the start.
+    macro_dt: macro step H.
     """
 
     model: list
@@ -51,17 +56,17 @@ class Arrays(NamedTuple):
         return State(*self.state)
 
 
-class Place(NamedTuple):
-    """Where a piece of a run begins.
+class PieceStart(NamedTuple):
+    """The place in a run where a piece begins.
 
-    memory: of the stepper, from the piece before.
-    starts: whether no step is remembered; then the memory of a first step takes the place of `memory`.
+    memory: memory of the stepper after the previous piece.
+    is_first: whether the stepper has no memory of earlier steps; then the memory of a first step replaces `memory`.
     t_start: time of the start of the whole run.
-    step: macro steps before.
+    step: macro steps done before the piece.
     """
 
     memory: Any
-    starts: Any
+    is_first: Any
     t_start: Any
     step: Any
 
@@ -70,9 +75,12 @@ class Place(NamedTuple):
 class Engine:
     """Compiled runs of all systems and schemes of one structure, as functions of `Arrays` and of numbers of steps.
 
+    Two kinds of loops: `whole` and `piece` count in a while-loop, which is fast, and whose numbers of steps are arguments; `stored` and
+    `checkpointed` scan, which reverse mode can differentiate, with static numbers of steps.
+
     Attributes:
-        structure: of the pytree `Model`.
-        num_saves: saved intervals that there is room for.
+        structure: structure of the pytree `Model`.
+        num_saves: saved intervals that fit into the arrays of a run.
         save_micro: whether micro nodes are saved.
     """
 
@@ -99,44 +107,47 @@ class Engine:
 
     @cached_property
     def checkpointed(self):
-        """The same with derivatives in reverse mode only, that need memory like the logarithm of the number of steps."""
+        """`stored` with derivatives in reverse mode only, whose memory grows like the logarithm of the number of steps."""
 
         def checkpointed(arrays: Arrays, save_every):
-            loops = Stored() if self.num_saves * save_every <= WHOLE else Recursive(save_every)
+            loops = Stored() if self.num_saves * save_every <= MOST_STORED_STEPS else Recursive(save_every)
             return self.trajectory(arrays, save_every, loops=loops, reverse_only=True)
 
         return jax.jit(checkpointed, static_argnums=1)
 
     @cached_property
     def piece(self):
-        """``piece(saved, arrays, place, save_every, saves)``: a run of any length, by pieces.
+        """``piece(saved, arrays, begin, save_every, saves)``: the next `saves` saved intervals of a run, as a `_Loop`.
 
-        Computes the first `saves` saved intervals into the arrays `saved`, whose memory it takes over, and returns `_Counted`.
+        The nodes are written into the arrays `saved`, which are donated: the caller must not use them again.
         """
 
-        def piece(saved: Saved, arrays: Arrays, place: Place, save_every, saves):
+        def piece(saved: Saved, arrays: Arrays, begin: PieceStart, save_every, saves):
             start, macro_dt = arrays.start(), arrays.macro_dt
             stepper = self.stepper(arrays.model, start)
-            memory = jax.tree.map(partial(jnp.where, place.starts), stepper.init(start, macro_dt), place.memory)
-            times = _Times(place.t_start, macro_dt, save_every)
-            return self._counted(stepper, _At.before(start, memory, place.step), saved, times, saves)
+            memory = jax.tree.map(partial(jnp.where, begin.is_first), stepper.init(start, macro_dt), begin.memory)
+            times = _Times(begin.t_start, macro_dt, save_every)
+            return self._by_while_loop(stepper, _Cursor.before(start, memory, begin.step), saved, times, saves)
 
         return jax.jit(piece, donate_argnums=0)
 
-    def next_piece(self, arrays: Arrays, place: Place, save_every: int, saves: int) -> tuple[Trajectory, State, Any]:
+    def next_piece(
+        self, arrays: Arrays, begin: PieceStart, save_every: int, saves: int
+    ) -> tuple[Trajectory, State, Any]:
         """`piece` with its trajectory in arrays of NumPy, and the state and memory at its end."""
         scheme = self.model(arrays.model).scheme
         free = self._free[tuple(a.shape for a in arrays.state)]
         try:
             room = free.pop()
         except IndexError:  # the first piece, or all arrays are in use by other threads
-            room = self._nothing(arrays.start(), scheme.num_micro)
-        done = self.piece(room, arrays, place, save_every, saves)
-        saved = done.saved.first(saves, int(done.number))
-        free.append(done.saved)
+            room = self._empty(arrays.start(), scheme.num_micro)
+        loop = self.piece(room, arrays, begin, save_every, saves)
+        saved = loop.saved.first(saves, int(loop.number))
+        free.append(loop.saved)
         macro_dt = np.asarray(arrays.macro_dt)
-        times = np.asarray(place.t_start) + (place.step + np.arange(saves + 1) * save_every) * macro_dt
-        return self._trajectory(scheme, done._replace(saved=saved), times, macro_dt), done.at.state, done.at.memory
+        times = np.asarray(begin.t_start) + (begin.step + np.arange(saves + 1) * save_every) * macro_dt
+        trajectory = self._trajectory(scheme, loop._replace(saved=saved), times, macro_dt)
+        return trajectory, loop.cursor.state, loop.cursor.memory
 
     @cached_property
     def _free(self) -> defaultdict[tuple, list[Saved]]:
@@ -144,109 +155,122 @@ class Engine:
         return defaultdict(list)
 
     def blank_memory(self, arrays: Arrays):
-        """The memory that `piece` is given where it starts: zeros."""
+        """Zeros in the shapes of the memory of the stepper, for a `PieceStart` that is the first."""
         return _blank_memory(self, tuple((a.shape, a.dtype) for a in (*arrays.model, *arrays.state)))
 
     def trajectory(
         self, arrays: Arrays, save_every, saves=None, loops: Loops | None = None, reverse_only: bool = False
     ) -> Trajectory:
-        """A run from its first step, not compiled; of all saved intervals, or of the first `saves` of them.
+        """A run from its first step, not jitted; of all saved intervals, or of the first `saves` of them.
 
         Args:
-            loops: to be differentiated; None for the fastest.
+            loops: loops that reverse mode can differentiate; None for the while-loop.
             reverse_only: as of `plan`.
         """
         start, macro_dt = arrays.start(), arrays.macro_dt
         stepper, times = self.stepper(arrays.model, start, reverse_only), _Times(start.t, macro_dt, save_every)
-        at = _At.before(start, stepper.init(start, macro_dt), 0)
+        cursor = _Cursor.before(start, stepper.init(start, macro_dt), 0)
         if loops is not None:
-            return self._scanned(stepper, at, times, loops)
-        done = self._counted(stepper, at, self._nothing(start, stepper.scheme.num_micro), times, saves)
+            return self._by_scan(stepper, cursor, times, loops)
+        empty = self._empty(start, stepper.scheme.num_micro)
+        loop = self._by_while_loop(stepper, cursor, empty, times, saves)
         nodes = start.t + jnp.arange(self.num_saves + 1) * save_every * macro_dt
-        return self._trajectory(stepper.scheme, done, nodes, macro_dt)
+        return self._trajectory(stepper.scheme, loop, nodes, macro_dt)
 
     def model(self, leaves: list) -> Model:
         """The `Model` with these leaves."""
         return jax.tree.unflatten(self.structure, leaves)
 
     def stepper(self, leaves: list, state: State, reverse_only: bool = False) -> Plan:
-        """How its steps are taken."""
+        """The `Plan` that takes the steps of the model with these leaves."""
         solver, scheme, system = self.model(leaves)
         return plan(system, scheme, state, solver, fallback=False, reverse_only=reverse_only)
 
-    def _counted(self, stepper: Plan, at: "_At", saved: Saved, times: "_Times", saves) -> "_Counted":
-        """`saves * save_every` macro steps; with `saves` None all that there is room for, whether or not steps fail: lanes go on together."""
-        interval = self._interval(stepper, at.state, times, PLAIN)
+    def _by_while_loop(self, stepper: Plan, cursor: "_Cursor", saved: Saved, times: "_Times", saves) -> "_Loop":
+        """``saves * save_every`` macro steps, or fewer if one fails.
 
-        def goes_on(done: _Counted):
-            return done.number <= self.num_saves if saves is None else (done.number <= saves) & (done.at.failed_at < 0)
+        With `saves` None all `num_saves` intervals, failed or not: the end of the loop then depends on no lane of a batch, and `jax.vmap` need
+        not select between old and new values in every lane.
+        """
+        interval = self._interval(stepper, cursor.state, times, PLAIN)
 
-        def save(done: _Counted) -> _Counted:
-            number, at, saved = done
+        def goes_on(loop: _Loop):
+            if saves is None:
+                return loop.number <= self.num_saves
+            return (loop.number <= saves) & (loop.cursor.failed_at < 0)
+
+        def save(loop: _Loop) -> _Loop:
+            number, cursor, saved = loop
             is_later = number > 0  # turn 0 saves the start, so that the code for nodes is compiled once
-            moved, info, micro = interval(at, jnp.where(is_later, times.save_every, 0))
-            at = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, at)
-            node, at = _node(stepper.system, stepper.solver.tolerance, at)
-            return _Counted(number + 1, at, saved.write(number, node, info, micro))
+            moved, info, micro = interval(cursor, jnp.where(is_later, times.save_every, 0))
+            cursor = jax.tree.map(lambda a, b: a if a is b else jnp.where(is_later, a, b), moved, cursor)
+            node, cursor = _node(stepper.system, stepper.solver.tolerance, cursor)
+            return _Loop(number + 1, cursor, saved.write(number, node, info, micro))
 
-        return jax.lax.while_loop(goes_on, save, _Counted(jnp.asarray(0), at, saved))
+        return jax.lax.while_loop(goes_on, save, _Loop(jnp.asarray(0), cursor, saved))
 
-    def _scanned(self, stepper: Plan, at: "_At", times: "_Times", loops: Loops) -> Trajectory:
-        """All of a run from its first step, by loops that can be differentiated."""
+    def _by_scan(self, stepper: Plan, cursor: "_Cursor", times: "_Times", loops: Loops) -> Trajectory:
+        """A whole run from its first step, by loops that reverse mode can differentiate."""
         system, tolerance = stepper.system, stepper.solver.tolerance
-        interval = self._interval(stepper, at.state, times, loops)
+        interval = self._interval(stepper, cursor.state, times, loops)
 
-        def save(at: _At, _):
-            at, info, micro = interval(at, times.save_every)
-            node, at = _node(system, tolerance, at)
-            return at, (node, info, micro)
+        def save(cursor: _Cursor, _):
+            cursor, info, micro = interval(cursor, times.save_every)
+            node, cursor = _node(system, tolerance, cursor)
+            return cursor, (node, info, micro)
 
-        first, at = _node(system, tolerance, at)
-        at, (nodes, info, micros) = loops.scan(save, at, self.num_saves)
+        first, cursor = _node(system, tolerance, cursor)
+        cursor, (nodes, info, micros) = loops.scan(save, cursor, self.num_saves)
         nodes = jax.tree.map(lambda a, b: jnp.concatenate([jnp.asarray(a)[None], b]), first, nodes)
         before_end = _before_end(stepper.scheme, times.macro_dt)
         micro = None if micros is None else MicroNodes(nodes.state.t[1:, None] - before_end, micros)
-        return Trajectory(*nodes, info=info, result=at.result, failed_at=at.failed_at, micro=micro)
+        return Trajectory(*nodes, info=info, result=cursor.result, failed_at=cursor.failed_at, micro=micro)
 
     def _interval(self, stepper: Plan, state: State, times: "_Times", loops: Loops):
-        """``at, info, micro = interval(at, count)``: the macro steps between two saved nodes."""
+        """``cursor, info, micro = interval(cursor, count)``: the `count` macro steps between two saved nodes."""
         no_info = RunInfo(np.asarray(0), np.asarray(0), np.zeros(()))
         no_micro = jnp.zeros((stepper.scheme.num_micro, state.q_f.shape[0])) if self.save_micro else None
-        take = _step_of(stepper, times, self.save_micro)
+        take_step = _step_of(stepper, times, self.save_micro)
 
-        def interval(at: _At, count):
-            at, info, micro = loops.repeat(count, take, (at, no_info, no_micro))
-            if stepper.defers_projection:
-                state, memory = stepper.project(at.state, at.memory)
-                at = at._replace(state=state, memory=memory)
-            return at, info, micro
+        def interval(cursor: _Cursor, count):
+            cursor, info, micro = loops.repeat(count, take_step, (cursor, no_info, no_micro))
+            if stepper.defers_projection:  # momenta off the hidden constraints cost nothing between saved nodes
+                state, memory = stepper.project(cursor.state, cursor.memory)
+                cursor = cursor._replace(state=state, memory=memory)
+            return cursor, info, micro
 
         return interval
 
-    def _nothing(self, state: State, num_micro: int) -> Saved:
+    def _empty(self, state: State, num_micro: int) -> Saved:
         return Saved.none(state, self.num_saves, num_micro if self.save_micro else None)
 
-    def _trajectory(self, scheme, done: "_Counted", times, macro_dt) -> Trajectory:
-        status = {"result": done.at.result, "failed_at": done.at.failed_at}
+    def _trajectory(self, scheme, loop: "_Loop", times, macro_dt) -> Trajectory:
+        status = {"result": loop.cursor.result, "failed_at": loop.cursor.failed_at}
         before_end = _before_end(scheme, macro_dt) if self.save_micro else None
-        return done.saved.trajectory(done.at.state.q_s.shape[0], times, status, before_end)
+        return loop.saved.trajectory(loop.cursor.state.q_s.shape[0], times, status, before_end)
 
 
 engine = lru_cache(maxsize=32)(Engine)
-"""The engine with these attributes. Thousands of programs would exhaust the memory maps that a process may have."""
+"""``engine(structure, num_saves, save_micro)``: the `Engine` with these attributes, made once. The 33rd structure displaces the one used
+least recently, which compiles again when it is needed: each program takes memory maps, of which a process has a limited number."""
 
 
 def _before_end(scheme, macro_dt):
-    """(num_micro,) by how much the micro nodes of a macro step are earlier than its end."""
+    """(num_micro,) times from the micro nodes of a macro step to its end, ``H (1 - c_i)``."""
     return macro_dt * (1 - scheme.micro_times)
 
 
 @lru_cache(maxsize=256)
 def _blank_memory(engine: Engine, shapes: tuple):
-    """Zeros in the shapes of the memory of a stepper; `shapes` and types of the leaves and of the five arrays of a state."""
+    """Zeros in the shapes of the memory of a stepper.
+
+    Args:
+        engine: makes the stepper.
+        shapes: (shape, dtype) of the leaves of the model and, last, of the five arrays of the state.
+    """
 
     def memory(*arrays):
-        start = State(*arrays[-5:])  # the five arrays of a state
+        start = State(*arrays[-5:])
         return engine.stepper(list(arrays[:-5]), start).init(start, 1.0)
 
     blank = jax.eval_shape(memory, *(jax.ShapeDtypeStruct(*shape) for shape in shapes))
@@ -254,15 +278,15 @@ def _blank_memory(engine: Engine, shapes: tuple):
 
 
 class _Times(NamedTuple):
-    """Times of a run: that of its start, the macro step H, and the macro steps from one saved node to the next."""
+    """Time of the start of a run, macro step H, and macro steps from one saved node to the next."""
 
     t_start: Any
     macro_dt: Any
     save_every: Any
 
 
-class _At(NamedTuple):
-    """Where a run is: before macro step `step`, with the worst `result` so far and the step that failed, -1 if none did."""
+class _Cursor(NamedTuple):
+    """Progress of a run: state and memory before macro step `step`, the worst `result` so far, the failed step or -1."""
 
     state: State
     memory: Any
@@ -271,59 +295,63 @@ class _At(NamedTuple):
     failed_at: Int[Numbers, ""]
 
     @classmethod
-    def before(cls, state: State, memory, step) -> "_At":
-        """A step, without failures so far."""
+    def before(cls, state: State, memory, step) -> "_Cursor":
+        """The cursor before macro step `step`, without failures so far."""
         return cls(state, memory, jnp.asarray(step), np.asarray(int(Result.CONVERGED)), np.asarray(-1))
 
 
-class _Counted(NamedTuple):
-    """Number of the next node to be saved, where the run is, and the nodes that are saved."""
+class _Loop(NamedTuple):
+    """Carry of the while-loop: number of the next node to be saved, cursor of the run, and the nodes saved so far."""
 
     number: Int[Numbers, ""]
-    at: _At
+    cursor: _Cursor
     saved: Saved
 
 
 def _step_of(stepper: Plan, times: _Times, save_micro: bool):
-    """A macro step as the body of a loop. From a failure on momenta are NaN, and by them all positions after it."""
+    """A macro step as the body of a loop."""
     t_start, macro_dt, _ = times
 
     def step(_, carry):
-        at, worst, _ = carry
-        alive = at.failed_at < 0
-        state, info, memory = stepper.step(at.state, at.memory, macro_dt)
+        cursor, worst, _ = carry
+        alive = cursor.failed_at < 0
+        state, info, memory = stepper.step(cursor.state, cursor.memory, macro_dt)
         ok = alive & (info.result <= Result.CONVERGED_AT_ROUNDOFF)
-        now = RunInfo(info.method, info.iterations, info.residual)
-        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, now)
+        info_of_step = RunInfo(info.method, info.iterations, info.residual)
+        worst = jax.tree.map(lambda a, b: jnp.where(alive, jnp.maximum(a, b), a), worst, info_of_step)
+        # NaN in the momenta alone: the next step carries it into all positions.
         p_s, p_f = (jnp.where(ok, p, jnp.nan) for p in (state.p_s, state.p_f))
-        state = State(t_start + (at.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
-        result = jnp.where(alive, jnp.maximum(at.result, info.result), at.result)
-        failed_at = jnp.where(alive & ~ok, at.step, at.failed_at)
+        # t_k = t_0 + k H from the step number, since a sum of steps would accumulate round-off; the time of the stepper is ignored.
+        state = State(t_start + (cursor.step + 1) * macro_dt, state.q_s, state.q_f, p_s, p_f)
+        result = jnp.where(alive, jnp.maximum(cursor.result, info.result), cursor.result)
+        failed_at = jnp.where(alive & ~ok, cursor.step, cursor.failed_at)
         micro = jnp.where(ok, info.q_f_micro, jnp.nan) if save_micro else None
-        return _At(state, memory, at.step + 1, result, failed_at), worst, micro
+        return _Cursor(state, memory, cursor.step + 1, result, failed_at), worst, micro
 
     return step
 
 
-def _node(system: System, tolerance, at: _At) -> tuple[Node, _At]:
-    """What is saved of a node, and the status after a look at it.
+def _node(system: System, tolerance, cursor: _Cursor) -> tuple[Node, _Cursor]:
+    """The saved node, and the status after a check of its energy and constraints.
 
-    A potential may be NaN where its gradient is not (a logarithm beyond its pole), a lane of a batch may start off its
-    constraints, and rows that were left out may not follow from them: such nodes are no result either.
+    Three nodes fail here after steps that succeeded: the energy is NaN although its gradient is finite (a logarithm beyond its pole); a
+    lane of a batch started off its constraints; or the rows of ``system.implied``, redundant constraints that the solver leaves out, are
+    violated.
     """
-    state = at.state
+    state = cursor.state
     phase = state.q_s, state.q_f, state.p_s, state.p_f
     energy, residual = invariants.energy(system, *phase), invariants.constraint_residual(system, state)
+    # A loose Newton tolerance leaves constraints violated by about as much; 100 times covers constraints of larger units than momenta.
     allowed = jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
     finite, kept = jnp.isfinite(energy), residual[0] <= allowed
-    breaks = (at.failed_at < 0) & ~(finite & kept)
+    breaks = (cursor.failed_at < 0) & ~(finite & kept)
     violated = Result.CONSTRAINT_VIOLATED
-    if system.implied is not None:  # the residual has rows that are not solved for, too
+    if system.implied is not None:  # the residual includes the implied rows: blame them if the solved rows are kept
         solved = max_abs(system.constraints(state.t, state.q_s, state.q_f))
         violated = jnp.where(solved <= allowed, Result.NOT_IMPLIED, violated)
     cause = jnp.where(finite, violated, Result.NON_FINITE)
-    result = jnp.where(breaks, cause, at.result)
-    failed_at = jnp.where(breaks, jnp.maximum(at.step - 1, 0), at.failed_at)
+    result = jnp.where(breaks, cause, cursor.result)
+    failed_at = jnp.where(breaks, jnp.maximum(cursor.step - 1, 0), cursor.failed_at)
     *phase, energy, residual = (jnp.where(failed_at < 0, a, jnp.nan) for a in (*phase, energy, residual))
     node = Node(State(jnp.asarray(state.t), *phase), energy, residual)
-    return node, at._replace(result=result, failed_at=failed_at)
+    return node, cursor._replace(result=result, failed_at=failed_at)

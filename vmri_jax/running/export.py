@@ -1,4 +1,4 @@
-"""A run for other programs: tables of named columns, CSV, pandas, xarray."""
+"""Export of a run to other programs: tables of named columns, CSV, pandas, Parquet, xarray."""
 
 import csv
 import importlib
@@ -31,30 +31,27 @@ DIMENSIONS = {
     "t_micro": ("t", "micro"),
     "q_f_micro": ("t", "micro", "fast"),
 }
-"""Names of the axes of all arrays with a row for each saved node."""
+"""Names of the axes of every array that has a row for each saved node."""
 MICRO = "t_micro", "q_f_micro"
 """Names of the arrays of micro nodes."""
 FILL = {"f": np.nan, "i": -1}
-"""Values where there are none, by kind of number: of what a run did before its start, and of rows that are not there yet."""
+"""Missing values by kind of number, float or integer: of the solver's work before the start, and of rows not yet written."""
 
 
 def rows_of(run: SavedRun) -> dict[str, np.ndarray]:
-    """The arrays of a run with a row for each saved node; what its steps did before a node is in the row of that node.
+    """The arrays of a run with a row for each saved node; row k has the work of the solver from node k - 1 to node k.
 
     Args:
         run: one run, or a batch.
     """
-    known = (
-        dict(vars(run.states))
-        | run.info._asdict()
-        | ({} if run.micro is None else dict(zip(MICRO, run.micro, strict=True)))
-    )
-    known |= {"energy": run.energy, "constraint_residual": run.constraint_residual}
+    micro = {} if run.micro is None else dict(zip(MICRO, run.micro, strict=True))
+    fields = dict(vars(run.states)) | run.info._asdict() | micro
+    fields |= {"energy": run.energy, "constraint_residual": run.constraint_residual}
     if run.error is not None:
-        known |= {
+        fields |= {
             name: getattr(run.error, name.removeprefix("error_")) for name in DIMENSIONS if name.startswith("error_")
         }
-    arrays = {name: np.asarray(value) for name, value in known.items() if value is not None}
+    arrays = {name: np.asarray(value) for name, value in fields.items() if value is not None}
     axis = arrays["t"].ndim - 1
     for name, array in arrays.items():
         missing = len(run) - array.shape[axis]
@@ -65,11 +62,11 @@ def rows_of(run: SavedRun) -> dict[str, np.ndarray]:
 
 
 class Exports(Quantities):
-    """Ways out of a run. All of them carry the names of bodies and coordinates."""
+    """Methods that export a run, with the names of bodies and coordinates."""
 
     def columns(self) -> dict[str, np.ndarray]:
         """Columns (k,) by name: time, coordinates by their names, velocities "v ..." if the system is known, momenta "p ...",
-        energy, constraint residuals, and what the solver did before each node.
+        energy, constraint residuals, and the work of the solver since the previous node.
 
         Raises:
             ValueError: this is a batch.
@@ -83,19 +80,19 @@ class Exports(Quantities):
         if run.origin.knows_system:
             v_s, v_f = map(np.asarray, run.velocities)
             parts.insert(1, ("v ", v_s, v_f))
-        found = {"t": rows["t"]}
+        columns = {"t": rows["t"]}
         for letter, slow, fast in parts:
             labels = [*names.slow_coordinates, *names.fast_coordinates]
-            found |= {letter + name: column for name, column in zip(labels, [*slow.T, *fast.T], strict=True)}
+            columns |= {letter + name: column for name, column in zip(labels, [*slow.T, *fast.T], strict=True)}
         position, velocity = rows["constraint_residual"].T
-        found |= {"energy": rows["energy"], "constraint residual": position, "constraint rate": velocity}
+        columns |= {"energy": rows["energy"], "constraint residual": position, "constraint rate": velocity}
         if run.error is not None:
             shares = {"slow share": rows["error_slow"], "fast share": rows["error_fast"]}
-            found |= {"error": run.error.positions} | {f"error, {name}": share for name, share in shares.items()}
-        return found | {name: rows[name] for name in ("method", "iterations", "residual")}
+            columns |= {"error": run.error.positions} | {f"error, {name}": share for name, share in shares.items()}
+        return columns | {name: rows[name] for name in ("method", "iterations", "residual")}
 
     def to_csv(self, path) -> None:
-        """Write `columns` to a .csv file, with a line of names; a file that is there is replaced.
+        """Write `columns` to a .csv file, with a line of names; an existing file is replaced.
 
         Args:
             path: of the file.
@@ -123,10 +120,10 @@ class Exports(Quantities):
         return pandas.DataFrame(columns).set_index("t")
 
     def to_parquet(self, path) -> None:
-        """Write `columns` to a .parquet file, with time as the first one (needs the extra ``vmri_jax[parquet]``).
+        """Write `columns` to a .parquet file, time first (needs the extra ``vmri_jax[parquet]``).
 
         Args:
-            path: of the file; one that is there is replaced.
+            path: of the file; an existing file is replaced.
 
         Raises:
             ValueError: this is a batch.
@@ -140,8 +137,8 @@ class Exports(Quantities):
     def to_xarray(self):
         """The run as an `xarray.Dataset` over time (needs the extra ``vmri_jax[xarray]``), with a dimension of lanes in a batch.
 
-        Row k of "method", "iterations", "residual" and of the micro nodes is what led to node k, so that the first is empty
-        (-1 or NaN). The store of `vmri_jax.stream` has the same dimensions.
+        Row k of "method", "iterations", "residual" and of the micro nodes belongs to the steps from node k - 1 to node k, so that row 0 is
+        empty (-1 or NaN). The store of `vmri_jax.stream` has the same dimensions.
 
         Raises:
             ImportError: xarray is not installed.
@@ -157,25 +154,36 @@ class Exports(Quantities):
             "fast": names.fast_coordinates,
             "level": ["position", "velocity"],
         }
-        if lanes and np.any(rows["t"] != rows["t"][0]):  # lanes with steps of their own
+        if lanes and np.any(
+            rows["t"] != rows["t"][0]
+        ):  # each lane has its own macro step: node numbers replace the times
             coordinates["t"] = ("t", np.arange(rows["t"].shape[1]))
             data["time"] = (("lane", "t"), rows["t"])
         return xarray.Dataset(data, coords=coordinates, attrs=attributes(run))
 
 
 def attributes(run: SavedRun) -> dict:
-    """The status of a run, and the names of its parts as JSON."""
+    """The status of a run, and the names of bodies and constraints as JSON."""
     if np.ndim(run.t) > 1:
-        found = {"result": np.asarray(run.result), "failed_at": np.asarray(run.failed_at)}
+        status = {"result": np.asarray(run.result), "failed_at": np.asarray(run.failed_at)}
     else:
-        found = {"result": Result(int(run.result)).name, "failed_at": int(run.failed_at)}
+        status = {"result": Result(int(run.result)).name, "failed_at": int(run.failed_at)}
     names = run.origin.names
-    return found | ({} if names is None else {"names": json.dumps(names.to_dict())})
+    return status | ({} if names is None else {"names": json.dumps(names.to_dict())})
 
 
-def extra(package: str, what: str, name: str = "xarray"):
-    """A package that is not always installed, by what needs it and the name of the extra that has it."""
+def extra(package: str, caller: str, name: str = "xarray"):
+    """An optional package.
+
+    Args:
+        package: to import.
+        caller: the function that needs it, for the message.
+        name: the extra of vmri_jax that installs it.
+
+    Raises:
+        ImportError: it is not installed.
+    """
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise ImportError(f"{what} needs {package}; install it with pip install 'vmri_jax[{name}]'.") from error
+        raise ImportError(f"{caller} needs {package}; install it with pip install 'vmri_jax[{name}]'.") from error

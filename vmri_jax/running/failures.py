@@ -1,16 +1,16 @@
-"""The error of a run that failed: how, and what probably made it fail."""
+"""The exception of a failed run, with its probable cause."""
 
 import numpy as np
 
 from vmri_jax.mechanics.jumps import in_words, jump_ahead
-from vmri_jax.running.largest_motion import what_moves_most
+from vmri_jax.running.largest_motion import largest_motion_in_words
 from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result, SimulationError
 
 
 def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micro: int) -> SimulationError:
-    """The error that says how a failed run failed, and what moved most before that."""
-    from vmri_jax.stability.labels import swapped_at_start  # only where a run failed: it stands on this room
+    """The `SimulationError` of a failed run: the failing step, its status, and the largest motion before it."""
+    from vmri_jax.stability.labels import swapped_at_start  # here: vmri_jax.stability itself imports this room
 
     step = int(trajectory.failed_at)
     interval = step // save_every
@@ -21,13 +21,13 @@ def simulation_error(trajectory: Trajectory, macro_dt, save_every: int, num_micr
         int(trajectory.info.iterations[interval]),
         float(trajectory.info.residual[interval]),
         trajectory,
-        what_moves_most(trajectory, step, save_every, float(macro_dt), num_micro),
+        largest_motion_in_words(trajectory, step, save_every, float(macro_dt), num_micro),
     )
     return error.advised(float(macro_dt), swapped_at_start(trajectory), _jump(trajectory, macro_dt, save_every))
 
 
 def _jump(trajectory: Trajectory, macro_dt, save_every: int) -> str:
-    """The sentence about a force that jumps in the failing step or the one after it; empty where none does."""
+    """A sentence about a force that jumps in the failing step or in the next one; empty where no force jumps."""
     if not trajectory.origin.knows_system or np.ndim(trajectory.t) != 1:
         return ""
     system, interval = trajectory.origin.system(), int(trajectory.failed_at) // save_every

@@ -10,10 +10,10 @@ from typing import IO
 
 @contextmanager
 def replaced(path: str | Path) -> Iterator[IO[bytes]]:
-    """A binary file to write to that takes the place of `path`, at once and on disk, when all went well."""
-    path = Path(path).resolve()  # of a link its target
+    """A binary file to write to; if the block raises nothing it replaces `path` in one operation, after its bytes are on disk."""
+    path = Path(path).resolve()  # a link stays, its target is replaced
     check_place(path)
-    if path.exists() and not path.is_file():  # a folder is refused by open, a device cannot be replaced
+    if path.exists() and not path.is_file():  # a device is written to directly: it cannot be replaced
         with path.open("wb") as file:
             yield file
         return
@@ -32,7 +32,7 @@ def replaced(path: str | Path) -> Iterator[IO[bytes]]:
 
 @contextmanager
 def made_beside(path: Path) -> Iterator[Path]:
-    """A new folder that takes the place of `path` when all went well; one that is there gives way only then."""
+    """A new folder that replaces `path` if the block raises nothing; until then an existing folder stays."""
     partial, old = (path.with_name(f".{path.name}.{os.getpid()}.{end}") for end in ("partial", "old"))
     shutil.rmtree(partial, ignore_errors=True)
     try:
@@ -48,17 +48,17 @@ def made_beside(path: Path) -> Iterator[Path]:
 
 
 def clear_partial(path: Path) -> None:
-    """Remove files in a folder whose writing did not come to its end."""
+    """Remove the partial files that an interrupted `replaced` left in a folder."""
     for file in path.rglob("*.partial"):
         file.unlink()
 
 
 def check_place(path: Path) -> None:
-    """Refuse a place where no file can be.
+    """Refuse a path where no file can exist.
 
     Raises:
-        FileNotFoundError: its folder does not exist.
-        IsADirectoryError: it is a folder.
+        FileNotFoundError: the folder above it does not exist.
+        IsADirectoryError: the path is a folder.
     """
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path} cannot be written: the folder {path.parent} does not exist; make it first.")
@@ -67,9 +67,9 @@ def check_place(path: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a place where no file can be written, before long work: a file is made beside `path` and removed again.
+    """Refuse a path where no file can be written, before long work: a file is made beside `path` and removed again.
 
-    Permissions alone do not tell: on a file system that is read-only, or for a name that is too long, only an attempt does.
+    Permissions alone do not tell: only an attempt finds a read-only file system, or a name that is too long.
 
     Raises:
         FileNotFoundError, IsADirectoryError: as of `check_place`.
@@ -79,7 +79,7 @@ def check_writable(path: Path) -> None:
     check_place(path)
     if path.exists() and not os.access(path, os.W_OK):
         raise PermissionError(f"{path} cannot be written: there is a file that may not be changed; give another name.")
-    if path.exists() and not path.is_file():  # a device
+    if path.exists() and not path.is_file():  # a device: written to directly, without a file beside it
         return
     attempt = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -90,10 +90,10 @@ def check_writable(path: Path) -> None:
 
 
 def make_writable_folder(path: Path) -> None:
-    """Make a folder with all folders above it, and refuse one in which no file can be written.
+    """Make a folder with all folders above it, and refuse a folder in which no file can be written.
 
     Raises:
-        OSError: it cannot be made, or no file can be made in it.
+        OSError: the folder cannot be made, or no file can be made in it.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -105,8 +105,8 @@ def make_writable_folder(path: Path) -> None:
 
 
 def synchronize(path: Path) -> None:
-    """Wait until a file, or the entries of a folder, are on disk."""
-    if os.name == "nt":  # folders cannot be opened there, files only for writing
+    """Wait until a file, or the list of files of a folder, is on disk."""
+    if os.name == "nt":  # Windows opens no folders, and files for synchronisation only if they are writable
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:

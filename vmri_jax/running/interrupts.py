@@ -1,4 +1,4 @@
-"""Ctrl-C in a long run: the piece at work is finished, nothing computed is lost."""
+"""Ctrl-C in a long run: the current piece is finished, and no computed step is lost."""
 
 import signal
 import threading
@@ -7,15 +7,16 @@ from contextlib import contextmanager
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run, a batch of tasks or a study was stopped by Ctrl-C; everything that was computed before is in `.done`.
+    """Ctrl-C stopped a run, a batch of tasks or a study; `.done` has all results computed before.
 
-    A `KeyboardInterrupt`: a program that does not expect it stops, as after any Ctrl-C.
+    It is a `KeyboardInterrupt`: a program that does not catch it stops, as after any Ctrl-C.
 
     Attributes:
-        done: of `simulate` a `Trajectory`, of `stream` a `StoredTrajectory`, of `check` a `Report`, of an ensemble the `Ensemble`, of a
-            study its table of rows, of a mapping over tasks the list of results with None for tasks that were not done.
-        number, total: macro steps, tasks or rows that were done, and those asked for; `total` is None where it is not known before.
-        units: "macro steps", "cases", "chunks", "runs".
+        done: the `Trajectory` of `simulate`, the `StoredTrajectory` of `stream`, the `Report` of `check`, the `Ensemble` of an ensemble, the
+            table of rows of a study, or the list of results of a mapping over tasks, with None for tasks that were not done.
+        number: macro steps, tasks or rows done.
+        total: their number in the complete work; None where it is not known before.
+        units: their name, "macro steps", "cases", "chunks", "runs".
     """
 
     def __init__(self, done, number: int, total: int | None, units: str, advice: str = ""):
@@ -29,17 +30,17 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def interrupts_noted() -> Iterator[Callable[[], bool]]:
-    """Within, a first Ctrl-C is only noted and a second one raises; yields the function that says whether there was one.
+    """Context in which a first Ctrl-C is only noted and a second one raises; yields a function that tells whether Ctrl-C was pressed.
 
-    Where Python allows no handlers (outside the main thread), or somebody else handles Ctrl-C, nothing changes.
+    Outside of the main thread, where Python allows no handlers, and where the program has its own handler, nothing changes.
     """
-    own = signal.default_int_handler
-    active = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is own
+    default = signal.default_int_handler
+    active = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is default
     noted = []
 
     def note(number, frame) -> None:
         noted.append(number)
-        signal.signal(signal.SIGINT, own)
+        signal.signal(signal.SIGINT, default)
 
     if active:
         signal.signal(signal.SIGINT, note)
@@ -47,4 +48,4 @@ def interrupts_noted() -> Iterator[Callable[[], bool]]:
         yield lambda: bool(noted)
     finally:
         if active:
-            signal.signal(signal.SIGINT, own)
+            signal.signal(signal.SIGINT, default)

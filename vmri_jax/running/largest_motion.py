@@ -1,4 +1,4 @@
-"""Which body or coordinate moves most in a step: what a step that fails is probably too large for."""
+"""The body or coordinate that moves most in a step: a step that fails is probably too large for it."""
 
 from typing import NamedTuple
 
@@ -10,24 +10,23 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import System
 
 LARGE_TURN = 0.5
-"""Radians that a rigid body may turn in a step. Directors that multipliers hold from the start of a step have no next position beyond
-one radian; with a larger value a step near that limit is no longer blamed."""
+"""Radians that a rigid body may turn in a step. Beyond one radian the constraint forces at the start of a step, which hold the directors,
+cannot make them unit vectors again at its end; with a larger value a step near that limit is no longer blamed."""
 LARGE_MOVE = 0.25
-"""Part of the extent of all positions that a point or a coordinate may move in a step; with a larger value a step that throws a point
-through the others is no longer blamed."""
-
+"""Distance that a point or a coordinate may move in a step, as a part of the extent of all positions; with a larger value a step that throws
+a point through other points is no longer blamed."""
 RUN_AWAY = 20.0
-"""Multiple of what a step allows above which a motion is the outcome of an instability, not its cause; with a larger value steps are
-advised that follow from numbers of an explosion."""
+"""Multiple of `LARGE_TURN` or `LARGE_MOVE` above which a motion is the result of an instability, not its cause; with a larger value the advice
+computes steps from positions that have already exploded."""
 
 
 class Motion(NamedTuple):
     """How far a body, or a coordinate without a body, moves in a step.
 
     name: of the body or coordinate.
-    micro: whether it is fast, so that a micro step counts.
-    amount: radians that a rigid body turns; else the part of the extent of all positions.
-    turns: whether it is a turn.
+    micro: whether it is fast, so that the motion in a micro step counts.
+    amount: radians for a turn; for a move the distance as a part of the extent of all positions.
+    turns: whether this is the turn of a rigid body; else it is a move.
     """
 
     name: str
@@ -37,14 +36,14 @@ class Motion(NamedTuple):
 
     @property
     def size(self) -> float:
-        """The amount over what a step allows."""
+        """The amount divided by the limit, `LARGE_TURN` or `LARGE_MOVE`."""
         return self.amount / (LARGE_TURN if self.turns else LARGE_MOVE)
 
     def sentence(self, macro_dt: float) -> str:
-        """What it means for the step.
+        """The motion in words, with advice on the step.
 
         Args:
-            macro_dt: H, the step at which it moves so far.
+            macro_dt: macro step H in which the motion happens.
         """
         step = "micro step" if self.micro else "macro step"
         moves = f"turns {self.amount:.2g} rad" if self.turns else f"moves {self.amount:.1%} of the extent of the system"
@@ -63,15 +62,15 @@ class Motion(NamedTuple):
 
 
 def largest_motion(system: System, state: State, names: Names | None, macro_dt: float, num_micro: int) -> Motion | None:
-    """The motion that is largest over what a step allows; None where there are no coordinates or no numbers.
+    """The motion of largest `Motion.size` in the step from a state; None where there are no coordinates or no finite numbers.
 
     A rigid body turns by ``h |omega|`` with ``2 |omega|^2 = sum_i |dd_i/dt|^2`` over its three directors d_i.
 
     Args:
-        system, state: what moves, and where it is before the step.
-        names: of its coordinates, None if they have none.
-        macro_dt: H, length of the macro step.
-        num_micro: micro steps in it.
+        system, state: system, and its state before the step.
+        names: names of the coordinates, or None.
+        macro_dt: macro step H.
+        num_micro: micro steps of the macro step.
     """
     q, h = {"s": np.asarray(state.q_s), "f": np.asarray(state.q_f)}, {"s": macro_dt, "f": macro_dt / num_micro}
     v_s, v_f = velocity(system, state.q_s, state.q_f, state.p_s, state.p_f)
@@ -84,27 +83,29 @@ def largest_motion(system: System, state: State, names: Names | None, macro_dt: 
     for name, place in known.bodies.items():
         move, micro = moves[place.part][place.start : place.start + place.size], place.part == "f"
         if name in known.rigid:
+            # The centre of mass comes first, then the directors: h^2 |dd_i/dt|^2 of each.
             squares = np.sum(move[len(AXES) :].reshape(-1, len(AXES)) ** 2, axis=1)
-            three = len(squares) == len(AXES)
-            turn = np.sqrt(squares.sum() / 2 if three else squares.max(initial=0.0))
+            has_all_directors = len(squares) == len(AXES)  # a body of fewer directors turns by its fastest director
+            turn = np.sqrt(squares.sum() / 2 if has_all_directors else squares.max(initial=0.0))
             motions.append(Motion(name, micro, float(turn), True))
             move = move[: len(AXES)]
-        if name in known.numbered:
-            most = int(np.abs(move).argmax())
-            name, move = labels[place.part][place.start + most], move[most]
+        if name in known.numbered:  # coordinates without bodies: name the one that moves most
+            fastest = int(np.abs(move).argmax())
+            name, move = labels[place.part][place.start + fastest], move[fastest]
         if extent > 0:
             motions.append(Motion(name, micro, float(np.linalg.norm(move) / extent), False))
     return max((motion for motion in motions if np.isfinite(motion.amount)), key=lambda m: m.size, default=None)
 
 
-def what_moves_most(trajectory, step: int, save_every: int, macro_dt: float, num_micro: int) -> str:
-    """The sentence about the largest motion at the last node before a step that failed; empty where nothing is known.
+def largest_motion_in_words(trajectory, step: int, save_every: int, macro_dt: float, num_micro: int) -> str:
+    """A sentence about the largest motion at the last node before a failed step; empty where the run does not know its system.
 
     Args:
-        trajectory: of the run, or a part of it, with the node before the failure; it may know its system.
-        step: number of the step that failed, counted from the first node of `trajectory`.
+        trajectory: the run, or a part of it with the node before the failure.
+        step: number of the failed step, counted from the first node of `trajectory`.
         save_every: macro steps from one node to the next.
-        macro_dt, num_micro: of the run.
+        macro_dt: macro step H.
+        num_micro: micro steps of the macro step.
     """
     if not trajectory.origin.knows_system:
         return ""

@@ -1,4 +1,4 @@
-"""Loops of steps: as fast as they go, or with derivatives in reverse mode that need little memory."""
+"""Loops of steps: the plain loops of JAX, and loops whose derivatives in reverse mode need little memory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,21 +9,22 @@ import jax.numpy as jnp
 
 from vmri_jax.steppers.solved import ROOT
 
-WHOLE = 1000
-"""Most macro steps whose states are all kept for a derivative: a longer run would take more memory than computing states again takes time."""
-WIDTH = 100
-"""Parts that are kept at a time, at every level of `Recursive`."""
+MOST_STORED_STEPS = 1000
+"""Most macro steps for which "checkpoint" keeps every state. A larger value takes more memory and saves the second computation of states
+in runs up to that length."""
+PARTS_PER_LEVEL = 100
+"""Most parts into which `Recursive` divides a run or a part. A larger value takes more memory, and fewer levels compute states again."""
 
 
 class Loops:
     """JAX's own loops."""
 
     def repeat(self, count, step: Callable, carry):
-        """``carry = step(i, carry)`` for i from 0 to count - 1; here `count` may be traced."""
+        """``carry = step(i, carry)`` for i from 0 to count - 1; these plain loops allow a traced `count`."""
         return jax.lax.fori_loop(0, count, step, carry)
 
     def scan(self, body: Callable, carry, count: int):
-        """``carry, y = body(carry, None)``, `length` times, and the stacked y."""
+        """``carry, y = body(carry, None)``, `count` times; returns the last carry and the stacked y."""
         return jax.lax.scan(body, carry, length=count)
 
 
@@ -31,58 +32,63 @@ PLAIN = Loops()
 
 
 class Stored(Loops):
-    """Derivatives keep of every step where it starts and the solution of its equations, and compute the rest again."""
+    """Reverse mode keeps the start of every step and the solution of its equations, and computes everything else again.
+
+    The solution is the array that a `Solver` names `ROOT`; a stepper without this name computes its step again.
+    """
 
     def repeat(self, count: int, step: Callable, carry):
-        return jax.lax.scan(_kept(_as_body(step)), carry, jnp.arange(count))[0]
+        return jax.lax.scan(_keeps_root(_as_body(step)), carry, jnp.arange(count))[0]
 
 
 @dataclass(frozen=True)
 class Recursive(Loops):
-    """Derivatives keep the starts of parts of a run, and run a part again, which has parts itself, to step through it.
+    """Reverse mode keeps the starts of the parts of a run, and runs each part again, itself divided into parts, to step back through it.
 
-    With k levels of at most `WIDTH` parts, n steps need memory for ``k WIDTH`` of them and are computed k times; k is
-    ``log n / log WIDTH``, rounded up.
+    With w = `PARTS_PER_LEVEL` and k levels, ``k = ceil(log n / log w)``, a run of n steps takes memory for ``k w`` states and computes
+    every step k times.
 
     Source: A. Griewank, A. Walther, Evaluating Derivatives, 2nd ed., SIAM (2008), chapter 12.
 
-    every: steps from one saved node to the next.
+    every: macro steps from one saved node to the next.
     """
 
     every: int
 
     def repeat(self, count: int, step: Callable, carry):
-        return _levels(_kept(_as_body(step)), carry, count)[0]
+        return _levels(_keeps_root(_as_body(step)), carry, count)[0]
 
     def scan(self, body: Callable, carry, count: int):
-        keep = _kept if self.every == 1 else _started
+        # With every == 1 the body is a single step, whose root is kept; else `repeat` keeps the roots inside of the body.
+        keep = _keeps_root if self.every == 1 else _keeps_start
         return _levels(keep(lambda carry, _: body(carry, None)), carry, count)
 
 
 def _levels(body: Callable, carry, count: int):
-    """``jax.lax.scan`` over the numbers below `count` as loops within loops, of which the starts are kept."""
+    """``jax.lax.scan`` over the numbers below `count` as nested loops; reverse mode keeps the start of each loop."""
     outermost, *sizes = _sizes(count)
     if not sizes:
         return jax.lax.scan(body, carry, jnp.arange(count))
-    part = _where_alive(body, count)
+    # The product of the sizes may exceed `count`: the last turns do nothing, and their outputs are cut off.
+    part = _up_to(count, body)
     for size in reversed(sizes):
-        part = _started(_part_of(part, size))
+        part = _keeps_start(_part_of(part, size))
     carry, ys = jax.lax.scan(part, carry, jnp.arange(outermost))
     return carry, jax.tree.map(lambda y: y.reshape(-1, *y.shape[1 + len(sizes) :])[:count], ys)
 
 
 def _part_of(step: Callable, size: int) -> Callable:
-    """So many steps as one; its number tells theirs."""
+    """`size` steps as one part: part k has the steps ``k size`` to ``(k + 1) size - 1``."""
     return lambda carry, number: jax.lax.scan(lambda carry, i: step(carry, number * size + i), carry, jnp.arange(size))
 
 
-def _kept(body: Callable) -> Callable:
-    """Its derivative keeps where a step starts and the solution of its equations."""
+def _keeps_root(body: Callable) -> Callable:
+    """The body, for which reverse mode keeps the carry at its start and the roots of its equations."""
     return jax.checkpoint(body, policy=jax.checkpoint_policies.save_only_these_names(ROOT), prevent_cse=False)
 
 
-def _started(body: Callable) -> Callable:
-    """Its derivative keeps where a part starts."""
+def _keeps_start(body: Callable) -> Callable:
+    """The body, for which reverse mode keeps the carry at its start alone."""
     return jax.checkpoint(body, prevent_cse=False)
 
 
@@ -91,15 +97,15 @@ def _as_body(step: Callable) -> Callable:
 
 
 def _sizes(count: int) -> list[int]:
-    """Parts of a loop, parts of a part, and so on; at most WIDTH each, about alike, their product at least `count`."""
-    levels = max(ceil(log(count) / log(WIDTH) - 1e-9), 1)
+    """Turns of each of the nested loops, the outermost first: at most `PARTS_PER_LEVEL`, nearly equal, with a product of at least `count`."""
+    levels = max(ceil(log(count) / log(PARTS_PER_LEVEL) - 1e-9), 1)  # 1e-9: round-off of the logarithms adds no level
     width = ceil(count ** (1 / levels) - 1e-9)
     inner = [width] * (levels - 1)
     return [ceil(count / prod(inner)), *inner]
 
 
-def _where_alive(body: Callable, count: int) -> Callable:
-    """The body for numbers below `count`; others change nothing."""
+def _up_to(count: int, body: Callable) -> Callable:
+    """The body for numbers below `count`; for larger numbers the carry stays and the outputs are zeros."""
 
     def step(carry, number):
         nothing = jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(body, carry, number)[1])

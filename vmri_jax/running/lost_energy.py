@@ -1,4 +1,4 @@
-"""Whether a run that went through has lost its energy, as an unstable step does that does not overflow."""
+"""Check of the energy of a run whose steps all succeeded: an unstable step may change it without an overflow."""
 
 import jax
 import jax.numpy as jnp
@@ -16,25 +16,26 @@ class LostEnergyWarning(UserWarning):
     """The energy of a system that keeps it has changed by half of the largest kinetic energy of a run."""
 
 
-LOST = 0.5
-"""Part of the largest kinetic energy: a change of the energy above it is said."""
-LOOKED_AT = 1000
-"""Nodes at which the kinetic energy is computed."""
-ROUNDOFF = 1e-9
-"""Part of the kinetic energy and all potentials below which changes of their sum are round-off; a larger one hides losses of systems whose terms cancel."""
-DIGITS = 10 * np.finfo(float).eps
-"""Part of the largest position that a step may move positions by round-off alone; a larger one hides slower motions."""
+REPORTED_CHANGE = 0.5
+"""Change of the energy, as a part of the largest kinetic energy, above which the user is warned; a larger value misses slower instabilities."""
+NODES_CHECKED = 1000
+"""Most nodes at which the kinetic energy is computed; a larger number makes the check of a long run take longer."""
+ROUNDOFF_OF_ENERGY = 1e-9
+"""Change of the energy, as a part of the sum of the moduli of its terms, up to which it is round-off. A larger value hides losses in systems
+whose terms cancel."""
+ROUNDOFF_OF_STEP = 10 * np.finfo(float).eps
+"""Round-off of a position in a step, as a part of the largest position; a larger value hides slower motions."""
 
 
 def lost_energy(run: Trajectory, macro_dt: float) -> str:
-    """What is wrong with the energy of a run of a system that keeps it; empty where nothing is.
+    """A sentence about a run whose system keeps its energy and whose energy has changed; empty for any other run.
 
-    A system at rest moves by round-off: n steps H change velocities by up to ``sqrt(n) DIGITS |q| / H``, in random directions. A kinetic
-    energy below that of such velocities, and a change below round-off of the terms that make up the energy, say nothing.
+    A system at rest moves by round-off: n steps H change velocities by up to ``sqrt(n) ROUNDOFF_OF_STEP |q| / H``, in random directions. The
+    check therefore ignores kinetic energies below the energy of these velocities, and changes below the round-off of the energy's terms.
 
     Args:
-        run: one run, without a failure, that knows its system; of constant masses, else nothing is said.
-        macro_dt: step H.
+        run: one run without a failure. The result is empty unless it knows its system, and its masses are constant.
+        macro_dt: macro step H.
     """
     if not run.origin.knows_system:
         return ""
@@ -44,15 +45,18 @@ def lost_energy(run: Trajectory, macro_dt: float) -> str:
     energy = np.asarray(run.energy)
     change = np.abs(energy - energy[0])
     worst = int(change.argmax())
-    if not change[worst] > ROUNDOFF * np.abs(energy).max():
+    if (
+        not change[worst] > ROUNDOFF_OF_ENERGY * np.abs(energy).max()
+    ):  # the usual case ends here, without kinetic energies
         return ""
-    nodes = np.unique(np.append(np.linspace(0, len(energy) - 1, LOOKED_AT).astype(int), worst))
+    nodes = np.unique(np.append(np.linspace(0, len(energy) - 1, NODES_CHECKED).astype(int), worst))
     slow = _kinetic(system.kinetic.slow_mass, np.asarray(run.states.p_s)[nodes])
     fast = _kinetic(system.kinetic.fast_mass, np.asarray(run.states.p_f)[nodes])
     kinetic = (slow + fast).max()
-    if not change[worst] > LOST * kinetic or not change[worst] > _kinetic_of_roundoff(run, macro_dt):
+    if not change[worst] > REPORTED_CHANGE * kinetic or not change[worst] > _kinetic_of_roundoff(run, macro_dt):
         return ""
-    if not change[worst] > ROUNDOFF * np.max(at_nodes(_size_of_terms, run.origin, _states(run, nodes))):
+    states = jax.tree.map(lambda a: np.asarray(a)[nodes], run.states)
+    if not change[worst] > ROUNDOFF_OF_ENERGY * np.max(at_nodes(_size_of_terms, run.origin, states)):
         return ""
     return (
         f"the computed motion is wrong: the energy, which the system keeps, has changed by {change[worst]:.3g} at t = {np.asarray(run.t)[worst]:.4g}, "
@@ -69,16 +73,12 @@ def _kinetic(mass, p: np.ndarray) -> np.ndarray:
 
 
 def _kinetic_of_roundoff(run: Trajectory, macro_dt: float) -> float:
-    """Kinetic energy of velocities that round-off of the positions makes in the steps of a run."""
+    """Kinetic energy ``sum_i m_i v^2 / 2`` of the velocity ``v = sqrt(n) ROUNDOFF_OF_STEP |q| / H`` that n steps make by round-off."""
     mass, t = run.origin.system().kinetic, np.asarray(run.t)
     steps = float(t[-1] - t[0]) / macro_dt
     position = max(np.abs(q).max(initial=0.0) for q in (np.asarray(run.states.q_s), np.asarray(run.states.q_f)))
     total = sum(float(jnp.trace(part.matrix)) for part in (mass.slow_mass, mass.fast_mass))
-    return total * steps * (DIGITS * position / macro_dt) ** 2 / 2
-
-
-def _states(run: Trajectory, nodes: np.ndarray) -> State:
-    return jax.tree.map(lambda a: np.asarray(a)[nodes], run.states)
+    return total * steps * (ROUNDOFF_OF_STEP * position / macro_dt) ** 2 / 2
 
 
 def _size_of_terms(system: System, state: State):

@@ -23,13 +23,14 @@ def macro_step(
     before.
 
     Args:
-        system, scheme: what moves, and how.
+        system: the system.
+        scheme: a scheme or composition.
         state: a consistent state, from `initial_state` or a former step.
         macro_dt: length H of the macro step, positive.
-        solver: how implicit equations are solved.
+        solver: for implicit equations; None for `solvers.Auto`.
 
     Returns:
-        The state at the end of the step, and what the step did.
+        The state at the end of the step, and the status, method, iterations and micro nodes of the step.
 
     Raises:
         TypeError: no System, or no State.

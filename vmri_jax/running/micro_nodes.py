@@ -1,8 +1,8 @@
-"""The micro nodes between the macro nodes of a run, with what is known of the motion there.
+"""Positions and velocities at the micro nodes between the macro nodes of a run.
 
-A run keeps its fast positions at micro nodes. The slow ones are those of the cubic that has the positions and velocities of the
-macro nodes. Fast velocities are those of the cubic spline through the nodes of a macro step with the velocities at its ends,
-an approximation of order 4.
+A run keeps the fast positions at its micro nodes. Slow positions and velocities there come from the cubic Hermite polynomial through
+the positions and velocities of the two macro nodes. Fast velocities come from the cubic spline through the micro nodes of a macro step
+with the known velocities at its ends, an approximation of order 4.
 """
 
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ import numpy as np
 
 
 class Nodes(NamedTuple):
-    """Positions and velocities at all nodes in order, macro and micro: t (k,), the others (k, n)."""
+    """Positions and velocities at all nodes in order, macro and micro: t is (k,), positions and velocities are (k, n)."""
 
     t: np.ndarray
     q_s: np.ndarray
@@ -21,11 +21,11 @@ class Nodes(NamedTuple):
 
 
 def why_not(t, t_micro) -> str:
-    """Why the micro nodes of a run are no refinement of its nodes; empty if they are.
+    """The reason why the micro nodes of a run do not refine its macro nodes; empty if they do.
 
     Args:
         t: (k,) times of the macro nodes.
-        t_micro: (k - 1, num_micro) times of the micro nodes before each of them, or None.
+        t_micro: (k - 1, num_micro) times of the micro nodes before each macro node, or None.
     """
     if np.ndim(t) != 1:
         return "it is a batch; take one lane of it"
@@ -34,8 +34,9 @@ def why_not(t, t_micro) -> str:
     t, t_micro = np.asarray(t, dtype=float), np.asarray(t_micro, dtype=float)
     if len(t) < 2:
         return "it has a single node"
-    step = np.diff(t) / t_micro.shape[1]
-    if np.any(t_micro[:, 0] - t[:-1] > 1.5 * step):
+    micro_dt = np.diff(t) / t_micro.shape[1]
+    # Micro nodes belong to the last macro step of a saved interval; 1.5 tells a first micro node at h from one at least 2 h after the node.
+    if np.any(t_micro[:, 0] - t[:-1] > 1.5 * micro_dt):
         return "it kept those of some macro steps only; simulate with save_every=1"
     if np.any(np.diff(np.append(t[:1], t_micro)) <= 0):
         return "the stages of its composition go back in time"

@@ -1,4 +1,4 @@
-"""The origin of a run: its system and the names of its parts, and functions of a state at all of its nodes."""
+"""The origin of a run, its system and names; and the evaluation of functions of system and state at all nodes of a run."""
 
 import pickle
 from dataclasses import dataclass, replace
@@ -23,10 +23,10 @@ class Origin:
     """The origin of a run, as far as it is known; a pytree, whose arrays have the lanes of a batch of runs as their first axes.
 
     Attributes:
-        names: of bodies and constraints, None if nothing has one.
-        bare: the system that moved, without its parameters; None of a run that was read from a file.
-        params: parameters of the run, as of its system.
-        settings: scheme and steps, where they were chosen for an accuracy.
+        names: names of bodies and constraints; None if there are none.
+        bare: the system without its parameters; None for a run that was read from a file.
+        params: the parameters of the run, like ``system.params``.
+        settings: scheme and steps of a run with an accuracy, for which they were chosen; else None.
     """
 
     names: Names | None = None
@@ -46,16 +46,16 @@ class Origin:
 
     @classmethod
     def from_file(cls, names: dict | None, settings: dict | None = None) -> "Origin":
-        """The origin of a run of which names and settings are known at most, from plain data."""
+        """The origin of a run that was read from a file: names and settings from plain data, without a system."""
         known_names = None if names is None else Names.from_dict(names)
         return cls(known_names, settings=None if settings is None else Settings.from_dict(settings))
 
     def repeated(self, lanes: tuple[int, ...], params: Any = None) -> "Origin":
-        """The same for a batch of runs: every array is repeated, without copies.
+        """The origin of a batch of runs: a view of every array with the axes of lanes, without copies.
 
         Args:
             lanes: shape of the batch.
-            params: parameters that differ between lanes, of one lane each; None where all have the same.
+            params: parameters with the axes of lanes, where lanes differ in them; None where all lanes share them.
         """
         if not lanes:
             return self
@@ -71,13 +71,13 @@ class Origin:
         return self.bare is not None
 
     def system(self, axes: int = 0) -> System:
-        """The system with the parameters of the run; of a batch of runs that of its first lane.
+        """The system with the parameters of the run; of a batch with the parameters of its first lane.
 
         Args:
             axes: number of axes of lanes.
 
         Raises:
-            ValueError: it is not known.
+            ValueError: the run does not know its system.
         """
         if self.bare is None:
             raise ValueError(
@@ -90,14 +90,14 @@ class Origin:
         return bare.with_params(params)
 
     def shaped(self, part: Part, vectors) -> Any:
-        """Vectors (..., n) as the user gave the start: vectors, or a dictionary of arrays."""
+        """Vectors (..., n) in the form in which the user gave the start: vectors, or a dictionary of arrays by name."""
         return vectors if self.names is None else self.names.shaped(part, vectors)
 
     def check(self, n_s: int, n_f: int) -> None:
-        """Refuse a system of other coordinates than the run.
+        """Refuse a system whose numbers of coordinates differ from the run.
 
         Raises:
-            ValueError: with the numbers that do not fit.
+            ValueError: with the numbers of the run.
         """
         try:
             check_system(self.system(), np.zeros(n_s), np.zeros(n_f))
@@ -105,7 +105,7 @@ class Origin:
             raise ValueError(f"of: the run has {n_s} slow and {n_f} fast coordinates. {error}") from None
 
     def __getstate__(self) -> dict:
-        """All of it, or the names alone where Python cannot pickle a function of the system, as of a lambda."""
+        """All fields for pickle; without the system if Python cannot pickle one of its functions, such as a lambda."""
         state = dict(vars(self))
         try:
             pickle.dumps(self.bare)
@@ -115,11 +115,11 @@ class Origin:
 
 
 UNKNOWN = Origin()
-"""The origin of a run of which nothing is known."""
+"""The origin of a run whose system and names are unknown."""
 
 
 def names_of(moving: Any) -> Names | None:
-    """The names that a problem or a scene has."""
+    """The names of a problem or a scene; None for a system."""
     return getattr(moving, "names", None)
 
 
@@ -127,34 +127,38 @@ def at_nodes(function, origin: Origin, nodes, *static):
     """``function(system, node, *static)`` at every node.
 
     Args:
-        function: of a module: it is compiled once for each system structure.
-        origin: its system and parameters.
-        nodes: a `State` or tuple whose first array is the times (k,), of a batch (lanes, k).
+        function: a function at module level, so that it is compiled once for each system structure.
+        origin: the origin of the run.
+        nodes: a `State` or tuple whose first array is the times, (k,) or in a batch (lanes, k).
         static: further arguments, the same at all nodes.
 
     Raises:
         ValueError: the system is not known.
     """
     axes = jax.tree.leaves(nodes)[0].ndim
-    origin.system(axes - 1)  # refuses one that is not known
+    origin.system(axes - 1)  # raises if the system is not known
     arrays, structure = jax.tree.flatten((origin.bare, origin.params))
+    # Arrays that all lanes share go in once: mapped over the lanes they would be copied for each.
     repeated = tuple(_is_repeated(array, axes - 1) for array in arrays)
-    arrays = [array[(0,) * (axes - 1)] if once else array for array, once in zip(arrays, repeated, strict=True)]
+    arrays = [array[(0,) * (axes - 1)] if shared else array for array, shared in zip(arrays, repeated, strict=True)]
     return _mapped(function, axes, repeated, structure, static, arrays, nodes)
 
 
 def _is_repeated(array, axes: int) -> bool:
-    """Whether an array of NumPy is one array for all lanes, as `Origin.repeated` makes it."""
+    """Whether an array of NumPy is a view with zero strides along the lanes, as `Origin.repeated` makes it."""
     return isinstance(array, np.ndarray) and axes > 0 and not any(array.strides[:axes])
 
 
 @eqx.filter_jit
 def _mapped(function, axes: int, repeated: tuple[bool, ...], structure, static: tuple, arrays: list, nodes):
-    def at(arrays, node):
+    def at_node(arrays, node):
         bare, params = jax.tree.unflatten(structure, arrays)
         return function(bare.with_params(params), node, *static)
 
+    mapped = at_node
     for axis in range(axes):
-        lanes = [None if axis == 0 or once else 0 for once in repeated]  # the innermost axis is that of the nodes
-        at = jax.vmap(at, (lanes, 0))
-    return at(arrays, nodes)
+        lanes = [
+            None if axis == 0 or shared else 0 for shared in repeated
+        ]  # axis 0, the innermost map, runs over the nodes
+        mapped = jax.vmap(mapped, (lanes, 0))
+    return mapped(arrays, nodes)

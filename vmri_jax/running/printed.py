@@ -1,4 +1,4 @@
-"""What `print` shows: tables, and the console that all of them are printed on."""
+"""Printed tables, and the console that prints them."""
 
 import os
 
@@ -7,13 +7,13 @@ from rich.table import Table
 from rich.text import Text
 
 PIPE_COLUMNS = 1000
-"""Characters in a line of a pipe or a file: wider than any table, so that no cell is broken into several lines."""
+"""Characters in a line of a pipe or a file. It is wider than any table, so that no cell is broken into lines; a larger value changes nothing."""
 
 
 class OutputConsole(Console):
     """A console of rich that keeps wide tables whole where its output is a pipe or a file.
 
-    In a terminal and in a notebook it has their width. The variable COLUMNS of the environment is obeyed everywhere.
+    In a terminal or a notebook it takes their width. The environment variable COLUMNS overrides both.
     """
 
     @property
@@ -25,7 +25,7 @@ class OutputConsole(Console):
 
 
 class PrintedTable(Table):
-    """A table of rich that `print` shows as well; its caption has the width of the console, not that of the table."""
+    """A table of rich that the built-in `print` shows, too; its caption takes the width of the console, not of the table."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         caption, self.caption = self.caption, None

@@ -1,7 +1,7 @@
-"""Progress of long work: who is told, and how it is shown, as a bar in a terminal and as lines elsewhere.
+"""Progress of long work, shown as a bar in a terminal and as lines elsewhere.
 
-Work that takes more than two seconds says by a line what it does, whether it was asked for progress or not. A thread of its own
-writes the lines, so that they come while JAX compiles, too.
+Work that takes more than two seconds prints a line about its current task, even if the user did not ask for progress. A separate
+thread writes the lines, so that they appear while JAX compiles, too.
 """
 
 import sys
@@ -13,39 +13,40 @@ from functools import wraps
 from typing import ParamSpec, TypeVar, cast
 
 Progress = Callable[[str, int, int], None]
-"""Called as ``progress(what, done, total)`` before every piece of work and once at the end."""
+"""Called as ``progress(what, done, total)`` before every piece of work and once at the end: `what` names the piece, `done` of `total` pieces
+are finished."""
 P = ParamSpec("P")
 R = TypeVar("R")
 ShowsProgress = bool | Progress
-"""The argument ``progress`` of all functions that take long: True for a bar, False for a line now and then, or a function that is told."""
+"""The argument ``progress`` of all functions that take long: True for a bar, False for occasional lines, or a `Progress` of the user."""
 
 
-SECONDS = 2.0
-"""Before the first line, and between two lines that tell something new; with a larger value the user waits longer in silence."""
+SECONDS_BETWEEN_LINES = 2.0
+"""Seconds before the first line, and between two lines with different texts; with a larger value the user waits longer in silence."""
 LONGEST_SILENCE = 60.0
-"""Seconds between two lines at most. Lines that tell nothing new come after twice the time of the one before; with a larger value the
-log of a run that compiles for an hour has fewer lines."""
-LOOKS = 0.5
-"""Seconds between two looks of the thread at the work; a larger value makes lines late by as much."""
+"""Most seconds between two lines. The wait before a line that repeats the last one doubles each time up to this value; a larger value
+shortens the log of a run that compiles for an hour."""
+POLL_SECONDS = 0.5
+"""Seconds between two checks of the thread; a larger value delays every line by as much."""
 
 
 class Working:
-    """Within, what is being done is said on the error stream if it takes more than two seconds.
+    """Context that prints its current task on the error stream if the work takes more than two seconds.
 
         with Working("fit") as tell:
             tell("the Jacobian at the start", 1, 3)
 
-    It costs about a microsecond where nothing is said. Works within each other share one line, the outermost one first.
+    Short work costs about a microsecond. Nested contexts share one line, the outermost name first.
     """
 
     def __init__(self, name: str, shown: bool = True):
-        self.name, self.shown, self.what, self.part = name, shown, "", ""
+        self.name, self.shown, self.task, self.percent = name, shown, "", ""
         self.begin = self.last = time.monotonic()
-        self.wait, self.said = SECONDS, ""
+        self.wait, self.printed = SECONDS_BETWEEN_LINES, ""
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """A `Progress`: what is done now."""
-        self.what, self.part = what, f"{done / total:4.0%}  " if 0 < done < total else ""
+        """A `Progress`: notes the current task for the next line."""
+        self.task, self.percent = what, f"{done / total:4.0%}  " if 0 < done < total else ""
 
     def __enter__(self) -> Progress:
         _works.append(self)
@@ -56,18 +57,19 @@ class Working:
     def __exit__(self, *_) -> None:
         _works.remove(self)
 
-    def say(self, inner: Sequence["Working"], now: float) -> None:
-        """A line about this and the works within it, if it is time for one."""
+    def print_line(self, inner: Sequence["Working"], now: float) -> None:
+        """Print a line about this context and the contexts within it, if enough time has passed since the last line."""
         works = [self, *inner]
         if not all(work.shown for work in works):
             return
-        line = "; ".join(filter(None, (": ".join(filter(None, (work.name, work.what))) for work in works)))
-        news = self.part + line != self.said
-        if now - self.last < (SECONDS if news else self.wait):
+        tasks = "; ".join(filter(None, (": ".join(filter(None, (work.name, work.task))) for work in works)))
+        line = self.percent + tasks
+        is_new = line != self.printed
+        if now - self.last < (SECONDS_BETWEEN_LINES if is_new else self.wait):
             return
-        self.wait = SECONDS if news else min(2 * self.wait, LONGEST_SILENCE)
-        self.last, self.said = now, self.part + line
-        print(f"{now - self.begin:5.0f} s  {self.said}", file=sys.stderr, flush=True)
+        self.wait = SECONDS_BETWEEN_LINES if is_new else min(2 * self.wait, LONGEST_SILENCE)
+        self.last, self.printed = now, line
+        print(f"{now - self.begin:5.0f} s  {line}", file=sys.stderr, flush=True)
 
 
 _works: list[Working] = []
@@ -76,7 +78,7 @@ _watchers: list[threading.Thread] = []
 
 
 def _wake() -> None:
-    """Have the thread look at the work; after a fork of the process there is none yet."""
+    """Wake the thread that prints, and start it if there is none, as at first use and after a fork of the process."""
     _awake.set()
     if not any(watcher.is_alive() for watcher in _watchers):
         _watchers[:] = [threading.Thread(target=_watch, name="vmri_jax progress", daemon=True)]
@@ -86,13 +88,13 @@ def _wake() -> None:
 def _watch() -> None:
     while True:
         _awake.wait()
-        time.sleep(LOOKS)
+        time.sleep(POLL_SECONDS)
         works = tuple(_works)
         if works:
-            works[0].say(works[1:], time.monotonic())
+            works[0].print_line(works[1:], time.monotonic())
         else:
             _awake.clear()
-            if _works:  # begun in between
+            if _works:  # work that began before `clear` found the event still set and did not wake the thread
                 _awake.set()
 
 
@@ -106,7 +108,7 @@ def progress_shown() -> Iterator[Progress]:
     console = Console(stderr=True)
     if not (console.is_terminal or console.is_jupyter):
         with Working("") as tell:
-            tell("starting", 0, 1)  # else a line without words comes before the first piece of work
+            tell("starting", 0, 1)  # else the line before the first piece of work would be empty
             yield tell
         return
     columns = BarColumn(bar_width=24), TimeElapsedColumn(), TextColumn("{task.description}")
@@ -116,11 +118,11 @@ def progress_shown() -> Iterator[Progress]:
 
 
 def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Progress]:
-    """Within, whoever asked for progress is told about the work.
+    """Context that yields the `Progress` for the argument `progress` of a function.
 
     Args:
-        name: of the function that works, for lines that nobody asked for.
-        progress: the argument of that function.
+        name: name of the function, for its lines and messages.
+        progress: True for a bar, False for occasional lines, or a `Progress`.
 
     Raises:
         TypeError: neither True nor False nor a function.
@@ -135,7 +137,7 @@ def progress_to(name: str, progress: ShowsProgress) -> AbstractContextManager[Pr
 
 
 def shows_progress(function: Callable[P, R]) -> Callable[P, R]:
-    """`function`, which calls its argument `progress`, for users that give True or False for it, see `ShowsProgress`."""
+    """Decorator: `function` takes a `Progress` as its argument `progress`, the decorated one also True or False."""
 
     @wraps(function)
     def shown(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -151,7 +153,7 @@ def silent(what: str, done: int, total: int) -> None:
 
 
 def part(progress: Progress, index: int, count: int, name: str = "") -> Progress:
-    """Progress of part `index` of `count` equal parts of a longer work, with `name` before what it says."""
+    """Progress of part `index` of `count` equal parts of longer work; `name` is put before each task."""
 
     def within(what: str, done: int, total: int) -> None:
         progress(f"{name}{what}", 1000 * index + 1000 * done // max(total, 1), 1000 * count)

@@ -1,4 +1,4 @@
-"""What follows from the positions and momenta of a run: velocities, multipliers, reaction forces, work, by name."""
+"""Quantities computed from the positions and momenta of a run: velocities, multipliers, reaction forces, work, by name."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -22,18 +22,19 @@ from vmri_jax.running.micro_nodes import Nodes, why_not, with_micro_nodes
 from vmri_jax.running.origin import Origin, at_nodes
 from vmri_jax.running.saved_run import SavedRun
 
-RANDOM = 0.5
-"""Values at nodes with a von Neumann ratio above this count as random: the nodes do not resolve what they are of."""
+RANDOM_RATIO = 0.5
+"""Von Neumann ratio, mean squared difference of neighbours over variance, above which the values at the nodes count as random: the nodes do
+not resolve the function. A larger value trusts the rules of integration on noise."""
 
 
 class Work(NamedTuple):
-    """What changes the energy of a run from its start to each of its saved nodes, (k,).
+    """Work on a system from the start of a run to each of its saved nodes, (k,).
 
-    forces: work of the forces that no potential gives.
+    forces: work of ``force``, the forces without a potential.
     constraints: work of constraints that move with time.
-    balance: ``E - E_0 - forces - constraints``: the error of the run, and of these integrals.
-    uncertainty: how well the nodes resolve the integrals: the largest difference between Simpson's and the trapezoidal rule; where
-        the power jumps from node to node, the spread of a sum of random numbers like it.
+    balance: ``E - E_0 - forces - constraints``: the error of the run plus the error of these integrals.
+    uncertainty: error of the integrals: the largest difference between Simpson's and the trapezoidal rule; where the power jumps from node
+        to node, the standard deviation of a sum of random numbers of the same scatter.
     """
 
     forces: np.ndarray
@@ -45,24 +46,24 @@ class Work(NamedTuple):
         if not has_values(self):
             return f"Work({eqx.tree_pformat(self._asdict(), width=1000)})"
         nodes = np.flatnonzero(np.isfinite(self.balance))
-        forces, constraints, left = (float(a[nodes[-1]]) if nodes.size else np.nan for a in self[:3])
+        forces, constraints, balance = (float(a[nodes[-1]]) if nodes.size else np.nan for a in self[:3])
         until = "the end" if nodes.size == len(self.balance) else f"node {nodes.size - 1}, after which the run failed"
         return summary(
             f"Work from the start to {until}, and the change of the energy",
             {
-                "change of the energy": f"{forces + constraints + left:.6g}",
+                "change of the energy": f"{forces + constraints + balance:.6g}",
                 "work of forces": f"{forces:.6g}",
                 "work of moving constraints": f"{constraints:.6g}",
-                "left of the balance": f"{left:.2g}, the error of the run and of the two works",
+                "left of the balance": f"{balance:.2g}, the error of the run and of the two works",
                 "resolved by the nodes to": f"{float(self.uncertainty):.2g}",
             },
         )
 
 
 class Quantities(ABC):
-    """Quantities of a run by name, of a `Trajectory` or of one on disk.
+    """Quantities of a `Trajectory` or a `StoredTrajectory`, by the names of bodies and constraints.
 
-    Velocities, multipliers and work need the system. A run that was read from a file learns it by ``run.of(problem)``.
+    Velocities, multipliers and work need the system: ``run.of(problem)`` gives it to a run that was read from a file.
     """
 
     @abstractmethod
@@ -72,7 +73,7 @@ class Quantities(ABC):
     @property
     @abstractmethod
     def origin(self) -> Origin:
-        """What the run is of."""
+        """System, parameters and names of the run, as far as they are known."""
 
     @property
     def names(self) -> Names:
@@ -128,7 +129,9 @@ class Quantities(ABC):
         """
         run = self.whole()
         names = run.names
-        if names.kinematics is not None and body in names.rigid:  # p of a root is that of all it carries
+        if (
+            names.kinematics is not None and body in names.rigid
+        ):  # the coordinate p of a root includes all bodies that it carries
             return _part(at_nodes(_body_momenta, run.origin, run.states, names.kinematics), names.place_of(body))
         return _of_body(run, body, _body_momenta, run.states.p_s, run.states.p_f)
 
@@ -147,17 +150,17 @@ class Quantities(ABC):
     def multipliers(self, micro: bool = False) -> dict:
         """Lagrange multipliers of the equations of motion at the saved nodes, (..., k, rows) for each constraint by name.
 
-        They are those of ``M a = -dU/dq + F - G^T lambda`` for the accelerations that keep the constraints. Of dependent
-        constraints they are those of least norm.
+        They solve ``M a = -dU/dq + F - G^T lambda`` together with the second time derivative of the constraints, ``G a + ... = 0``. For
+        dependent constraints lambda has the least norm.
 
         Args:
-            micro: at the micro nodes ``t_micro`` instead, (k - 1, num_micro, rows), with the velocities of a spline through
-                them; for runs with save_micro=True and save_every=1.
+            micro: values at the micro nodes ``t_micro`` instead, (k - 1, num_micro, rows), with velocities from a spline through
+                the micro nodes; for runs with save_micro=True and save_every=1.
 
         Raises:
             ValueError: the run does not know its system, or did not keep the micro nodes.
         """
-        run = _known("multipliers", self.whole())
+        run = _concrete("multipliers", self.whole())
         values = np.asarray(at_nodes(_multipliers, run.origin, _states(run, micro)))
         return {name: _shaped(run, values[..., rows], micro) for name, rows in run.names.rows.items()}
 
@@ -166,12 +169,12 @@ class Quantities(ABC):
 
         Args:
             constraint: its name; "constraint" or "slow_constraint" for all rows of a system without names.
-            micro: at the micro nodes instead, as of `multipliers`.
+            micro: values at the micro nodes instead, see `multipliers`.
 
         Raises:
-            ValueError: no constraint of this name, and as of `multipliers`.
+            ValueError: no constraint of this name; see also `multipliers`.
         """
-        run = _known("reaction_forces", self.whole())
+        run = _concrete("reaction_forces", self.whole())
         names = run.names
         if constraint not in names.rows:
             hint = (
@@ -184,12 +187,12 @@ class Quantities(ABC):
         forces, touched = at_nodes(reaction_force, run.origin, _states(run, micro), rows)
         n_s = run.states.q_s.shape[-1]
         parts = {"s": (forces[..., :n_s], touched[..., :n_s]), "f": (forces[..., n_s:], touched[..., n_s:])}
-        found = {}
+        by_body = {}
         for name, (part, start, size) in names.bodies.items():
             force, touches = (np.asarray(a[..., start : start + size]) for a in parts[part])
             if touches.any():
-                found[name] = _shaped(run, force, micro)
-        return found
+                by_body[name] = _shaped(run, force, micro)
+        return by_body
 
     def work(self) -> Work:
         """Work of forces and of moving constraints since the start, and the balance with the energy.
@@ -205,18 +208,18 @@ class Quantities(ABC):
             cumulative_trapezoid,
         )
 
-        run = _known("work", self.whole())
+        run = _concrete("work", self.whole())
         if np.ndim(run.t) != 1:
             raise ValueError("work: the run is a batch; take one lane of it, run.lane(i).")
         micro = why_not(run.t, run.t_micro) == "" and bool(np.isfinite(run.energy[1]))
-        states = _states(run, micro, every=True)
-        power = np.asarray(at_nodes(powers, run.origin, states))
-        t, every = np.asarray(states.t), run.t_micro.shape[1] if micro else 1
-        done = cumulative_trapezoid(power, t, axis=0, initial=0.0)
-        simpson = cumulative_simpson(power, x=t, axis=0, initial=0.0) if len(t) > 2 else done
-        between = np.nanmax(np.abs(simpson - done), initial=0.0)
-        uncertainty = float(max(between, *(_spread(t, values) for values in power.T)))
-        forces, constraints = simpson[::every].T
+        states = _states(run, micro, with_start=True)
+        power = np.asarray(at_nodes(powers, run.origin, states))  # (m, 2): F . v and lambda . dg/dt
+        t, stride = np.asarray(states.t), run.t_micro.shape[1] if micro else 1
+        trapezoidal = cumulative_trapezoid(power, t, axis=0, initial=0.0)
+        simpson = cumulative_simpson(power, x=t, axis=0, initial=0.0) if len(t) > 2 else trapezoidal
+        difference = np.nanmax(np.abs(simpson - trapezoidal), initial=0.0)
+        uncertainty = float(max(difference, *(_deviation_of_integral(t, values) for values in power.T)))
+        forces, constraints = simpson[::stride].T
         energy = np.asarray(run.energy)
         return Work(forces, constraints, energy - energy[0] - forces - constraints, uncertainty)
 
@@ -224,20 +227,20 @@ class Quantities(ABC):
         """Positions, energy and constraints against time, a matplotlib `Figure`; more in `vmri_jax.plots`.
 
         Args:
-            title: over the figure.
+            title: title above the panels.
         """
-        from vmri_jax.plots import plot_trajectory  # matplotlib takes half a second
+        from vmri_jax.plots import plot_trajectory  # here: its import takes half a second
 
         run: Any = self.whole()
         return plot_trajectory(run, title)
 
 
-def _known(what: str, run: SavedRun) -> SavedRun:
-    """The run, unless its numbers are tracers of a transformation."""
+def _concrete(method: str, run: SavedRun) -> SavedRun:
+    """The run; refused by `method` if its numbers are tracers of a transformation."""
     if not is_concrete(run.energy):
         raise ValueError(
-            f"{what}: the run is traced by JAX, inside of jit, grad or vmap. Return the run and ask outside, "
-            f"run.of(problem).{what}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can be traced."
+            f"{method}: the run is traced by JAX, inside of jit, grad or vmap. Return the run and ask outside, "
+            f"run.of(problem).{method}(...); of one state, vmri_jax.mechanics.motion.motion(system, run[-1]) can be traced."
         )
     return run
 
@@ -246,8 +249,10 @@ def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
     """Values (..., k, size) of a body.
 
     Args:
-        carried: what gives the values of bodies that are functions of the coordinates, at one node.
-        slow, fast: values of all coordinates.
+        run: the run.
+        body: its name.
+        carried: function of (system, state, kinematics) for bodies in joint coordinates, whose values are functions of the coordinates.
+        slow, fast: values of all coordinates, for every other body.
     """
     names = run.names
     if body in names.carried:
@@ -256,7 +261,12 @@ def _of_body(run: SavedRun, body: str, carried: Callable, slow=None, fast=None):
 
 
 def _part(values: Any, place: Place):
-    """Values of one body among those of all, (slow, fast)."""
+    """Values of one body.
+
+    Args:
+        values: (slow, fast), values of all bodies.
+        place: part and place of the body.
+    """
     part, start, size = place
     return values[part == "f"][..., start : start + size]
 
@@ -279,8 +289,8 @@ def _velocities(run: SavedRun):
     return at_nodes(_velocity, run.origin, run.states)
 
 
-def _states(run: SavedRun, micro: bool, every: bool = False) -> State:
-    """The states at the saved nodes, or at the micro nodes; at `every` node with the start."""
+def _states(run: SavedRun, micro: bool, with_start: bool = False) -> State:
+    """The states at the saved nodes, or at all micro nodes, with or without the start."""
     if not micro:
         return run.states
     reason = why_not(run.t, run.t_micro)
@@ -289,7 +299,7 @@ def _states(run: SavedRun, micro: bool, every: bool = False) -> State:
     nodes = _all_nodes(run)
     p_s, p_f = at_nodes(_momenta, run.origin, nodes)
     states = State(nodes.t, nodes.q_s, nodes.q_f, p_s, p_f)
-    return states if every else jax.tree.map(lambda a: a[1:], states)
+    return states if with_start else jax.tree.map(lambda a: a[1:], states)
 
 
 def _all_nodes(run: SavedRun) -> Nodes:
@@ -299,26 +309,26 @@ def _all_nodes(run: SavedRun) -> Nodes:
     count = len(nodes.t) if np.all(finite) else int(np.argmin(finite))
     if count < 2:
         raise ValueError("micro nodes: the run failed in its first step; there are none.")
-    kept = Nodes(*(a[:count] for a in nodes))
-    found = with_micro_nodes(kept, run.t_micro[: count - 1], run.micro.q_f[: count - 1])
+    macro_nodes = Nodes(*(a[:count] for a in nodes))  # splines take finite values only
+    all_nodes = with_micro_nodes(macro_nodes, run.t_micro[: count - 1], run.micro.q_f[: count - 1])
     missing = (len(nodes.t) - count) * run.t_micro.shape[1]
-    return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in found))
+    return Nodes(*(np.pad(a, [(0, missing)] + [(0, 0)] * (a.ndim - 1), constant_values=np.nan) for a in all_nodes))
 
 
 def _shaped(run: SavedRun, values: np.ndarray, micro: bool) -> np.ndarray:
     return values.reshape(*np.shape(run.t_micro), -1) if micro else values
 
 
-def _spread(t: np.ndarray, power: np.ndarray) -> float:
-    """Standard deviation of the integral of a power whose values at the nodes are like random ones; zero if they are not.
+def _deviation_of_integral(t: np.ndarray, power: np.ndarray) -> float:
+    """Standard deviation of the integral of a power whose values at the nodes look random; zero for a smooth power.
 
-    Random values differ from their neighbours as much as from their mean: their von Neumann ratio is 2, that of a smooth function
-    is about zero.
+    The von Neumann ratio ``sum (P_{k+1} - P_k)^2 / sum (P_k - mean P)^2`` is 2 for random values and about zero for a smooth function.
     """
     power = power[np.isfinite(power)]
     jumps, scatter = np.sum(np.diff(power) ** 2), np.sum((power - np.mean(power)) ** 2)
-    if jumps <= RANDOM * scatter:
+    if jumps <= RANDOM_RATIO * scatter:
         return 0.0
+    # The integral H sum_k P_k of n independent values of variance scatter / n has the variance H^2 scatter.
     return float(np.mean(np.diff(t)) * np.sqrt(scatter))
 
 

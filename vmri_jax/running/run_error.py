@@ -9,14 +9,15 @@ from vmri_jax.mechanics.arrays import Numbers
 
 
 class RunError(NamedTuple):
-    """Estimated error of a run at its k saved nodes, NaN where it is not certified.
+    """Estimated error of a run at its k saved nodes, by Richardson's extrapolation; NaN where it is not certified.
 
     Attributes:
-        q_s, q_f: (k, n_s), (k, n_f) positions of the run minus those of the motion.
-        slow, fast: (k,) largest slow and fast share of the error over all coordinates; NaN if they were not asked for, or if their companion failed.
-        of: error of the function that was asked for, in its shape; None if there was none.
+        q_s, q_f: (k, n_s), (k, n_f) positions of the run minus positions of the exact motion.
+        slow, fast: (k,) largest modulus of the slow and of the fast share of the error over all coordinates. Shares have signs and add up
+            to the error, so that each may be larger. NaN without shares, or if their companion run failed.
+        of: error of the user's function of the run, in its shape; None without a function.
         certified_until: time of the last node whose error is certified.
-        growth: of the error in the second half of the time until then.
+        growth: factor by which the error grows in the second half of the time up to `certified_until`.
     """
 
     q_s: Float[Numbers, "k n_s"]
@@ -34,7 +35,7 @@ class RunError(NamedTuple):
 
     @property
     def is_certified(self) -> bool:
-        """Whether the error of every node is."""
+        """Whether the error of every node is certified."""
         return bool(np.isfinite(self.positions).all())
 
     @property
@@ -43,7 +44,7 @@ class RunError(NamedTuple):
         return float(self.positions.max(initial=0.0)) if self.is_certified else float("inf")
 
     def part(self, nodes: slice) -> "RunError":
-        """The error at some of the nodes; that of the function stays whole unless it has a value for each node."""
+        """The error at some of the nodes; the error of the user's function stays whole unless it has a value for each node."""
         lanes = (slice(None),) * (np.ndim(self.slow) - 1)
         of = self.of[*lanes, nodes] if np.shape(self.of)[: len(lanes) + 1] == np.shape(self.slow) else self.of
         at_nodes = {name: getattr(self, name)[*lanes, nodes] for name in ("q_s", "q_f", "slow", "fast")}
@@ -53,7 +54,7 @@ class RunError(NamedTuple):
         return f"RunError: {self.in_words()}"
 
     def in_words(self) -> str:
-        """The largest error and its shares, and up to which time they are certified."""
+        """The largest error, its shares, and the time up to which it is certified."""
         known = np.isfinite(self.positions)
         if not known.any():
             return "no error is certified"

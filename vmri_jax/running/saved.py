@@ -1,4 +1,7 @@
-"""Saved nodes of a run while it is computed: a row of numbers for each, so that a node is one write; and the trajectory they make."""
+"""Saved nodes of a run while it is computed, one row of numbers for each node, and the trajectory made from the rows.
+
+A node is a single write into a single array: XLA on CPU would take longer for one write into each field.
+"""
 
 from itertools import accumulate
 from typing import Any, NamedTuple
@@ -12,17 +15,17 @@ from vmri_jax.mechanics.arrays import Numbers
 from vmri_jax.mechanics.state import State
 from vmri_jax.running.trajectory import MicroNodes, RunInfo, Trajectory
 
-NUMBERS = 2**17
-"""Numbers in the nodes of a piece of a run, a megabyte. With more of them processes with many systems need more memory, with fewer long
-runs are called for more often, which takes some 30 microseconds each time."""
-
-
-OTHERS, DONE = 4, len(RunInfo._fields)
-"""Numbers of a node besides positions and momenta (time, energy, two constraint residuals), and of the solver's work before it."""
+NUMBERS_PER_PIECE = 2**17
+"""Numbers in the nodes of a piece of a run, a megabyte. A larger value takes more memory in processes with many systems; a smaller one
+divides long runs into more calls of some 30 microseconds each."""
+SCALARS_PER_NODE = 4
+"""Numbers of a node besides positions and momenta: time, energy, two constraint residuals."""
+SOLVER_NUMBERS = len(RunInfo._fields)
+"""Numbers of a row for the work of the solver since the previous node."""
 
 
 class Node(NamedTuple):
-    """Fields of a `Trajectory` at a node."""
+    """The fields of a `Trajectory` that belong to a node."""
 
     state: State
     energy: Float[Numbers, "*k"]
@@ -30,10 +33,10 @@ class Node(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """Room for nodes, arrays of JAX or of NumPy.
+    """Arrays for the nodes of a run, of JAX or of NumPy.
 
-    rows: each a `Node` and the `RunInfo` since the one before.
-    micros: fast positions at micro nodes, None unless asked for.
+    rows: a row for each node: its `Node`, and the `RunInfo` since the previous node.
+    micros: fast positions at micro nodes; None unless micro nodes are saved.
     """
 
     rows: Float[Numbers, "room+1 numbers"]
@@ -41,13 +44,13 @@ class Saved(NamedTuple):
 
     @classmethod
     def none(cls, state: State, room: int, num_micro: int | None) -> "Saved":
-        """Before anything is saved. `num_micro` is None unless micro nodes are saved."""
-        row = _unknown(_numbers(state))
+        """Arrays without nodes. `num_micro` is None unless micro nodes are saved."""
+        row = _empty_row(_numbers_per_row(state))
         micros = None if num_micro is None else jnp.full((room, num_micro, state.q_f.shape[0]), jnp.nan)
         return cls(jnp.broadcast_to(row, (room + 1, row.size)), micros)
 
     def write(self, number, node: Node, info: RunInfo, micro) -> "Saved":
-        """With node `number`; number 0 is the start, which has no micro nodes before it."""
+        """The arrays with node `number` written into them; node 0, the start, has no micro nodes before it."""
         row = jnp.concatenate([jnp.ravel(jnp.asarray(a, float)) for a in jax.tree.leaves((node, info))])
         rows = jax.lax.dynamic_update_index_in_dim(self.rows, row, number, 0)
         micros = self.micros
@@ -56,9 +59,9 @@ class Saved(NamedTuple):
         return Saved(rows, micros)
 
     def first(self, saves: int, written: int) -> "Saved":
-        """The first `saves` saved intervals as arrays of NumPy, of which only the first `written` nodes are known."""
+        """The first `saves` saved intervals as arrays of NumPy; nodes from number `written` on are old data and become NaN."""
         rows = np.array(np.asarray(self.rows)[: saves + 1])
-        rows[written:] = _unknown(rows.shape[1])
+        rows[written:] = _empty_row(rows.shape[1])
         if self.micros is None:
             return Saved(rows, None)
         micros = np.array(np.asarray(self.micros)[:saves])
@@ -70,32 +73,31 @@ class Saved(NamedTuple):
 
         Args:
             num_slow: n_s.
-            times: (room + 1,) of all nodes, which nodes after a failure have, too.
+            times: (room + 1,) times of all nodes, for the nodes after a failure, whose rows are empty.
             status: `result` and `failed_at`.
-            before_end: (num_micro,) by how much the micro nodes of a step are earlier than its end.
+            before_end: (num_micro,) times from the micro nodes of a macro step to its end.
         """
         module = jnp if isinstance(self.rows, jax.Array) else np
-        num_fast = (self.rows.shape[1] - OTHERS - DONE) // 2 - num_slow
+        num_fast = (self.rows.shape[1] - SCALARS_PER_NODE - SOLVER_NUMBERS) // 2 - num_slow
         ends = list(accumulate((1, num_slow, num_fast, num_slow, num_fast, 1, 2)))
-        t, q_s, q_f, p_s, p_f, energy, residual, did = module.split(self.rows, ends, axis=1)
+        t, q_s, q_f, p_s, p_f, energy, constraint_residual, work = module.split(self.rows, ends, axis=1)
         t = module.where(module.isnan(t[:, 0]), times, t[:, 0])
-        method, iterations, left = did[1:].T
-        info = RunInfo(method.astype(int), iterations.astype(int), left)
+        method, iterations, residual = work[1:].T
+        info = RunInfo(method.astype(int), iterations.astype(int), residual)
         micro = None if self.micros is None else MicroNodes(t[1:, None] - before_end, self.micros)
-        return Trajectory(State(t, q_s, q_f, p_s, p_f), energy[:, 0], residual, info, **status, micro=micro)
+        return Trajectory(State(t, q_s, q_f, p_s, p_f), energy[:, 0], constraint_residual, info, **status, micro=micro)
 
 
-def _numbers(state: State) -> int:
-    """Numbers in the row of a node."""
-    return 2 * (state.q_s.size + state.q_f.size) + OTHERS + DONE
+def _numbers_per_row(state: State) -> int:
+    return 2 * (state.q_s.size + state.q_f.size) + SCALARS_PER_NODE + SOLVER_NUMBERS
 
 
-def _unknown(numbers: int) -> np.ndarray:
-    """The row of a node that no step has reached: NaN, and no work of the solver before it."""
-    return np.append(np.full(numbers - DONE, np.nan), np.zeros(DONE))
+def _empty_row(numbers: int) -> np.ndarray:
+    """The row of a node that no step has reached: NaN, and zeros for the work of the solver."""
+    return np.append(np.full(numbers - SOLVER_NUMBERS, np.nan), np.zeros(SOLVER_NUMBERS))
 
 
 def room_of_a_piece(state: State, num_micro: int, save_micro: bool) -> int:
-    """Saved intervals of a piece of a run: the same for all lengths, so that they share one program."""
-    numbers = _numbers(state) + (num_micro * (state.q_f.size + 1) if save_micro else 0)
-    return max(NUMBERS // numbers, 1)
+    """Saved intervals that fit into a piece of a run: the same for runs of all lengths, so that they share one program."""
+    numbers = _numbers_per_row(state) + (num_micro * (state.q_f.size + 1) if save_micro else 0)
+    return max(NUMBERS_PER_PIECE // numbers, 1)

@@ -10,18 +10,20 @@ from vmri_jax.schemes.scheme import Scheme
 
 @dataclass(frozen=True)
 class Settings:
-    """The arguments of `vmri_jax.simulate` that make the same run again, from the same start: ``vm.simulate(problem, **run.settings.arguments)``.
+    """The arguments of `vmri_jax.simulate` that repeat a run from the same start: ``vm.simulate(problem, **run.settings.arguments)``.
 
     Attributes:
         scheme: the scheme or composition.
-        python: the expression that makes it.
-        options: the same on the command line; empty for a scheme of one's own.
-        macro_dt: H.
-        num_steps, save_every: macro steps, and those from one saved node to the next.
-        gain: time of single steps over that of these micro steps for the same error, by the prices and shares of the trial runs.
+        python: the Python expression of the scheme.
+        options: the options of the scheme on the command line; empty for a scheme of the user.
+        macro_dt: macro step H.
+        num_steps: macro steps of the run.
+        save_every: macro steps from one saved node to the next.
+        gain: computing time with one micro step per macro step, divided by the time with the chosen number, for the same error; computed
+            from the prices and error shares of the trial runs.
     """
 
-    scheme: Scheme | Composition = field(compare=False)  # `python` and the numbers say all of it
+    scheme: Scheme | Composition = field(compare=False)  # `python` and the numbers identify it
     python: str
     options: str
     macro_dt: float
@@ -36,15 +38,15 @@ class Settings:
         return {"scheme": self.scheme, **steps}
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain data, which JSON keeps."""
+        """Plain data for JSON."""
         return {**vars(self), "scheme": to_plain(self.scheme)}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Settings":
-        """The inverse of `to_dict`, also of what JSON makes of it.
+        """The inverse of `to_dict`.
 
         Args:
-            data: from `to_dict`.
+            data: from `to_dict`, directly or through JSON.
         """
         return cls(**{**data, "scheme": from_plain(data["scheme"])})
 

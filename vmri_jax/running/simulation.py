@@ -1,4 +1,13 @@
-"""A run whose arguments have been checked, and its programs: at once, or in pieces that runs of all lengths share."""
+"""`Simulation`: a run with checked arguments, and the three ways to compute it.
+
+| call | program | used by |
+|---|---|---|
+| ``run()`` | `Engine.whole`, compiled for its number of saved nodes | `prepare` |
+| ``run.in_pieces()``, ``run.advance(...)`` | `Engine.piece`, one program for runs of all lengths | `simulate`, `stream` |
+| `vmri_jax.running.traced` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
+
+*Exact matrices* are those of the solver `solvers.Arrowhead` with the settings of the user's solver, the fallback of "auto".
+"""
 
 import warnings
 from collections.abc import Callable
@@ -19,7 +28,7 @@ from vmri_jax.mechanics.state import Movable, State, opened, start_of
 from vmri_jax.mechanics.summary import numbers, summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.arguments import Steps, check_run, check_vectors, nothing_fast
-from vmri_jax.running.engine import Arrays, Engine, Model, Place, engine
+from vmri_jax.running.engine import Arrays, Engine, Model, PieceStart, engine
 from vmri_jax.running.failures import simulation_error
 from vmri_jax.running.interrupts import Interrupted, interrupts_noted
 from vmri_jax.running.memory import check_memory
@@ -36,41 +45,41 @@ from vmri_jax.steppers.solvers import Newton
 
 PARTS_OF_A_BAR = 50
 """Parts of a run with a progress bar. More parts move the bar more smoothly, and each costs a call of some 30 microseconds."""
-STEPPING = "the run: it is compiled if it is the first of its kind, then stepped"
-FALLING_BACK = (
-    "a step that the first method does not solve: the run is made again with exact matrices, compiled if they are new"
-)
-"""What a run says of itself when it takes long."""
+STEPPING = "the run: compiling its program if it is new, then taking its steps"
+"""Line about a run that takes more than two seconds."""
+FALLING_BACK = "the first solver did not solve a step: computing the run again with exact matrices (solvers.Arrowhead), as accurate but slower"
+"""Line about a fallback that takes more than two seconds."""
 
 
 class Checkpoint(NamedTuple):
-    """Where a run stands: all that its next steps depend on, to the last bit.
+    """A run between two steps: everything that its next steps depend on, to the last bit.
 
     step: macro steps done.
-    state, memory: at the node reached, and what the last step hands on.
-    fell_back: whether the first method has given way to exact matrices.
-    starts: whether no step is remembered, so that `memory` is blank.
+    state: state at the node reached.
+    memory: memory of the stepper, such as the start of Newton's next iteration.
+    fell_back: whether exact matrices have replaced the first method.
+    is_first: whether the stepper has no memory of earlier steps, so that `memory` is blank.
     """
 
     step: int
     state: State
     memory: Any
     fell_back: bool = False
-    starts: bool = False
+    is_first: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A run whose arguments have been checked: at once by a call, with a program of its own, or in pieces that all lengths share.
+    """A run with checked arguments, ready to be computed.
 
-    A run is made with the first method of its plan. The fallback is a policy of the run: a run or a piece in which that method fails is
-    made again with exact matrices, by a program that is compiled then.
+    The first method of its plan computes the run. If that method fails in a run or a piece, the run or piece is computed again with exact
+    matrices; their program is compiled only then.
 
     Attributes:
         system, scheme, solver, state, num_steps, save_every, save_micro: as of `simulate`.
-        macro_dt: an array of shape ().
-        names: of bodies and constraints, None if there are none.
-        may_fall_back: whether a run that the first method does not solve is made again with exact matrices, else it fails.
+        macro_dt: macro step H, an array of shape ().
+        names: names of bodies and constraints; None if there are none.
+        may_fall_back: whether exact matrices are tried where the first method fails; else the run fails.
     """
 
     system: System
@@ -85,11 +94,11 @@ class Simulation:
     may_fall_back: bool = True
 
     def __call__(self, state=None, *, macro_dt=None, params=None, num_steps=None, throw: bool = True) -> Trajectory:
-        """The run, or the same from another start, with another step size, other parameters, another number of steps.
+        """The trajectory of the run; arguments replace its start, macro step, parameters or number of steps.
 
         Args:
-            state, macro_dt, params: of the same shapes as before; None for those of the run.
-            num_steps: a multiple of the number of saved intervals, which stays; None for that of the run.
+            state, macro_dt, params: in the shapes of the run; None for the values of the run.
+            num_steps: a multiple of the number of saved intervals, which stays; None for the number of the run.
             throw: raise `SimulationError` if a step fails, as `simulate` does; else return the trajectory, NaN from the failure on.
 
         Raises:
@@ -111,13 +120,13 @@ class Simulation:
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
-        """The program of the run by its first method, to look into."""
+        """The compiled program of the run by its first method, for inspection."""
         return self._program(False).lower(*self._arguments(None, None, None, None)).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
-        """A function without arguments that makes such a run and waits for it, for a clock.
+        """A function without arguments that computes the run and waits for its result, to be timed.
 
-        It takes the fallback if the run needs it. Arguments as of a call.
+        It runs the program that succeeds, of the first method or of the fallback. Arguments as of a call.
         """
         arrays, *counts = self._arguments(state, macro_dt, params, num_steps)
         arguments = jax.device_put(arrays), *counts
@@ -146,14 +155,16 @@ class Simulation:
         return Arrays(leaves, start, macro_dt), save_every, self.num_saves
 
     def _leaves_with(self, params) -> list:
-        own, structure = jax.tree.flatten(self.system.params)
-        given, structure_given = jax.tree.flatten(params)
-        if not all(isinstance(leaf, float) or getattr(leaf, "dtype", None) == np.float64 for leaf in given):
+        """The leaves of the model with other parameters."""
+        expected, expected_structure = jax.tree.flatten(self.system.params)
+        new, structure = jax.tree.flatten(params)
+        # The full check takes longer than a short run; plain float64 leaves need none.
+        if not all(isinstance(leaf, float) or getattr(leaf, "dtype", None) == np.float64 for leaf in new):
             check_params(params)
-        if structure_given != structure or list(map(np.shape, given)) != list(map(np.shape, own)):
+        if structure != expected_structure or list(map(np.shape, new)) != list(map(np.shape, expected)):
             raise ValueError(f"params is {params!r}; give the pytree of system.params with other numbers in it.")
-        leaves = self.arrays.model
-        return leaves[: len(leaves) - len(own)] + [np.asarray(leaf) for leaf in given]
+        leaves = self.arrays.model  # the parameters come last, see `Arrays`
+        return leaves[: len(leaves) - len(expected)] + [np.asarray(leaf) for leaf in new]
 
     def _program(self, falls_back: bool):
         """The compiled run, see `Engine.whole`."""
@@ -168,7 +179,7 @@ class Simulation:
         return summary("Simulation, prepared: run() makes a Trajectory", lines | self.system.terms())
 
     def with_scheme(self, scheme: Scheme | Composition) -> "Simulation":
-        """The same run by another scheme."""
+        """The same run with another scheme."""
         return replace(self, scheme=of_one_type(scheme))
 
     @property
@@ -183,12 +194,12 @@ class Simulation:
 
     @property
     def is_concrete(self) -> bool:
-        """Whether there are only numbers, no tracers of a transformation."""
+        """Whether all arrays are concrete numbers, not tracers of a transformation."""
         return is_concrete(self.arrays)
 
     @cached_property
     def plan(self) -> Plan:
-        """How its steps are taken; ``print`` shows it in words."""
+        """The `Plan` that takes its steps; ``print`` shows it in words."""
         return plan(self.system, self.scheme, self.state, self.solver)
 
     @cached_property
@@ -198,18 +209,18 @@ class Simulation:
 
     @cached_property
     def arrays(self) -> Arrays:
-        """The numbers that it is computed from."""
+        """The arguments of its programs."""
         model = Model(self.solver, self.scheme, self.system)
         return Arrays(jax.tree.leaves(model), tuple(vars(self.state).values()), self.macro_dt)
 
     @cached_property
     def engine(self) -> Engine:
-        """Its programs with the first method."""
+        """Its programs with the first method of the plan."""
         return self.engine_for(False, self.num_saves)
 
     @cached_property
     def exact_engine(self) -> Engine:
-        """Its programs with exact matrices, for what the first method does not solve."""
+        """Its programs with exact matrices, the fallback."""
         return self.engine_for(True, self.num_saves)
 
     def engine_for(self, is_exact: bool, num_saves: int) -> Engine:
@@ -222,64 +233,74 @@ class Simulation:
         first_and_exact = self.solver, self.solver.exact()
         return tuple(jax.tree.structure(Model(solver, self.scheme, self.system)) for solver in first_and_exact)
 
-    def check(self, what: str = "simulate: the state", constraints: bool = True) -> None:
-        """Refuse a system whose functions return something else than they should, and constraints that cannot be kept."""
+    def check(self, state_name: str = "simulate: the state", constraints: bool = True) -> None:
+        """Refuse a system whose functions return wrong types or shapes, and a state that violates the constraints.
+
+        Args:
+            state_name: the state in messages.
+            constraints: whether to check the constraints at the state.
+        """
         shapes = tuple(a.shape for a in self.arrays.state)
         numbers = tuple(np.asarray(leaf).tobytes() for leaf in self.arrays.model)
-        _check_once(_Known((self._structures[0], shapes, numbers), self.system, self.state, what, constraints))
+        _check_once(_Checked((self._structures[0], shapes, numbers), self.system, self.state, state_name, constraints))
 
     def start(self, state: State | None = None, step: int = 0, fell_back: bool = False) -> Checkpoint:
-        """Before the first step; or from a state before step number `step`, as if that was the first one."""
+        """The checkpoint before the first step; or before step number `step` at another state, with blank memory."""
         start = self.arrays.state if state is None else _arrays(state)
         memory = self._piece_engine(fell_back).blank_memory(self.arrays._replace(state=start))
-        return Checkpoint(step, State(*start), memory, fell_back, starts=True)
+        return Checkpoint(step, State(*start), memory, fell_back, is_first=True)
 
     def _piece_engine(self, is_exact: bool) -> Engine:
         return self.engine_for(is_exact, room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro))
 
-    def advance(self, at: Checkpoint, saves: int) -> tuple[list[Trajectory], Checkpoint]:
-        """The next `saves` saved intervals, in pieces; again with exact matrices from a piece on that the first method does not solve."""
-        pieces, room = [], self._piece_engine(at.fell_back).num_saves
-        for done in range(
-            0, saves, room
-        ):  # after a failure, too: pieces that start from NaN end at once, without a method that failed
+    def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[list[Trajectory], Checkpoint]:
+        """The next `saves` saved intervals, in pieces; from the first piece that the first method does not solve, with exact matrices."""
+        pieces, room = [], self._piece_engine(checkpoint.fell_back).num_saves
+        # Pieces after a failure start from NaN and end at once: the trajectory keeps its length.
+        for done in range(0, saves, room):
             size = min(room, saves - done)
-            piece, after = self._advance(at, size)
-            if not at.fell_back and self._fallback_helps(piece):
+            piece, after = self._advance(checkpoint, size)
+            if not checkpoint.fell_back and self._fallback_helps(piece):
                 with Working(FALLING_BACK):
-                    piece, after = self._advance(self.start(at.state, at.step, fell_back=True), size)
+                    again = self.start(checkpoint.state, checkpoint.step, fell_back=True)
+                    piece, after = self._advance(again, size)
             pieces.append(piece)
-            at = after
-        return pieces, at
+            checkpoint = after
+        return pieces, checkpoint
 
-    def _advance(self, at: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
-        arrays = self.arrays._replace(state=tuple(vars(at.state).values()))
-        place = Place(at.memory, at.starts, self.arrays.state[0], at.step)
-        piece, state, memory = self._piece_engine(at.fell_back).next_piece(arrays, place, self.save_every, saves)
-        return piece, Checkpoint(at.step + saves * self.save_every, state, memory, at.fell_back)
+    def _advance(self, checkpoint: Checkpoint, saves: int) -> tuple[Trajectory, Checkpoint]:
+        step, state, memory, fell_back, is_first = checkpoint
+        arrays = self.arrays._replace(state=tuple(vars(state).values()))
+        begin = PieceStart(memory, is_first, self.arrays.state[0], step)
+        piece, state, memory = self._piece_engine(fell_back).next_piece(arrays, begin, self.save_every, saves)
+        return piece, Checkpoint(step + saves * self.save_every, state, memory, fell_back)
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
-        """Whether a step failed that another method may solve: not where equations are explicit or linear, or solved, as of `NOT_IMPLIED`."""
+        """Whether a step failed that exact matrices may solve.
+
+        They cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor a step that was solved but violates implied
+        constraints, `Result.NOT_IMPLIED`.
+        """
         failed = self.may_fall_back and int(piece.failed_at) >= 0 and int(piece.result) != Result.NOT_IMPLIED
         return failed and int(np.max(piece.info.method)) > Method.LINEAR and self.plan.has_fallback
 
     def in_pieces(self, progress: ShowsProgress = False) -> Trajectory:
-        """The whole run; with a progress bar Ctrl-C raises `Interrupted` with what was computed."""
+        """The whole run; with a progress bar Ctrl-C raises `Interrupted` with the trajectory computed so far."""
         if progress is False:
             with Working(STEPPING):
                 return self._joined(self.advance(self.start(), self.num_saves)[0])
-        size, at, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
+        size, checkpoint, pieces = -(-self.num_saves // PARTS_OF_A_BAR), self.start(), []
         with interrupts_noted() as interrupted, progress_to("simulate", progress) as tell:
             for done in range(0, self.num_saves, size):
                 tell("simulating", done, self.num_saves)
-                more, at = self.advance(at, min(size, self.num_saves - done))
-                pieces += more
+                new_pieces, checkpoint = self.advance(checkpoint, min(size, self.num_saves - done))
+                pieces += new_pieces
                 if interrupted():
-                    raise Interrupted(self._joined(pieces), at.step, self.num_steps, "macro steps")
+                    raise Interrupted(self._joined(pieces), checkpoint.step, self.num_steps, "macro steps")
         return self._joined(pieces)
 
     def _joined(self, pieces: list[Trajectory]) -> Trajectory:
-        """One run, as arrays of JAX; `jax.numpy.asarray` would compile a program for every length."""
+        """One trajectory with arrays of JAX; `device_put`, since `jax.numpy.asarray` would compile a program for every length."""
         return with_origin(jax.device_put(join(pieces)), self.origin)
 
 
@@ -296,15 +317,14 @@ def prepare(
     save_micro: bool = False,
     solver: Newton | None = None,
 ) -> "Simulation":
-    """Check and compile what `simulate` would run, to be run again and again.
+    """Check and compile a run of `simulate` once, to be called many times.
 
         run = vm.prepare(system, scheme, state, macro_dt=0.01, num_steps=1000, save_every=10)
         trajectory = run()
         other = run(other_state, macro_dt=0.02, params=other_params)
 
-    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The
-    fallback of the method "auto" is not compiled here, but by the first call that needs it, which says so and takes as long as this.
-    Arguments as of `simulate`.
+    A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
+    that needs the fallback of the method "auto" compiles it, which takes as long as `prepare`. Arguments as of `simulate`.
 
     Returns:
         The `Simulation`.
@@ -325,17 +345,20 @@ def prepare(
 
 
 def simulation(moving: Movable, scheme, state: State | None, solver: Newton | None, steps: Steps) -> Simulation:
-    """The simulation that these arguments of `simulate` ask for; bad ones are refused."""
+    """The `Simulation` with these arguments of `simulate`; bad arguments raise."""
     warn_if_slow()
     problem = opened(moving)
     system, state = start_of("simulate", problem, state)
     macro_dt, num_steps, save_every = check_run(system, scheme, state, solver, steps)
-    useless = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
-    if useless:
-        warnings.warn(f"simulate: {useless}", stacklevel=3)
-    how, scheme, system = of_one_type((solver or solvers.Auto(), scheme, system))
-    state, macro_dt = State(*_arrays(state)), _float(macro_dt)
-    return Simulation(system, scheme, how, state, macro_dt, num_steps, save_every, steps.save_micro, names_of(problem))
+    advice = (
+        nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
+    )  # scenes only: `opened` returns problems as they are
+    if advice:
+        warnings.warn(f"simulate: {advice}", stacklevel=3)
+    solver = solver or solvers.Auto()
+    solver, scheme, system = of_one_type((solver, scheme, system))
+    state, macro_dt, names = State(*_arrays(state)), _float(macro_dt), names_of(problem)
+    return Simulation(system, scheme, solver, state, macro_dt, num_steps, save_every, steps.save_micro, names)
 
 
 def _arrays(state: State) -> tuple:
@@ -343,25 +366,26 @@ def _arrays(state: State) -> tuple:
 
 
 def _float(value):
-    """Numbers as an array of float64, of NumPy unless they are traced."""
+    """Numbers as an array of float64: of JAX if they are traced, else of NumPy, which is made faster."""
     return np.asarray(value, dtype=float) if is_concrete(value) else jnp.asarray(value, dtype=float)
 
 
 @dataclass(frozen=True)
-class _Known:
-    """A system with a start at which it has been checked; with the same key it need not be checked again."""
+class _Checked:
+    """A system and a state to be checked, equal to every other one of the same `key`: structure, shapes and numbers of the model."""
 
     key: tuple
     system: System = field(compare=False)
     state: State = field(compare=False)
-    what: str = field(compare=False)
+    state_name: str = field(compare=False)
     constraints: bool
 
 
 @lru_cache(maxsize=256)
-def _check_once(known: _Known) -> None:
-    check_system(known.system, known.state.q_s, known.state.q_f)
-    check_closures(known.system, known.state.q_s, known.state.q_f)
-    check_mass(known.system, known.state.q_s, known.state.q_f)
-    if known.constraints:
-        check_constraints(known.system, known.state, known.what)
+def _check_once(checked: _Checked) -> None:
+    """Check a system at a state; the cache skips the check for equal ones, which would take longer than a short run."""
+    check_system(checked.system, checked.state.q_s, checked.state.q_f)
+    check_closures(checked.system, checked.state.q_s, checked.state.q_f)
+    check_mass(checked.system, checked.state.q_s, checked.state.q_f)
+    if checked.constraints:
+        check_constraints(checked.system, checked.state, checked.state_name)

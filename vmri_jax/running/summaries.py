@@ -1,4 +1,4 @@
-"""What a run is, in a few lines: how many nodes of which times, its coordinates by name, and what it has kept."""
+"""The summary of a run in a few lines: nodes and times, status, coordinates by name, energy, error, solver."""
 
 from collections import Counter
 
@@ -14,13 +14,13 @@ def summary_of(run: SavedRun) -> tuple[str, dict[str, str]]:
     """Title and lines of the summary of a run, or of a batch of runs.
 
     Args:
-        run: with values, no tracers.
+        run: a run of concrete values, not tracers.
     """
     t, energy, residual = (np.asarray(a) for a in (run.t, run.energy, run.constraint_residual))
     lanes = t.shape[:-1]
-    of = f" of a batch of {' x '.join(map(str, lanes))} runs" if lanes else ""
+    batch = f" of a batch of {' x '.join(map(str, lanes))} runs" if lanes else ""
     times = f" from t = {np.nanmin(t):.6g} to {np.nanmax(t):.6g}" if np.isfinite(t).any() else ""
-    return f"Trajectory{of}: {t.shape[-1]} saved nodes{times}", {
+    return f"Trajectory{batch}: {t.shape[-1]} saved nodes{times}", {
         "status": statuses(np.asarray(run.result), np.asarray(run.failed_at)),
         **named_coordinates(run.origin.names, run),
         "energy": energy_in_words(energy, run.keeps_energy),
@@ -33,28 +33,28 @@ def summary_of(run: SavedRun) -> tuple[str, dict[str, str]]:
 
 
 def named_coordinates(names: Names | None, run: SavedRun) -> dict[str, str]:
-    """Lines on the slow and the fast coordinates of a run by name, plain names where none are known."""
+    """Lines on the slow and the fast coordinates of a run, with their names or else with plain names."""
     names = (names or Names()).of_coordinates(run.states.q_s.shape[-1], run.states.q_f.shape[-1])
     return {"slow": coordinates(names.slow_coordinates), "fast": coordinates(names.fast_coordinates)}
 
 
 def statuses(result: np.ndarray, failed_at: np.ndarray) -> str:
-    """The status of a run by name; of a batch how many runs have which, and where the first ones failed."""
+    """The status of a run by name; of a batch the number of runs of each status, and the numbers of the failed lanes."""
     if not result.ndim:
-        at = "" if failed_at < 0 else f" at macro step {failed_at}; all saved nodes after it are NaN"
-        return f"{Result(int(result)).name}{at}"
-    seen = Counter(Result(int(r)).name for r in result.ravel())
+        failure = "" if failed_at < 0 else f" at macro step {failed_at}; all saved nodes after it are NaN"
+        return f"{Result(int(result)).name}{failure}"
+    counts = Counter(Result(int(r)).name for r in result.ravel())
     failed = [str(i) for i in np.flatnonzero(failed_at.ravel() >= 0)]
-    where = f"; failed: run.lane(i) for i = {listed(failed)}" if failed else ""
-    return ", ".join(f"{count} {name}" for name, count in seen.most_common()) + where
+    lanes = f"; failed: run.lane(i) for i = {listed(failed)}" if failed else ""
+    return ", ".join(f"{count} {name}" for name, count in counts.most_common()) + lanes
 
 
 def energy_in_words(energy: np.ndarray, kept: bool | None) -> str:
-    """Energy at the start and how it changes; of a batch the largest change in a run.
+    """Energy at the start and its change; of a batch the largest change in a run.
 
     Args:
-        energy: (k,), of a batch (..., k); NaN after a failure.
-        kept: whether the system keeps it; None if that is not known.
+        energy: (k,), in a batch (..., k); NaN after a failure.
+        kept: whether the system keeps its energy; None if the system is not known.
     """
     start = energy[..., :1]
     change = np.abs(energy - start)

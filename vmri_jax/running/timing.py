@@ -7,14 +7,15 @@ import jax
 import numpy as np
 
 MIN_SECONDS = 0.02
-"""A sample shorter than this is made of several calls; longer than clocks and schedulers disturb."""
+"""Least seconds of a sample; shorter runs are called several times. It is long against the resolution of clocks and the time slices of
+schedulers; a larger value makes measurements take longer."""
 
 Tell = Callable[[str], None]
-"""Told what is about to be measured."""
+"""Called with the name of a run before it is measured."""
 
 
 def silent(_: str) -> None:
-    """Say nothing."""
+    """A `Tell` that prints nothing."""
 
 
 def interleaved(
@@ -26,14 +27,14 @@ def interleaved(
 ) -> dict[str, list[float]]:
     """Seconds per call of every run, `repeats` samples each, after one call that is not counted.
 
-    The runs take turns, and every round starts with another one, so that a slow moment of the machine, or what the run
-    before left in the caches, hits all of them alike.
+    The runs take turns, and every round starts with another run, so that a slow moment of the machine, or the caches as the previous run
+    left them, affect all runs alike.
 
     Args:
-        runs: callables by name; what they return is waited for (`jax.block_until_ready`).
-        repeats: samples of each.
-        min_seconds: a sample is the mean of as many calls as take about so long.
-        tell: told the name of each run before its first call.
+        runs: callables by name; the clock stops when their results are ready (`jax.block_until_ready`).
+        repeats: samples of each run.
+        min_seconds: seconds of a sample, the mean of several calls.
+        tell: called with the name of each run before its first call.
         clock: `time.process_time` where other processes share the core.
     """
     calls, seconds = {}, {name: [] for name in runs}
@@ -50,7 +51,7 @@ def interleaved(
 
 
 def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Mean seconds of `calls` calls, results awaited."""
+    """Mean seconds of `calls` calls, up to the moment when their results are ready."""
     start = clock()
     for _ in range(calls):
         jax.block_until_ready(run())
@@ -58,9 +59,10 @@ def seconds_per_call(run: Callable[[], object], calls: int, clock: Callable[[], 
 
 
 def least_seconds(runs: Sequence[Callable[[], object]], samples: int) -> list[float]:
-    """Seconds of every run on a machine of its own, as well as a busy machine tells: the least of samples taken in turns.
+    """Estimated seconds of every run on an idle machine: the least of `samples` samples, taken in turns.
 
-    On a CPU a sample is the lesser of wall and processor time: other programs lengthen the first, threads of its own the second.
+    On a CPU a sample is the lesser of wall time, which other programs lengthen, and processor time, which the threads of the run itself
+    lengthen.
     """
     clocks = (time.perf_counter, time.process_time) if jax.default_backend() == "cpu" else (time.perf_counter,)
     least = [float("inf")] * len(runs)
@@ -72,18 +74,18 @@ def least_seconds(runs: Sequence[Callable[[], object]], samples: int) -> list[fl
 
 
 def seconds_each(function: Callable, q, count: int = 2000, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Seconds per evaluation in a compiled loop in which every evaluation waits for the one before.
+    """Seconds per evaluation in a compiled loop in which every evaluation depends on the previous one.
 
     Args:
         function: ``function(q)``, shaped like q.
-        q: where it is evaluated.
+        q: point of evaluation.
         count: evaluations in the loop.
         clock: as of `interleaved`.
     """
 
     @jax.jit
-    def loop(q, nothing):
-        return jax.lax.fori_loop(0, count, lambda _, q: q + nothing * function(q), q)
+    def loop(q, zero):  # an argument, since XLA would remove the function behind a constant zero
+        return jax.lax.fori_loop(0, count, lambda _, q: q + zero * function(q), q)
 
     seconds = interleaved({"": lambda: loop(q, 0.0)}, 3, 0.005, clock=clock)[""]
     return float(np.median(seconds)) / count

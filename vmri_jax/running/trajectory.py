@@ -1,4 +1,4 @@
-"""What a run returns: saved nodes, what the solver did, conserved quantities, and where it stopped."""
+"""`Trajectory`, the result of a run: saved nodes, work of the solver, energy and constraints, and status."""
 
 import json
 from dataclasses import dataclass, replace
@@ -24,21 +24,22 @@ from vmri_jax.steppers.results import Method, Result, Status
 
 FORMAT = "vmri_jax trajectory 2"
 NODES = ("t", "q_s", "q_f", "p_s", "p_f", "energy", "constraint_residual")
-"""Fields with one entry per saved node; all others but `STATUS` have one per saved interval."""
+"""Arrays with a row for each saved node; all arrays but `NODES`, `STATUS` and `ERROR` have a row for each saved interval."""
 STATUS = ("result", "failed_at")
+"""Arrays with one value for the run."""
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
-"""The estimated error, which may be None, as arrays."""
+"""Arrays of the estimated error; absent in runs without one."""
 STATUS_ARRAYS = jax.Array, np.ndarray
-"""What the status of a run comes as."""
+"""Types of the status of a run before it becomes a `Status`."""
 
 
 class RunInfo(NamedTuple):
-    """What the solver did from one saved node to the next.
+    """Work of the solver from one saved node to the next.
 
     Attributes:
-        method: code of the most expensive method that a step took, see `Method`.
-        iterations: most Newton iterations of a step, 0 for explicit ones.
-        residual: largest residual that a step left, relative to the momentum, and of the constraints.
+        method: code of the most expensive method of a step, see `Method`.
+        iterations: most Newton iterations of a step; 0 for explicit steps.
+        residual: largest residual after a step: of the equations relative to the momentum, or of the constraints.
     """
 
     method: Int[Numbers, "k-1"]
@@ -50,15 +51,16 @@ class RunInfo(NamedTuple):
         return f"RunInfo: {self.in_words()}" if has_values(self) else f"RunInfo({eqx.tree_pformat(arrays, width=1000)})"
 
     def in_words(self) -> str:
-        """The most that the solver did, of arrays that have values."""
+        """The most expensive method, the most iterations and the largest residual, of concrete arrays."""
         if not np.size(self.method):
             return "no step"
-        method, most = Method(int(np.max(self.method))), int(np.max(self.iterations))
-        return f"{method.name}, at most {most} iterations per step, residual at most {np.nanmax(self.residual, initial=0.0):.1e}"
+        method, iterations = Method(int(np.max(self.method))), int(np.max(self.iterations))
+        residual = np.nanmax(self.residual, initial=0.0)
+        return f"{method.name}, at most {iterations} iterations per step, residual at most {residual:.1e}"
 
 
 class MicroNodes(NamedTuple):
-    """Micro nodes of the macro step that ends at each saved node, its start excluded.
+    """Micro nodes of the macro step that ends at each saved node, without the start of the step.
 
     t: times.
     q_f: fast positions.
@@ -71,23 +73,24 @@ class MicroNodes(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Exports):
-    """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has an axis of lanes before.
+    """Trajectory at the k saved macro nodes, the first one the start; in a batch every array has a leading axis of lanes.
 
     ``len(run)`` is k; ``run[i]`` is the `State` at a node, ``run[-1]`` that at the end; ``run[a:b]`` and ``run[a:b:n]`` are the
     `Trajectory` of these nodes. Velocities, multipliers, reaction forces and work are `Quantities` of it. It is a pytree of arrays; its
     origin travels with it through ``jax.tree.map``, ``jax.vmap``, ``jax.jit`` and pickle.
 
-    Positions, velocities and momenta are dictionaries of arrays, ``run.q_f["load"]``, where the start of the problem is; `states` has vectors.
+    Positions, velocities and momenta are dictionaries of arrays, ``run.q_f["load"]``, if the problem was given its start as dictionaries;
+    `states` always has vectors.
 
     Attributes:
         states: all saved nodes as a `State` of arrays (k,), (k, n); NaN after a failure.
         energy: Hamiltonian.
-        constraint_residual: largest |g| and largest |G v|, of the rows that were left out as implied, too.
-        info: work of the solver since the node before.
-        result: status of the run, the number of a `Result`, as which it prints; the first that was no success.
-        failed_at: index of the macro step that failed, -1 if none did.
-        micro: the micro nodes of the macro step that ends at each saved node (its start excluded); None unless asked for.
-        error: estimated error of the positions, a `RunError`; None unless asked for.
+        constraint_residual: largest |g| and largest |G v|, including rows that the solver leaves out as implied by other rows.
+        info: work of the solver since the previous node.
+        result: status of the run, the number of a `Result`, which prints as a sentence; after a failure the status of the failed step.
+        failed_at: number of the macro step that failed; -1 if no step failed.
+        micro: the micro nodes of the macro step that ends at each saved node; None without save_micro=True.
+        error: estimated error of the positions, a `RunError`; None without error=True or an accuracy.
         origin: system, parameters and names.
     """
 
@@ -134,12 +137,12 @@ class Trajectory(Exports):
 
     @property
     def t_micro(self) -> Any:
-        """(k - 1, num_micro) times of the micro nodes; None unless asked for."""
+        """(k - 1, num_micro) times of the micro nodes; None without save_micro=True."""
         return None if self.micro is None else self.micro.t
 
     @property
     def q_f_micro(self) -> Any:
-        """(k - 1, num_micro, n_f) fast positions at the micro nodes, or by name; None unless asked for."""
+        """(k - 1, num_micro, n_f) fast positions at the micro nodes, or by name; None without save_micro=True."""
         return None if self.micro is None else self.origin.shaped("f", self.micro.q_f)
 
     @property
@@ -148,14 +151,14 @@ class Trajectory(Exports):
         return self.origin.settings  # pyright: ignore[reportReturnType]
 
     def of(self, moving: System | Problem | HasProblem) -> "Trajectory":
-        """The same run with its origin: its system, and the names of its parts.
+        """The same run with its origin: its system, and the names of bodies and constraints.
 
         Args:
             moving: the Problem, Scene or System that was simulated.
 
         Raises:
-            TypeError: something else.
-            ValueError: it has other numbers of coordinates.
+            TypeError: `moving` is none of the three.
+            ValueError: its numbers of coordinates differ from the run.
         """
         origin = replace(Origin.of(moving), settings=self.settings)
         origin.check(self.states.q_s.shape[-1], self.states.q_f.shape[-1])
@@ -177,9 +180,9 @@ class Trajectory(Exports):
     def __getitem__(self, nodes: slice) -> "Trajectory": ...
     def __getitem__(self, nodes):
         if isinstance(nodes, int | np.integer):
-            at = range(len(self))[nodes]  # beyond the ends an IndexError
+            node = range(len(self))[nodes]  # raises IndexError beyond the ends
             lanes = (slice(None),) * (np.ndim(self.t) - 1)
-            return jax.tree.map(lambda a: a[*lanes, at], self.states)
+            return jax.tree.map(lambda a: a[*lanes, node], self.states)
         if not isinstance(nodes, slice):
             raise TypeError(
                 f"Trajectory: the index is {nodes!r}; give the number of a node, or a slice as in run[:100]."
@@ -195,7 +198,7 @@ class Trajectory(Exports):
         """One run of a batch.
 
         Args:
-            i: its number.
+            i: number of the lane.
 
         Raises:
             ValueError: this is no batch.
@@ -215,13 +218,13 @@ class Trajectory(Exports):
         return self[-1]
 
     def save(self, path, drawing: dict | None = None) -> None:
-        """Write all arrays to a .npz file (no pickled objects); a file that is there is replaced when all is on disk.
+        """Write all arrays to a .npz file (no pickled objects); an existing file is replaced after all bytes are on disk.
 
         Names of coordinates are the arrays ``slow_names`` and ``fast_names``; ``settings`` of a run with an accuracy are JSON.
 
         Args:
             path: of the file.
-            drawing: plain data of a `vmri_jax.animation.Drawing`, kept next to the arrays.
+            drawing: plain data of a `vmri_jax.animation.Drawing`, written beside the arrays.
 
         Raises:
             OSError: the file cannot be written.
@@ -243,8 +246,8 @@ class Trajectory(Exports):
         """Read a trajectory written by `save`, as arrays of NumPy; with ``.of(problem)`` it knows its system again.
 
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: a file that is damaged or not a trajectory.
+            FileNotFoundError: the file does not exist.
+            ValueError: the file is damaged or not a trajectory.
         """
         path = FilePath(path)
         if not path.exists():
@@ -283,32 +286,35 @@ class Trajectory(Exports):
 
 
 def with_origin(trajectory: Trajectory, origin: Origin) -> Trajectory:
-    """A trajectory of the engine as users get it: with its origin, and with a status that prints as a sentence."""
+    """A trajectory of the engine with its origin, and with a status that prints as a sentence."""
     result = trajectory.result
     if isinstance(result, STATUS_ARRAYS) and result.ndim == 0 and is_concrete(result):
         result = Status(result)
     return replace(trajectory, result=result, origin=origin)
 
 
-def ends_of(what: str, nodes: slice, count: int) -> tuple[int, int, int]:
-    """First and last node of a slice, and the stride from one to the next.
+def ends_of(run: str, nodes: slice, count: int) -> tuple[int, int, int]:
+    """First node, last node and stride of a slice.
 
     Args:
-        what: the class of the run, for messages.
+        run: the class of the run, for messages.
         nodes: the slice.
-        count: number of nodes there are.
+        count: nodes of the run.
 
     Raises:
-        ValueError: no node, or backwards.
+        ValueError: the slice is empty, or goes backwards.
     """
     first, stop, stride = nodes.indices(count)
     if stride < 1 or first >= stop:
-        raise ValueError(f"{what}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
+        raise ValueError(f"{run}: no nodes {first}:{stop}:{stride}; it has {count}, and they are taken forwards.")
     return first, first + (stop - 1 - first) // stride * stride, stride
 
 
 def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
-    """The arrays of some nodes of a trajectory: between two of them the most that the solver did, and no failure after them."""
+    """The arrays of the nodes first, first + stride, ..., last of a trajectory.
+
+    Between two of these nodes the work of the solver is the maximum over the intervals; a failure after the last node is left out.
+    """
     lanes = (slice(None),) * (np.ndim(arrays["t"]) - 1)
 
     def part(name: str, value):
@@ -321,17 +327,17 @@ def part_of(arrays: dict, first: int, last: int, stride: int) -> dict:
         starts = range(0, last - first, stride)
         return np.maximum.reduceat(between, starts, axis=len(lanes)) if starts else between
 
-    aside = (*STATUS, *ERROR)
-    found: dict = {name: None if a is None else part(name, a) for name, a in arrays.items() if name not in aside}
-    failed = np.isnan(found["energy"]).any(axis=-1)
-    before = (np.asarray(arrays["failed_at"]) >= 0) & ~failed
-    found["failed_at"] = np.where(before, -1, arrays["failed_at"])
-    found["result"] = np.where(before, int(Result.CONVERGED), arrays["result"])
-    return found
+    without_rows = (*STATUS, *ERROR)
+    parts: dict = {name: None if a is None else part(name, a) for name, a in arrays.items() if name not in without_rows}
+    failed = np.isnan(parts["energy"]).any(axis=-1)
+    ends_before_failure = (np.asarray(arrays["failed_at"]) >= 0) & ~failed
+    parts["failed_at"] = np.where(ends_before_failure, -1, arrays["failed_at"])
+    parts["result"] = np.where(ends_before_failure, int(Result.CONVERGED), arrays["result"])
+    return parts
 
 
 def join(pieces: list[Trajectory]) -> Trajectory:
-    """Consecutive trajectories, each starting where the one before ends, as one, with arrays of NumPy."""
+    """One trajectory of consecutive pieces, each of which starts with the last node of the previous piece; with arrays of NumPy."""
     if len(pieces) == 1:
         return pieces[0]
     flat = [named_arrays(piece) for piece in pieces]
@@ -342,14 +348,14 @@ def join(pieces: list[Trajectory]) -> Trajectory:
         first = flat[0][name]
         if first is None or name in STATUS:
             return status[name]
-        skip = 1 if name in NODES else 0  # a piece starts with the last node of the one before
+        skip = 1 if name in NODES else 0  # the first node repeats the last one of the previous piece
         return np.concatenate([first, *(f[name][skip:] for f in flat[1:])])
 
     return from_named_arrays({name: joined(name) for name in flat[0]})
 
 
 def named_arrays(trajectory: Trajectory) -> dict:
-    """All arrays of a trajectory by name, positions as vectors; None for those that were not asked for."""
+    """All arrays of a trajectory by name, positions as vectors; None for micro nodes that were not saved."""
     arrays = dict(vars(trajectory.states)) | {
         name: getattr(trajectory, name) for name in ("energy", "constraint_residual")
     }
@@ -359,27 +365,27 @@ def named_arrays(trajectory: Trajectory) -> dict:
 
 
 def from_named_arrays(arrays: dict) -> Trajectory:
-    """The inverse of `named_arrays`; those that may be None may be absent."""
+    """The inverse of `named_arrays`; arrays of micro nodes and of the error may be absent."""
     states = State(*(arrays[name] for name in ("t", "q_s", "q_f", "p_s", "p_f")))
     info = RunInfo(*(arrays[name] for name in RunInfo._fields))
-    others = {name: arrays[name] for name in ("energy", "constraint_residual", *STATUS)}
+    fields = {name: arrays[name] for name in ("energy", "constraint_residual", *STATUS)}
     micro = None if arrays.get(MICRO[0]) is None else MicroNodes(*(arrays[name] for name in MICRO))
     error: Any = None if arrays.get(ERROR[0]) is None else RunError(*(arrays.get(name) for name in ERROR))
-    return Trajectory(states, info=info, micro=micro, error=error, **others)
+    return Trajectory(states, info=info, micro=micro, error=error, **fields)
 
 
 def from_arrays(arrays: list) -> Trajectory:
-    """The trajectory with these leaves."""
+    """The trajectory with these leaves, with or without micro nodes."""
     return jax.tree.unflatten(_STRUCTURES[len(arrays)], arrays)
 
 
 _FIELDS = {*NODES, *STATUS, *MICRO, *RunInfo._fields}
-_ONE = np.zeros(())
+_SCALAR = np.zeros(())
 _STRUCTURES = {
     len(jax.tree.leaves(trajectory)): jax.tree.structure(trajectory)
-    for micro in (None, _ONE)
+    for micro in (None, _SCALAR)
     for trajectory in [
-        from_named_arrays(dict.fromkeys(_FIELDS, _ONE) | dict.fromkeys(MICRO, micro))
+        from_named_arrays(dict.fromkeys(_FIELDS, _SCALAR) | dict.fromkeys(MICRO, micro))
     ]  # its origin has no arrays
 }
-"""Of trajectories without and with micro nodes, by the number of their arrays."""
+"""Tree structures of trajectories without and with micro nodes, by their number of arrays."""

@@ -1,4 +1,4 @@
-"""Trajectories on disk: long runs written chunk by chunk, that survive a kill and go on where they were."""
+"""Trajectories on disk: long runs written chunk by chunk, which can be resumed after their process was killed."""
 
 from vmri_jax.running.store.stored import StoredTrajectory
 from vmri_jax.running.store.stream import stream

@@ -1,4 +1,4 @@
-"""Which run a store holds: functions, parameters, scheme, step and start in words, so that two runs can be compared."""
+"""The identity of a run: functions, parameters, scheme, step and start as text, so that a run can be compared with the run of a store."""
 
 import dataclasses
 import hashlib
@@ -16,28 +16,35 @@ from vmri_jax.mechanics.state import State
 from vmri_jax.mechanics.system import KineticFunction, System
 from vmri_jax.running.simulation import Simulation
 
-IN_FULL = 8
-"""Numbers of the largest array that is written out in a message about two runs that differ; larger ones are compared by a digest."""
+MOST_NUMBERS_PRINTED = 8
+"""Numbers of the largest array that is written out in the identity; larger arrays appear as a digest. A larger value makes messages about
+different runs longer."""
 
 
 def identity(simulation: Simulation, start: State) -> dict[str, str]:
-    """All that decides a run, by name. Functions are known by their name and by the operations they trace to."""
-    found = {"solver": type(simulation.solver).__name__}
+    """Everything that determines a run, as text by name. A function is identified by its name and by the operations that it traces to."""
+    texts = {"solver": type(simulation.solver).__name__}
     for name in ("system", "scheme", "solver", "macro_dt", "save_every", "save_micro"):
-        found |= describe(name, getattr(simulation, name))
-    found |= describe("state", start)
-    return found | {f"operations of {name}": text for name, text in _operations(simulation.system, start).items()}
+        texts |= describe(name, getattr(simulation, name))
+    texts |= describe("state", start)
+    return texts | {f"operations of {name}": text for name, text in _operations(simulation.system, start).items()}
 
 
 def environment() -> dict[str, str]:
-    """What the last digits of a run depend on besides."""
+    """Versions, machine and compiler flags, on which the last digits of a run depend."""
     versions = {name: version(name) for name in ("vmri_jax", "jax", "jaxlib")}
     flags = os.environ.get("XLA_FLAGS", "")
     return versions | {"machine": f"{platform.system()} {platform.machine()}", "XLA_FLAGS": flags}
 
 
 def differences(here: dict[str, str], there: dict[str, str], same_jax: bool) -> list[str]:
-    """What differs between two identities, in words; operations are printed differently by another JAX."""
+    """Sentences about the differences of two identities.
+
+    Args:
+        here, there: identities of the run and of the store.
+        same_jax: whether both were made with the same version of JAX; another version prints operations differently, so that they are not
+            compared.
+    """
     names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
     if not same_jax:
         names = [name for name in names if not name.startswith("operations of ")]
@@ -45,23 +52,23 @@ def differences(here: dict[str, str], there: dict[str, str], same_jax: bool) -> 
 
 
 def changed_conditions(here: dict[str, str], there: dict[str, str]) -> list[str]:
-    """What of two environments differs, in words."""
+    """Texts about the differences of two environments, the present one and the one of the store."""
     return [f"{name} {value} ({there.get(name)} then)" for name, value in here.items() if value != there.get(name)]
 
 
 def describe(name: str, value) -> dict[str, str]:
-    """Everything in a value in words, by the name of its place."""
+    """All leaves of a value as text, by the path to each leaf, which begins with `name`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, TracedOnce):
         parts = [describe(f"{name}.{field.name}", getattr(value, field.name)) for field in dataclasses.fields(value)]
         return {key: text for part in parts for key, text in part.items()}
-    if isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):  # rules of potentials by name
+    if isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):  # quadrature rules of potentials
         parts = [describe(f"{name}[{key!r}]", part) for key, part in value.items()]
         return {key: text for part in parts for key, text in part.items()}
     leaves, _ = jax.tree_util.tree_flatten_with_path(value)
-    return {name + jax.tree_util.keystr(path): _words(leaf) for path, leaf in leaves}
+    return {name + jax.tree_util.keystr(path): _text(leaf) for path, leaf in leaves}
 
 
-def _words(leaf) -> str:
+def _text(leaf) -> str:
     if isinstance(leaf, TracedOnce):
         leaf = leaf.function
     if callable(leaf):
@@ -69,13 +76,13 @@ def _words(leaf) -> str:
     if isinstance(leaf, str | bool):
         return str(leaf)
     array = np.asarray(leaf)
-    if array.size <= IN_FULL:
+    if array.size <= MOST_NUMBERS_PRINTED:
         return str(array.tolist())
     return f"{array.dtype}{array.shape}, digest {_digest(array.tobytes())}"
 
 
 def _operations(system: System, start: State) -> dict[str, str]:
-    """Digests of what the user's functions do: a changed body under the same name is another run."""
+    """Digests of the operations of the user's functions: a function with a changed body and the same name makes another run."""
     q_s, q_f, params = start.q_s, start.q_f, system.params
     functions = {
         "slow_potential": (system.slow_potential, (q_s, q_f, params)),

@@ -1,19 +1,18 @@
-"""Layout of a store on disk, and what is written in which order.
+"""Layout of a store on disk, and the order in which its files are written.
 
 A store is a folder, a zarr group of format 3 that any zarr library reads, and `xarray.open_zarr` as a dataset:
 
     t, q_s, q_f, ...   one array per field of `Trajectory`, a row per saved node, the start first, one file per chunk of rows
-    resume/checkpoint  one file of bytes, an .npz: how many intervals are saved, the status, and all that the next ones
-                       depend on
-    attributes         format, identity of the run, chunk, names, what it was made with
+    resume/checkpoint  one file of bytes, an .npz: number of saved intervals, status, and the `Checkpoint` of the run
+    attributes         format, identity of the run, chunk, names, versions and machine
 
-What the steps before a node did is in the row of that node, so that the first row of these arrays is empty.
+Row k of the solver's arrays has its work from node k - 1 to node k, so that their first row is empty.
 
-The checkpoint is what commits a chunk: it is replaced as a whole after the files of the chunk are on disk. What lies beyond
-it does not count and is written again. A new store is made beside its place and moved there when it is complete, so a kill at
-any moment leaves a valid store or none.
+The checkpoint commits a chunk: it is replaced as a whole after the files of the chunk are on disk. Rows beyond the checkpoint do not count;
+a resumed run writes them again. A new store is made beside its place and moved there when it is complete, so that a kill at any moment
+leaves a valid store or none.
 
-zarr takes seconds to import: only the functions that need it do so.
+zarr takes seconds to import: the functions that need it import it themselves.
 """
 
 import io
@@ -39,17 +38,18 @@ from vmri_jax.steppers.results import Result
 FORMAT = "vmri_jax trajectory store 2"
 METADATA = "zarr.json"
 CHECKPOINT = Path("resume", "checkpoint", "c", "0")
-"""File of the checkpoint within a store; in a group of its own, which datasets leave out."""
+"""File of the checkpoint within a store; in a separate group, which datasets leave out."""
 CONFIG: Any = {"write_empty_chunks": True}
-"""Of arrays that are written to: every chunk has its file, so that one that is missing is noticed."""
+"""Configuration of the arrays: every chunk gets a file, even if all its values are the fill value, so that a missing file is an error."""
 
 
 class Record(NamedTuple):
-    """What a checkpoint file holds.
+    """Contents of a checkpoint file.
 
-    saved: intervals that count.
-    result, failed_at: status up to there, as in `Trajectory`.
-    step, fell_back, leaves: the `Checkpoint`, its state and memory as a list of arrays.
+    saved: number of committed saved intervals.
+    result, failed_at: status of these intervals, as in `Trajectory`.
+    step, fell_back: as in `Checkpoint`.
+    leaves: state and memory of the `Checkpoint` as a list of arrays.
     """
 
     saved: int
@@ -60,13 +60,15 @@ class Record(NamedTuple):
     leaves: list[np.ndarray]
 
     @classmethod
-    def of(cls, at: Checkpoint, saved: int = 0, result: int = int(Result.CONVERGED), failed_at: int = -1) -> "Record":
-        """With what a checkpoint consists of."""
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((at.state, at.memory))]
-        return cls(saved, result, failed_at, at.step, at.fell_back, leaves)
+    def of(
+        cls, checkpoint: Checkpoint, saved: int = 0, result: int = int(Result.CONVERGED), failed_at: int = -1
+    ) -> "Record":
+        """The record of a checkpoint."""
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((checkpoint.state, checkpoint.memory))]
+        return cls(saved, result, failed_at, checkpoint.step, checkpoint.fell_back, leaves)
 
     def checkpoint(self, like: Checkpoint) -> Checkpoint:
-        """The checkpoint, with the structure of another one of the same run (shapes alone will do).
+        """The checkpoint, with the tree structure of `like`, any checkpoint of the same run.
 
         Raises:
             ValueError: the arrays are not those of this structure.
@@ -75,11 +77,11 @@ class Record(NamedTuple):
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise ValueError("the checkpoint was made by a version of vmri_jax whose steps remember something else")
         state, memory = jax.tree.unflatten(structure, map(jnp.asarray, self.leaves))
-        return Checkpoint(self.step, state, memory, self.fell_back, starts=self.step == 0)
+        return Checkpoint(self.step, state, memory, self.fell_back, is_first=self.step == 0)
 
 
 def create(path: Path, attributes: dict[str, Any], record: Record) -> None:
-    """Make a store without rows; one that is at this place gives way when the new one is complete."""
+    """Make a store without rows; it replaces an existing store when it is complete."""
     import zarr
 
     with locked(path) if path.exists() else nullcontext(), made_beside(path) as partial:
@@ -100,14 +102,14 @@ def change_attributes(path: Path, **changes) -> None:
 
 
 class Writer:
-    """Appends the pieces of a run to a store that is to have `rows` rows, the start and one for each saved interval."""
+    """Appends the pieces of a run to a store of `rows` rows, the start and one for each saved interval."""
 
     def __init__(self, path: Path, rows: int, chunk: int):
         self._path, self._rows, self._chunk = path, rows, chunk
         self._arrays: dict[str, Any] = {}
 
     def append(self, piece: Trajectory, saved: int) -> None:
-        """Write the next intervals, the last ones of a chunk of rows, behind `saved` ones; they count from `commit` on."""
+        """Write a piece after the `saved` intervals in the store; it ends with a full chunk of rows, and counts after `commit`."""
         values = rows_of(piece)
         files = []
         if saved == 0:
@@ -119,10 +121,12 @@ class Writer:
             self._arrays[name][first : last + 1] = value[1 if saved else 0 :]
             chunks = range(first // self._chunk, last // self._chunk + 1)
             files += [_chunk_file(self._path / name, value.ndim, k) for k in chunks]
-        synchronize_files(files)  # after all have been written: the first wait is one for most of the others
+        synchronize_files(
+            files
+        )  # at the end: while the system writes the first file, it writes most of the others, too
 
     def _make(self, values: dict[str, np.ndarray]) -> list[Path]:
-        """Make all arrays; returns the files there are."""
+        """Make all arrays; returns all files of the store."""
         import zarr
 
         group = zarr.open_group(self._path, mode="r+")
@@ -131,7 +135,7 @@ class Writer:
         return _files(self._path)
 
     def _open(self, values: dict[str, np.ndarray]) -> list[Path]:
-        """Open all arrays; those of a run that is made longer get more rows. Returns their metadata."""
+        """Open all arrays, and give them more rows if the run became longer; returns their metadata files."""
         import zarr
 
         for name, value in values.items():
@@ -144,7 +148,7 @@ class Writer:
 
 
 def commit(path: Path, record: Record) -> None:
-    """From now on the rows of this record count."""
+    """Replace the checkpoint: the rows of this record count from now on."""
     file = path / CHECKPOINT
     file.parent.mkdir(exist_ok=True)
     with replaced(file) as out:
@@ -155,8 +159,8 @@ def read_attributes(path: Path) -> dict[str, Any]:
     """Attributes of a store.
 
     Raises:
-        FileNotFoundError: nothing there.
-        ValueError: something else than a store, or a damaged one.
+        FileNotFoundError: the path does not exist.
+        ValueError: the path is no store, or a damaged one.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; give the folder of a stored trajectory.")
@@ -167,7 +171,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     try:
         attributes = json.loads((path / METADATA).read_text())["attributes"]
         if attributes["format"] != FORMAT:
-            raise ValueError(f"its format is {attributes['format']!r}, that of this version {FORMAT!r}")
+            raise ValueError(f"its format is {attributes['format']!r}, the format of this version {FORMAT!r}")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a stored trajectory ({type(error).__name__}: {error}).") from error
     return attributes
@@ -177,7 +181,7 @@ def read_record(path: Path) -> Record:
     """The checkpoint of a store.
 
     Raises:
-        ValueError: it is missing or damaged.
+        ValueError: the checkpoint is missing or damaged.
     """
     try:
         with np.load(io.BytesIO((path / CHECKPOINT).read_bytes()), allow_pickle=False) as data:
@@ -189,7 +193,7 @@ def read_record(path: Path) -> Record:
 
 
 def read_rows(path: Path, name: str, rows: slice, chunk: int) -> np.ndarray:
-    """Rows of one array; they must have been committed.
+    """Rows of an array, which must have been committed.
 
     Raises:
         ValueError: a file of these rows is missing or damaged.
@@ -199,7 +203,7 @@ def read_rows(path: Path, name: str, rows: slice, chunk: int) -> np.ndarray:
     try:
         array = zarr.open_array(path / name, mode="r")
         for k in range(rows.start // chunk, -(-rows.stop // chunk)):
-            if array.size and not _chunk_file(path / name, array.ndim, k).is_file():  # zarr would fill it in
+            if array.size and not _chunk_file(path / name, array.ndim, k).is_file():  # zarr would return fill values
                 raise ValueError(f"chunk {k} is missing")
         return np.asarray(array[rows])
     except Exception as error:
@@ -208,10 +212,10 @@ def read_rows(path: Path, name: str, rows: slice, chunk: int) -> np.ndarray:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Within, no other process writes to this store; released by the system whatever happens to this process."""
+    """Context in which no other process writes to this store; the operating system releases the lock even if this process is killed."""
     try:
         import fcntl
-    except ImportError:  # a system without such locks
+    except ImportError:  # Windows has no such locks
         yield
         return
     descriptor = os.open(path, os.O_RDONLY)
@@ -230,7 +234,7 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def _packed(record: Record) -> bytes:
-    """A record as the bytes of an .npz file; of the same length all along a run."""
+    """A record as the bytes of an .npz file, of the same length throughout a run."""
     out = io.BytesIO()
     counts = np.array([record.saved, record.result, record.failed_at, record.step, record.fell_back], dtype=np.int64)
     leaves = {f"leaf_{k}": leaf for k, leaf in enumerate(record.leaves)}
@@ -257,7 +261,7 @@ def _create_array(group, name: str, like: np.ndarray, rows: int, chunk: int):
 
 
 def consolidate(path: Path) -> None:
-    """Copy the metadata of all arrays into that of the group, where datasets look for it first."""
+    """Copy the metadata of all arrays into the metadata of the group, where `xarray` looks for it first."""
     import zarr
 
     with warnings.catch_warnings():
@@ -274,9 +278,9 @@ def _files(path: Path) -> list[Path]:
 
 
 def synchronize_files(files: list[Path]) -> None:
-    """Wait until these files, and that they are there, are on disk."""
+    """Wait until these files and the lists of files of their folders are on disk."""
     for file in files:
-        if file.exists():  # a vector of no coordinates has none
+        if file.exists():  # arrays without coordinates have no files
             synchronize(file)
     for folder in {file.parent for file in files}:
         synchronize(folder)

@@ -1,4 +1,4 @@
-"""Reading a store: how far its run is, and any part of its trajectory."""
+"""`StoredTrajectory`: reads the status of a store and any part of its trajectory."""
 
 from copy import copy
 from pathlib import Path
@@ -11,7 +11,7 @@ from vmri_jax.mechanics.state import HasProblem, Problem, State
 from vmri_jax.mechanics.summary import summary
 from vmri_jax.mechanics.system import System
 from vmri_jax.running.export import MICRO, Exports
-from vmri_jax.running.largest_motion import what_moves_most
+from vmri_jax.running.largest_motion import largest_motion_in_words
 from vmri_jax.running.origin import Origin
 from vmri_jax.running.store.layout import Record, read_attributes, read_record, read_rows
 from vmri_jax.running.summaries import named_coordinates
@@ -20,27 +20,27 @@ from vmri_jax.steppers.results import Result, SimulationError
 
 
 class StoredTrajectory(Exports):
-    """A trajectory on disk, written by `stream`; only what is asked for is read.
+    """A trajectory on disk, written by `stream`; it reads only the nodes that are requested.
 
-    ``len(stored)`` is the number of saved nodes, the start among them (0 before the first chunk is complete); ``stored[i]`` is
-    the `State` at a node, ``stored[a:b]`` and ``stored[a:b:n]`` are a `Trajectory` of these nodes, ``stored.load()`` is all of
-    them. Its `Quantities` are those of all nodes. What it says is what was on disk when it was opened; open it again to
-    follow a run at work. `xarray.open_zarr` reads its folder as well.
+    ``len(stored)`` is the number of saved nodes, including the start (0 before the first chunk is complete); ``stored[i]`` is
+    the `State` at a node, ``stored[a:b]`` and ``stored[a:b:n]`` are a `Trajectory` of these nodes, ``stored.load()`` is the `Trajectory` of
+    all nodes. Its `Quantities` cover all nodes. Length and status are from the moment when the store was opened: open it again to
+    follow a running simulation. `xarray.open_zarr` reads its folder, too.
 
     Args:
         path: folder of the store.
 
     Attributes:
-        num_steps: macro steps that the run was to make.
+        num_steps: macro steps of the complete run.
         save_every: macro steps from one saved node to the next.
         chunk: saved intervals that are written together.
         step: macro steps on disk.
-        result: status up to there, the first that was no success.
-        failed_at: index of the macro step that failed, -1 if none did.
+        result: status of these steps; after a failure the status of the failed step.
+        failed_at: number of the macro step that failed; -1 if no step failed.
 
     Raises:
-        FileNotFoundError: nothing there.
-        ValueError: something else than a store, or a damaged one.
+        FileNotFoundError: the path does not exist.
+        ValueError: the path is no store, or a damaged one.
     """
 
     def __init__(self, path):
@@ -73,11 +73,11 @@ class StoredTrajectory(Exports):
         return self._origin
 
     def of(self, moving: System | Problem | HasProblem) -> "StoredTrajectory":
-        """The same with its system, see `Trajectory.of`."""
+        """The same run with its system, see `Trajectory.of`."""
         return self.with_origin(self[:1].of(moving).origin)
 
     def with_origin(self, origin: Origin) -> "StoredTrajectory":
-        """The same with another origin."""
+        """The same run with another origin."""
         stored = copy(self)
         stored._origin = origin
         return stored
@@ -89,7 +89,7 @@ class StoredTrajectory(Exports):
 
     @property
     def complete(self) -> bool:
-        """Whether all steps were made."""
+        """Whether all steps are done, without a failure."""
         return self.success and self.step == self.num_steps
 
     @property
@@ -121,15 +121,15 @@ class StoredTrajectory(Exports):
     def __getitem__(self, nodes: slice) -> Trajectory: ...
     def __getitem__(self, nodes):
         if isinstance(nodes, int | np.integer):
-            at = range(len(self))[nodes]  # beyond the ends an IndexError
-            return self[at : at + 1][0]
+            node = range(len(self))[nodes]  # raises IndexError beyond the ends
+            return self[node : node + 1][0]
         if not isinstance(nodes, slice):
             raise TypeError(
                 f"StoredTrajectory: the index is {nodes!r}; give the number of a node, or a slice as in stored[:100]."
             )
         first, last, stride = ends_of(f"StoredTrajectory {self.path}", nodes, len(self))
         arrays = {name: self._rows(name, slice(first, last + 1, stride)) for name in NODES}
-        for name in RunInfo._fields:  # the most of all intervals between two nodes
+        for name in RunInfo._fields:  # the maximum over the intervals between two nodes
             rows = self._rows(name, slice(first + 1, last + 1))
             arrays[name] = np.maximum.reduceat(rows, range(0, len(rows), stride)) if len(rows) else rows
         if self.attributes["save_micro"]:
@@ -140,12 +140,12 @@ class StoredTrajectory(Exports):
         return with_origin(from_named_arrays(arrays), self.origin)
 
     def chunks(self):
-        """The trajectory piece by piece, each of a chunk and starting where the one before ends."""
+        """The trajectory in pieces of a chunk each; a piece starts with the last node of the previous piece."""
         for first in range(0, len(self) - 1, self.chunk):
             yield self[first : first + self.chunk + 1]
 
     def raise_failure(self, num_micro: int = 1) -> None:
-        """Raise the `SimulationError` of a run that failed; its trajectory is this one.
+        """Raise the `SimulationError` of a failed run, with this store as its trajectory; do nothing after a success.
 
         Args:
             num_micro: micro steps of the macro step.
@@ -158,8 +158,8 @@ class StoredTrajectory(Exports):
         time = float(before.t[0] + (before.t[1] - before.t[0]) * within / self.save_every)
         iterations, residual = int(before.info.iterations[0]), float(before.info.residual[0])
         macro_dt = float(before.t[1] - before.t[0]) / self.save_every
-        moved = what_moves_most(before, 0, 1, macro_dt, num_micro)
-        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self, moved).advised(macro_dt)
+        motion = largest_motion_in_words(before, 0, 1, macro_dt, num_micro)
+        raise SimulationError(self.result, self.failed_at, time, iterations, residual, self, motion).advised(macro_dt)
 
     def _rows(self, name: str, rows: slice) -> np.ndarray:
         return read_rows(self.path, name, rows, self.chunk)

@@ -1,4 +1,4 @@
-"""Runs that are written to disk while they are computed, and go on where they were."""
+"""`stream`: runs that are written to disk while they are computed, and can be resumed."""
 
 import os
 import warnings
@@ -24,12 +24,13 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.solvers import Newton
 
-PARTS = 100
-"""Chunks of a run on disk; more of them lose less after a kill, and take more files."""
+CHUNKS_PER_RUN = 100
+"""Chunks of a long run on disk. With more chunks a kill loses less of the run, and the store has more files."""
 LEAST_MICRO_STEPS = 1_000_000
-"""Fewest micro steps of a chunk, about a second: shorter chunks would spend their time on files."""
+"""Fewest micro steps of a chunk, about a second of computing: shorter chunks would spend their time on files, longer ones lose more after a
+kill."""
 MOST_BYTES = 2**26
-"""Most bytes of a chunk, which is held in memory as a whole."""
+"""Most bytes of a chunk, which is held in memory as a whole; a larger value takes more memory."""
 
 
 def stream(
@@ -52,34 +53,33 @@ def stream(
     progress: ShowsProgress = False,
     drawing: dict | None = None,
 ) -> StoredTrajectory:
-    """`simulate` that writes the trajectory to disk chunk by chunk: a long run survives a kill, and goes on with `resume`.
+    """`simulate` that writes the trajectory to disk chunk by chunk; `resume` continues a run whose process was killed.
 
-    A chunk counts when all of it is on disk, together with a checkpoint of everything that the next steps depend on (the
-    state, and what Newton's iteration learned): on the same machine with the same versions, a resumed run is identical
-    to the uninterrupted one to the last bit. The memory needed is that of one chunk.
+    A chunk counts when all of it is on disk, together with a checkpoint of everything that the next steps depend on, the
+    state and the memory of the solver: on the same machine with the same versions, a resumed run is identical
+    to an uninterrupted one to the last bit. One chunk is held in memory at a time.
 
     Args:
         system, scheme, state, macro_dt, micro_dt, t_end, save_every, save_micro, solver: as in `simulate`.
         out: folder of the store, a zarr group; conventionally named .zarr.
-        num_steps: macro steps. A resumed run may be given more of them than before: then it is made longer.
+        num_steps: macro steps. A larger number than before makes a resumed run longer.
         chunk: saved intervals that are computed and written together, kept by the store; None for a hundredth of the run,
             within limits.
-        resume: go on with the run that is in `out`, which must be the same one; start it if there is none. A run that is
-            complete is returned at once.
-        overwrite: replace a store that is in `out`.
-        throw: raise `SimulationError` if a step fails; else return the store. What was computed is on disk either way.
-        progress: True for a bar, or a function that is told (what, done, total).
-        drawing: what the system looks like, plain data kept with the run (see `Trajectory.save`).
+        resume: continue the run in `out`, which must be this run; start it if `out` does not exist. A complete run is returned at once.
+        overwrite: replace a store in `out`.
+        throw: raise `SimulationError` if a step fails; else return the store. Either way all computed chunks are on disk.
+        progress: True for a bar, or a function of (what, done, total).
+        drawing: plain data of a `vmri_jax.animation.Drawing`, kept in the store (see `Trajectory.save`).
 
     Returns:
         The `StoredTrajectory`. After a failure it ends with the chunk of the failure, NaN from the failing step on.
 
     Raises:
         ValueError, TypeError: bad arguments, or a store of another run, before anything is computed.
-        FileExistsError: there is something in `out` and neither `resume` nor `overwrite` is asked for.
-        OSError: `out` cannot be written; of a full disk the chunks before are kept.
+        FileExistsError: `out` exists, and neither `resume` nor `overwrite` is set.
+        OSError: `out` cannot be written; after a full disk the earlier chunks are kept.
         SimulationError: a step failed; the store is its trajectory.
-        Interrupted: Ctrl-C; the chunk at work was finished first (a second Ctrl-C does not wait for it).
+        Interrupted: Ctrl-C; the current chunk is finished first (a second Ctrl-C does not wait for it).
     """
     path = Path(out)
     _check_place(path, resume, overwrite)
@@ -108,7 +108,7 @@ def stream(
             _check_same_run(stored, attributes, chunk)
             _lengthen(stored, num_steps)
             clear_partial(path)
-            for step in _go_on(StoredTrajectory(path), run, tell):
+            for step in _continue(StoredTrajectory(path), run, tell):
                 if interrupted():
                     raise Interrupted(StoredTrajectory(path), step, num_steps, "macro steps")
     stored = StoredTrajectory(path)
@@ -118,36 +118,37 @@ def stream(
     return stored
 
 
-def _go_on(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iterator[int]:
-    """Compute and write what is not there yet; yields the number of macro steps done after every chunk."""
+def _continue(stored: StoredTrajectory, run: Simulation, tell: Progress) -> Iterator[int]:
+    """Compute and write the missing chunks; yields the number of macro steps done after every chunk."""
     path, chunk, record = stored.path, stored.chunk, stored.record
     rows = stored.num_steps // run.save_every
     if record.saved == rows or not stored.success:
         return
     try:
-        at = record.checkpoint(like=run.start(fell_back=record.fell_back))
+        checkpoint = record.checkpoint(like=run.start(fell_back=record.fell_back))
     except ValueError as error:
         raise ValueError(f"{path} can be read, but its run cannot go on: {error}.") from error
     writer = layout.Writer(path, rows + 1, chunk)
-    nodes = [*range((record.saved + 1) // chunk * chunk + chunk, rows + 1, chunk), rows + 1]  # chunks of rows are full
-    sizes = [end - begin for begin, end in pairwise([record.saved + 1, *nodes])]
+    # Every write but the last ends at a multiple of `chunk` rows, so that no file is written twice.
+    ends = [*range((record.saved + 1) // chunk * chunk + chunk, rows + 1, chunk), rows + 1]
+    sizes = [end - begin for begin, end in pairwise([record.saved + 1, *ends])]
     for size in sizes:
         tell("simulating", record.saved, rows)
-        pieces, at = run.advance(at, size)
+        pieces, checkpoint = run.advance(checkpoint, size)
         piece = join(pieces)
-        with _explained(path, at.step - size * run.save_every):
+        with _explained(path, checkpoint.step - size * run.save_every):
             writer.append(piece, record.saved)
-            result = max(record.result, int(piece.result))  # failures are larger
-            record = Record.of(at, record.saved + size, result, int(piece.failed_at))
+            result = max(record.result, int(piece.result))  # failures have larger codes than successes
+            record = Record.of(checkpoint, record.saved + size, result, int(piece.failed_at))
             layout.commit(path, record)
-        yield at.step
+        yield checkpoint.step
         if record.failed_at >= 0:
             return
 
 
 @contextmanager
 def _explained(path: Path, step: int) -> Iterator[None]:
-    """Errors of the file system say what is kept and what to do."""
+    """Context whose errors of the file system name the last macro step on disk and the way to continue."""
     try:
         yield
     except OSError as error:
@@ -158,7 +159,7 @@ def _explained(path: Path, step: int) -> Iterator[None]:
 
 
 def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
-    """Refuse what is in the way, and a place that does not exist."""
+    """Refuse an existing file or store, unless it is to be resumed or replaced, and a folder that does not exist."""
     if resume and overwrite:
         raise ValueError("stream: both resume and overwrite are asked for; choose one of them.")
     if not path.resolve().parent.is_dir():
@@ -166,22 +167,22 @@ def _check_place(path: Path, resume: bool, overwrite: bool) -> None:
     if not path.exists():
         check_writable(path)
         return
-    found = StoredTrajectory(path)  # or it is something else
+    stored = StoredTrajectory(path)  # raises if the path is no store
     if not (resume or overwrite):
         raise FileExistsError(
-            f"{path} holds a run of {found.num_steps} macro steps, {found.step} of them done. Go on with it (resume), replace "
+            f"{path} holds a run of {stored.num_steps} macro steps, {stored.step} of them done. Go on with it (resume), replace "
             "it (overwrite), or give another name."
         )
 
 
 def _check_same_run(stored: StoredTrajectory, attributes: dict[str, Any], chunk: int | None) -> None:
     there, here = stored.attributes["made_with"], attributes["made_with"]
-    found = differences(attributes["identity"], stored.attributes["identity"], there["jax"] == here["jax"])
+    different = differences(attributes["identity"], stored.attributes["identity"], there["jax"] == here["jax"])
     if chunk not in (None, stored.chunk):
-        found.append(f"chunk: {chunk} here, {stored.chunk} in the store")
-    if found:
+        different.append(f"chunk: {chunk} here, {stored.chunk} in the store")
+    if different:
         raise ValueError(
-            f"{stored.path} holds another run and cannot go on with this one. What differs: {'; '.join(found)}. Give the "
+            f"{stored.path} holds another run and cannot go on with this one. Differences: {'; '.join(different)}. Give the "
             "arguments it was started with, or another name."
         )
     changed = changed_conditions(here, there)
@@ -202,8 +203,8 @@ def _lengthen(stored: StoredTrajectory, num_steps: int) -> None:
 
 
 def _chunk(run: Simulation) -> int:
-    """Saved intervals per chunk where none are given."""
+    """Saved intervals per chunk where the user gives none."""
     num_micro, n_s, n_f = run.scheme.num_micro, run.state.q_s.shape[0], run.state.q_f.shape[0]
-    numbers = 2 * (n_s + n_f) + 8 + (num_micro * (n_f + 1) if run.save_micro else 0)
-    wanted = max(run.num_saves // PARTS, LEAST_MICRO_STEPS // (num_micro * run.save_every))
+    numbers = 2 * (n_s + n_f) + 8 + (num_micro * (n_f + 1) if run.save_micro else 0)  # of a saved node, 8 bytes each
+    wanted = max(run.num_saves // CHUNKS_PER_RUN, LEAST_MICRO_STEPS // (num_micro * run.save_every))
     return max(1, min(wanted, run.num_saves, MOST_BYTES // (8 * numbers)))
