@@ -169,7 +169,7 @@ def test_wrong_types(arguments, message):
 
 
 def test_chaotic_motion_misses_the_accuracy(monkeypatch):
-    monkeypatch.setattr(steps, "LONGEST", 0.0)
+    monkeypatch.setattr(steps, "MOST_TRIAL_SECONDS", 0.0)
     monkeypatch.setattr(steps, "FEWEST_STEPS", 1024)
     with pytest.warns(steps.AccuracyNotReached, match="no error is certified"), pytest.warns(match="chaotic"):
         run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), accuracy=1e-3, t_end=40.0)

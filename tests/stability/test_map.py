@@ -83,7 +83,7 @@ def test_rows_over_kappa_compositions_and_the_explicit_limit(tmp_path):
 
     over_kappa.to_json(tmp_path / "map.json")
     again = StabilityMap.from_json(tmp_path / "map.json")
-    assert again.found == over_kappa.found
+    assert again.unstable == over_kappa.unstable
     assert again.rows == over_kappa.rows
     assert np.array_equal(again.radius, over_kappa.radius)
     over_kappa.to_csv(tmp_path / "map.csv")

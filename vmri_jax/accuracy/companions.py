@@ -4,15 +4,15 @@ A run with macro steps H and micro steps h = H / N has, with a scheme of order p
 
     x_{H,h}(t) - x(t) = S(t) H^p + F(t) h^p + ...
 
-Its slow share ``S H^p`` goes with H at fixed h, its fast share ``F h^p`` with h at fixed H. Two companions from the same start separate them:
-the first halves both, the second h alone. With ``r = 2^p / (2^p - 1)`` (Richardson's extrapolation)
+The slow share ``S H^p`` vanishes with H at fixed h, the fast share ``F h^p`` with h at fixed H. Two companion runs from the same start
+separate them: the first halves H and h, the second halves h alone. With ``r = 2^p / (2^p - 1)`` (Richardson's extrapolation)
 
     half the macro step:        S H^p + F h^p = r (x_{H,h} - x_{H/2,h/2})
     twice the micro steps:              F h^p = r (x_{H,h} - x_{H,h/2})
 
-Where a scheme has the order q instead of p, as on vibrations that its steps do not resolve, the true error over the estimate is
-``(1 - 2^-p) / (1 - 2^-q)``: 1.5 for p = 2 and q = 1. Above order 2 an error has terms ``H^a h^b``, too, which count in part to both shares.
-Positions that are wrong by a good part of the whole motion are not certified.
+This is an estimate, not a bound. If the error falls with an order q below p, as for vibrations that the steps do not resolve, the true error
+is ``(1 - 2^-p) / (1 - 2^-q)`` times the estimate: 1.5 times for p = 2 and q = 1. Above order 2 an error also has mixed terms ``H^a h^b``,
+which count in part to both shares. *Certified* is the error of a node up to which every estimate is small against the extent of the motion.
 """
 
 import warnings
@@ -29,11 +29,11 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.results import Result
 
 LARGEST_CERTIFIED = 0.1
-"""Part of the extent of the motion: from the first node on whose estimated error is above it no error is certified. Beyond it the leading
-term of the error is not the error; a larger part certifies numbers that mean nothing."""
-FASTER_THAN_POWERS = 32.0
-"""Growth of the error from half of a time to that time, above which the motion is called chaotic. Errors of regular motions grow like t or
-t^2, by 2 or 4; those of a chaotic motion like exp(L t). A larger growth overlooks chaos that begins late."""
+"""Largest certified error, as a part of the extent of the motion; from the first node with a larger one, no error is certified. Above it the
+leading term of the error no longer dominates, so that a larger value certifies meaningless numbers."""
+CHAOTIC_GROWTH = 32.0
+"""Growth of the error in the second half of a time, above which the motion is called chaotic. Errors of regular motions grow like t or t^2, by
+2 or 4, errors of chaotic motions like exp(L t). A larger value overlooks chaos that begins late."""
 
 
 class UncertifiedWarning(UserWarning):
@@ -47,14 +47,14 @@ def with_error(
     shares: bool = True,
     halved: Trajectory | None = None,
 ) -> Trajectory:
-    """The same trajectory with its `RunError`; warns where it is not certified over the whole run.
+    """The trajectory with its `RunError`; warns if the error is not certified over the whole run.
 
     Args:
-        run: the simulation that made the trajectory; no step of it failed.
-        trajectory: its nodes.
-        of: function of a run, whose error is estimated too.
-        shares: whether to estimate the slow and the fast share, too. Their companion has more micro steps and is compiled for itself.
-        halved: the companion with half the macro step, if it has been made.
+        run: the simulation.
+        trajectory: its trajectory, without a failed step.
+        of: function of a run, whose error is estimated, too.
+        shares: whether to estimate the slow and the fast share, too. Their companion has twice the micro steps, another program.
+        halved: the companion with half the macro step, if it has been computed.
     """
     scheme, order = run.scheme, run.order
     halved = companion(run, scheme, 2) if halved is None else halved
@@ -88,26 +88,29 @@ def ratio(order: int) -> float:
 
 
 def extrapolated(order: int, trajectory: Trajectory, finer: Trajectory) -> np.ndarray:
-    """(k, n_s + n_f) the part of the error of the positions that a companion with steps half as long takes away, in the limit."""
+    """(k, n_s + n_f) ``r (x - x')``: the part of the error of the positions x that vanishes with the steps halved in the companion x'."""
     return ratio(order) * (_positions(trajectory) - _positions(finer))
 
 
 def _of_error(
     of: Callable, order: int, trajectory: Trajectory, halved: Trajectory, certified: np.ndarray
 ) -> np.ndarray:
-    """Error of a function of the run: NaN at nodes that are not certified, and if it is no function of nodes, unless all of them are."""
+    """Error of a function of the run.
+
+    A function with a value for each node is NaN at nodes that are not certified; any other function is NaN unless all nodes are certified.
+    """
     error = ratio(order) * (np.asarray(of(trajectory)) - np.asarray(of(halved)))
-    at_nodes = error.shape[:1] == certified.shape
-    kept = certified.reshape(-1, *(1,) * (error.ndim - 1)) if at_nodes else certified.all()
-    return np.where(kept, error, np.nan)
+    has_node_values = error.shape[:1] == certified.shape
+    shown = certified.reshape(-1, *(1,) * (error.ndim - 1)) if has_node_values else certified.all()
+    return np.where(shown, error, np.nan)
 
 
 def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarray, float]:
-    """(k,) which nodes have a certified error, and the growth of the error in the second half of their time.
+    """(k,) whether the error of each node is certified, and the growth of the error in the second half of the certified time.
 
     Args:
         trajectory: the run.
-        error: (k, n_s + n_f) of its positions.
+        error: (k, n_s + n_f) estimated error of its positions.
     """
     t, extent = np.asarray(trajectory.t), extent_of(trajectory)
     envelope = np.maximum.accumulate(largest_of(error))
@@ -119,20 +122,20 @@ def certified_nodes(trajectory: Trajectory, error: np.ndarray) -> tuple[np.ndarr
 
 
 def extent_of(trajectory: Trajectory) -> float:
-    """Largest way of a coordinate from its smallest to its largest value in a run."""
+    """Largest difference between the largest and the smallest value of a coordinate in a run."""
     return float(np.ptp(_positions(trajectory), axis=0).max(initial=0.0))
 
 
 def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> None:
-    """Refuse a function of a run that does not return numbers; it is tried on a run that rests at the start.
+    """Refuse a function of a run that does not return numbers; it is called with a run that rests at the start.
 
     Args:
         of, error: as of `simulate`.
         run: the simulation whose error is estimated.
 
     Raises:
-        TypeError: no function, or one that returns something else than numbers.
-        ValueError: a function without ``error=True``.
+        TypeError: `of` is no function, or returns no numbers.
+        ValueError: `of` without ``error=True``.
     """
     if of is None:
         return
@@ -146,21 +149,18 @@ def check_function_of_run(of: Callable | None, error: bool, run: Simulation) -> 
 
 
 def resting(run: Simulation) -> Trajectory:
-    """A run of the same nodes, without micro nodes, that stays at the start: for a look at functions of runs."""
+    """A trajectory at the times of a run that stays at the start, without micro nodes: an argument to try functions of runs on."""
     start, k = run.state, run.num_saves + 1
-    nodes = {name: np.repeat(np.asarray(value)[None], k, axis=0) for name, value in vars(start).items()}
-    nodes["t"] = start.t + np.arange(k) * run.save_every * run.macro_dt
-    none = np.zeros(k - 1, int)
-    status = {"result": int(Result.CONVERGED), "failed_at": -1}
-    kept = {"energy": np.zeros(k), "constraint_residual": np.zeros((k, 2)), "residual": np.zeros(k - 1)}
-    solver = {"method": none, "iterations": none}
-    arrays = nodes | kept | solver
-    arrays |= {name: np.asarray(value) for name, value in status.items()}
+    arrays = {name: np.repeat(np.asarray(value)[None], k, axis=0) for name, value in vars(start).items()}
+    arrays["t"] = start.t + np.arange(k) * run.save_every * run.macro_dt
+    arrays |= {"energy": np.zeros(k), "constraint_residual": np.zeros((k, 2))}
+    arrays |= {"method": np.zeros(k - 1, int), "iterations": np.zeros(k - 1, int), "residual": np.zeros(k - 1)}
+    arrays |= {"result": np.asarray(int(Result.CONVERGED)), "failed_at": np.asarray(-1)}
     return replace(from_named_arrays(arrays), origin=run.origin)
 
 
 def companion(run: Simulation, scheme: Scheme | Composition, parts: int) -> Trajectory:
-    """The same run with another scheme, each macro step in equal parts, at the same saved nodes; it may fail."""
+    """The run with another scheme and every macro step divided into equal parts, at the same saved nodes; it may fail."""
     finer = replace(
         run,
         macro_dt=run.macro_dt / parts,
@@ -172,23 +172,23 @@ def companion(run: Simulation, scheme: Scheme | Composition, parts: int) -> Traj
 
 
 def _positions(trajectory: Trajectory) -> np.ndarray:
-    """(k, n_s + n_f)"""
+    """(k, n_s + n_f) positions, slow first."""
     return np.concatenate([trajectory.states.q_s, trajectory.states.q_f], axis=1)
 
 
-def _failure(trajectory: Trajectory, run: Simulation) -> float:
-    """Time of the step of a run with half the macro step that failed."""
-    return float(trajectory.t[0]) + int(trajectory.failed_at) * float(run.macro_dt) / 2
+def _failure(halved: Trajectory, run: Simulation) -> float:
+    """Time of the failed step of the companion with half the macro step."""
+    return float(halved.t[0]) + int(halved.failed_at) * float(run.macro_dt) / 2
 
 
 def _uncertified(error: RunError, trajectory: Trajectory) -> str:
-    """Why, and what to do."""
+    """The reason why an error is not certified, and advice."""
     t = float(error.certified_until)
     energy = np.asarray(trajectory.energy)
     kept = (
         f" The energy has changed by at most {np.abs(energy - energy[0]).max():.1e}." if trajectory.keeps_energy else ""
     )
-    if float(error.growth) > FASTER_THAN_POWERS:
+    if float(error.growth) > CHAOTIC_GROWTH:
         return (
             f"the motion is chaotic, small errors have grown {float(error.growth):.0f} times in the second half of the time until t = {t:.4g}: "
             f"from there on an error of positions means nothing.{kept}"

@@ -1,4 +1,4 @@
-"""The schemes a search may choose from: families with num_micro open."""
+"""The schemes that a search may choose from: families of schemes that differ only in num_micro."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from vmri_jax.schemes.scheme import Scheme, explicit_slow, fully_explicit, fully
 class Family:
     """Schemes that differ only in num_micro.
 
-    name: in tables and figures.
+    name: name in tables and figures.
     make: the scheme with a number of micro steps (per stage, in a composition).
-    options: the same on the command line.
-    python: the same in a program, with ``{}`` for num_micro.
+    options: options of the scheme on the command line.
+    python: Python expression of the scheme, with ``{}`` for num_micro.
     first: the num_micro that a search tries first.
     """
 
@@ -28,7 +28,7 @@ class Family:
     first: int = 5
 
     def composed(self, coefficients: str) -> "Family":
-        """Compositions of its schemes."""
+        """The family of compositions of its schemes, by the name of their coefficients."""
 
         def make(num_micro: int) -> Composition:
             return compose(self.make(num_micro), coefficients)
@@ -37,11 +37,11 @@ class Family:
         return Family(f"{self.name}, {coefficients}", make, options, python)
 
     def label(self, num_micro: int) -> str:
-        """With num_micro."""
+        """Name with num_micro, for progress and tables."""
         return f"{self.name}, {num_micro} micro"
 
     def coarsest(self, num_micro: int, frequency: float, t_end: float) -> int:
-        """Macro steps up to `t_end` at which the fastest vibration begins to be seen: ``omega h`` about the degree."""
+        """Fewest macro steps up to `t_end` worth a trial: their micro steps h just resolve the fastest vibration, ``omega h`` = degree."""
         scheme = self.make(num_micro)
         longest = 1.0
         if isinstance(scheme, Composition):
@@ -55,8 +55,8 @@ def families(
     """The schemes of order 2, compositions of the first two of them, and Galerkin schemes.
 
     Args:
-        compositions: their names, see `vmri_jax.compose`.
-        degrees: of the Galerkin schemes, which have Lobatto quadrature.
+        compositions: names of coefficients, see `vmri_jax.compose`.
+        degrees: degrees of the Galerkin schemes, which have Lobatto quadrature.
     """
     bases = [of_order_2(make) for make in (fully_explicit, explicit_slow, fully_implicit, takahashi_imada)]
     menu = bases + [base.composed(name) for base in bases[:2] for name in compositions]
@@ -64,7 +64,7 @@ def families(
 
 
 def of_order_2(make: Callable[[int], Scheme]) -> Family:
-    """The family of one of the schemes of order 2, which are made from num_micro alone."""
+    """The family of a scheme of order 2 whose only argument is num_micro."""
     name = make.__name__
     return Family(name.replace("_", " "), make, f"--scheme {name.replace('_', '-')}", f"vm.{name}({{}})")
 
@@ -76,5 +76,5 @@ def of_degree(degree: int) -> Family:
         partial(galerkin, degree=degree, rule="lobatto"),
         f"--scheme galerkin --degree {degree} --rule lobatto",
         f'vm.galerkin({{}}, {degree}, "lobatto")',
-        1 if degree > 2 else Family.first,  # high degrees resolve the fast variables with a single interval
+        1 if degree > 2 else Family.first,  # a single interval of high degree resolves the fast variables
     )

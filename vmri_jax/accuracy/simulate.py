@@ -1,4 +1,4 @@
-"""`simulate`: a run with steps that are given, or with steps that keep an accuracy; its error, if it is asked for."""
+"""`simulate`: a run with given steps, or with steps chosen for an accuracy; with an estimate of its error on request."""
 
 import warnings
 from collections.abc import Callable
@@ -50,38 +50,41 @@ def simulate(
         run = vm.simulate(problem, vm.fully_implicit(10), macro_dt=0.01, t_end=10.0)
         run = vm.simulate(problem, accuracy=1e-5, t_end=10.0)
 
-    With an accuracy the steps, and without a scheme the scheme, are chosen by trial runs, see `vmri_jax.accuracy.steps`; the choice is
-    ``run.settings``, and ``run.error`` tells the error of the run. Resonant steps are passed over in systems of up to 60 coordinates.
+    With an accuracy, trial runs choose the steps, and the scheme if none is given, see `vmri_jax.accuracy.steps`; ``run.settings`` has the
+    choice, ``run.error`` the error of the run. Resonant steps are avoided in systems of up to 60 coordinates.
 
-    Compiled once per system structure and scheme structure: step sizes, parameters, rule weights, initial states, numbers of steps and of
-    saved nodes may vary without compiling again. Works under ``jax.vmap`` over state,
-    params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``; then the status is in the trajectory and never raised, and names
-    work inside of the function that is transformed: ``run.position("load")``.
-    Under ``jax.vmap`` the method "auto" computes its fallback for every lane: take `simulate_batch`, or "nested".
+    Outside of transformations, `simulate` compiles once per structure of system and scheme: macro steps, parameters, rule weights, starts,
+    numbers of steps and of saved nodes vary without another compilation; num_micro and save_micro are part of the structure. It works
+    under ``jax.vmap`` over state, params and macro_dt, and under ``jax.grad`` and ``jax.jacfwd``, where save_every and the number of saved
+    nodes are part of the structure, too. There a failed step does not raise: the status is in the trajectory. Names work inside of the
+    transformed function: ``run.position("load")``. Under ``jax.vmap`` the solver `solvers.Auto` computes its fallback for every lane: take
+    `simulate_batch`, or ``solver=vm.solvers.Nested()``.
+
+    If a system keeps its energy, a run with given steps warns with `LostEnergyWarning` when the energy changes by half of the largest
+    kinetic energy.
 
     Args:
-        system: what moves and where it starts, a `Problem` or a scene; or a `System`, with a state.
-        scheme: how; None for one that is chosen, with an accuracy.
-        state: start, from `initial_state` or a former run; None for that of the problem.
+        system: a `Problem` or a scene; or a `System`, with a state.
+        scheme: a scheme or composition; None, with an accuracy, to have it chosen.
+        state: start, from `initial_state` or an earlier run; None for the start of the problem.
         macro_dt, micro_dt: step size, exactly one of them (``macro_dt = num_micro * micro_dt``).
-        num_steps, t_end: macro steps, a multiple of `save_every`, or the time that they end at; exactly one of them.
+        num_steps, t_end: number of macro steps, a multiple of `save_every`, or the time of the end; exactly one of them.
         save_every: macro steps from one saved node to the next.
         save_micro: also keep the fast positions at the micro nodes of the macro step that ends at each saved node.
-        solver: how implicit equations are solved.
+        solver: for implicit equations, one of `vmri_jax.solvers`; None for `solvers.Auto`.
         throw: raise `SimulationError` (which carries the partial trajectory) if a step fails; else return the trajectory,
-            NaN from the failure on.
-        progress: True for a bar, or a function that is told (what, done, total), with an accuracy about every trial run. Without it a run that takes more than
-            two seconds says so by a line now and then.
-        adjoint: how the run is differentiated, one of `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
+            NaN after the failure.
+        progress: True for a bar, or a function of (what, done, total), with an accuracy called before every trial run. With False a run
+            that takes more than two seconds prints occasional lines on the error stream.
+        adjoint: method of differentiation, see `vmri_jax.running.adjoints`: "stored" in all modes, "checkpoint" and
             "reversible" in reverse mode with little memory, "forward" for few parameters; "auto" chooses by length and symmetry.
-        error: estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`. It takes two more runs: one with
-            half the macro step, one with twice the micro steps, which is compiled for itself. A run that failed has none.
-        of: with `error` or `accuracy`, a function of a run, without its micro nodes, whose error is estimated too, ``run.error.of``: it returns
+        error: estimate the error of the positions and its slow and fast share, ``run.error``, a `RunError`. This takes two more runs: one
+            with half the macro step, one with twice the micro steps, which needs another program. A failed run has no error.
+        of: with `error` or `accuracy`, a function of a run (without micro nodes) whose error is estimated, too, ``run.error.of``. It returns
             numbers, such as ``lambda run: run.position("load")``.
-        accuracy: largest error of a position at a saved node, in the unit of the positions; in place of step sizes, with `t_end`.
-        num_saves: with an accuracy, saved intervals, equally spaced; None for at most a thousand.
-
-    A run of a system that keeps its energy, with steps that are given, is told about by a `LostEnergyWarning` if the energy has changed by half of the largest kinetic energy.
+        accuracy: largest error of a position at a saved node, in the unit of the positions; replaces the step size, and needs `t_end`.
+        num_saves: with an accuracy, the number of saved intervals, equally spaced. None for one per macro step, at most 1000; these are
+            often few, so that a smooth curve takes, for example, num_saves=200.
 
     Returns:
         The `Trajectory`, with ``num_steps / save_every + 1`` saved nodes. Times are ``t_0 + k macro_dt``, computed from
@@ -90,7 +93,7 @@ def simulate(
     Raises:
         ValueError, TypeError: bad arguments, before anything is computed.
         SimulationError: a step failed.
-        Interrupted: Ctrl-C while `progress` is shown; it carries what was computed.
+        Interrupted: Ctrl-C while `progress` is shown; it carries the trajectory computed so far.
     """
     check_flags(throw=throw, error=error)
     if accuracy is not None:
@@ -111,8 +114,7 @@ def simulate(
             f"simulate: {missing} without an accuracy; give accuracy=1e-5 with it, or a scheme and save_every."
         )
     check_adjoint(adjoint, scheme)
-    steps_asked_for = Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro)
-    run = simulation(system, scheme, state, solver, steps_asked_for)
+    run = simulation(system, scheme, state, solver, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
     if not run.is_concrete:
         if error:
             raise ValueError(
@@ -124,7 +126,9 @@ def simulate(
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     check_function_of_run(of, error, run)
     trajectory = run.in_pieces(progress)
-    if int(trajectory.failed_at) == 0:  # the first step: perhaps there is something wrong with the start
+    if (
+        int(trajectory.failed_at) == 0
+    ):  # a failed first step may be due to a start off the constraints, a clearer message
         check_constraints(run.system, run.state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, save_every, scheme.num_micro)
@@ -137,7 +141,7 @@ def simulate(
 def _end(
     steps: dict[str, Any], t_end: float | None, save_every: int, save_micro: bool, adjoint: str, num_saves
 ) -> float:
-    """`t_end`; arguments of steps beside an accuracy, from which the steps follow, are refused."""
+    """`t_end` of a run with an accuracy; refuses arguments of step size and saving, which the accuracy determines."""
     refused = [name for name, value in steps.items() if value is not None]
     refused += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro + ["adjoint"] * (adjoint != "auto")
     if refused:

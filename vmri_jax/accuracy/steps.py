@@ -1,16 +1,16 @@
-"""Steps for an accuracy: H and num_micro of a scheme, and the scheme from a small menu, by the errors of trial runs.
+"""Steps for an accuracy: macro step and num_micro of a scheme, and the scheme from a small menu, from the errors of trial runs.
 
-A trial is a run over the whole time with large macro steps, and one with half of them; their difference is its error e, see
-`vmri_jax.accuracy.companions`. A scheme of order p keeps the error ``eps`` in
+A trial is a run over the whole time with large macro steps, and a companion run with half the macro step; both give the error e of the trial,
+see `vmri_jax.accuracy.companions`. A scheme of order p has an error of at most ``eps`` with
 
     n = n_trial (e / eps)^(1 / p)
 
-macro steps. With the slow share ``S H^p`` and the fast share ``F (H/N)^p`` of e, and a time of ``a + b N`` for a macro step of N micro
-steps, the least time for an error is reached with
+macro steps. A macro step of N micro steps takes the time ``a + b N`` and makes an error with the shares ``S H^p`` (slow) and
+``F (H/N)^p`` (fast). The least time for a given error is reached with
 
-    N^(p + 1) = (a / b) (F / S),
+    N^(p + 1) = (a / b) (F / S).
 
-where the time that is spent on each grid goes with the share that it leaves.
+Then the times on both grids have the ratio of the error shares, ``a / (b N) = S / (F / N^p)``.
 """
 
 import math
@@ -43,48 +43,57 @@ from vmri_jax.schemes.composition import Composition, stage_scheme
 from vmri_jax.schemes.scheme import Scheme, fully_explicit, fully_implicit
 from vmri_jax.steppers.solvers import Newton
 
-AIM = 0.5
-"""Part of the accuracy that steps are chosen for. Trials predict errors of finer runs to about a factor of 2; with a larger part more runs
-miss the accuracy and are made again, with a smaller one all take more steps."""
-SAVED = 1000
-"""Most saved intervals of a run whose number of steps is chosen; more make long runs fill the memory."""
-FEWEST_STEPS, FIRST_MICRO = 16, 5
-"""Macro steps and micro steps of first trials; trials that do not see the motion are made again with twice the steps."""
+AIMED_PART = 0.5
+"""Part of the accuracy for which steps are chosen. Trials predict errors of finer runs to about a factor of 2: with a larger part more runs
+miss the accuracy and are repeated, with a smaller part all runs take more steps."""
+MOST_SAVED = 1000
+"""Most saved intervals of a run with an accuracy whose user gives no number; a larger value takes more memory in long runs."""
+FEWEST_STEPS = 16
+"""Macro steps of the first trial of a scheme; a trial without a certified error is repeated with twice the steps. A larger value makes
+searches with large accuracies slower."""
+FIRST_MICRO = 5
+"""Micro steps of the first trials; the search then chooses another number. One far from the best number makes the trials take longer."""
 MOST_STEPS = 2**22
-"""Macro steps of the longest run that is tried. A larger number lets searches for what cannot be reached take minutes."""
-LONGEST = 20.0
-"""Seconds of a run and its companion, compiling included, after which steps are not halved further. A larger value makes a search for
-an error that cannot be certified, as of chaotic motion, take longer."""
+"""Macro steps of the longest trial. With a larger value searches for an accuracy out of reach take minutes."""
+MOST_TRIAL_SECONDS = 20.0
+"""Seconds of a trial, compiling included, after which the search stops to halve the steps of an uncertified trial. With a larger value
+searches take longer where no error can be certified, as for chaotic motion."""
 MOST_MICRO = 64
-"""Most micro steps that are chosen; more save little where slow forces are not a hundred times as dear as fast ones."""
+"""Most micro steps chosen; more save little unless an evaluation of the slow force takes a hundred times as long as of the fast force."""
 MOST_COORDINATES = 60
-"""Coordinates of the largest system that a single interval of high degree is tried on, and whose steps are looked at for resonances. The
-matrices of both have all coordinates: with 200 of them they take minutes, and steps by kicks win."""
-SAME = 1.3
-"""Factor within which two numbers of micro steps cost the same: the second is not compiled. A larger one misses savings."""
-LEAST_TIME, LEAST_SHARE = 0.02, 1e-3
-"""Least time of a grid over that of a macro step, and least slow share over the fast one: numbers of micro steps stay finite where a measured
-time or a share vanishes."""
+"""Most coordinates of a system for which a single interval of high degree is tried, and for which resonances are looked up. The matrices of
+both have a row for each coordinate: with 200 of them they take minutes, and schemes with kicks are faster."""
+SAME_COST = 1.3
+"""Ratio of two numbers of micro steps up to which they count as equally fast, so that the second is not compiled. A larger value misses
+savings."""
+LEAST_TIME = 0.02
+"""Least seconds a and b in ``a + b N``, as a part of the seconds of a macro step, since the noise of the clock may make either of them zero.
+A larger value pulls the number of micro steps towards the present one."""
+LEAST_SHARE = 1e-3
+"""Least slow share of the error, as a part of the fast share: the number of micro steps stays finite where the slow share vanishes. A larger
+value allows fewer micro steps."""
 SAMPLES = 4
-"""Runs whose least time counts; with fewer of them what runs between makes micro steps look dear or cheap by chance."""
+"""Timed runs of each length, of which the fastest counts. With fewer runs other programs on the machine distort the prices of the steps."""
 USUAL_TRIALS = 5
-"""Trial runs of a usual search, which a bar of progress starts from; with another number the bar moves too fast or too slowly."""
-REPEATS = 5
-"""Runs after the first one that may miss the accuracy before the search gives up."""
-RESONANT = 1e-6
-"""Growth of disturbances in a macro step above which a step is resonant, see `vmri_jax.stability.advise`."""
-SHORTER = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
-"""Macro steps that are looked at for one without resonance, in units of the one that accuracy asks for."""
+"""Trial runs of a usual search, the total that a progress bar starts with; with a larger value the bar ends before it is full."""
+MOST_REPEATS = 5
+"""Runs that may miss the accuracy before the search gives up; a larger value makes searches for an accuracy out of reach take longer."""
+RESONANT_GROWTH = 1e-6
+"""Growth of disturbances per macro step above which a step is resonant, see `vmri_jax.stability.advise`; a larger value accepts steps of
+weak resonances."""
+SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
+"""Macro steps that are tried in this order until one is not resonant, in units of the largest step for the accuracy."""
 
 
 COMPOSED = ((2.5, None), (5.0, "suzuki4"), (8.0, "kahan-li6"), (np.inf, "kahan-li8"))
-"""Compositions by the digits of accuracy up to which they are taken: higher orders need fewer steps for many digits, and more for few."""
+"""(most digits, composition): the composition for an accuracy of up to so many digits. Higher orders need fewer steps for many digits, and
+more steps for few."""
 ROUNDOFF = 100 * np.finfo(float).eps
-"""Part of the largest position below which errors are round-off."""
+"""Error below which an accuracy is refused as round-off, as a part of the largest position; a larger value refuses reachable accuracies."""
 
 
 class AccuracyNotReached(UserWarning):
-    """A run has a larger error than it was asked for, or one that is not certified."""
+    """The error of a run exceeds its accuracy, or is not certified."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +103,10 @@ class Trial:
     Attributes:
         family, num_micro: the scheme.
         run: the simulation.
-        trajectory, halved: its result, and that with half the macro step.
-        errors: (k, n_s + n_f) of the positions.
-        error: the largest of them; infinite where one is not certified.
+        trajectory: its trajectory.
+        halved: trajectory of its companion with half the macro step.
+        errors: (k, n_s + n_f) errors of the positions.
+        error: the largest error; infinite unless all errors are certified.
     """
 
     family: Family
@@ -109,15 +119,15 @@ class Trial:
 
     @cached_property
     def seconds(self) -> float:
-        """Time of a macro step."""
+        """Measured seconds of a macro step."""
         return _seconds_of_steps(self.run)[0]
 
     def steps_for(self, error: float) -> int:
-        """Macro steps that keep this error, by the order of the scheme."""
+        """Macro steps for this error, ``n (e / error)^(1 / p)``."""
         return max(1, int(np.ceil(self.run.num_steps * (self.error / error) ** (1 / self.run.order))))
 
     def time_for(self, error: float) -> float:
-        """Seconds of a run that keeps this error; infinite where none is certified."""
+        """Seconds of a run with this error; infinite if the error of the trial is not certified."""
         return self.steps_for(error) * self.seconds if np.isfinite(self.error) else np.inf
 
 
@@ -136,19 +146,19 @@ class Prices(NamedTuple):
     order: int
 
     def relative_time(self, num_micro: int) -> float:
-        """Time of a run with a certain error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not depend on N."""
+        """Time of a run with a given error, ``(a + b N) (S + F / N^p)^(1 / p)``, up to a factor that does not depend on N."""
         error = self.slow + self.fast / num_micro**self.order
         return (self.macro_seconds + num_micro * self.micro_seconds) * error ** (1 / self.order)
 
 
 class Search:
-    """Trial runs from one start over one length of time.
+    """Trial runs of several schemes from the same start over the same time.
 
     Args:
-        make: a `Simulation` of a scheme, of a single macro step.
-        length: time that is simulated, s.
-        num_saves: saved intervals; None for at most `SAVED`.
-        progress: told before every trial run.
+        make: function of a scheme that returns a `Simulation` of a single macro step.
+        length: simulated time, in the unit of time of the system.
+        num_saves: saved intervals; None for at most `MOST_SAVED`.
+        progress: called before every trial run.
     """
 
     def __init__(
@@ -163,28 +173,28 @@ class Search:
         self.num_trials = 0
         self.prices: Prices | None = None
 
-    def saving(self, num_steps: int) -> tuple[int, int]:
-        """At least so many macro steps, a multiple of the saved intervals, and the macro steps from one saved node to the next."""
-        saves = self.num_saves or min(num_steps, SAVED)
+    def rounded(self, num_steps: int) -> tuple[int, int]:
+        """(num_steps, save_every): the number of macro steps, rounded up to a multiple of the saved intervals."""
+        saves = self.num_saves or min(num_steps, MOST_SAVED)
         save_every = -(-num_steps // saves)
         if self.num_saves is None:
             saves = -(-num_steps // save_every)
         return saves * save_every, save_every
 
     def run(self, family: Family, num_micro: int, num_steps: int) -> Simulation:
-        """The run with at least so many macro steps."""
+        """The run with at least `num_steps` macro steps."""
         key = family.python, num_micro
         if key not in self.runs:
             self.runs[key] = self.make(family.make(num_micro))
-        num_steps, save_every = self.saving(num_steps)
+        num_steps, save_every = self.rounded(num_steps)
         dt = np.asarray(self.length / num_steps)
         return replace(self.runs[key], macro_dt=dt, num_steps=num_steps, save_every=save_every)
 
     def first_trials(self, menu: Sequence[tuple[Family, int]]) -> list[Trial]:
         """A trial of each scheme.
 
-        Steps that are too large for the motion fail or diverge, and need no fallback: it is compiled only where no scheme of the menu works
-        without it.
+        First without the fallback: steps that are too large for the motion fail with any method. The fallback is compiled only if no scheme
+        of the menu succeeds without it.
         """
         trials = [self.trial(*scheme, FEWEST_STEPS) for scheme in menu]
         if any(int(trial.trajectory.failed_at) < 0 for trial in trials):
@@ -192,12 +202,12 @@ class Search:
         return [self.trial(*scheme, FEWEST_STEPS, falls_back=True) for scheme in menu]
 
     def trial(self, family: Family, num_micro: int, num_steps: int, falls_back: bool = False) -> Trial:
-        """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; else the last one in the time there is.
+        """The first trial with a certified error, of 1, 2, 4, ... times the macro steps; the last trial if the search runs out of time or steps.
 
         Args:
             family, num_micro: the scheme.
-            num_steps: macro steps, at least.
-            falls_back: whether steps that the first method does not solve are made again with exact matrices, see `Simulation`.
+            num_steps: least number of macro steps.
+            falls_back: whether exact matrices are tried where the first method fails, see `Simulation`.
         """
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)
@@ -210,36 +220,39 @@ class Search:
             errors = extrapolated(run.order, trajectory, halved)
             done = max(int(trajectory.failed_at), int(halved.failed_at)) < 0
             certified = bool(done and certified_nodes(trajectory, errors)[0].all())
-            is_last = 2 * run.num_steps > MOST_STEPS or (seconds > LONGEST and run.num_steps > FEWEST_STEPS)
+            # The seconds of the first trial include compiling, which later trials do not repeat.
+            is_late = seconds > MOST_TRIAL_SECONDS and run.num_steps > FEWEST_STEPS
+            is_last = 2 * run.num_steps > MOST_STEPS or is_late
             if certified or is_last:
                 error = float(largest_of(errors).max()) if certified else np.inf
                 return Trial(family, num_micro, run, trajectory, halved, errors, error)
             num_steps = 2 * run.num_steps
 
     def with_best_num_micro(self, trial: Trial, accuracy: float) -> Trial:
-        """A trial with the number of micro steps of the least time for an accuracy, if that differs."""
+        """A trial with the number of micro steps of the least time for an accuracy; `trial` itself if its number is about as fast."""
         num_micro, p = trial.num_micro, trial.run.order
         finer = self.run(trial.family, 2 * num_micro, trial.run.num_steps)
         finer_trajectory = finer.in_pieces()
         if int(finer_trajectory.failed_at) >= 0:
             return trial
-        by_fast = extrapolated(p, trial.trajectory, finer_trajectory)
-        fast, slow = (float(largest_of(part).max()) for part in (by_fast, trial.errors - by_fast))
-        of_one, of_two = _seconds_of_steps(trial.run, finer)
-        # b = (time(2 N) - time(N)) / N and a = time(N) - N b; noise of the clock must not make one of them zero
-        least = LEAST_TIME * of_one
-        micro_seconds = max(of_two - of_one, least) / num_micro
-        macro_seconds = max(of_one - num_micro * micro_seconds, least)
+        fast_share = extrapolated(p, trial.trajectory, finer_trajectory)
+        fast, slow = (float(largest_of(share).max()) for share in (fast_share, trial.errors - fast_share))
+        # time(N) = a + b N: b = (time(2 N) - time(N)) / N and a = time(N) - N b
+        seconds, finer_seconds = _seconds_of_steps(trial.run, finer)
+        least = LEAST_TIME * seconds
+        micro_seconds = max(finer_seconds - seconds, least) / num_micro
+        macro_seconds = max(seconds - num_micro * micro_seconds, least)
         slow = max(slow, LEAST_SHARE * fast)
         self.prices = Prices(macro_seconds, micro_seconds, slow, num_micro**p * fast, p)
+        # N^(p + 1) = (a / b) (F / S), rounded to a multiple of the unit of the rules
         best = (macro_seconds / micro_seconds * self.prices.fast / slow) ** (1 / (p + 1))
         unit = _unit(trial.run.system, stage_scheme(trial.run.scheme))
         best = unit * int(np.clip(round(best / unit), 1, max(1, MOST_MICRO // unit)))
-        if max(best, num_micro) <= SAME * min(best, num_micro):
+        if max(best, num_micro) <= SAME_COST * min(best, num_micro):
             return trial
-        num_steps = max(1, round(trial.run.num_steps * num_micro / best))
-        other = self.trial(trial.family, best, num_steps, trial.run.may_fall_back)
-        return min((trial, other), key=lambda one: one.time_for(AIM * accuracy))
+        num_steps = max(1, round(trial.run.num_steps * num_micro / best))  # micro steps of about the same length
+        new_trial = self.trial(trial.family, best, num_steps, trial.run.may_fall_back)
+        return min((trial, new_trial), key=lambda candidate: candidate.time_for(AIMED_PART * accuracy))
 
 
 def with_accuracy(
@@ -259,15 +272,15 @@ def with_accuracy(
     Warns with `AccuracyNotReached` if no trial is as accurate.
 
     Args:
-        system, scheme, state, solver, t_end: as of `vmri_jax.simulate`; None for a scheme from the menu.
-        accuracy: in the unit of the positions.
-        num_saves: saved intervals, equally spaced; None for at most `SAVED`.
+        system, scheme, state, solver, t_end: as of `vmri_jax.simulate`; scheme None for a scheme from the menu.
+        accuracy: largest error, in the unit of the positions.
+        num_saves: saved intervals, equally spaced; None for at most `MOST_SAVED`.
         of: function of a run, refused before the trials if it returns no numbers.
-        progress: told before every trial run.
+        progress: called before every trial run.
 
     Raises:
-        TypeError: not a scheme.
-        ValueError: an accuracy below round-off, or above the extent of the motion; what `vmri_jax.simulate` refuses.
+        TypeError: scheme is not a scheme.
+        ValueError: an accuracy below round-off, or above the extent of the motion; arguments that `vmri_jax.simulate` refuses.
     """
     if not isinstance(scheme, Scheme | Composition | None):
         raise TypeError(
@@ -284,7 +297,7 @@ def with_accuracy(
     def make(scheme: Scheme | Composition) -> Simulation:
         run = simulation(system, scheme, state, solver, Steps(length, num_steps=1))
         run.check()
-        check_memory("simulate", run.state, scheme.num_micro, num_saves or SAVED, False)
+        check_memory("simulate", run.state, scheme.num_micro, num_saves or MOST_SAVED, False)
         check_function_of_run(of, True, run)
         return run
 
@@ -297,7 +310,8 @@ def with_accuracy(
             f"simulate: accuracy is {accuracy:g}, and no position moves by more than {extent:.3g} until t = {t_end:g}: any run is as "
             "accurate. Give a smaller one, in the unit of the positions."
         )
-    best = min(trials, key=lambda trial: trial.time_for(AIM * accuracy))
+    best = min(trials, key=lambda trial: trial.time_for(AIMED_PART * accuracy))
+    # A single interval of high degree (above 1) stays single: it resolves the fast variables by its degree.
     can_choose = micro_steps_help(opened_system, start) and stage_scheme(best.run.scheme).degree == 1
     if can_choose and np.isfinite(best.error) and best.error > 0:
         best = search.with_best_num_micro(best, accuracy)
@@ -321,12 +335,12 @@ def with_accuracy(
 
 
 def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
-    """A trial of the same scheme with an error below `accuracy`, made again with more steps where it misses; else the last one."""
+    """A trial of the scheme of `best` with an error of at most `accuracy`, or the last trial if `MOST_REPEATS` of them miss it."""
     fewest = 1
-    for _ in range(REPEATS):
+    for _ in range(MOST_REPEATS):
         if not np.isfinite(best.error):
             break
-        num_steps = _beside_resonances(search, best, max(best.steps_for(AIM * accuracy), fewest))
+        num_steps = _beside_resonances(search, best, max(best.steps_for(AIMED_PART * accuracy), fewest))
         if num_steps > MOST_STEPS:
             break
         best = search.trial(best.family, best.num_micro, num_steps, best.run.may_fall_back)
@@ -337,7 +351,7 @@ def _accurate(search: Search, best: Trial, accuracy: float) -> Trial:
 
 
 def _check(accuracy: float, length: float, start: State) -> None:
-    """Refuse accuracies that no run can have."""
+    """Refuse accuracies below round-off, and an end before the start."""
     check_number("simulate: accuracy", accuracy)
     size = max(np.abs(np.asarray(q)).max(initial=0.0) for q in (start.q_s, start.q_f))
     floor = ROUNDOFF * size
@@ -351,10 +365,10 @@ def _check(accuracy: float, length: float, start: State) -> None:
 
 
 def _menu(scheme, system: System, start: State, accuracy: float, length: float) -> list[tuple[Family, int]]:
-    """Families and their first numbers of micro steps.
+    """Families to try, with their first numbers of micro steps.
 
-    A scheme of the user's is the only one. Else there are two: kicks, for masses that depend on the configuration the midpoint rule, composed
-    to an order of about the number of digits that are asked for; and a single interval of high degree.
+    The user's scheme is the only one on its menu. Else there are two: kicks (the midpoint rule if masses depend on the configuration),
+    composed to an order of about the number of digits of the accuracy; and a single interval of high degree.
     """
     if scheme is not None:
         family = Family("own", scheme.with_num_micro, "", "scheme.with_num_micro({})")
@@ -368,34 +382,35 @@ def _menu(scheme, system: System, start: State, accuracy: float, length: float) 
     num_micro = unit * -(-FIRST_MICRO // unit) if micro_steps_help(system, start) else 1
     kicks = base if name is None else base.composed(name), num_micro
     single = of_degree(int(np.clip(np.ceil(digits), 2, 8))), 1
-    # A single interval has no k-th micro node.
+    # A single micro interval cannot carry a rule on every k-th micro node.
     has_single = unit == 1 and start.q_s.size + start.q_f.size <= MOST_COORDINATES
     return [kicks, single] if has_single else [kicks]
 
 
 def micro_steps_help(system: System, start: State) -> bool:
-    """Whether a macro step may save something: fast coordinates, and slow ones or potentials that the macro grid evaluates less often."""
+    """Whether micro steps may save time: the system has fast coordinates, and slow coordinates or potentials for the macro grid."""
     return bool(start.q_f.size and (start.q_s.size or system.slow_potential is not None or system.potentials))
 
 
 def _unit(system: System, scheme: Scheme) -> int:
-    """The smallest number of micro steps that all rules on every k-th micro node fit into."""
+    """The number whose multiples are allowed as num_micro: the least common multiple of all k of rules on every k-th micro node."""
     return math.lcm(scheme.unit, *(name for name, _ in system.potentials if isinstance(name, int)))
 
 
 def _seconds_of_steps(*runs: Simulation) -> np.ndarray:
-    """Seconds of a macro step of each run: the difference of runs of n and of 2 n steps, without what a call takes besides."""
+    """Seconds of a macro step of each run, ``(T(2 n) - T(n)) / n``: the difference cancels the fixed cost of a call."""
     doubles = [replace(run, num_steps=2 * run.num_steps, save_every=2 * run.save_every) for run in runs]
-    seconds = least_seconds([each.in_pieces for each in (*runs, *doubles)], SAMPLES)
-    once, twice = np.reshape(seconds, (2, len(runs)))
-    return np.maximum(twice - once, 0.1 * twice) / [run.num_steps for run in runs]
+    seconds = least_seconds([run.in_pieces for run in (*runs, *doubles)], SAMPLES)
+    single, double = np.reshape(seconds, (2, len(runs)))
+    return np.maximum(double - single, 0.1 * double) / [
+        run.num_steps for run in runs
+    ]  # noise may make the difference negative
 
 
 def _beside_resonances(search: Search, trial: Trial, num_steps: int) -> int:
-    """This number of macro steps, or the next larger one at which small motions about the start do not grow."""
-    from vmri_jax.stability.linear import (
-        small_motions,  # only here: that room draws, and matplotlib takes half a second
-    )
+    """This number of macro steps, or the next larger number for which small motions about the start do not grow."""
+    # Imported here, since vmri_jax.stability imports matplotlib, which takes half a second.
+    from vmri_jax.stability.linear import small_motions
     from vmri_jax.stability.multipliers import multipliers
 
     start = trial.run.state
@@ -403,8 +418,8 @@ def _beside_resonances(search: Search, trial: Trial, num_steps: int) -> int:
         return num_steps
     try:
         motions = small_motions(trial.run.system, trial.run.state)
-    except ValueError:  # a start without small motions, as of a mechanism that is driven in all of its freedoms
+    except ValueError:  # no small motions: a mechanism whose drives prescribe all of its coordinates
         return num_steps
-    numbers = [search.saving(int(np.ceil(num_steps / shorter)))[0] for shorter in SHORTER]
+    numbers = [search.rounded(int(np.ceil(num_steps / shorter)))[0] for shorter in SHORTER_STEPS]
     radii = multipliers(motions, trial.run.scheme, [search.length / n for n in numbers]).radius
-    return next((n for n, radius in zip(numbers, radii, strict=True) if radius <= 1 + RESONANT), num_steps)
+    return next((n for n, radius in zip(numbers, radii, strict=True) if radius <= 1 + RESONANT_GROWTH), num_steps)

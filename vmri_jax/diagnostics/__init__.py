@@ -1,4 +1,4 @@
-"""What a discrete trajectory should keep, and how to see whether it does."""
+"""Quantities that a discrete trajectory should conserve, and measurements of them."""
 
 from vmri_jax.diagnostics.linear import frequencies, null_space_condition, step_condition, symplectic_defect, tangents
 from vmri_jax.diagnostics.orders import OrderFit, fit_order, observed_order

@@ -1,4 +1,4 @@
-"""Linearised at a state: frequencies, the derivative of a step, the condition of its equations."""
+"""Linearisation at a state: frequencies, derivative of a step, condition numbers of its equations."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ def phase_vector(state: State):
 
 
 def phase_splits(state: State) -> tuple[int, int, int]:
-    """Where ``jnp.split`` cuts a `phase_vector` into its four parts."""
+    """The indices at which ``jnp.split`` cuts a `phase_vector` into q_s, q_f, p_s, p_f."""
     n_s, n = state.q_s.size, state.q_s.size + state.q_f.size
     return n_s, n, n + n_s
 
@@ -35,10 +35,10 @@ def tangents(system: System, t, z, splits):
     """Orthonormal basis, one row each, of the tangent vectors of the constraint manifold.
 
     Args:
-        system: its constraints.
+        system: the system with the constraints.
         t: time.
         z: (2 n,) point ``(q_s, q_f, p_s, p_f)`` on the manifold.
-        splits: where z is cut into its four parts.
+        splits: of `phase_splits`.
     """
 
     def constraints(z):
@@ -48,22 +48,21 @@ def tangents(system: System, t, z, splits):
 
 
 def _null_space(normals):
-    """Orthonormal basis, one row each, of the vectors that are orthogonal to independent rows."""
+    """Orthonormal basis, one vector per row, of the space orthogonal to the rows of `normals`, which are linearly independent."""
     if not normals.shape[0]:
         return jnp.eye(normals.shape[1])
     return jnp.linalg.svd(normals, full_matrices=True)[2][normals.shape[0] :]
 
 
 def frequencies(system: Movable, state: State | None = None):
-    """Angular frequencies of small vibrations about a state, the largest first: those of the frozen linear problem.
+    """Angular frequencies of small vibrations about a state, the largest first.
 
-    Square roots of the generalised eigenvalues of ``Hessian(V + W)`` and the mass matrix on the tangent space of the
-    constraints; zero where the curvature is not positive. Away from equilibrium they are estimates: forces of the
-    constraints are left out.
+    ``Hessian(V + W) u = omega^2 M u`` on the tangent space of the constraints; zero where omega^2 is not positive. Away from an equilibrium
+    the frequencies are estimates, since the constraint forces are left out.
 
     Args:
-        system: masses, potentials, constraints; a problem, a scene, or a system.
-        state: where it is linearised; None for the start of the problem.
+        system: a problem, a scene, or a system.
+        state: point of linearisation; None for the start of the problem.
     """
     system, state = start_of("frequencies", system, state)
     n_s = state.q_s.size
@@ -75,10 +74,10 @@ def frequencies(system: Movable, state: State | None = None):
 
     mass = jax.hessian(lambda v: system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params))(v)
     basis = np.asarray(_null_space(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q)))
-    half = np.linalg.cholesky(basis @ np.asarray(mass) @ basis.T)
+    # With M = L L^T the eigenvalues are those of the symmetric matrix L^-1 K L^-T.
+    cholesky = np.linalg.cholesky(basis @ np.asarray(mass) @ basis.T)
     stiffness = basis @ np.asarray(jax.hessian(potential)(q)) @ basis.T
-    inner = np.linalg.solve(half, np.linalg.solve(half, stiffness).T)
-    return frequencies_of(inner)
+    return frequencies_of(np.linalg.solve(cholesky, np.linalg.solve(cholesky, stiffness).T))
 
 
 def frequencies_of(stiffness: np.ndarray) -> np.ndarray:
@@ -118,12 +117,12 @@ def symplectic_defect(
 def step_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt, sweeps: int = 10) -> float:
     """Condition number of the Newton matrix of a macro step, rows and columns scaled to length one.
 
-    The matrix is that of the first iteration from straight motion; it is dense here, so take few micro steps. Scaling is
-    by square roots of the lengths, again and again (Ruiz 2001).
+    The Newton matrix of the first iteration, which starts from straight motion, is formed as a dense matrix: take few micro steps. Each
+    sweep divides rows and columns by the square roots of their lengths (Ruiz 2001).
 
     Args:
         system, scheme, state, macro_dt: as in `simulate`.
-        sweeps: times that rows and columns are scaled.
+        sweeps: number of sweeps.
     """
     system, state = start_of("step_condition", system, state)
     a = np.asarray(_newton_matrix(system, scheme, state, macro_dt))
@@ -138,8 +137,9 @@ def step_condition(system: Movable, scheme: Scheme, state: State | None = None, 
 def null_space_condition(system: Movable, scheme: Scheme, state: State | None = None, *, macro_dt) -> float:
     """Condition number of the Newton matrix of a macro step on its free motions, without any scaling.
 
-    The equations of motion, their multipliers removed by a basis P of the null space of the constraints, ``P^T A P``: what the
-    method "null_space" of `Newton` solves. The matrix is that of the first iteration from straight motion; it is dense here.
+    The matrix is ``P^T A P`` with the matrix A of the equations of motion and a basis P of the null space of the constraints, which removes
+    the multipliers: the matrix of the solver `solvers.NullSpace`. A is the dense Newton matrix of the first iteration, which starts from
+    straight motion.
 
     Args:
         system, scheme, state, macro_dt: as in `simulate`.

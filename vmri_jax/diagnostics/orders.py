@@ -1,4 +1,4 @@
-"""Orders of convergence that errors show."""
+"""Observed orders of convergence."""
 
 from typing import NamedTuple
 
@@ -18,17 +18,16 @@ STUDENT = (np.nan, 12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23)
 
 
 def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> OrderFit:
-    """Order of convergence: least-squares slope of log error over log step, round-off plateau masked.
+    """Order of convergence: least-squares slope of log error over log step, without the round-off plateau.
 
-    The plateau is where errors stop falling with the step: from the first interval, towards smaller steps, whose slope
-    is less than half the steepest one. Errors within a factor `plateau` of it, or of `floor`, are left out; at least the
-    two largest steps stay.
+    The plateau begins, towards smaller steps, at the first interval whose slope is less than half the steepest slope.
+    Errors within a factor `plateau` of it, or of `floor`, are left out; at least the two largest steps stay.
 
     Args:
         macro_dt: (k,) step sizes.
-        errors: (k,) errors; those that are not finite or zero are ignored.
-        plateau: how far above the round-off plateau an error must lie to count.
-        floor: known error of the reference.
+        errors: (k,) errors; errors that are zero or not finite are ignored.
+        plateau: factor by which an error must exceed the round-off plateau to count.
+        floor: known error of the reference solution.
 
     Raises:
         ValueError: fewer than two usable errors.
@@ -41,7 +40,9 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
     h, e = h[good][order], e[good][order]
     slopes = np.diff(np.log(e)) / np.diff(np.log(h))
     flat = np.flatnonzero(slopes < slopes.max() / 2)
-    flat = flat[flat > slopes.argmax()]
+    flat = flat[
+        flat > slopes.argmax()
+    ]  # flat slopes before the steepest one belong to steps that do not resolve the motion
     level = max(floor, e[flat[0] + 1 :].max() if flat.size else 0.0)
     keep = e > plateau * level
     keep[:2] = True
@@ -55,5 +56,5 @@ def fit_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> Or
 
 
 def observed_order(macro_dt, errors, plateau: float = 10.0, floor: float = 0.0) -> float:
-    """The order of `fit_order`, with the same arguments and errors."""
+    """The order of `fit_order`, with the same arguments and exceptions."""
     return fit_order(macro_dt, errors, plateau, floor).order

@@ -1,14 +1,14 @@
-"""The drift meter: the energy that a symplectic scheme really keeps, from the nodes of a run alone.
+"""The shadow energy, which a symplectic scheme conserves, computed from the nodes of a run; it measures the drift of a run.
 
-The nodes of a symplectic scheme lie on the motion of a modified Hamiltonian, whose action over a step is the discrete Lagrangian
-``L_d``. Along any motion the energy is ``E = p . q' - (action)'``, so with
+The nodes of a symplectic scheme lie on a motion of a modified Hamiltonian, whose action over a step is the discrete Lagrangian
+``L_d``. Along any motion the energy is ``E = p . q' - (action)'``. Therefore, with
 
     b_n = 2 L_d(n) + p_n . q_n - p_{n+1} . q_{n+1}        beta_{n+1} = beta_n + b_n
     E_n = (q' . p - q . p' - beta') / 2
 
-and derivatives by central differences over 2 k + 1 nodes it is found up to ``O(H^{2k})``, without knowing the modified
-Hamiltonian. The energy of the system itself oscillates with ``O(H^r)``; this one stands still, and shows drifts that are smaller by
-many digits.
+and derivatives by central differences over 2 k + 1 nodes, the modified Hamiltonian is known up to ``O(H^{2k})`` without its formula. The
+energy of the system itself oscillates by ``O(H^r)``, r the order of the scheme; the shadow energy does not, so that it shows drifts smaller
+by many digits.
 
 Source: R. D. Skeel, D. J. Hardy, Practical construction of modified Hamiltonians, SIAM J. Sci. Comput. 23 (2001).
 """
@@ -36,22 +36,24 @@ from vmri_jax.steppers.marched import Marched
 from vmri_jax.steppers.results import Result
 
 BLOCKS = 20
-"""Parts of a run whose means the drift is fitted to."""
-MISSED = 1e-6
-"""Part of the step that a step taken again may miss the next node by."""
+"""Parts of a run to whose means the drift is fitted; with more parts neighbouring means are correlated, with fewer the standard error of the
+slope is uncertain."""
+LARGEST_MISS = 1e-6
+"""Largest distance between a recomputed node and the node of the run, as a part of the length of the step; a larger value accepts runs of
+another system or scheme."""
 
 
 @dataclass(frozen=True)
 class ShadowEnergy:
-    """The energy that a scheme keeps, and whether it does.
+    """The shadow energy of a run, and its drift.
 
     Attributes:
         t: (m,) times of the nodes that have k nodes on either side.
-        energy: (m,) the shadow energy there.
-        band: its largest minus its smallest value.
-        energy_band: the same of the energy of the system, over the same nodes.
-        drift, drift_error: slope of a straight line through the means of 20 parts of the run, and its standard error, both per time.
-        rounding: drift if every step lost a unit of round-off of the energy in the same direction.
+        energy: (m,) shadow energy at these nodes.
+        band: largest minus smallest shadow energy.
+        energy_band: largest minus smallest energy of the system at these nodes.
+        drift, drift_error: slope of a straight line through the means of 20 parts of the run, and its standard error, in energy per time.
+        rounding: drift of a run in which every step changes the energy by a unit of round-off in the same direction.
     """
 
     t: Float[np.ndarray, "m"]
@@ -64,48 +66,48 @@ class ShadowEnergy:
 
     @property
     def drifts(self) -> bool:
-        """Whether the drift is more than four standard errors, and more than rounding explains."""
+        """Whether the drift exceeds four standard errors and the drift by round-off."""
         return abs(self.drift) > max(4 * self.drift_error, self.rounding)
 
     @property
     def ratio(self) -> float:
-        """How much smaller the band is than that of the energy."""
+        """Band of the energy of the system divided by the band of the shadow energy."""
         return self.energy_band / self.band if self.band else np.inf
 
     def __repr__(self) -> str:
-        seen = "it drifts" if self.drifts else "no drift is seen"
+        verdict = "it drifts" if self.drifts else "no drift is seen"
         return (
             f"shadow energy: band {self.band:.1e} (energy of the system: {self.energy_band:.1e}), "
-            f"drift {self.drift:.1e} +- {self.drift_error:.0e} per time: {seen}"
+            f"drift {self.drift:.1e} +- {self.drift_error:.0e} per time: {verdict}"
         )
 
 
 def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Trajectory, k: int = 5) -> ShadowEnergy:
-    """The energy that a symplectic scheme keeps along a run, with its drift.
+    """The shadow energy of a symplectic scheme along a run, and its drift.
 
         run = vm.simulate(problem, scheme, macro_dt=0.01, num_steps=10_000)
         print(vm.diagnostics.shadow_energy(problem, scheme, run))
 
-    It needs macro nodes that resolve the fast motion: the band shrinks with k for ``omega H < 2`` or so, fast below 1/2. Where it
-    grows with k, from ``omega H`` of 0.9 pi on, the resonance of kicks at pi is near, which the energy shows from 0.95 pi on.
+    The macro nodes must resolve the fast motion: the band shrinks with k if ``omega H`` is below about 2, fast below 1/2. A band that
+    grows with k, from ``omega H = 0.9 pi`` on, announces the resonance of kicks at pi, which the energy itself shows from 0.95 pi on.
 
     Args:
-        system, scheme: of the run; without forces and constraints that depend on time, since those keep no energy.
-        trajectory: with every macro node saved, at least 2 k + 21 of them.
-        k: nodes that central differences take on either side; they are of order 2 k.
+        system, scheme: as of the run. The system has neither forces nor constraints that depend on time, since it must conserve its energy.
+        trajectory: a run with every macro node saved, at least 2 k + 21 of them.
+        k: nodes on either side of the central differences, whose order is 2 k.
 
     Raises:
-        ValueError: forces, rheonomic constraints, a mollified scheme; nodes left out; too few of them; a run that failed.
+        ValueError: forces, rheonomic constraints, a mollified scheme; nodes left out; too few nodes; a failed run.
     """
     whole_number("shadow_energy: k", k)
     system = _checked(system, scheme, trajectory, k)
     t = np.asarray(trajectory.t)
     nodes = State(*(jnp.asarray(a) for a in (t, *list(vars(trajectory.states).values())[1:])))
     macro_dt = (t[-1] - t[0]) / (len(t) - 1)
-    actions, missed, result = _actions(system, scheme, nodes, macro_dt)
-    if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(missed) < MISSED:
+    actions, miss, result = _actions(system, scheme, nodes, macro_dt)
+    if int(result) > Result.CONVERGED_AT_ROUNDOFF or not float(miss) < LARGEST_MISS:
         raise ValueError(
-            f"shadow_energy: steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(missed):.1e} of "
+            f"shadow_energy: steps of {macro_dt:.6g} from the nodes of the trajectory miss the next ones by {float(miss):.1e} of "
             "a step. It must be a run of this system and scheme with every macro node saved (save_every=1)."
         )
     q, p = (np.concatenate(pair, axis=1) for pair in ((nodes.q_s, nodes.q_f), (nodes.p_s, nodes.p_f)))
@@ -118,12 +120,13 @@ def shadow_energy(system: Movable, scheme: Scheme | Composition, trajectory: Tra
 
 
 def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajectory, k: int) -> System:
+    """The system; refuses runs that conserve no energy, failed or have too few nodes."""
     _, *nodes = vars(trajectory.states).values()
     start = State(trajectory.t[..., 0], *(a[..., 0, :] for a in nodes))
     system, _ = start_of("shadow_energy", system, start)
     if system.force is not None or system.is_rheonomic:
-        what = "forces" if system.force is not None else "constraints that depend on time"
-        raise ValueError(f"shadow_energy: the system has {what}: no energy is kept. Leave them out.")
+        cause = "forces" if system.force is not None else "constraints that depend on time"
+        raise ValueError(f"shadow_energy: the system has {cause}: no energy is kept. Leave them out.")
     if stage_scheme(scheme).slow.mollified:
         raise ValueError("shadow_energy: the action of a mollified scheme depends on more than the nodes of a step.")
     if int(np.max(trajectory.failed_at)) >= 0 or not np.isfinite(trajectory.energy).all():
@@ -139,25 +142,27 @@ def _checked(system: Movable, scheme: Scheme | Composition, trajectory: Trajecto
 
 @jax.jit
 def _actions(system: System, scheme: Scheme | Composition, nodes: State, macro_dt):
-    """Discrete Lagrangian of every step, the most that a step misses the next node by (over its length), the worst `Result`."""
+    """Discrete Lagrangian of every step, largest distance of a step from the next node relative to its length, worst `Result`."""
     parts = jnp.asarray(scheme.coefficients) if isinstance(scheme, Composition) else jnp.ones(1)
 
-    def step(at):
-        start, end = at
+    def step(nodes):
+        start, end = nodes
 
         def stage(carry, part):
             state, action = carry
-            state, more, result = _stage(system, stage_scheme(scheme), state, part * macro_dt)
-            return (state, action + more), result
+            state, action_of_stage, result = _stage(system, stage_scheme(scheme), state, part * macro_dt)
+            return (state, action + action_of_stage), result
 
         (reached, action), results = jax.lax.scan(stage, (start, jnp.zeros(())), parts)
-        q, expected, before = (jnp.concatenate([s.q_s, s.q_f]) for s in (reached, end, start))
-        size = jnp.max(jnp.abs(expected - before)) + 1e-9 * jnp.max(jnp.abs(expected))
-        return action, jnp.max(jnp.abs(q - expected)) / size, jnp.max(results)
+        q, q_end, q_start = (jnp.concatenate([s.q_s, s.q_f]) for s in (reached, end, start))
+        length = jnp.max(jnp.abs(q_end - q_start)) + 1e-9 * jnp.max(
+            jnp.abs(q_end)
+        )  # positive for a system at rest, too
+        return action, jnp.max(jnp.abs(q - q_end)) / length, jnp.max(results)
 
     starts, ends = (jax.tree.map(lambda a, part=part: a[part], nodes) for part in (slice(-1), slice(1, None)))
-    actions, missed, results = jax.lax.map(step, (starts, ends))
-    return actions, jnp.max(missed), jnp.max(results)
+    actions, misses, results = jax.lax.map(step, (starts, ends))
+    return actions, jnp.max(misses), jnp.max(results)
 
 
 def _stage(system: System, scheme: Scheme, state: State, macro_dt):
@@ -181,7 +186,10 @@ def _stage(system: System, scheme: Scheme, state: State, macro_dt):
 
 
 def _energy(q, p, actions, macro_dt, k: int):
-    """Shadow energy at the nodes that have k nodes on either side; positions are taken from there, to lose no digits."""
+    """Shadow energy at the nodes that have k nodes on either side.
+
+    Positions are measured from the middle node, q - q_0: products with large positions would lose digits.
+    """
     nodes, inner = len(q), slice(k, len(q) - k)
     shifted = [slice(k + j, nodes - k + j) for j in range(-k, k + 1)]
     q_0, p_0 = q[inner], p[inner]
@@ -189,29 +197,31 @@ def _energy(q, p, actions, macro_dt, k: int):
     def momentum_sum(part):
         return np.sum(p[part] * (q[part] - q_0), axis=1)
 
-    of_steps = [
+    # b_n of the 2 k steps about each node
+    b = [
         2 * actions[k + j : nodes - k + j] + momentum_sum(shifted[k + j]) - momentum_sum(shifted[k + j + 1])
         for j in range(-k, k)
     ]
-    twice = np.zeros(len(q_0))
-    beta = np.zeros(len(q_0))  # from node -j to node j
+    # f' = sum_j w_j (f_j - f_-j) / H with w_j = (-1)^(j+1) k!^2 / (j (k-j)! (k+j)!); q . p' vanishes since q - q_0 is zero in the middle
+    twice_energy = np.zeros(len(q_0))
+    beta = np.zeros(len(q_0))  # beta_j - beta_-j
     for j in range(1, k + 1):
-        beta = beta + of_steps[k - j] + of_steps[k + j - 1]
+        beta = beta + b[k - j] + b[k + j - 1]
         weight = (-1) ** (j + 1) * factorial(k) ** 2 / (j * factorial(k - j) * factorial(k + j))
-        twice += weight * (np.sum((q[shifted[k + j]] - q[shifted[k - j]]) * p_0, axis=1) - beta)
-    return twice / (2 * macro_dt)
+        twice_energy += weight * (np.sum((q[shifted[k + j]] - q[shifted[k - j]]) * p_0, axis=1) - beta)
+    return twice_energy / (2 * macro_dt)
 
 
 def _slope(t, values) -> tuple[float, float]:
     """Slope of a straight line through the means of `BLOCKS` parts, and its standard error.
 
-    What is left of neighbouring parts may be alike; fewer of them then count, ``(1 - rho) / (1 + rho)`` for a correlation rho.
+    If the residuals of neighbouring parts have the correlation rho, the variance of the slope grows by ``(1 + rho) / (1 - rho)``.
     """
     means = np.array([[part.mean() for part in np.array_split(a, BLOCKS)] for a in (t - t.mean(), values)])
     x, y = means - means.mean(axis=1, keepdims=True)
     slope = np.sum(x * y) / np.sum(x**2)
-    left = y - slope * x
-    squares = float(np.sum(left**2))
-    alike = np.clip(np.sum(left[1:] * left[:-1]) / squares, 0.0, 0.9) if squares else 0.0
-    error = np.sqrt(squares / (BLOCKS - 2) / np.sum(x**2) * (1 + alike) / (1 - alike))
+    residual = y - slope * x
+    squares = float(np.sum(residual**2))
+    rho = np.clip(np.sum(residual[1:] * residual[:-1]) / squares, 0.0, 0.9) if squares else 0.0
+    error = np.sqrt(squares / (BLOCKS - 2) / np.sum(x**2) * (1 + rho) / (1 - rho))
     return float(slope), float(error)

@@ -10,18 +10,18 @@ from matplotlib.figure import Figure
 from vmri_jax.plots import Theme
 
 Details = Mapping[str, np.ndarray]
-"""Arrays that a picture is drawn from, by name."""
+"""Arrays for the picture of a case, by name."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a case measured.
+    """Result of a case.
 
     Args:
-        measured: the figures in a sentence.
+        measured: the measured values in a sentence.
         passed: whether the criterion is met; None if the case does not apply.
-        values: the figures by name.
-        details: arrays that the picture of the case is drawn from.
+        values: the measured values by name.
+        details: arrays for the picture of the case.
     """
 
     measured: str
@@ -40,12 +40,13 @@ class Case:
     """One hard case.
 
     Args:
-        number: its place in the list.
-        title: a few words.
-        setup, criterion: a sentence each: what is run, and what counts as a pass.
-        run: ``run(full) -> Outcome``, a quick form or the full one.
-        draw: ``draw(details, theme)`` makes its picture, if it has one.
-        does_not_apply: why the case has no sense for the system; empty where it has.
+        number: number of the case in the list.
+        title: title of a few words.
+        setup: the run or the comparison, in a sentence.
+        criterion: the condition for a pass, in a sentence.
+        run: ``run(full) -> Outcome``, the full form of the case or a quick one.
+        draw: ``draw(details, theme)`` makes its picture; None if it has none.
+        does_not_apply: the reason why the case is meaningless for the system; empty if it is meaningful.
     """
 
     number: int

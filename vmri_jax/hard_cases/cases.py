@@ -1,4 +1,4 @@
-"""The hard cases that make sense for any system, with steps chosen from its frequencies."""
+"""The hard cases that apply to any system, with steps chosen from its frequencies."""
 
 from dataclasses import dataclass
 
@@ -36,15 +36,19 @@ from vmri_jax.stability.linear import small_motions
 from vmri_jax.steppers import solvers
 
 NUM_MICRO = 5
+"""Micro steps per macro step of the cases."""
 PHASE = 0.2
-"""omega h of the fastest vibration: resolved, and omega H = 1 well below the first resonance."""
-LONGER, SLOWER = 8, 0.75
-"""Factor by which a run is made longer if its energy has a trend, and the part of the rate of that trend above which it is a drift: a trend of the
-slowest motion turns back or settles in the longer run, a drift goes on."""
+"""omega h of the fastest vibration, which resolves it; omega H = 1 is well below the first resonance. A larger value may meet resonances."""
+LONGER_RUN = 8
+"""Factor by which a run is lengthened if its energy has a trend. In the longer run the trend of a slow motion turns back or settles, and a
+drift goes on; a larger factor tells the two apart more safely and takes longer."""
+DRIFT_RATIO = 0.75
+"""Rate of the trend in the longer run, as a part of the rate in the first run, above which the trend is a drift; a larger value overlooks
+drifts that slow dcases."""
 ROUND_OFF_BAND = 1e-9
-"""Bands of the energy below this are round-off."""
-SHADOW = 2_000
-"""Steps that the drift meter looks at."""
+"""Relative band of the energy up to which it is round-off; a larger value overlooks small drifts."""
+SHADOW_STEPS = 2_000
+"""Steps of the run for the shadow energy; more of them find slower drifts and take longer."""
 ENERGY_CRITERION = (
     "no line explains more than half of the band, or it flattens in a longer run, or the band is below 1e-9"
 )
@@ -54,7 +58,7 @@ LANE_CRITERION = "the bad lane reports its failure, the others equal their singl
 
 @dataclass(frozen=True)
 class Resolved:
-    """A problem with a scheme and a step that resolve its fastest vibration; every method is a case."""
+    """A problem with a scheme and a macro step that resolve its fastest vibration, of frequency omega; every public method is a case."""
 
     problem: Problem
     scheme: Scheme
@@ -92,9 +96,9 @@ class Resolved:
         trajectory, change = self._energy(steps)
         trend = change.drifts and change.band > ROUND_OFF_BAND
         if trend and trajectory.success:
-            steps *= LONGER
+            steps *= LONGER_RUN
             before, (trajectory, change) = change, self._energy(steps)
-            trend = change.drifts and abs(change.drift) > SLOWER * abs(before.drift)
+            trend = change.drifts and abs(change.drift) > DRIFT_RATIO * abs(before.drift)
         e = np.asarray(trajectory.energy)
         return Outcome(
             f"{steps:.0e} steps: {status(trajectory)}, relative band {change.band:.1e}, drift {change.drift:.0e} per 1e5 steps "
@@ -105,9 +109,9 @@ class Resolved:
         )
 
     def _shadow(self) -> str:
-        """What the drift meter sees in the first steps, if it applies and the scheme resolves the motion."""
-        meter = drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW)
-        return "" if meter is None else f"; first {SHADOW} steps: {meter}"
+        """The shadow energy of the first steps in words; empty if there is none."""
+        shadow = drift_meter(self.problem, self.scheme, self.macro_dt, SHADOW_STEPS)
+        return "" if shadow is None else f"; first {SHADOW_STEPS} steps: {shadow}"
 
     def _energy(self, steps: int) -> tuple[Trajectory, Energy]:
         trajectory = long_run(self.problem, self.scheme, self.macro_dt, steps)
@@ -171,9 +175,9 @@ class Resolved:
 
 
 def resolved(problem: Problem) -> Resolved:
-    """A problem with five micro steps of ``omega h = 0.2`` for its fastest frequency at the start.
+    """A problem with five micro steps of ``omega h = 0.2`` for its largest frequency at the start.
 
-    Where nothing vibrates, omega is the rate at which velocity or acceleration changes positions by their own size.
+    If nothing vibrates, ``omega = max(|q'| / |q|, sqrt(|q''| / |q|))``, the rate at which positions change by their size.
 
     Raises:
         ValueError: the problem is refused by `initial_state`.
@@ -191,7 +195,7 @@ def resolved(problem: Problem) -> Resolved:
 
 
 def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
-    """The hard cases for a system of your own, each with a criterion; those that do not apply to it say why.
+    """The hard cases for a system, each with a criterion; cases that do not apply to the system give the reason.
 
     Args:
         problem: system and start; a `Problem` or a scene.
@@ -202,32 +206,38 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
     problem = problem_of("cases_for", problem)
     with Working("cases_for") as tell:
         tell("small motions about the start", 0, 1)
-        own = resolved(problem)
+        cases = resolved(problem)
     system = problem.system
     unconstrained = "" if system.is_constrained else "the system has no constraints"
     one_way = _turns_one_way(problem)
 
     def precision(full: bool) -> Outcome:
-        return single_precision(problem, own.macro_dt)
+        return single_precision(problem, cases.macro_dt)
 
     def differences(full: bool) -> Outcome:
-        return derivatives(problem, own.scheme, own.macro_dt)
+        return derivatives(problem, cases.scheme, cases.macro_dt)
 
     def lane(full: bool) -> Outcome:
-        return bad_lane(problem, own.scheme, own.macro_dt, 20, solvers.Auto(), lanes=64 if full else 16)
+        return bad_lane(problem, cases.scheme, cases.macro_dt, 20, solvers.Auto(), lanes=64 if full else 16)
 
-    step = f"fully_implicit, num_micro {NUM_MICRO}, H = {own.macro_dt:.3g}"
-    one = f"num_micro 1, omega = {own.omega:.3g}"
+    step = f"fully_implicit, num_micro {NUM_MICRO}, H = {cases.macro_dt:.3g}"
+    single = f"num_micro 1, omega = {cases.omega:.3g}"
     rows = [
-        ("advice", step, "no error, no warning", own.advice),
-        ("rank of the constraints", step, "rows independent at the start and on the way", own.rank, unconstrained),
-        ("constraints for long", step, "position constraint below 1e-10", own.constraints, unconstrained),
-        ("energy for long", step, ENERGY_CRITERION, own.energy, _does_work(system)),
-        ("loose Newton tolerance", f"{step}, 1e-4 to 1e-12", "error shrinks with the tolerance", own.tolerance),
-        ("tiny steps", f"{step} and smaller", "scaled condition flat", own.tiny_steps),
-        ("reversibility", step, "back at the start to 1e-6", own.reversal, one_way),
-        ("explicit limit", f"fully_explicit, {one}", EXPLICIT_CRITERION, own.explicit_limit, _has_no_limit(system)),
-        ("reductions", one, "known methods to 1e-10", own.reductions, _is_not_reduced(system)),
+        ("advice", step, "no error, no warning", cases.advice),
+        ("rank of the constraints", step, "rows independent at the start and on the way", cases.rank, unconstrained),
+        ("constraints for long", step, "position constraint below 1e-10", cases.constraints, unconstrained),
+        ("energy for long", step, ENERGY_CRITERION, cases.energy, _does_work(system)),
+        ("loose Newton tolerance", f"{step}, 1e-4 to 1e-12", "error shrinks with the tolerance", cases.tolerance),
+        ("tiny steps", f"{step} and smaller", "scaled condition flat", cases.tiny_steps),
+        ("reversibility", step, "back at the start to 1e-6", cases.reversal, one_way),
+        (
+            "explicit limit",
+            f"fully_explicit, {single}",
+            EXPLICIT_CRITERION,
+            cases.explicit_limit,
+            _has_no_limit(system),
+        ),
+        ("reductions", single, "known methods to 1e-10", cases.reductions, _is_not_reduced(system)),
         ("float32", "64-bit mode off, and float32 data", "refused with the one-line fix", precision),
         ("one bad lane in a batch", step, LANE_CRITERION, lane),
         ("derivatives", step, "gradients and Hessians are those of the functions, to 1e-4", differences),
@@ -240,7 +250,7 @@ def cases_for(problem: Problem | HasProblem) -> tuple[Case, ...]:
 
 
 def _does_work(system: System) -> str:
-    """Why no energy is kept; empty for a closed system."""
+    """The reason why the system does not conserve its energy; empty for a closed system."""
     if system.is_rheonomic:
         return "its constraints move with time and do work: no energy is kept"
     if system.force is not None:
@@ -249,7 +259,7 @@ def _does_work(system: System) -> str:
 
 
 def _has_no_limit(system: System) -> str:
-    """Why ``omega h = 2`` is not where an explicit scheme becomes unstable; empty where it is."""
+    """The reason why the stability limit of an explicit scheme is not ``omega h = 2``; empty if it is."""
     if system.is_constrained:
         return "every step solves for the multipliers of its constraints, explicit schemes too"
     if not system.has_constant_mass:
@@ -260,7 +270,7 @@ def _has_no_limit(system: System) -> str:
 
 
 def _is_not_reduced(system: System) -> str:
-    """Why the known methods, as written here, are others; empty where the scheme reduces to them."""
+    """The reason why the scheme does not reduce to the known methods as written here; empty if it does."""
     if not system.has_constant_mass:
         return "its kinetic energy is a function, and the known methods are written here for constant masses"
     if system.is_rheonomic:
@@ -271,7 +281,7 @@ def _is_not_reduced(system: System) -> str:
 
 
 def _turns_one_way(problem: Problem) -> str:
-    """Why turned momenta do not lead back; empty for potentials, and a kinetic energy that is even in the velocities."""
+    """The reason why reversed momenta do not lead back to the start; empty if they do: potentials, and a kinetic energy even in the velocities."""
     if problem.system.is_rheonomic:
         return "its constraints move with time: the way back is another motion"
     if problem.system.force is not None:

@@ -1,10 +1,10 @@
-"""Whether derivatives are those of the functions: gradients against differences of values, second derivatives of gradients.
+"""Check of derivatives: gradients against differences of values, second derivatives against differences of gradients.
 
-With s(z) a function of positions (and velocities), or the sum of its components with some weights, and d a direction,
+With s(z) a function of positions (and velocities), or a weighted sum of its components, and d a direction,
 
     grad s(z) . d = (8 (s(z + h d) - s(z - h d)) - (s(z + 2 h d) - s(z - 2 h d))) / (12 h) + O(h^4)
 
-for one h at least: too large an h meets the curvature, too small a one round-off. The second derivative of a potential is
+must hold for at least one h: higher derivatives spoil a large h, round-off a small one. The second derivative of a potential is
 compared with differences of the gradient in the same way, and must be symmetric.
 """
 
@@ -23,17 +23,20 @@ from vmri_jax.mechanics.state import Problem
 from vmri_jax.schemes.scheme import Scheme
 
 DIRECTIONS = 6
+"""Random directions in which derivatives are compared; more of them find errors in more coordinates and take longer."""
 STEPS = 10.0 ** -np.arange(2, 7)
-"""h, in units of the largest position."""
-OFF = 1e-4
-"""Points are moved by so much of the largest position: a bend exactly there has no derivative."""
+"""Values of h, in units of the largest position."""
+DISPLACEMENT = 1e-4
+"""Largest random displacement of the points, as a part of the largest position: a function with a bend exactly at a point has no derivative
+there. A larger value leaves the states of the run."""
 WRONG = 1e-4
-"""Relative difference from which on a derivative is wrong; those that are right are at 1e-7 and below."""
+"""Relative difference from which a derivative is wrong; right derivatives differ by at most 1e-7. A larger value overlooks small errors."""
 ROUND_OFF = 1e-14
+"""Round-off of a difference of values, as a part of the value; a larger value hides errors of small derivatives."""
 
 
 class Term(NamedTuple):
-    """A function of the system as one of a vector: ``function(z) -> (m,)``, and the points z (k, n) to look at."""
+    """A function of the system as a function of a vector, ``function(z) -> (m,)``, and (k, n) points z at which to compare its derivatives."""
 
     name: str
     function: Callable
@@ -41,61 +44,62 @@ class Term(NamedTuple):
 
 
 def derivatives(problem: Problem, scheme: Scheme, macro_dt: float) -> Outcome:
-    """The largest relative difference of derivatives, and which function is wrong."""
+    """The largest relative difference of derivatives, and the functions whose derivatives are wrong."""
     worst = {}
     for name, function, points in _terms(problem, scheme, macro_dt):
-        first, second, lopsided = _apart(function, points)
+        first, second, asymmetry = _differences(function, points)
         worst[f"the gradient of {name} from differences of its values"] = first
         if "potential" in name:
             worst[f"the second derivative of {name} from differences of its gradient"] = second
-            worst[f"the second derivative of {name} from its transpose"] = lopsided
-    wrong = {what: apart for what, apart in worst.items() if not apart < WRONG}
+            worst[f"the second derivative of {name} from its transpose"] = asymmetry
+    wrong = {comparison: difference for comparison, difference in worst.items() if not difference < WRONG}
     largest = max(worst.values(), default=0.0)
     if not wrong:
         return Outcome(f"at most {largest:.0e} from differences", True, {"apart": largest})
-    words = "; ".join(f"{what} differs by {apart:.2g}" for what, apart in wrong.items())
+    words = "; ".join(f"{comparison} differs by {difference:.2g}" for comparison, difference in wrong.items())
     return Outcome(
-        f"relative to its size, {words}. Likely cause: a derivative of one's own (jax.custom_jvp, custom_vjp) that is not that of the "
-        "function, or jax.lax.stop_gradient, which hides a part from it. Forces that no potential has belong into force.",
+        f"relative to its size, {words}. Likely cause: a custom derivative (jax.custom_jvp, custom_vjp) that differs from the derivative of "
+        "the function, or jax.lax.stop_gradient, which hides a part of it. Forces without a potential belong into force.",
         False,
         {"apart": largest},
     )
 
 
 def _terms(problem: Problem, scheme: Scheme, macro_dt: float) -> Iterator[Term]:
-    """What the system consists of, at the start and along a short run as far as it goes."""
+    """The functions of the system, with points at the start and along a short run up to a failure."""
     system, n_s = problem.system, problem.q_s.size
     along = run(problem, scheme, macro_dt, 20, save_every=5)
     speeds = jax.jit(jax.vmap(lambda *z: jnp.concatenate(velocity(system, *z))))
     velocities = np.asarray(speeds(along.q_s, along.q_f, along.p_s, along.p_f))
-    found = np.concatenate([along.q_s, along.q_f, velocities], axis=1)
-    found, t = found[np.isfinite(found).all(axis=1)], along.t[0]
-    n = found.shape[1] // 2
+    points = np.concatenate([along.q_s, along.q_f, velocities], axis=1)
+    points, t = points[np.isfinite(points).all(axis=1)], along.t[0]
+    n = points.shape[1] // 2
     params = system.params
     if (slow := system.slow_potential) is not None:
-        yield Term("slow_potential", lambda q: slow(q[:n_s], q[n_s:], params)[None], found[:, :n])
+        yield Term("slow_potential", lambda q: slow(q[:n_s], q[n_s:], params)[None], points[:, :n])
     if (fast := system.fast_potential) is not None:
-        yield Term("fast_potential", lambda q: fast(q, params)[None], found[:, n_s:n])
+        yield Term("fast_potential", lambda q: fast(q, params)[None], points[:, n_s:n])
     for name, potential in system.potentials:
         function = partial(_of_joined, potential, n_s, params)
-        yield Term(f"potential {name!r}", function, found[:, :n])
+        yield Term(f"potential {name!r}", function, points[:, :n])
     if not system.has_constant_mass:
         parts = (n_s, n, n + n_s)
-        yield Term("kinetic", lambda z: system.kinetic(*jnp.split(z, parts), params)[None], found)
+        yield Term("kinetic", lambda z: system.kinetic(*jnp.split(z, parts), params)[None], points)
     if system.is_constrained:
-        yield Term("the constraints", lambda q: system.constraints(t, q[:n_s], q[n_s:]), found[:, :n])
+        yield Term("the constraints", lambda q: system.constraints(t, q[:n_s], q[n_s:]), points[:, :n])
 
 
 def _of_joined(potential: Callable, n_s: int, params, q):
-    """(1,) value of a potential of all positions q."""
+    """(1,) value of a potential, as a function of all positions q."""
     return potential(q[:n_s], q[n_s:], params)[None]
 
 
-def _apart(function: Callable, points: np.ndarray) -> tuple[float, float, float]:
-    """Relative differences of the gradient, of the second derivative, and of that from its transpose; largest of all points."""
+def _differences(function: Callable, points: np.ndarray) -> tuple[float, float, float]:
+    """Largest relative differences over all points: of the gradient and of the second derivative from differences, and of the second
+    derivative from its transpose."""
     random = np.random.default_rng(0)
     size = float(np.abs(points).max(initial=0.0)) or 1.0
-    points = points + OFF * size * random.uniform(-1, 1, points.shape)
+    points = points + DISPLACEMENT * size * random.uniform(-1, 1, points.shape)
     directions = random.uniform(-1, 1, (DIRECTIONS, points.shape[1]))
 
     def value(z):
@@ -107,34 +111,40 @@ def _apart(function: Callable, points: np.ndarray) -> tuple[float, float, float]
     def compared(z):
         d = jnp.asarray(directions)
         gradient = jax.grad(value)
-        own, curved = jax.lax.map(lambda x: jax.jvp(gradient, (z,), (x,)), d)
-        values, slopes = (_differences(f, z, d, size) for f in (value, gradient))
-        bent = curved @ d.T
-        first = _nearest(jnp.sum(own * d, axis=1), values, jnp.abs(value(z)) / size)
-        second = _nearest(curved, slopes, jnp.abs(gradient(z)).max() / size)
-        scale = jnp.abs(bent).max() + ROUND_OFF * jnp.abs(gradient(z)).max() / size
-        return first, second, jnp.abs(bent - bent.T).max() / jnp.where(scale > 0, scale, 1.0)
+        gradients, second_derivatives = jax.lax.map(lambda x: jax.jvp(gradient, (z,), (x,)), d)  # grad s and s'' d
+        quotients, gradient_quotients = (_quotients(f, z, d, size) for f in (value, gradient))
+        bilinear = second_derivatives @ d.T  # d_i . s'' d_j
+        first = _smallest_difference(jnp.sum(gradients * d, axis=1), quotients, jnp.abs(value(z)) / size)
+        second = _smallest_difference(second_derivatives, gradient_quotients, jnp.abs(gradient(z)).max() / size)
+        scale = jnp.abs(bilinear).max() + ROUND_OFF * jnp.abs(gradient(z)).max() / size
+        return first, second, jnp.abs(bilinear - bilinear.T).max() / jnp.where(scale > 0, scale, 1.0)
 
     if not points.shape[1]:
         return 0.0, 0.0, 0.0
-    first, second, lopsided = (float(np.max(np.asarray(x))) for x in compared(jnp.asarray(points)))
-    return first, second, lopsided
+    first, second, asymmetry = (float(np.max(np.asarray(x))) for x in compared(jnp.asarray(points)))
+    return first, second, asymmetry
 
 
-def _differences(f: Callable, z, directions, size: float):
-    """Differences of f along every direction for every h, (STEPS, DIRECTIONS, ...)."""
+def _quotients(f: Callable, z, directions, size: float):
+    """Difference quotients of order 4 of f along every direction for every h, (STEPS, DIRECTIONS, ...)."""
 
-    def difference(h, d):
-        one, two = (f(z + k * h * d) - f(z - k * h * d) for k in (1, 2))
-        return (8 * one - two) / (12 * h)
+    def quotient(h, d):
+        near, far = (f(z + k * h * d) - f(z - k * h * d) for k in (1, 2))
+        return (8 * near - far) / (12 * h)
 
-    return jax.lax.map(lambda h: jax.lax.map(lambda d: difference(h, d), directions), jnp.asarray(STEPS * size))
+    return jax.lax.map(lambda h: jax.lax.map(lambda d: quotient(h, d), directions), jnp.asarray(STEPS * size))
 
 
-def _nearest(own, differences, per_size):
-    """The relative difference for the h where it is smallest, less round-off; `per_size`: value over the size of positions."""
-    away = jnp.abs(differences - own).reshape(len(STEPS), -1).max(axis=1)
-    away = jnp.where(jnp.isfinite(away), away, jnp.inf)
-    away = jnp.maximum(away - ROUND_OFF * per_size / STEPS, 0.0)
-    scale = jnp.maximum(jnp.abs(own).max(), jnp.abs(differences[2]).max())
-    return jnp.min(away) / jnp.where(scale > 0, scale, 1.0)
+def _smallest_difference(derivative, quotients, value_per_size):
+    """Relative difference of a derivative from its quotients, less round-off, for the h with the smallest difference.
+
+    Args:
+        derivative: (DIRECTIONS, ...).
+        quotients: (STEPS, DIRECTIONS, ...).
+        value_per_size: size of the values divided by the size of the positions, which sets the round-off.
+    """
+    difference = jnp.abs(quotients - derivative).reshape(len(STEPS), -1).max(axis=1)
+    difference = jnp.where(jnp.isfinite(difference), difference, jnp.inf)
+    difference = jnp.maximum(difference - ROUND_OFF * value_per_size / STEPS, 0.0)
+    scale = jnp.maximum(jnp.abs(derivative).max(), jnp.abs(quotients[2]).max())
+    return jnp.min(difference) / jnp.where(scale > 0, scale, 1.0)

@@ -1,4 +1,4 @@
-"""What must not slip through: single precision, one bad lane in a batch."""
+"""Checks of refusals: single precision, and one bad lane in a batch."""
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +13,12 @@ from vmri_jax.schemes.scheme import fully_implicit
 from vmri_jax.steppers.results import Result
 from vmri_jax.steppers.solvers import Newton
 
-ABSURD = 1e160
-"""A momentum whose kinetic energy overflows."""
+OVERFLOWING_MOMENTUM = 1e160
+"""A momentum whose square, and so its kinetic energy, overflows float64."""
 
 
 def single_precision(problem: Problem, macro_dt: float = 0.01) -> Outcome:
-    """What a run says with the 64-bit mode off, and the start to positions in float32."""
+    """Whether a run with the 64-bit mode off, and a start with positions in float32, are refused with the line that mends them."""
     state = problem.state()
     with jax.enable_x64(False):
         off = _refusal(lambda: simulate(problem.system, fully_implicit(2), state, macro_dt=macro_dt, num_steps=1))
@@ -35,6 +35,7 @@ def single_precision(problem: Problem, macro_dt: float = 0.01) -> Outcome:
 
 
 def _refusal(call) -> str:
+    """The message of the ValueError that a call raises; empty if it raises none."""
     try:
         call()
     except ValueError as error:
@@ -45,10 +46,10 @@ def _refusal(call) -> str:
 def bad_lane(
     problem: Problem, scheme, macro_dt, num_steps: int, solver: Newton, lanes: int = 256, compared: int = 4
 ) -> Outcome:
-    """A batch whose lanes start along one run, one of them with absurd momenta, against single runs of some lanes."""
+    """A batch whose lanes start at the nodes of a run, one of them with overflowing momenta, compared with single runs of some lanes."""
     bad = lanes // 3
-    along = run(problem, scheme, macro_dt, lanes - 1, solver=solver)  # consistent states, at rest or driven
-    p_s, p_f = (jnp.asarray(p).at[bad].set(ABSURD) for p in (along.p_s, along.p_f))
+    along = run(problem, scheme, macro_dt, lanes - 1, solver=solver)  # its nodes are consistent with all constraints
+    p_s, p_f = (jnp.asarray(p).at[bad].set(OVERFLOWING_MOMENTUM) for p in (along.p_s, along.p_f))
     states = State(along.t, along.q_s, along.q_f, p_s, p_f)
     options = {"macro_dt": macro_dt, "num_steps": num_steps, "save_every": num_steps, "solver": solver}
     batch = simulate_batch(problem.system, scheme, states, **options, warn=False)

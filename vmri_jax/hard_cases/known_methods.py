@@ -1,4 +1,4 @@
-"""Known methods, written out in numpy, that schemes with one micro step reduce to."""
+"""Known methods, written in NumPy, to which schemes with one micro step reduce."""
 
 from collections.abc import Callable
 
@@ -14,14 +14,16 @@ from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.study.program import joined
 
 ROUND_OFF = 4 * np.finfo(float).eps
-"""Of a position, of its size, in a step."""
+"""Round-off of a position in a step, as a part of the largest position; a larger value hides differences of momenta."""
 
 
 class Flat:
-    """A problem with slow and fast variables joined, as functions of q that return numpy arrays.
+    """A problem with slow and fast variables joined, as functions of q that return arrays of NumPy.
 
-    q, p: the start. mass, inverse_mass: (n, n). force, slope: ``-grad U`` and its derivative, U the sum of all potentials. rows, jacobian: of
-    the constraints.
+    q, p: (n,) start.
+    mass, inverse_mass: (n, n).
+    force, slope: ``-grad U`` and its derivative, with the sum U of all potentials.
+    rows, jacobian: values and Jacobian of the constraints.
     """
 
     def __init__(self, problem: Problem):
@@ -43,12 +45,13 @@ class Flat:
 
 
 def _compiled(function) -> Callable[[np.ndarray], np.ndarray]:
+    """The function of q, compiled, with results in NumPy."""
     compiled = jax.jit(function)
     return lambda q: np.asarray(compiled(q))
 
 
 def midpoint_integrator(flat: Flat, h: float, q, p):
-    """``p = M (q+ - q)/h - h/2 F(qm)``, ``p+ = M (q+ - q)/h + h/2 F(qm)``, qm the midpoint."""
+    """``p = M (q+ - q)/h - h/2 F(qm)`` by Newton's iteration, ``p+ = M (q+ - q)/h + h/2 F(qm)``, qm the midpoint."""
     new = q + h * flat.inverse_mass @ p
     for _ in range(8):
         middle = (q + new) / 2

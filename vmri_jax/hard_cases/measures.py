@@ -1,4 +1,4 @@
-"""What the cases measure: energy band and drift, constraints, iterations, conditioning, reversal."""
+"""Measurements of the cases: energy band and drift, constraints, iterations, reversal."""
 
 import warnings
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ from vmri_jax.running.trajectory import Trajectory
 from vmri_jax.steppers.results import Result
 from vmri_jax.study.program import joined
 
-SAVED = 10_000
-"""About as many nodes of a long run are kept."""
+SAVED_NODES = 10_000
+"""Approximate number of saved nodes of a long run; a larger value takes more memory."""
 
 
 def run(problem: Problem, scheme, macro_dt, num_steps: int, state: State | None = None, **options: Any) -> Trajectory:
-    """`vmri_jax.running.simulate`, by default from the problem's start; a failure is in the trajectory and not raised."""
+    """`vmri_jax.simulate` from a state, by default the start of the problem; a failure is in the trajectory and not raised."""
     start = problem.state() if state is None else state
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LostEnergyWarning)  # the cases measure it
@@ -30,8 +30,8 @@ def run(problem: Problem, scheme, macro_dt, num_steps: int, state: State | None 
 
 
 def long_run(problem: Problem, scheme, macro_dt, num_steps: int, **options) -> Trajectory:
-    """`run` that saves about `SAVED` nodes."""
-    return run(problem, scheme, macro_dt, num_steps, save_every=max(1, num_steps // SAVED), **options)
+    """`run` that saves about `SAVED_NODES` nodes."""
+    return run(problem, scheme, macro_dt, num_steps, save_every=max(1, num_steps // SAVED_NODES), **options)
 
 
 def status(trajectory: Trajectory) -> str:
@@ -47,7 +47,7 @@ def iterations(trajectory: Trajectory) -> int:
 
 @dataclass(frozen=True)
 class Energy:
-    """Energy of a run against its start.
+    """Change of the energy of a run since its start.
 
     band: largest deviation from the start.
     jump: largest change from one saved node to the next.
@@ -128,7 +128,7 @@ def difference(a, b) -> float:
 
 
 def reversal(problem: Problem, scheme, macro_dt, num_steps: int) -> float:
-    """Distance from the start after `num_steps` there and, with momenta turned around, as many back."""
+    """Distance from the start after `num_steps` steps forward and, with reversed momenta, `num_steps` steps back."""
     there = run(problem, scheme, macro_dt, num_steps, save_every=num_steps)
     if not there.success:
         return np.inf

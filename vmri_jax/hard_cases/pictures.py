@@ -7,11 +7,11 @@ from vmri_jax import plots
 from vmri_jax.hard_cases.case import Details
 
 BANDS = 400
-"""Pieces of a run whose least and largest error are drawn."""
+"""Pieces of a run for which least and largest error are drawn, about a pixel wide; more pieces make larger files."""
 
 
 def draw_energy(details: Details, theme: plots.Theme) -> Figure:
-    """Energy error against time, one curve per run; every curve as the band that it fills."""
+    """Energy error against time, for every run the band between its least and largest error."""
     runs = [name.removeprefix("t") for name in details if name == "t" or name.startswith("t ")]
     with plots.new_figure(7.2, 3.2, "", theme) as figure:
         axes = figure.subplots()

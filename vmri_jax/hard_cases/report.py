@@ -1,4 +1,4 @@
-"""Running cases, and what came out: a table, files, pictures."""
+"""Running the cases, and the report: a table, files, pictures."""
 
 import time
 from collections.abc import Collection, Sequence
@@ -22,7 +22,7 @@ VERDICTS = {True: ("pass", "green"), False: ("fail", "red"), None: ("does not ap
 
 @dataclass(frozen=True)
 class Row:
-    """A case that was run: what came out, and how long it took."""
+    """A case that was run, with its outcome and its seconds."""
 
     case: Case
     outcome: Outcome
@@ -62,7 +62,7 @@ class Report(ResultTable):
         return not any(row.missed for row in self.rows)
 
     def records(self) -> list[dict[str, Any]]:
-        """Everything but the arrays."""
+        """All fields of every row but the arrays for its picture."""
         return [
             {
                 "number": row.case.number,
@@ -94,12 +94,12 @@ class Report(ResultTable):
         return rich_table((NUMBER, TITLE, CRITERION, MEASURED, VERDICT, SECONDS), self.rows, ruled=True)
 
     def pictures(self, theme: plots.Theme = plots.LIGHT) -> dict:
-        """Figures by title of the case, of the cases that have one."""
+        """Figures by the title of the case, for all cases with a picture."""
         drawn = [(row.case.title, row.case.draw, row.outcome.details) for row in self.rows]
         return {title: draw(details, theme) for title, draw, details in drawn if draw is not None and details}
 
     def write(self, folder: str | Path) -> list[Path]:
-        """Write cases.md, cases.csv, cases.json and the pictures into a folder, which is made; returns what was written."""
+        """Write cases.md, cases.csv, cases.json and the pictures into a folder, made if it does not exist; returns their paths."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "cases.md").write_text(self.markdown(), encoding="utf-8")
@@ -133,17 +133,18 @@ def check(
 def run_cases(
     cases: Sequence[Case], numbers: Collection[int] = (), full: bool = False, progress: ShowsProgress = False
 ) -> Report:
-    """Run cases one after the other; one that raises is a failed row with the reason.
+    """Run cases one after the other; a case that raises becomes a failed row with the message of its exception.
 
     Args:
         cases: e.g. ``cases_for(problem)``.
-        numbers: which of them; all by default.
-        full: the full form instead of the quick one.
-        progress: True for a bar, or a function that is told before every case and at the end; else a line tells the case, where it takes more than two seconds.
+        numbers: numbers of the cases to run; all cases by default.
+        full: whether to run the full form instead of the quick one.
+        progress: True for a bar, or a function of (what, done, total), called before every case and at the end; with False a case that takes
+            more than two seconds prints a line.
 
     Raises:
         ValueError: a number that no case has.
-        Interrupted: Ctrl-C; carries the report of the cases that were done.
+        Interrupted: Ctrl-C; carries the report of the finished cases.
     """
     known = [case.number for case in cases]
     unknown = sorted(set(numbers) - set(known))
@@ -168,5 +169,5 @@ def _outcome(case: Case, full: bool) -> Outcome:
         return Outcome(case.does_not_apply, None)
     try:
         return case.run(full)
-    except Exception as error:  # whatever it is, the other cases are worth having
+    except Exception as error:  # the user's functions may raise anything, and the other cases still run
         return Outcome(f"raised {type(error).__name__}: {error}", False)

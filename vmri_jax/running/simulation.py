@@ -355,10 +355,9 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Newton | No
     )  # scenes only: `opened` returns problems as they are
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
-    solver = solver or solvers.Auto()
-    solver, scheme, system = of_one_type((solver, scheme, system))
+    chosen_solver, scheme, system = of_one_type((solver or solvers.Auto(), scheme, system))
     state, macro_dt, names = State(*_arrays(state)), _float(macro_dt), names_of(problem)
-    return Simulation(system, scheme, solver, state, macro_dt, num_steps, save_every, steps.save_micro, names)
+    return Simulation(system, scheme, chosen_solver, state, macro_dt, num_steps, save_every, steps.save_micro, names)
 
 
 def _arrays(state: State) -> tuple:

@@ -1,4 +1,4 @@
-"""Advice before a long run: is a step stable at this state, what is wrong where it is not, and which step is."""
+"""Advice before a long run: is a macro step stable at this state, why is it not, and which step is stable."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,31 +20,35 @@ from vmri_jax.stability.multipliers import multipliers
 from vmri_jax.stability.oscillator import fast_limit, kick_limit, phase, slow_limit
 from vmri_jax.study.table import Column, ResultTable
 
-SCAN = (0.5, 1.25)
-"""Macro steps that are looked at, in units of the one in question; further ones if none of them is safe."""
-TURN = 0.15
-"""Spacing of these in turns of the fastest vibration, in radians."""
+SCANNED_STEPS = (0.5, 1.25)
+"""Least and largest macro step of the first scan, in units of the step in question; a wider scan takes longer."""
+RADIANS_PER_POINT = 0.15
+"""Spacing of the scanned macro steps: the angle by which the fastest vibration turns more from one to the next. With a larger value two
+multipliers may pass each other twice between points, which hides a window."""
 POINTS = (48, 384)
-"""The fewest and the most of them."""
+"""Fewest and most points of a scan; more points take longer."""
 RESOLUTION = 1e-5
-"""Ends of windows are found to this part of the scan."""
-NEAR = 0.05
-"""Distance of a window of unstable steps, as a part of the step, up to which it counts as near: frequencies move along a trajectory."""
-WIDTHS = 3.0
-"""Distance of a window, in its widths, up to which it counts as near: width and motion of a window both grow with the coupling."""
-BEYOND = 0.01
-"""Part by which the step is longer in which causes are looked for: V and W together reach a limit before each alone."""
-SCANS = 5
-"""Scans downwards, each over smaller steps, until there is a safe one."""
+"""Accuracy of the ends of windows, as a part of the scan; narrower windows are left out."""
+NEAR_STEP = 0.05
+"""Largest distance of a near window of unstable steps, as a part of the step: along a trajectory frequencies change, and windows move. A larger
+value warns of more windows."""
+NEAR_WIDTHS = 3.0
+"""Largest distance of a near window, in its widths: width and displacement of a window both grow with the coupling. A larger value warns of
+more windows. A window is near if it is within both distances."""
+LONGER_FOR_CAUSE = 0.01
+"""Part by which the step is lengthened to find the cause: V and W together become unstable at a slightly shorter step than each alone. A larger
+value may blame a limit that is not yet reached."""
+MOST_SCANS = 5
+"""Most scans, each over smaller steps than the previous one, until one of them contains a safe step."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to know before a run.
+    """One result of `advise`.
 
-    severity: "error" where the step is unstable, "warning" where it may be or where something is set up badly, "note".
+    severity: "error" if the step is unstable, "warning" if an unstable step is near or slow and fast are swapped, or "note".
     kind: "impulse resonance", "combination resonance", "stability limit", "labels", "stages" or "motion".
-    sentence: what it is, for people.
+    sentence: the result in words.
     number: its measure: growth per step of an error, relative distance of a window, ratio of frequencies, longest
         stage, growth rate.
     """
@@ -57,15 +61,15 @@ class Finding:
 
 @dataclass(frozen=True)
 class Advice(ResultTable):
-    """What `advise` found.
+    """Result of `advise`.
 
     macro_dt: the step in question.
-    growth: measured growth of disturbances per macro step, 0 where stable.
-    findings: the worst first.
+    growth: measured growth of disturbances per macro step, 0 if the step is stable.
+    findings: results in words, the most severe first.
     windows: unstable intervals of macro_dt in the range `scanned`.
-    safe_macro_dt: the nearest step without an error or a window near it, macro_dt itself if that is one; NaN if none
-        was found.
-    fast_frequencies, slow_frequencies: (d,) of the fast and the slow potential at the state, the largest first.
+    scanned: least and largest macro step of all scans.
+    safe_macro_dt: the stable step nearest to macro_dt without a near window, macro_dt itself if it is such a step; NaN if no scan has one.
+    fast_frequencies, slow_frequencies: (d,) frequencies of the fast and of the slow potential at the state, the largest first.
     """
 
     columns = (
@@ -89,7 +93,7 @@ class Advice(ResultTable):
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """Whether the step is stable, and the nearest safe step, in a sentence."""
         if self.safe_macro_dt == self.macro_dt:
             return f"macro_dt = {self.macro_dt:.6g} is stable for small motions about this state."
         state = "unstable" if self.growth else "close to an instability"
@@ -136,27 +140,28 @@ def advise(
 ) -> Advice:
     """Judge a macro step before a long run, from the multipliers of the step of small motions about the state.
 
-    Everything called unstable was measured: the derivative of the step of the frozen problem (see `small_motions`) has
+    Instability is always measured: the derivative of the step of the frozen problem (see `small_motions`) has
     a multiplier outside the unit circle, at macro_dt or in a window of steps near it. Formulas only name the cause:
 
-    * stability limit: the step is unstable for the fast or the slow potential alone; ``omega h`` or ``omega H`` is beyond
-      what its rule bears (2 for kicks at the ends);
-    * impulse resonance: slow potential on the macro grid, two vibrations (or one twice) that turn together by a
-      multiple of 2 pi per macro step, as the micro steps turn them (midpoint rule: 2 atan(omega h / 2) each);
-    * combination resonance: the same with V on the micro grid, through the slow path that is one polynomial per macro step;
+    * stability limit: the step is unstable for the fast or the slow potential alone; ``omega h`` or ``omega H`` exceeds
+      the limit of its quadrature rule (2 for kicks at the ends);
+    * impulse resonance: the slow potential is on the macro grid, and the phases of two vibrations (or twice the phase of one) add up to a
+      multiple of 2 pi per macro step, counted as the micro steps turn them (midpoint rule: 2 atan(omega h / 2) per micro step);
+    * combination resonance: the same with V on the micro grid, where the slow path, one polynomial per macro step, couples the vibrations;
     * labels: the fastest vibration is one of the slow variables;
-    * stages, motion (notes): a composition with steps backwards; a state that is unstable by itself.
+    * stages, motion (notes): a composition with backward steps; a state that is itself unstable.
 
-    One compilation and some hundred eigenvalue problems. Motions are small here. Large ones, as of a hot molecule, change
-    frequencies along their way and meet resonances that no state shows: ask at several states of a run, and look at the energy of a long one.
+    It takes one compilation and some hundred eigenvalue problems. All motions are small here. Large motions, such as in a hot molecule,
+    change the frequencies along a trajectory and meet resonances that a single state does not show: call `advise` at several states of a
+    run, and plot the energy of a long run.
 
     Args:
-        system, scheme, state, macro_dt: of the run; without a state it is judged at the start of the problem or scene.
+        system, scheme, state, macro_dt: as of the run; state None for the start of the problem or scene.
         tolerance: growth per macro step above which a step is unstable.
 
     Raises:
         ValueError: a macro step that is not positive; second derivatives that are not finite at the state.
-        TypeError: not a scheme.
+        TypeError: scheme is not a scheme.
     """
     names = names_of(system)
     system, state = start_of("advise", system, state)
@@ -165,35 +170,35 @@ def advise(
     if not (np.ndim(macro_dt) == 0 and np.isfinite(macro_dt) and macro_dt > 0):
         raise ValueError(f"advise: macro_dt is {macro_dt}; it must be a positive number.")
     macro_dt, motions = float(macro_dt), small_motions(system, state)
-    lower, upper = SCAN[0] * macro_dt, SCAN[1] * macro_dt
+    lower, upper = SCANNED_STEPS[0] * macro_dt, SCANNED_STEPS[1] * macro_dt
     windows = _scan(motions, scheme, lower, upper, macro_dt, tolerance)
     radius = float(multipliers(motions, scheme, [macro_dt]).radius[0])
     growth = radius - 1 if radius > 1 + tolerance else 0.0
 
-    of_step = list(_of_step(motions, scheme, macro_dt, growth, windows))
+    step_findings = list(_step_findings(motions, scheme, macro_dt, growth, windows))
     safe = macro_dt
-    for _ in range(SCANS if of_step else 0):
+    for _ in range(MOST_SCANS if step_findings else 0):
         safe = _nearest_safe(macro_dt, windows, lower, upper)
         if not np.isnan(safe):
             break
         upper, lower = lower, lower / 3
         windows = _scan(motions, scheme, lower, upper, upper, tolerance) + windows
 
-    findings = [*of_step, *_labels(motions, names), *_stages(scheme), *_motion(motions)]
+    findings = [*step_findings, *_labels(motions, names), *_stages(scheme), *_motion(motions)]
     return Advice(
         macro_dt=macro_dt,
         growth=growth,
         findings=tuple(sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))),
         windows=tuple(windows),
-        scanned=(lower, SCAN[1] * macro_dt),
+        scanned=(lower, SCANNED_STEPS[1] * macro_dt),
         safe_macro_dt=safe,
         fast_frequencies=motions.fast_frequencies,
         slow_frequencies=motions.slow_frequencies,
     )
 
 
-def _of_step(motions: SmallMotions, scheme, macro_dt: float, growth: float, windows) -> Iterator[Finding]:
-    """An error where the step is unstable, else a warning for every window near it."""
+def _step_findings(motions: SmallMotions, scheme, macro_dt: float, growth: float, windows) -> Iterator[Finding]:
+    """An error if the step is unstable, else a warning for every near window."""
     if growth:
         kind, cause = _cause(motions, scheme, macro_dt)
         tenfold = max(1, round(np.log(10) / np.log1p(growth)))
@@ -208,20 +213,21 @@ def _of_step(motions: SmallMotions, scheme, macro_dt: float, growth: float, wind
             yield Finding("warning", kind, f"{where} There: {cause}", distance)
 
 
-def _scan(motions: SmallMotions, scheme, lower: float, upper: float, through: float, tolerance: float) -> list[Window]:
-    """Unstable windows of macro steps between lower and upper."""
+def _scan(motions: SmallMotions, scheme, lower: float, upper: float, point: float, tolerance: float) -> list[Window]:
+    """Unstable windows of macro steps between lower and upper, measured on a grid that contains `point`."""
     turn = motions.modes[0].max(initial=0.0) * (upper - lower)
-    grid = np.linspace(lower, upper, int(np.clip(turn / TURN, *POINTS)))
-    return measure(motions, scheme, np.union1d(grid, [through]), tolerance, RESOLUTION)[1]
+    grid = np.linspace(lower, upper, int(np.clip(turn / RADIANS_PER_POINT, *POINTS)))
+    return measure(motions, scheme, np.union1d(grid, [point]), tolerance, RESOLUTION)[1]
 
 
 def _margin(a: float, b: float, macro_dt: float) -> float:
-    """How far from a window steps are near it."""
-    return min(NEAR * macro_dt, WIDTHS * (b - a))
+    """Distance from the window (a, b) up to which a step is near it."""
+    return min(NEAR_STEP * macro_dt, NEAR_WIDTHS * (b - a))
 
 
 def _nearest_safe(macro_dt: float, windows, lower: float, upper: float) -> float:
     """The step nearest to macro_dt that is not near a window; NaN if there is none in the range."""
+    # 1.01: the safe step itself must not lie within the margin when it is judged again.
     unsafe = [(a - 1.01 * _margin(a, b, macro_dt), b + 1.01 * _margin(a, b, macro_dt)) for a, b, _ in windows]
     ends = [end for window in unsafe for end in window if lower <= end <= upper]
     free = [end for end in ends if not any(a < end < b for a, b in unsafe)]
@@ -235,38 +241,38 @@ def _cause(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float)
 
 
 def _stability_limit(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> str:
-    """What one of the potentials alone does to the step; empty where it is stable for each of them."""
+    """A sentence about a potential for which alone the step is unstable; empty if there is none."""
     stage = stage_scheme(scheme)
     longest = macro_dt * np.abs(_stage_lengths(scheme)).max()
-    of = " of the longest stage" if isinstance(scheme, Composition) else ""
+    of_stage = " of the longest stage" if isinstance(scheme, Composition) else ""
     micro_dt = longest / stage.num_micro
     cases = [
         ("fast", motions.fast_frequencies, "the micro step", micro_dt, fast_limit(stage)),
         ("slow", motions.slow_frequencies, "the macro step", longest, slow_limit(stage)),
     ]
-    shown = {"fast": "fast", "slow": "slow"}
+    labels = {"fast": "fast", "slow": "slow"}
     for name, _ in motions.system.potentials:
-        shown[f"potential {name}"] = f"further {name}" if name in shown else label(name)
+        labels[f"potential {name}"] = f"further {name}" if name in labels else label(name)
         placed, key = stage.rule_of(name), f"potential {name}"
         span = stage.num_micro if placed.grid == "macro" else placed.every
         step = f"the step of {span} micro intervals"
-        cases.append((key, frequencies_of(motions.others[key]), step, span * micro_dt, kick_limit(placed)))
-    for key, frequencies, of_step, step, limit in cases:
-        alone = multipliers(motions.only(key), scheme, [macro_dt * (1 + BEYOND)])
+        cases.append((key, frequencies_of(motions.further[key]), step, span * micro_dt, kick_limit(placed)))
+    for key, frequencies, step_name, step, limit in cases:
+        alone = multipliers(motions.only(key), scheme, [macro_dt * (1 + LONGER_FOR_CAUSE)])
         if alone.radius[0] > 1 + TOLERANCE:
-            bears = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
+            bound = f"; its quadrature rule is stable below {limit:.4g}" if np.isfinite(limit) else ""
             return (
-                f"The step is unstable for the {shown[key]} potential alone: its frequency {frequencies[0]:.4g} times {of_step}{of} "
-                f"is {frequencies[0] * step:.4g}{bears}."
+                f"The step is unstable for the {labels[key]} potential alone: its frequency {frequencies[0]:.4g} times {step_name}{of_stage} "
+                f"is {frequencies[0] * step:.4g}{bound}."
             )
     return ""
 
 
 def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float) -> tuple[str, str]:
-    """Kind of resonance, and the vibrations with the most energy in the multiplier that grows most."""
-    found = multipliers(motions, scheme, [macro_dt])
-    worst = np.argmax(np.where(found.own[0], 0.0, np.abs(found.values[0])))
-    eta, pi = np.split(found.vectors[0][:, worst], 2)
+    """Kind of resonance, and the vibrations with the most energy in the eigenvector of the largest multiplier."""
+    spectrum = multipliers(motions, scheme, [macro_dt])
+    worst = np.argmax(np.where(spectrum.growing[0], 0.0, np.abs(spectrum.values[0])))
+    eta, pi = np.split(spectrum.vectors[0][:, worst], 2)
     frequencies, modes = motions.modes
     energy = np.abs(modes.T @ eta) ** 2 * frequencies**2 + np.abs(modes.T @ pi) ** 2
     pair = np.argsort(-energy)[:2]
@@ -274,7 +280,7 @@ def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: fl
     kind = "impulse resonance" if stage_scheme(scheme).slow.grid == "macro" else "combination resonance"
     a, b = pair[0], pair[-1]
     turns = [_turn(motions, scheme, macro_dt, i) / np.pi for i in (a, b)]
-    if abs(found.values[0, worst].imag) < 1e-6:
+    if abs(spectrum.values[0, worst].imag) < 1e-6:  # a multiplier at 1 or -1: a vibration that resonates with itself
         return kind, (
             f"The vibration of frequency {frequencies[a]:.4g} turns by {turns[0]:.4g} pi in a macro step, close to a "
             "multiple of pi, and the slow potential feeds it."
@@ -286,7 +292,7 @@ def _resonance(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: fl
 
 
 def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, i) -> float:
-    """Angle by which vibration i turns in a macro step: as the micro steps turn it where W carries it."""
+    """Angle by which vibration i turns in a macro step: the phase of the micro steps if W carries the vibration, else ``omega H``."""
     frequencies, modes = motions.modes
     exact = float(frequencies[i] * macro_dt)
     if modes[:, i] @ motions.fast @ modes[:, i] < frequencies[i] ** 2 / 2:
@@ -298,14 +304,14 @@ def _turn(motions: SmallMotions, scheme: Scheme | Composition, macro_dt: float, 
 
 
 def _labels(motions: SmallMotions, names: Names | None) -> Iterator[Finding]:
-    """Whether slow variables carry faster vibrations than fast ones."""
-    found = swapped(motions, names)
-    if found is not None:
-        yield Finding("warning", "labels", *found)
+    """A warning if slow variables carry the fastest vibrations."""
+    sentence_and_ratio = swapped(motions, names)
+    if sentence_and_ratio is not None:
+        yield Finding("warning", "labels", *sentence_and_ratio)
 
 
 def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
-    """Whether a composition steps backwards."""
+    """A note if a composition has backward steps."""
     parts = _stage_lengths(scheme)
     if (parts > 0).all():
         return
@@ -320,12 +326,12 @@ def _stages(scheme: Scheme | Composition) -> Iterator[Finding]:
 
 
 def _stage_lengths(scheme: Scheme | Composition) -> np.ndarray:
-    """In macro steps."""
+    """Lengths of the stages of a macro step, in macro steps."""
     return np.asarray(scheme.coefficients) if isinstance(scheme, Composition) else np.ones(1)
 
 
 def _motion(motions: SmallMotions) -> Iterator[Finding]:
-    """Whether the state is unstable by itself."""
+    """A note if the state itself is unstable."""
     if not motions.growing.size:
         return
     rate = float(np.real(motions.growing).max())

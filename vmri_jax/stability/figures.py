@@ -11,19 +11,20 @@ from vmri_jax.plots import LIGHT, NotebookFigure, Theme, new_figure, panel_grid
 from vmri_jax.stability.map import StabilityMap
 
 GROWTHS_SHOWN = (1e-6, 1.0)
-"""Growth per step from the faintest to the full colour."""
+"""Growth per step of the faintest and of the full colour."""
 COLUMNS = 3
+"""Most panels in a row."""
 
 
 def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: Theme = LIGHT) -> NotebookFigure:
-    """Unstable regions over ``omega H / pi`` and the rows of each map, one panel per map; colour is the
-    largest growth per step in a window.
+    """Unstable windows over ``omega H / pi`` and the rows of each map, one panel per map.
 
-    Rows are stacked from the bottom: over kappa by its value, schemes in their order.
+    The colour of a window is its largest growth per step. Rows are stacked from the bottom: values of kappa at their heights, schemes in
+    their order.
 
     Args:
         maps: maps by the title of their panel, e.g. one per scheme, each over num_micro or kappa.
-        title: over the figure.
+        title: title above the panels.
         theme: colours.
     """
     columns = min(COLUMNS, len(maps))
@@ -37,7 +38,7 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
             over_kappa = stability.axis == "kappa"
             y = np.array(stability.rows, dtype=float) if over_kappa else np.arange(len(stability.rows))
             edges = _cells(y)
-            for windows, bottom, top in zip(stability.found, edges, edges[1:], strict=False):
+            for windows, bottom, top in zip(stability.unstable, edges, edges[1:], strict=False):
                 shade = colors.to_rgba(np.array([window.growth for window in windows]))
                 spans = [(w.start / np.pi, (w.stop - w.start) / np.pi) for w in windows]
                 axes.broken_barh(spans, (bottom, top - bottom), facecolors=shade, edgecolors=shade, linewidth=0.7)
@@ -56,7 +57,7 @@ def plot_stability(maps: Mapping[str, StabilityMap], title: str = "", theme: The
 
 
 def _cells(centres) -> np.ndarray:
-    """Edges of cells around increasing centres."""
+    """(k + 1,) edges of cells around k increasing centres, halfway between neighbours."""
     if len(centres) == 1:
         return centres[0] + np.array([-0.5, 0.5])
     middle = (centres[1:] + centres[:-1]) / 2

@@ -1,48 +1,50 @@
-"""Are slow and fast variables swapped? The variables that carry the fastest vibration should be the fast ones."""
+"""Check for swapped slow and fast variables: the variables that carry the fastest vibration should be the fast ones."""
 
 import numpy as np
 
 from vmri_jax.mechanics.names import Names
 from vmri_jax.stability.linear import SmallMotions, small_motions
 
-FASTER = 2.0
-"""Ratio of the fastest frequency of slow variables to that of fast ones above which the two are probably swapped."""
+SWAPPED_RATIO = 2.0
+"""Ratio of the highest frequency of slow variables to the highest frequency of fast variables, above which their labels are probably swapped;
+a larger value overlooks more swapped labels."""
 
 
 def swapped(motions: SmallMotions, names: Names | None = None) -> tuple[str, float] | None:
-    """What to do about slow variables that vibrate faster than the fast ones, and how much faster; None if they do not.
+    """Advice if slow variables vibrate faster than fast ones, and the ratio of their highest frequencies; else None.
 
     Args:
         motions: the small motions of a system about a state.
-        names: of its coordinates, where they are known.
+        names: names of its coordinates, or None.
     """
     frequencies, modes = motions.modes
     n_s, n_f, d = motions.rest.q_s.size, motions.rest.q_f.size, len(frequencies)
-    shares = (motions.shapes @ modes) * (motions.embed[n_s + n_f :, d:] @ modes)  # of each coordinate in each mode
+    # Coordinate i has the share u_i (M u)_i of the kinetic energy of the mode u, with u^T M u = 1.
+    shares = (motions.shapes @ modes) * (motions.embed[n_s + n_f :, d:] @ modes)
     slow = shares[:n_s].sum(axis=0) > 0.5
-    fastest, others = frequencies[slow].max(initial=0.0), frequencies[~slow].max(initial=0.0)
-    if not n_f or fastest <= FASTER * others or fastest == 0:
+    slow_highest, fast_highest = frequencies[slow].max(initial=0.0), frequencies[~slow].max(initial=0.0)
+    if not n_f or slow_highest <= SWAPPED_RATIO * fast_highest or slow_highest == 0:
         return None
-    carried = shares[:n_s, frequencies > fastest / FASTER].sum(axis=1)
+    carried = shares[:n_s, frequencies > slow_highest / SWAPPED_RATIO].sum(axis=1)
     labels = (names or Names()).of_coordinates(n_s, n_f).slow_coordinates
     sentence = (
-        f"The fastest vibration, of frequency {fastest:.4g}, is one of the slow variables "
-        f"{', '.join(labels[i] for i in np.flatnonzero(carried > 0.1))}; those of the fast variables reach {others:.4g}. "
+        f"The fastest vibration, of frequency {slow_highest:.4g}, is one of the slow variables "
+        f"{', '.join(labels[i] for i in np.flatnonzero(carried > 0.1))}; vibrations of the fast variables reach {fast_highest:.4g}. "
         "Swap the labels: make these variables fast and put their energy into fast_potential, and the soft ones slow."
     )
-    return sentence, float(fastest / others) if others else np.inf
+    return sentence, float(slow_highest / fast_highest) if fast_highest else np.inf
 
 
 def swapped_at_start(trajectory) -> str:
-    """The sentence of `swapped` about the first node of a run that failed; empty where there is nothing to say.
+    """The sentence of `swapped` about the first node of a failed run; empty if its labels are right.
 
     Args:
-        trajectory: it knows its system.
+        trajectory: a run that knows its system; for any other the result is empty.
     """
     if not trajectory.states.q_s.shape[-1] or not trajectory.states.q_f.shape[-1]:
         return ""  # nothing to swap: small motions of all coordinates would take seconds to compile
     try:
-        found = swapped(small_motions(trajectory.origin.system(), trajectory[0]), trajectory.names)
-    except (ValueError, TypeError, IndexError):  # nothing to expand: there is a better message about that
+        advice = swapped(small_motions(trajectory.origin.system(), trajectory[0]), trajectory.names)
+    except (ValueError, TypeError, IndexError):  # no expansion at the start: the error of the run says more about it
         return ""
-    return found[0] if found else ""
+    return advice[0] if advice else ""

@@ -1,8 +1,8 @@
-"""Linear models: the one of two oscillators, and the small motions of any system about a configuration.
+"""Linear models: two coupled oscillators, and the small motions of any system about a configuration.
 
-The stability of a step is that of its derivative. At an equilibrium it is exactly the step of the system's second-order
-expansion there; elsewhere the expansion stands for the *frozen* problem: the configuration held at rest by constant
-forces. Either way it is a `System` like any other, so that every scheme applies to it unchanged.
+A step is stable if its derivative is. At an equilibrium the derivative of the step is exactly the step of the second-order
+expansion of the system; elsewhere the expansion describes the *frozen* problem: constant forces hold the configuration at rest.
+In both cases the expansion is a `System`, to which every scheme applies unchanged.
 """
 
 from dataclasses import dataclass, field, replace
@@ -18,8 +18,9 @@ from vmri_jax.mechanics.invariants import potential_energy, velocity
 from vmri_jax.mechanics.state import Movable, Problem, State, start_of
 from vmri_jax.mechanics.system import ConstantMass, System
 
-GROWING = 1e-6
-"""Growth rates below this part of the fastest rate are round-off of motions that do not grow."""
+LEAST_GROWTH = 1e-6
+"""Growth rate up to which a motion does not grow, as a part of the largest rate: round-off of the eigenvalues. A larger value takes slowly
+growing motions for instabilities of the step."""
 
 
 def soft_spring(q_s, q_f, params):
@@ -59,11 +60,13 @@ class SmallMotions:
 
     system: the expansion to second order; its equilibrium is zero, its `params` are the coefficients.
     shapes: N, (n_s + n_f, d).
-    embed, read: (2 n, 2 d) from (eta, pi) to (q_s, q_f, p_s, p_f), and (2 d, 2 n) back.
-    slow, fast, stiffness: (d, d) Hessians of V with its own share of the constraint forces, of W, and of all together.
-    others: Hessians of further potentials, by "potential " and their name.
+    embed, read: matrices (2 n, 2 d) from (eta, pi) to (q_s, q_f, p_s, p_f), and (2 d, 2 n) back.
+    slow: (d, d) Hessian of V with its share of the constraint forces.
+    fast: (d, d) Hessian of W.
+    stiffness: (d, d) Hessian of all potentials and constraint forces.
     damping: (d, d) matrix of the velocities, gyroscopic and dissipative.
-    rest: the state zero of the expansion.
+    rest: the state of zero displacement and momentum of the expansion.
+    further: (d, d) Hessians of further potentials, by "potential " and their name.
     """
 
     system: System
@@ -75,18 +78,19 @@ class SmallMotions:
     stiffness: np.ndarray
     damping: np.ndarray
     rest: State
-    others: dict[str, np.ndarray] = field(default_factory=dict)
+    further: dict[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def rates(self) -> np.ndarray:
         """(2 d,) rates s of the motions ``exp(s t)``: imaginary for vibrations."""
-        zero, one = np.zeros_like(self.stiffness), np.eye(len(self.stiffness))
-        return np.linalg.eigvals(np.block([[zero, one], [-self.stiffness, -self.damping]]))
+        # eta' = v, v' = -K eta - D v
+        zero, identity = np.zeros_like(self.stiffness), np.eye(len(self.stiffness))
+        return np.linalg.eigvals(np.block([[zero, identity], [-self.stiffness, -self.damping]]))
 
     @property
     def growing(self) -> np.ndarray:
-        """The rates of motions that grow by themselves, whatever the scheme."""
-        return self.rates[np.real(self.rates) > GROWING * np.abs(self.rates).max(initial=0.0)]
+        """The rates of motions of the system that grow, whatever the scheme."""
+        return self.rates[np.real(self.rates) > LEAST_GROWTH * np.abs(self.rates).max(initial=0.0)]
 
     @property
     def slow_frequencies(self) -> np.ndarray:
@@ -95,7 +99,7 @@ class SmallMotions:
 
     @property
     def fast_frequencies(self) -> np.ndarray:
-        """(d,) frequencies of the fast potential alone, the largest first: what a micro step must resolve."""
+        """(d,) frequencies of the fast potential alone, the largest first, which micro steps must resolve; zero where it is not convex."""
         return frequencies_of(self.fast)
 
     @cached_property
@@ -106,38 +110,38 @@ class SmallMotions:
 
     @property
     def omega(self) -> float:
-        """The fastest frequency of W alone; where W has none, of everything."""
+        """The largest frequency of W alone; if W has none, the largest rate of all motions."""
         fast = self.fast_frequencies.max(initial=0.0)
         return float(fast if fast > 0 else np.abs(self.rates).max(initial=0.0))
 
     def only(self, name: str) -> "SmallMotions":
-        """The same with one potential alone: "slow" (V), "fast" (W), or one of `others`."""
-        left = {"slow": self.slow, "fast": self.fast, **self.others}
-        removed = [key for key in left if key != name]
-        none = {key: jax.tree.map(np.zeros_like, self.system.params[key]) for key in removed}
-        stiffness = self.stiffness - sum(left[key] for key in removed)
-        left |= {key: np.zeros_like(left[key]) for key in removed}
-        system = self.system.replace(params=self.system.params | none)
-        slow, fast = left.pop("slow"), left.pop("fast")
-        return replace(self, system=system, stiffness=stiffness, slow=slow, fast=fast, others=left)
+        """The small motions under one potential alone: "slow" (V), "fast" (W), or a key of `further`."""
+        hessians = {"slow": self.slow, "fast": self.fast, **self.further}
+        removed = [key for key in hessians if key != name]
+        zeros = {key: jax.tree.map(np.zeros_like, self.system.params[key]) for key in removed}
+        stiffness = self.stiffness - sum(hessians[key] for key in removed)
+        hessians |= {key: np.zeros_like(hessians[key]) for key in removed}
+        system = self.system.replace(params=self.system.params | zeros)
+        slow, fast = hessians.pop("slow"), hessians.pop("fast")
+        return replace(self, system=system, stiffness=stiffness, slow=slow, fast=fast, further=hessians)
 
 
 def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
     """Second-order expansion of a system about the configuration of a state, held at rest there.
 
-    Every term is expanded for itself, ``V(q + d) ~ d^T V'' d / 2`` and so on, and keeps its place in the scheme. Constraints
-    are ``G d + d^T g'' d / 2``, and their forces ``lambda`` (those of the moving state, so that a swinging rod is under
-    tension) act through ``lambda . g''``. V pulls at the constraints with its own share of lambda, a constant force on the
-    micro grid with the rest; at an equilibrium that is what the terms do. The kinetic energy is expanded at rest, forces
-    at the velocity of the state.
+    Every term is expanded separately, ``V(q + d) ~ d^T V'' d / 2`` and so on, and keeps its quadrature rule in the scheme. Constraints
+    become ``G d + d^T g'' d / 2``. Their multipliers ``lambda`` are taken from the moving state, so that a swinging rod is under tension,
+    and act through ``lambda . g''``. V balances its share of the constraint forces by a gradient in the expanded V, on the grid of V; a
+    constant force on the micro grid balances all other constraint forces. At an equilibrium this reproduces the original terms. The
+    kinetic energy is expanded at rest, forces at the velocity of the state.
 
     Args:
-        system: any; its potentials, constraints, kinetic energy and forces must have second derivatives there.
-        state: where, None for the start of the problem; its velocity enters through lambda and through the derivatives of the force.
+        system: a system, problem or scene whose potentials, constraints, kinetic energy and forces have second derivatives at the state.
+        state: point of expansion, None for the start of the problem; its velocity enters through lambda and the derivatives of the force.
 
     Raises:
-        TypeError: what cannot be simulated, or a System without a state.
-        ValueError: derivatives that are not finite there, constraints that leave no motion.
+        TypeError: `system` is none of the three, or a System without a state.
+        ValueError: derivatives that are not finite at the state; constraints that leave no motion.
     """
     system, state = start_of("small_motions", system, state)
     terms = {name: np.asarray(value) for name, value in _expansion(system, state).items()}
@@ -151,36 +155,39 @@ def small_motions(system: Movable, state: State | None = None) -> SmallMotions:
     n = len(terms["slow_gradient"])
     mass, coupling = terms["kinetic"][n:, n:], terms["kinetic"][n:, :n]
     shapes = _shapes(mass, terms["jacobian"])
-    multiplier, of_slow = _multipliers_at_rest(terms, mass)
-    bent, bent_by_slow = (np.tensordot(x, terms["curvature"], 1) for x in (multiplier, of_slow))
+    multiplier, slow_multiplier = _multipliers_at_rest(terms, mass)
+    # lambda . g'', the stiffness of the constraint forces
+    bending, slow_bending = (np.tensordot(x, terms["curvature"], 1) for x in (multiplier, slow_multiplier))
 
     def reduced(matrix):
         return shapes.T @ matrix @ shapes
 
-    others = {name: terms[name] for name, _ in _others(system)}
-    potentials = sum((terms["slow"], terms["fast"], *others.values()))
+    further = {name: terms[name] for name, _ in _further_potentials(system)}
+    potentials = sum((terms["slow"], terms["fast"], *further.values()))
     gyroscopic = reduced(coupling)
     zero = np.zeros_like(shapes)
     return SmallMotions(
-        system=_expanded_system(system, state, terms, multiplier, of_slow),
+        system=_expanded_system(system, state, terms, multiplier, slow_multiplier),
         shapes=shapes,
         embed=np.block([[shapes, zero], [coupling @ shapes - mass @ shapes @ gyroscopic, mass @ shapes]]),
         read=np.block([[shapes.T @ mass, zero.T], [zero.T, shapes.T]]),
-        slow=reduced(terms["slow"] + bent_by_slow),
+        slow=reduced(terms["slow"] + slow_bending),
         fast=reduced(terms["fast"]),
-        stiffness=reduced(potentials + bent - terms["kinetic"][:n, :n] - terms["force_q"]),
+        stiffness=reduced(potentials + bending - terms["kinetic"][:n, :n] - terms["force_q"]),
         damping=gyroscopic - gyroscopic.T - reduced(terms["force_v"]),
         rest=State(jnp.asarray(state.t, dtype=float), *np.split(np.zeros(2 * n), phase_splits(state))),
-        others={name: reduced(hessian) for name, hessian in others.items()},
+        further={name: reduced(hessian) for name, hessian in further.items()},
     )
 
 
 def _shapes(mass: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """N (n, d) with ``N^T M N = 1`` and ``G N = 0``."""
+    """N (n, d) with ``N^T M N = 1`` and ``G N = 0``: a basis T of the null space of G, divided by the Cholesky factor of ``T^T M T``."""
     tangents = np.eye(len(mass))
     if len(jacobian):
         _, sizes, rows = np.linalg.svd(jacobian)
-        tangents = rows[np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :].T
+        tangents = rows[
+            np.count_nonzero(sizes > 1e-10 * sizes.max(initial=0.0)) :
+        ].T  # dependent constraints count once
     if not tangents.shape[1]:
         raise ValueError(
             f"small_motions: the {len(jacobian)} constraints leave none of the {len(mass)} coordinates free; nothing moves."
@@ -189,7 +196,10 @@ def _shapes(mass: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
 
 
 def _multipliers_at_rest(terms: dict, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Multipliers lambda of the constraint forces ``-G^T lambda``, and the share of the slow potential in them."""
+    """Multipliers of the constraint forces ``-G^T lambda``, and the share of the slow potential in them.
+
+    ``lambda = (G M^-1 G^T)^+ (G M^-1 f + v^T g'' v)`` with the other forces f; the share of V has ``f = -dV/dq`` alone.
+    """
     G = terms["jacobian"]
     weighted = G @ np.linalg.inv(mass)
     gram = np.linalg.pinv(weighted @ G.T, rcond=1e-12, hermitian=True)
@@ -197,42 +207,43 @@ def _multipliers_at_rest(terms: dict, mass: np.ndarray) -> tuple[np.ndarray, np.
     return multiplier, -gram @ (weighted @ terms["slow_gradient"])
 
 
-def _expanded_system(system: System, state: State, terms: dict, multiplier, of_slow) -> System:
-    """The terms of a system as quadratic functions of the displacement; a term that is absent stays so."""
+def _expanded_system(system: System, state: State, terms: dict, multiplier, slow_multiplier) -> System:
+    """The terms of a system as quadratic functions of the displacement; absent terms stay absent."""
     n_s, n_g = state.q_s.size, system.num_constraints(state.q_s, state.q_f)[0]
     G, curvature = terms["jacobian"], terms["curvature"]
-    rest = G.T @ (multiplier - of_slow)
-    held = np.abs(rest).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
+    constant_force = G.T @ (multiplier - slow_multiplier)  # balances the constraint forces that V does not
+    has_constant_force = np.abs(constant_force).max(initial=0.0) > 1e-12 * np.abs(G.T @ multiplier).max(initial=0.0)
     return System(
         system.kinetic if system.has_constant_mass else _kinetic,
         None if system.slow_potential is None else _slow_potential,
         None if system.fast_potential is None else _fast_potential,
         None if system.constraint is None else _constraint,
         None if system.slow_constraint is None else _slow_constraint,
-        _force if held or terms["force_q"].any() or terms["force_v"].any() else None,
+        _force if has_constant_force or terms["force_q"].any() or terms["force_v"].any() else None,
         params={
             "kinetic": terms["kinetic"],
-            "slow": (-G.T @ of_slow, terms["slow"]),
+            "slow": (-G.T @ slow_multiplier, terms["slow"]),
             "fast": terms["fast"][n_s:, n_s:],
             "constraint": (G[:n_g], curvature[:n_g]),
             "slow_constraint": (G[n_g:, :n_s], curvature[n_g:, :n_s, :n_s]),
-            "force": (rest, terms["force_q"], terms["force_v"]),
-            **{name: terms[name] for name, _ in _others(system)},
+            "force": (constant_force, terms["force_q"], terms["force_v"]),
+            **{name: terms[name] for name, _ in _further_potentials(system)},
         },
-        potentials=[(name, _OtherPotential(f"potential {name}")) for name, _ in system.potentials],
+        potentials=[(name, _FurtherPotential(f"potential {name}")) for name, _ in system.potentials],
     )
 
 
-def _others(system: System):
-    """The further potentials, with the names that they have among the terms."""
+def _further_potentials(system: System):
+    """The further potentials, with their keys among the terms."""
     return [(f"potential {name}", function) for name, function in system.potentials]
 
 
 @partial(jax.jit, compiler_options=QUICK)
 def _expansion(system: System, state: State) -> dict:
-    """Derivatives of every term by the positions (n,), slow first, and velocities.
+    """Derivatives of every term with respect to the positions (n,), slow first, and the velocities.
 
-    impetus: forces without those of the constraints. centripetal: ``v^T g'' v``, the acceleration of g at constant v.
+    Among them "impetus": ``dT/dq - d/dt(dT/dv) - dU/dq + F``, all forces but the constraint forces, at constant v; and "centripetal":
+    ``v^T g'' v``, the second time derivative of g at constant v.
     """
     n_s = state.q_s.size
     q = jnp.concatenate([state.q_s, state.q_f])
@@ -263,7 +274,8 @@ def _expansion(system: System, state: State) -> dict:
         return jnp.concatenate(system.forces(state.t, q[:n_s], q[n_s:], v[:n_s], v[n_s:]))
 
     z = jnp.concatenate([q, v])
-    slope, turn = jax.jvp(jax.grad(kinetic), (z,), (jnp.concatenate([v, jnp.zeros_like(v)]),))
+    # The gradient (dT/dq, dT/dv) and its rate of change along q' = v, v' = 0.
+    gradient, rate = jax.jvp(jax.grad(kinetic), (z,), (jnp.concatenate([v, jnp.zeros_like(v)]),))
     force_q, force_v = jax.jacfwd(force, argnums=(0, 1))(q, v)
     return {
         "kinetic": jax.hessian(kinetic)(z.at[q.size :].set(0.0)),
@@ -275,8 +287,11 @@ def _expansion(system: System, state: State) -> dict:
         "centripetal": jax.jacfwd(jax.jacfwd(constraints_in_motion))(0.0),
         "force_q": force_q,
         "force_v": force_v,
-        "impetus": slope[: q.size] - turn[q.size :] - jax.grad(energy)(q) + force(q, v),
-        **{name: jax.hessian(lambda q, f=f: f(q[:n_s], q[n_s:], system.params))(q) for name, f in _others(system)},
+        "impetus": gradient[: q.size] - rate[q.size :] - jax.grad(energy)(q) + force(q, v),
+        **{
+            name: jax.hessian(lambda q, f=f: f(q[:n_s], q[n_s:], system.params))(q)
+            for name, f in _further_potentials(system)
+        },
     }
 
 
@@ -296,8 +311,8 @@ def _fast_potential(q_f, params):
 
 
 @dataclass(frozen=True)
-class _OtherPotential:
-    """A further potential; its Hessian has this name in the params."""
+class _FurtherPotential:
+    """A further potential ``q^T H q / 2``; `name` is the key of its Hessian H in the params."""
 
     name: str
 

@@ -1,4 +1,4 @@
-"""Stability maps: where a step with a scheme is stable, over ``omega H`` and over schemes or coupling strengths."""
+"""Stability maps: the stable macro steps of a scheme, over ``omega H`` and over schemes or coupling strengths."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -19,15 +19,16 @@ from vmri_jax.stability.windows import find_windows
 from vmri_jax.study.table import Column, ResultTable
 
 TOLERANCE = 1e-6
-"""Growth per step that counts as instability: round-off alone splits two equal multipliers by its square root, up to 2e-8."""
-INSIDE = np.linspace(0.0, 1.0, 9)
-"""Where the growth in a window is measured."""
-EDGE = 1e-7
-"""Ends of windows are refined to this part of the range of omega H; narrower windows are left out."""
+"""Growth per step that counts as instability. Round-off alone splits two equal multipliers by its square root, up to 2e-8; a larger value
+overlooks slow growth."""
+POINTS_IN_WINDOW = np.linspace(0.0, 1.0, 9)
+"""Points of a window at which its growth is measured, in widths from its start."""
+RESOLUTION = 1e-7
+"""Accuracy of the ends of windows, as a part of the range of omega H; narrower windows are left out. A larger value takes less time."""
 
 
 class Window(NamedTuple):
-    """An interval of unstable steps and the largest growth per step seen in it."""
+    """An interval of unstable steps, and the largest growth per step measured in it."""
 
     start: float
     stop: float
@@ -43,26 +44,26 @@ def windows_text(windows: Sequence[Window]) -> str:
 class StabilityMap(ResultTable):
     """Largest multipliers of a macro step over a grid, and the windows of instability.
 
-    axis: "scheme" or "kappa", what the rows are.
-    rows: (m,) their labels.
-    omega: frequency that scales the grid, the fastest one of the fast potential alone.
+    axis: "scheme" or "kappa", the meaning of the rows.
+    rows: (m,) labels of the rows.
+    omega: frequency that scales the grid, the largest frequency of the fast potential alone.
     omega_H: (n,) grid, macro step times omega.
-    radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions that grow by
-        themselves; infinite where the step failed.
-    found: per row, the windows of omega_H in which radius > 1 + tolerance; they may be far narrower than the grid.
-    tolerance: growth per step that counts.
+    radius: (m, n) spectral radius of the derivative of the step, without the multipliers of motions of the system that grow;
+        infinite where the step failed.
+    unstable: the windows of omega_H of each row in which radius > 1 + tolerance; they may be far narrower than the grid.
+    tolerance: growth per step that counts as instability.
     """
 
     columns = (
-        Column("row", lambda shown: str(shown[0])),
-        Column("unstable where omega H / pi is in", lambda shown: windows_text(shown[1])),
+        Column("row", lambda row: str(row[0])),
+        Column("unstable where omega H / pi is in", lambda row: windows_text(row[1])),
     )
     axis: str
     rows: tuple
     omega: float
     omega_H: np.ndarray
     radius: np.ndarray
-    found: tuple[tuple[Window, ...], ...]
+    unstable: tuple[tuple[Window, ...], ...]
     tolerance: float
 
     @property
@@ -78,10 +79,10 @@ class StabilityMap(ResultTable):
     def windows(self, row=None) -> list[Window]:
         """Intervals of omega H that are unstable, for one row (the first by default)."""
         if row is None:
-            return list(self.found[0])
+            return list(self.unstable[0])
         if row not in self.rows:
             raise ValueError(f"windows: there is no row {row!r}; there are {', '.join(map(repr, self.rows))}.")
-        return list(self.found[self.rows.index(row)])
+        return list(self.unstable[self.rows.index(row)])
 
     def first_unstable(self, row=None) -> float:
         """Smallest unstable omega H of one row (the first by default); infinite where there is none on the grid."""
@@ -89,10 +90,10 @@ class StabilityMap(ResultTable):
 
     def shown(self) -> list[tuple[Any, list[Window]]]:
         """The label of every row and its windows."""
-        return list(zip(self.rows, map(list, self.found), strict=True))
+        return list(zip(self.rows, map(list, self.unstable), strict=True))
 
     def records(self) -> list[dict[str, Any]]:
-        """One per row and grid point."""
+        """A record for each row and grid point."""
         return [
             {self.axis: label, "omega_H": float(x), "macro_dt": float(dt), "radius": float(value)}
             for label, radius in zip(self.rows, self.radius, strict=True)
@@ -100,16 +101,16 @@ class StabilityMap(ResultTable):
         ]
 
     def content(self) -> dict[str, Any]:
-        """Everything; `from_json` reads what `to_json` writes."""
+        """All fields, for `to_json`; `from_json` is the inverse."""
         return asdict(self) | {"omega_H": self.omega_H.tolist(), "radius": self.radius.tolist()}
 
     @classmethod
     def from_json(cls, path: str | Path) -> "StabilityMap":
         """A map written by `to_json`."""
         content = json.loads(Path(path).read_text())
-        found = tuple(tuple(Window(*window) for window in row) for row in content.pop("found"))
+        unstable = tuple(tuple(Window(*window) for window in row) for row in content.pop("unstable"))
         arrays = {name: np.array(content.pop(name), dtype=float) for name in ("omega_H", "radius")}
-        return cls(**content | arrays | {"rows": tuple(content["rows"]), "found": found})
+        return cls(**content | arrays | {"rows": tuple(content["rows"]), "unstable": unstable})
 
 
 def stability_map(
@@ -122,23 +123,23 @@ def stability_map(
     tolerance: float = TOLERANCE,
     executor: Any = None,
 ) -> StabilityMap:
-    """Where macro steps of length H are stable: multipliers of the step of small motions about a state.
+    """Stability of macro steps of length H, from the multipliers of the step of small motions about a state.
 
-    At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere those of the frozen problem
-    (see `small_motions`). Windows between grid points are found where multipliers of opposite Krein signature have
-    passed each other, and refined by bisection.
+    At an equilibrium these are the eigenvalues of the derivative of `macro_step`; elsewhere the eigenvalues for the frozen problem
+    (see `small_motions`). Multipliers of opposite Krein signature that have passed each other between two grid points reveal a window there,
+    whose ends are refined by bisection.
 
     Args:
         system: `linear_model()`, any other problem or scene, or a system with a state. The unit of the grid is its omega: the
-            fastest frequency of the fast potential alone, or of everything where that has none.
+            largest frequency of the fast potential alone, or the largest rate of all motions if this potential has no frequency.
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
             windows; multipliers that pass several others from one point to the next hide some.
         kappa: values of ``params["kappa"]`` of the system, one row each, for a single scheme.
-        state: where motions are small; None for the start of the problem.
+        state: point of expansion of the small motions; None for the start of the problem.
         tolerance: growth per macro step above which a step is unstable.
-        executor: where the rows are computed, as of `vmri_jax.ensemble`; None for this process.
+        executor: executor that computes the rows, as of `vmri_jax.ensemble`; None for this process.
 
     Raises:
         TypeError: a system or scheme of the wrong kind.
@@ -167,7 +168,7 @@ def stability_map(
         omega=omega,
         omega_H=grid,
         radius=np.array([radius for radius, _ in measured]),
-        found=tuple(tuple(Window(omega * a, omega * b, g) for a, b, g in windows) for _, windows in measured),
+        unstable=tuple(tuple(Window(omega * a, omega * b, g) for a, b, g in windows) for _, windows in measured),
         tolerance=tolerance,
     )
 
@@ -177,20 +178,21 @@ def measure(
     scheme: Scheme | Composition,
     macro_dt,
     tolerance: float = TOLERANCE,
-    resolution: float = EDGE,
+    resolution: float = RESOLUTION,
 ) -> tuple[np.ndarray, list[Window]]:
-    """Spectral radius (n,) at each of n increasing macro steps, and the unstable windows between first and last."""
+    """Spectral radius (n,) at n increasing macro steps, and the unstable windows between the first and the last of them."""
 
     def label(macro_dt):
         return multipliers(motions, scheme, macro_dt).krein_signatures(tolerance)
 
-    found = multipliers(motions, scheme, macro_dt)
-    edges = find_windows(label, macro_dt, found.krein_signatures(tolerance), resolution * (macro_dt[-1] - macro_dt[0]))
+    spectra = multipliers(motions, scheme, macro_dt)
+    signatures = spectra.krein_signatures(tolerance)
+    edges = find_windows(label, macro_dt, signatures, resolution * (macro_dt[-1] - macro_dt[0]))
     if not edges:
-        return found.radius, []
-    inside = np.array([a + (b - a) * INSIDE for a, b in edges])
+        return spectra.radius, []
+    inside = np.array([a + (b - a) * POINTS_IN_WINDOW for a, b in edges])
     peaks = multipliers(motions, scheme, inside.reshape(-1)).radius.reshape(inside.shape).max(axis=1) - 1
-    return found.radius, [Window(*ends, float(peak)) for ends, peak in zip(edges, peaks, strict=True)]
+    return spectra.radius, [Window(*ends, float(peak)) for ends, peak in zip(edges, peaks, strict=True)]
 
 
 def _grid(omega_H) -> np.ndarray:

@@ -20,13 +20,13 @@ from vmri_jax.steppers.solvers import Newton
 
 @dataclass(frozen=True)
 class Monodromy:
-    """Derivative of the end of a trajectory by its start, between the tangent spaces of the constraint manifold there.
+    """Derivative of the end of a trajectory with respect to its start, between the tangent spaces of the constraint manifold at both.
 
-    matrix: (k, k), k = 2 (n_s + n_f - n_g - n_gs), in the orthonormal bases `start_basis` and `end_basis` (k, 2 n) of
-        tangent vectors (q_s, q_f, p_s, p_f).
+    matrix: M, (k, k) with k = 2 (n_s + n_f - n_g - n_gs), in the orthonormal bases `start_basis` and `end_basis`.
+    start_basis, end_basis: (k, 2 n) tangent vectors (q_s, q_f, p_s, p_f), one per row.
     start, end: states.
-    closure: distance of the end from the start, relative to the larger size of the two.
-    symplectic_defect: largest entry of ``M^T J M - J`` on the tangent spaces, relative to the largest of ``|M|^2``.
+    closure: distance of the end from the start, relative to the larger norm of the two.
+    symplectic_defect: largest entry of ``M^T J M - J`` on the tangent spaces, relative to the larger of 1 and the largest ``|M_ij|^2``.
     """
 
     matrix: np.ndarray
@@ -41,15 +41,15 @@ class Monodromy:
     def multipliers(self) -> np.ndarray:
         """(k,) Floquet multipliers, the largest first.
 
-        They mean what they should where the trajectory closes, or stays near where it began (small `closure`): there
-        both ends share one tangent space.
+        They are meaningful only for a trajectory that closes, or ends near its start (small `closure`): then both ends
+        share a tangent space.
         """
         values = np.linalg.eigvals(self.start_basis @ self.end_basis.T @ self.matrix)
         return values[np.argsort(-np.abs(values), kind="stable")]
 
     @property
     def stretch(self) -> np.ndarray:
-        """(k,) singular values, the largest first: how much disturbances of the start have grown, closed or not."""
+        """(k,) singular values of M, the largest first: the growth of disturbances of the start, for closed and open trajectories."""
         return np.linalg.svd(self.matrix, compute_uv=False)
 
 
@@ -64,16 +64,16 @@ def monodromy(
 ) -> Monodromy:
     """Product of the step's derivatives along a trajectory, ``M = DPhi(z_(N-1)) ... DPhi(z_0)``.
 
-    With constraints, every factor is taken between the tangent spaces of the constraint manifold at its two ends.
+    With constraints, every factor maps between the tangent spaces of the constraint manifold at the two ends of its step.
 
     Args:
         system, scheme, macro_dt, solver: as in `macro_step`.
-        state: start, consistent; None for that of the problem or scene.
+        state: consistent start; None for the start of the problem or scene.
         num_steps: macro steps; one period of a periodic orbit gives its Floquet multipliers.
 
     Raises:
         ValueError: num_steps below 1, a macro step that is not positive.
-        RuntimeError: a step failed; says which and why.
+        RuntimeError: a step failed; with its number and reason.
     """
     system, state = start_of("monodromy", system, state)
     if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer) or num_steps < 1:

@@ -1,9 +1,9 @@
-"""Multipliers of a macro step: the eigenvalues of its derivative, and which of them may meet.
+"""Multipliers of a macro step, the eigenvalues of its derivative, and their Krein signatures.
 
-A symplectic map has its multipliers in pairs (a, 1/a). They stay on the unit circle, and motion bounded, until two of
-opposite Krein signature meet; those of equal signature pass through each other (Krein, Gelfand and Lidskii; Arnold,
-*Mathematical Methods of Classical Mechanics*, 42). So the signatures in the order of the angles change only across a
-meeting, however narrow the instability it leaves.
+The multipliers of a symplectic map come in pairs (a, 1/a). They stay on the unit circle, and the motion stays bounded, until two multipliers
+of opposite Krein signature meet; multipliers of equal signature pass through each other (Krein, Gelfand and Lidskii; Arnold,
+*Mathematical Methods of Classical Mechanics*, 42). Therefore the sequence of the signatures, in the order of the angles, changes only across
+such a meeting, however narrow the unstable window is.
 """
 
 from dataclasses import dataclass
@@ -26,9 +26,10 @@ from vmri_jax.steppers import solvers
 LANES = 64
 """Step sizes that one compiled call does side by side, where the system is small."""
 CONSTRAINED_ITERATIONS = 3
-"""Newton's iterations of a step at rest: kicks towards the constraints make it start elsewhere."""
-AT_ONE = 1e-5
-"""Multipliers closer to 1 belong to free motions, which have no signature."""
+"""Newton iterations of a step at rest with constraints. Without constraints the iteration starts at the solution, and one iteration is enough;
+kicks towards the constraints move its start away from the solution. More iterations take more time."""
+FREE_MOTION_ANGLE = 1e-5
+"""Angle in radians up to which a multiplier belongs to a free motion, which has no signature; a larger value leaves slow vibrations out."""
 
 
 @dataclass(frozen=True)
@@ -37,21 +38,24 @@ class Multipliers:
 
     values: (k, 2 d) eigenvalues of the derivative of the step; NaN where the step itself failed.
     vectors: (k, 2 d, 2 d) eigenvectors in the coordinates of `SmallMotions`, one per column.
-    own: (k, 2 d) whether the multiplier is one of the motion itself, which grows without the scheme's help.
+    growing: (k, 2 d) whether the multiplier belongs to a motion of the system that grows, whatever the scheme.
     """
 
     values: np.ndarray
     vectors: np.ndarray
-    own: np.ndarray
+    growing: np.ndarray
 
     @property
     def radius(self) -> np.ndarray:
-        """(k,) largest modulus of the multipliers that should not grow; infinite where the step failed."""
-        sizes = np.where(self.own, 0.0, np.abs(self.values))
+        """(k,) largest modulus of the multipliers that are not `growing`; infinite where the step failed."""
+        sizes = np.where(self.growing, 0.0, np.abs(self.values))
         return np.where(np.isnan(sizes).any(axis=1), np.inf, sizes.max(axis=1, initial=0.0))
 
     def krein_signatures(self, tolerance: float) -> list[bytes | None]:
-        """Krein signatures along the upper half circle, by angle; None where a multiplier has left the circle outwards."""
+        """Krein signatures along the upper half circle, by angle, for each of the k steps; None for an unstable step.
+
+        The signature of the eigenvector (eta, pi) is the sign of ``Im(conj(eta) . pi)``.
+        """
         d = self.values.shape[1] // 2
         signatures: list[bytes | None] = []
         for values, x, radius in zip(self.values, self.vectors, self.radius, strict=True):
@@ -60,7 +64,7 @@ class Multipliers:
                 continue
             signs = np.sign(np.imag(np.sum(np.conj(x[:d]) * x[d:], axis=0)))
             angles = np.angle(values)
-            upper = np.flatnonzero((angles > AT_ONE) & (np.abs(np.abs(values) - 1) <= tolerance))
+            upper = np.flatnonzero((angles > FREE_MOTION_ANGLE) & (np.abs(np.abs(values) - 1) <= tolerance))
             signatures.append(np.take(signs, upper[np.argsort(angles[upper])]).tobytes())
         return signatures
 
@@ -85,16 +89,17 @@ def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -
     failed = ~np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
     values, vectors = np.linalg.eig(np.where(failed[:, None, None], np.eye(size), matrices))
     values = np.where(failed[:, None], np.nan, values.astype(complex))
-    own = np.zeros(values.shape, dtype=bool)
+    # The multiplier nearest to exp(s H) belongs to the growing motion of rate s.
+    growing = np.zeros(values.shape, dtype=bool)
     for rate in motions.growing:
-        distance = np.where(own, np.inf, np.abs(values - np.exp(rate * macro_dt)[:, None]))
-        own[np.arange(len(own)), np.argmin(distance, axis=1)] = True
-    return Multipliers(values, vectors.astype(complex), own)
+        distance = np.where(growing, np.inf, np.abs(values - np.exp(rate * macro_dt)[:, None]))
+        growing[np.arange(len(growing)), np.argmin(distance, axis=1)] = True
+    return Multipliers(values, vectors.astype(complex), growing)
 
 
 @partial(jax.jit, compiler_options=QUICK)
 def _step_matrices(system: System, scheme, rest: State, embed, read, macro_dt):
-    """(k, 2 d, 2 d) derivatives of the macro step at rest for k lengths of it."""
+    """(k, 2 d, 2 d) derivatives of the macro step at rest, for k lengths of the step."""
     solver = solvers.Arrowhead(fixed_iterations=CONSTRAINED_ITERATIONS if system.is_constrained else 1)
 
     def step(coordinates, macro_dt):

@@ -1,4 +1,4 @@
-"""The test equation ``q'' = -omega^2 q`` under one rule: the phase of a step, and where the rule ceases to be stable.
+"""The test equation ``q'' = -omega^2 q`` under a quadrature rule: the phase of a step, and the stability limit of the rule.
 
 A step of length tau with a path of degree r has the discrete Lagrangian ``q^T S q / (2 tau)`` in the control points,
 ``S = D - x^2 B``, x = omega tau, with D and B the sums of the rules over ``l_i' l_j'`` and ``l_i l_j``. Eliminating the
@@ -6,8 +6,8 @@ control points inside leaves a symmetric 2 x 2 matrix, and the step turns by the
 
     cos(phi) = -(S_00 + S_11) / (2 S_01),          unstable where |cos(phi)| > 1.
 
-Midpoint rule: ``phi = 2 atan(x / 2)``; kicks at the ends (Verlet): ``2 asin(x / 2)``, stable for x < 2. Where kicks are corrected
-x^2 becomes ``x^2 (1 - x^2 / 12)``: stable for x < 2 sqrt(3).
+Midpoint rule: ``phi = 2 atan(x / 2)``; kicks at the ends (Verlet): ``2 asin(x / 2)``, stable for x < 2. Kicks with gradient correction
+(Takahashi and Imada) replace x^2 by ``x^2 (1 - x^2 / 12)``: stable for x < 2 sqrt(3).
 """
 
 import numpy as np
@@ -17,9 +17,9 @@ from vmri_jax.schemes.quadrature import PlacedRule, Rule, midpoint
 from vmri_jax.schemes.scheme import Scheme
 
 RESOLUTION = 0.05
-"""Spacing of x over which the phase is followed."""
-FARTHEST = 30.0
-"""Limits beyond this x are called infinite."""
+"""Spacing of x along which the phase is unwrapped and limits are searched; with a larger value a narrow unstable interval is missed."""
+LARGEST_X = 30.0
+"""Largest x searched for a limit; larger limits count as infinite."""
 
 
 def phase(scheme: Scheme, x: float) -> float:
@@ -29,10 +29,13 @@ def phase(scheme: Scheme, x: float) -> float:
     """
     if not scheme.fast.is_local:
         return np.nan
-    at = np.linspace(0.0, x, 2 + int(abs(x) / RESOLUTION))
-    cosine, direction = _turn(scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.gradient_corrected, at)
+    path = np.linspace(0.0, x, 2 + int(abs(x) / RESOLUTION))
+    cosine, direction = _turn(
+        scheme.degree, scheme.kinetic.rule, scheme.fast.rule, scheme.fast.gradient_corrected, path
+    )
     if abs(cosine[-1]) > 1:
         return np.nan
+    # Unwrapped from x = 0: the cosine alone gives the phase only up to sign and multiples of 2 pi.
     return float(np.sign(x) * np.unwrap(np.arctan2(direction * np.sqrt(np.maximum(1 - cosine**2, 0)), cosine))[-1])
 
 
@@ -46,7 +49,7 @@ def fast_limit(scheme: Scheme) -> float:
 
 
 def kick_limit(placed: PlacedRule) -> float:
-    """The same for a vibration that kicks alone drive, omega times the time from kick to kick; infinite for other rules."""
+    """The smallest unstable ``omega tau`` of a vibration under kicks alone, tau the time from kick to kick; infinite for other rules."""
     return _limit(1, midpoint, placed.rule, False) if placed.only_ends else np.inf
 
 
@@ -57,29 +60,32 @@ def slow_limit(scheme: Scheme) -> float:
 
 
 def _limit(degree: int, kinetic: Rule, potential: Rule, corrected: bool) -> float:
+    """The smallest x at which ``|cos(phi)| > 1``, refined between grid points; infinite if there is none."""
+
     def first_unstable(x):
         unstable = np.flatnonzero(np.abs(_turn(degree, kinetic, potential, corrected, x)[0]) > 1 + 1e-12)
         return unstable[0] if unstable.size else None
 
-    x = np.arange(0.0, FARTHEST, RESOLUTION)
+    x = np.arange(0.0, LARGEST_X, RESOLUTION)
     while x[1] - x[0] > 1e-9:
-        at = first_unstable(x)
-        if at is None:
+        first = first_unstable(x)
+        if first is None:
             return np.inf
-        x = np.linspace(x[at - 1], x[at], 30)
+        x = np.linspace(x[first - 1], x[first], 30)
     return float(x[-1])
 
 
 def _turn(degree: int, kinetic: Rule, potential: Rule, corrected: bool, x):
-    """cos(phi) and the sign of sin(phi), at each x."""
+    """cos(phi) and the sign of sin(phi), at every x."""
     slopes, values = lagrange_derivative(degree, kinetic.nodes), lagrange_basis(degree, potential.nodes)
     D = slopes.T @ (np.asarray(kinetic.weights)[:, None] * slopes)
     B = values.T @ (np.asarray(potential.weights)[:, None] * values)
     squares = np.asarray(x)[:, None, None] ** 2
     S = D - squares * (1 - corrected * squares / 12) * B
+    # Schur complement of the inner control points: S_ee - S_ei S_ii^-1 S_ie, 2 x 2 in the control points at the ends.
     ends, inside = np.ix_([0, -1], [0, -1]), slice(1, -1)
-    across = S[:, inside][:, :, [0, -1]]
-    two = S[:, *ends] - np.swapaxes(across, 1, 2) @ np.linalg.solve(S[:, inside, inside], across)
+    coupling = S[:, inside][:, :, [0, -1]]
+    schur = S[:, *ends] - np.swapaxes(coupling, 1, 2) @ np.linalg.solve(S[:, inside, inside], coupling)
     with np.errstate(divide="ignore", invalid="ignore"):
-        cosine = -(two[:, 0, 0] + two[:, 1, 1]) / (2 * two[:, 0, 1])
-    return cosine, np.sign(-two[:, 0, 1])
+        cosine = -(schur[:, 0, 0] + schur[:, 1, 1]) / (2 * schur[:, 0, 1])
+    return cosine, np.sign(-schur[:, 0, 1])

@@ -1,7 +1,7 @@
-"""The vibrations of a system about a state, and which coordinates carry them: what a macro and a micro step have to resolve.
+"""The vibrations of a system about a state, and the coordinates that carry them, to choose macro and micro steps that resolve them.
 
-Of the small motions of the linearised system, ``M x'' = -K x`` on the tangent space of the constraints, with ``K u = omega^2 M u``
-and ``u^T M u = 1``: coordinate i has the part ``u_i (M u)_i`` of the kinetic energy of the vibration.
+The linearised system is ``M x'' = -K x`` on the tangent space of the constraints. In a vibration u with ``K u = omega^2 M u`` and
+``u^T M u = 1``, coordinate i has the part ``u_i (M u)_i`` of the kinetic energy.
 """
 
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ from vmri_jax.stability.linear import small_motions
 from vmri_jax.study.table import Column, ResultTable
 
 ROWS_SHOWN = 12
-"""Vibrations in the table, the fastest first."""
-NAMED = 3
-"""Coordinates that are named for each vibration."""
+"""Vibrations in the printed table, the fastest first; a larger number makes it longer than a screen."""
+MOST_NAMED = 3
+"""Most coordinates that the table names for a vibration; a larger number makes its lines longer."""
 LEAST_PART = 0.05
-"""Part of the kinetic energy below which a coordinate is not named."""
+"""Least part of the kinetic energy of a coordinate that is named; a larger value names fewer coordinates."""
 
 
 @dataclass(frozen=True)
 class Vibration:
     """One vibration of the linearised system.
 
-    frequency: angular, zero for a motion that does not vibrate.
+    frequency: angular frequency; zero for a motion that does not vibrate.
     period: ``2 pi / frequency``.
     fast_part: part of its kinetic energy in the fast coordinates.
     parts: part of its kinetic energy in each coordinate by name, the largest first.
@@ -39,7 +39,7 @@ class Vibration:
 
 
 def _named(vibration: Vibration) -> str:
-    named = [f"{name} {part:.0%}" for name, part in vibration.parts.items() if part >= LEAST_PART][:NAMED]
+    named = [f"{name} {part:.0%}" for name, part in vibration.parts.items() if part >= LEAST_PART][:MOST_NAMED]
     return ", ".join(named) or "spread over many"
 
 
@@ -47,7 +47,8 @@ def _named(vibration: Vibration) -> str:
 class Vibrations(ResultTable):
     """The vibrations about a state, the fastest first.
 
-    growth_rate: of the motion about the state that grows fastest by itself, ``exp(growth_rate t)``; 0 where none does.
+    rows: all vibrations.
+    growth_rate: largest rate r of a motion of the system that grows like ``exp(r t)``; 0 if none grows.
     """
 
     columns = (
@@ -60,14 +61,14 @@ class Vibrations(ResultTable):
     growth_rate: float
 
     def shown(self) -> tuple[Vibration, ...]:
-        """The fastest ones."""
+        """The rows of the printed table, the fastest vibrations."""
         return self.rows[:ROWS_SHOWN]
 
     @property
     def caption(self) -> str:
-        """How many are left out, and whether the state is unstable."""
-        left = len(self.rows) - ROWS_SHOWN
-        more = f"{left} slower ones are in .rows and .to_csv(path). " if left > 0 else ""
+        """The number of rows that the table leaves out, and whether the state is unstable."""
+        omitted = len(self.rows) - ROWS_SHOWN
+        more = f"{omitted} slower ones are in .rows and .to_csv(path). " if omitted > 0 else ""
         grows = (
             f"Motion about this state grows by itself, like exp({self.growth_rate:.3g} t)." if self.growth_rate else ""
         )
@@ -79,7 +80,7 @@ def vibrations(system: Movable, state: State | None = None) -> Vibrations:
 
     Args:
         system: a problem, a scene, or a system with a state.
-        state: where it is linearised, held there by constant forces; None for the start of the problem.
+        state: point of linearisation, which constant forces hold at rest; None for the start of the problem.
 
     Raises:
         TypeError, ValueError: as of `vmri_jax.stability.small_motions`.
@@ -92,9 +93,8 @@ def vibrations(system: Movable, state: State | None = None) -> Vibrations:
     motions = small_motions(system, state)
     frequencies, modes = motions.modes
     d = motions.shapes.shape[1]
-    energies = (motions.shapes @ modes) * (
-        motions.embed[n_s + n_f :, d:] @ modes
-    )  # u_i (M u)_i, a column for each vibration
+    # u_i (M u)_i, a column for each vibration; `embed` has M times the shapes in its block of momenta.
+    energies = (motions.shapes @ modes) * (motions.embed[n_s + n_f :, d:] @ modes)
     rows = []
     for frequency, parts in zip(frequencies.tolist(), energies.T, strict=True):
         largest = {labels[i]: float(parts[i]) for i in np.argsort(-parts)}

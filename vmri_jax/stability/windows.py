@@ -1,11 +1,12 @@
-"""Intervals of a parameter in which something is unstable, found between samples and refined by bisection."""
+"""Unstable intervals of a parameter, located between samples and refined by bisection."""
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-POINTS = 64
-"""Samples per call."""
+POINTS_PER_CALL = 64
+"""Samples that all brackets together get in a call of `label`, the number that `multipliers` computes at a time for small systems; more samples
+divide brackets faster, and each costs an eigenvalue problem."""
 
 
 def find_windows(
@@ -13,34 +14,36 @@ def find_windows(
 ) -> list[tuple[float, float]]:
     """Unstable intervals of x between its first and last value.
 
-    Neighbouring samples with different labels hold an end of a window between them, or a whole one. Such intervals are
-    divided again and again, all at the same time, until they are shorter than `resolution`; a window shorter than that is
-    left out.
+    Between neighbouring samples with different labels lies an end of a window, or a whole window. All such brackets are
+    divided at the same time, until they are shorter than `resolution`; shorter windows are left out.
 
     Args:
-        label: of an array of samples; None means unstable, anything else is compared.
+        label: function of an array of samples that returns a label for each: None for unstable, else any value to compare.
         x: (k,) increasing samples to start from.
         labels: their labels.
-        resolution: length.
+        resolution: length of a bracket at which its division ends.
     """
-    found = [x[0]] if labels[0] is None else []
+    edges = [x[0]] if labels[0] is None else []
     samples = zip(x, x[1:], labels, labels[1:], strict=False)
-    brackets = [(a, b, at_a, at_b) for a, b, at_a, at_b in samples if at_a != at_b]
+    brackets = [(a, b, label_a, label_b) for a, b, label_a, label_b in samples if label_a != label_b]
     while brackets:
-        between = max(1, POINTS // len(brackets))
-        fractions = np.arange(1, between + 1) / (between + 1)
+        count = max(1, POINTS_PER_CALL // len(brackets))
+        fractions = np.arange(1, count + 1) / (count + 1)
         inner = np.array([a + (b - a) * fractions for a, b, _, _ in brackets])
         inner_labels = iter(label(inner.reshape(-1)))
         divided = []
-        for (a, b, at_a, at_b), points in zip(brackets, inner, strict=True):
+        for (a, b, label_a, label_b), points in zip(brackets, inner, strict=True):
             nodes = [a, *points, b]
-            at = [at_a, *(next(inner_labels) for _ in points), at_b]
-            divided += [piece for piece in zip(nodes, nodes[1:], at, at[1:], strict=False) if piece[2] != piece[3]]
+            node_labels = [label_a, *(next(inner_labels) for _ in points), label_b]
+            pieces = zip(nodes, nodes[1:], node_labels, node_labels[1:], strict=False)
+            divided += [piece for piece in pieces if piece[2] != piece[3]]
         brackets = [piece for piece in divided if piece[1] - piece[0] > resolution]
-        found += [
-            a if at_b is None else b for a, b, at_a, at_b in divided if b - a <= resolution and None in (at_a, at_b)
-        ]
+        # Of a short bracket with an unstable side, the stable end: the window includes the bracket. Two different stable labels hide a
+        # window shorter than the resolution.
+        for a, b, label_a, label_b in divided:
+            if b - a <= resolution and None in (label_a, label_b):
+                edges.append(a if label_b is None else b)
     if labels[-1] is None:
-        found.append(x[-1])
-    found = [float(edge) for edge in sorted(found)]
-    return list(zip(found[::2], found[1::2], strict=True))
+        edges.append(x[-1])
+    edges = [float(edge) for edge in sorted(edges)]
+    return list(zip(edges[::2], edges[1::2], strict=True))
