@@ -126,9 +126,8 @@ def simulate(
     check_memory("simulate", run.state, scheme.num_micro, run.num_saves, save_micro)
     check_function_of_run(of, error, run)
     trajectory = run.in_pieces(progress)
-    if (
-        int(trajectory.failed_at) == 0
-    ):  # a failed first step may be due to a start off the constraints, a clearer message
+    # A first step may fail because the start is off its constraints, which has a clearer message.
+    if int(trajectory.failed_at) == 0:
         check_constraints(run.system, run.state, "simulate: the state")
     if throw and int(trajectory.failed_at) >= 0:
         raise simulation_error(trajectory, run.macro_dt, save_every, scheme.num_micro)

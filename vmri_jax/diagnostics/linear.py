@@ -74,7 +74,7 @@ def frequencies(system: Movable, state: State | None = None):
 
     mass = jax.hessian(lambda v: system.kinetic(q[:n_s], q[n_s:], v[:n_s], v[n_s:], system.params))(v)
     basis = np.asarray(_null_space(jax.jacfwd(lambda q: system.constraints(state.t, q[:n_s], q[n_s:]))(q)))
-    # With M = L L^T the eigenvalues are those of the symmetric matrix L^-1 K L^-T.
+    # With M = L L^T, the squares omega^2 are the eigenvalues of the symmetric matrix L^-1 K L^-T.
     cholesky = np.linalg.cholesky(basis @ np.asarray(mass) @ basis.T)
     stiffness = basis @ np.asarray(jax.hessian(potential)(q)) @ basis.T
     return frequencies_of(np.linalg.solve(cholesky, np.linalg.solve(cholesky, stiffness).T))

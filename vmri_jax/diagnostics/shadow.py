@@ -155,9 +155,8 @@ def _actions(system: System, scheme: Scheme | Composition, nodes: State, macro_d
 
         (reached, action), results = jax.lax.scan(stage, (start, jnp.zeros(())), parts)
         q, q_end, q_start = (jnp.concatenate([s.q_s, s.q_f]) for s in (reached, end, start))
-        length = jnp.max(jnp.abs(q_end - q_start)) + 1e-9 * jnp.max(
-            jnp.abs(q_end)
-        )  # positive for a system at rest, too
+        # Positive for a system at rest, too.
+        length = jnp.max(jnp.abs(q_end - q_start)) + 1e-9 * jnp.max(jnp.abs(q_end))
         return action, jnp.max(jnp.abs(q - q_end)) / length, jnp.max(results)
 
     starts, ends = (jax.tree.map(lambda a, part=part: a[part], nodes) for part in (slice(-1), slice(1, None)))

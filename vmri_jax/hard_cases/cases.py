@@ -44,7 +44,7 @@ LONGER_RUN = 8
 drift goes on; a larger factor tells the two apart more safely and takes longer."""
 DRIFT_RATIO = 0.75
 """Rate of the trend in the longer run, as a part of the rate in the first run, above which the trend is a drift; a larger value overlooks
-drifts that slow dcases."""
+drifts that slow down."""
 ROUND_OFF_BAND = 1e-9
 """Relative band of the energy up to which it is round-off; a larger value overlooks small drifts."""
 SHADOW_STEPS = 2_000

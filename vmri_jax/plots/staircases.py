@@ -26,7 +26,7 @@ class Step(Protocol):
 
 
 class Marked(NamedTuple):
-    """A run that gets a mark of its own.
+    """A run with a separate mark.
 
     label: name in the legend.
     seconds: computing time.

@@ -171,9 +171,8 @@ def legend_below(figure: Figure, size: float = 9.0) -> None:
     if not curves:
         return
     width, height = figure.get_size_inches()
-    column = (
-        size / 72 * (4 + 0.56 * max(map(len, curves)))
-    )  # the line before the name, and the mean width of its letters
+    # Inches of a column: 4 letters for the line before the name, and 0.56 of the size for a letter of the name.
+    column = size / 72 * (4 + 0.56 * max(map(len, curves)))
     columns = max(1, min(len(curves), int(width / column)))
     rows = math.ceil(len(curves) / columns)
     figure.set_size_inches(width, height + 0.1 + 1.35 * size / 72 * rows)
@@ -206,9 +205,8 @@ def log_ticks(axis: Axis, values: Sequence[float] | np.ndarray) -> None:
         axis: an axis of a panel with or without curves.
         values: numbers drawn along the axis.
     """
-    if (
-        axis.get_scale() != "log"
-    ):  # a panel without curves is still linear, and logarithmic ticks refuse its limits 0 and 1
+    # A panel without curves is still linear, and logarithmic ticks refuse its limits 0 and 1.
+    if axis.get_scale() != "log":
         (axis.axes.set_xscale if axis is axis.axes.xaxis else axis.axes.set_yscale)("log")
     finite = [value for value in values if np.isfinite(value) and value > 0]
     axis.set_minor_formatter(NullFormatter())

@@ -212,7 +212,8 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_no
                 state, info, memory = back.step(state, memory, -macro_dt)
                 state, memory = back.project(state, memory)
                 state = _where_solved(info.result, state)
-            by_micro = jnp.where(number == 0, interval.by_micro, 0.0)  # micro nodes are those of the last step
+            # Only the last step of the interval saves micro nodes.
+            by_micro = jnp.where(number == 0, interval.by_micro, 0.0)
             by_real_of_step, by_state, by_dt_of_step = jax.vjp(step, real, state, macro_dt)[1]((by_state, by_micro))
             return (state, memory), *_plus((by_real,), (by_real_of_step,)), by_state, by_dt + by_dt_of_step
 

@@ -154,9 +154,8 @@ class Exports(Quantities):
             "fast": names.fast_coordinates,
             "level": ["position", "velocity"],
         }
-        if lanes and np.any(
-            rows["t"] != rows["t"][0]
-        ):  # each lane has its own macro step: node numbers replace the times
+        # Each lane has its own macro step: node numbers replace the times.
+        if lanes and np.any(rows["t"] != rows["t"][0]):
             coordinates["t"] = ("t", np.arange(rows["t"].shape[1]))
             data["time"] = (("lane", "t"), rows["t"])
         return xarray.Dataset(data, coords=coordinates, attrs=attributes(run))

@@ -45,9 +45,8 @@ def lost_energy(run: Trajectory, macro_dt: float) -> str:
     energy = np.asarray(run.energy)
     change = np.abs(energy - energy[0])
     worst = int(change.argmax())
-    if (
-        not change[worst] > ROUNDOFF_OF_ENERGY * np.abs(energy).max()
-    ):  # the usual case ends here, without kinetic energies
+    # The usual case ends here, without kinetic energies.
+    if not change[worst] > ROUNDOFF_OF_ENERGY * np.abs(energy).max():
         return ""
     nodes = np.unique(np.append(np.linspace(0, len(energy) - 1, NODES_CHECKED).astype(int), worst))
     slow = _kinetic(system.kinetic.slow_mass, np.asarray(run.states.p_s)[nodes])

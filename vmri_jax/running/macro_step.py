@@ -1,4 +1,4 @@
-"""One macro step on its own."""
+"""A single macro step, without a run."""
 
 import jax
 

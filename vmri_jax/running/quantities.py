@@ -129,9 +129,8 @@ class Quantities(ABC):
         """
         run = self.whole()
         names = run.names
-        if (
-            names.kinematics is not None and body in names.rigid
-        ):  # the coordinate p of a root includes all bodies that it carries
+        # The coordinate p of a root includes all bodies that it carries.
+        if names.kinematics is not None and body in names.rigid:
             return _part(at_nodes(_body_momenta, run.origin, run.states, names.kinematics), names.place_of(body))
         return _of_body(run, body, _body_momenta, run.states.p_s, run.states.p_f)
 

@@ -6,7 +6,7 @@
 | ``run.in_pieces()``, ``run.advance(...)`` | `Engine.piece`, one program for runs of all lengths | `simulate`, `stream` |
 | `vmri_jax.running.traced` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
 
-*Exact matrices* are those of the solver `solvers.Arrowhead` with the settings of the user's solver, the fallback of "auto".
+*Exact matrices* are the matrices of the solver `solvers.Arrowhead` with the settings of the user's solver, the fallback of "auto".
 """
 
 import warnings
@@ -350,9 +350,8 @@ def simulation(moving: Movable, scheme, state: State | None, solver: Newton | No
     problem = opened(moving)
     system, state = start_of("simulate", problem, state)
     macro_dt, num_steps, save_every = check_run(system, scheme, state, solver, steps)
-    advice = (
-        nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
-    )  # scenes only: `opened` returns problems as they are
+    # Scenes only: `opened` returns problems as they are.
+    advice = nothing_fast(scheme, state.q_f.size) if moving is not problem else ""
     if advice:
         warnings.warn(f"simulate: {advice}", stacklevel=3)
     chosen_solver, scheme, system = of_one_type((solver or solvers.Auto(), scheme, system))

@@ -1,6 +1,6 @@
 """Runs under transformations of JAX: the whole run is one function of arrays.
 
-*Exact matrices* are those of the solver `solvers.Arrowhead` with the settings of the user's solver, the fallback of "auto".
+*Exact matrices* are the matrices of the solver `solvers.Arrowhead` with the settings of the user's solver, the fallback of "auto".
 """
 
 from collections.abc import Callable

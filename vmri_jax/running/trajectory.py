@@ -101,7 +101,7 @@ class Trajectory(Exports):
     result: Int[Numbers, ""]
     failed_at: Int[Numbers, ""]
     micro: MicroNodes | None = None
-    error: RunError = None  # pyright: ignore[reportAssignmentType] as `micro` None unless asked for
+    error: RunError = None  # pyright: ignore[reportAssignmentType] None in most runs, and users need no check for None
     origin: Origin = UNKNOWN
 
     def __repr__(self) -> str:

@@ -135,7 +135,7 @@ def stability_map(
         scheme: a scheme or composition, or several by label, e.g. ``{n: explicit_slow(n) for n in (2, 3, 5)}``; each
             num_micro and structure is compiled once.
         omega_H: (n,) increasing positive values of omega times the macro step. A spacing of 0.1 or less finds narrow
-            windows; multipliers that pass several others from one point to the next hide some.
+            windows; with a larger one a multiplier may pass several multipliers between two points, which hides windows.
         kappa: values of ``params["kappa"]`` of the system, one row each, for a single scheme.
         state: point of expansion of the small motions; None for the start of the problem.
         tolerance: growth per macro step above which a step is unstable.

@@ -70,7 +70,7 @@ class Multipliers:
 
 
 def multipliers(motions: SmallMotions, scheme: Scheme | Composition, macro_dt) -> Multipliers:
-    """Multipliers of one macro step of the given lengths (k,).
+    """Multipliers of a macro step for k lengths of the step.
 
     The derivative of the step is exact, ``jax.jacfwd(macro_step)`` of the expansion at rest on the tangent space of the
     constraint manifold.

@@ -258,7 +258,7 @@ def test_another_system_is_not_resumed(run, uninterrupted, out):
     with pytest.raises(ValueError, match=r"state.q_s: \[.*\] here, \[.*\] in the store"):
         run(uninterrupted.path, resume=True, state=moved)
     run(out, num_steps=PER_CHUNK, system=system.replace(fast_potential=same_name(2)))
-    with pytest.raises(ValueError, match=r"differs: operations of fast_potential: digest \w+ here, digest \w+ in"):
+    with pytest.raises(ValueError, match=r"Differences: operations of fast_potential: digest \w+ here, digest \w+ in"):
         run(out, num_steps=PER_CHUNK, resume=True, system=system.replace(fast_potential=same_name(4)))
 
 

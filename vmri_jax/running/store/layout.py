@@ -71,7 +71,7 @@ class Record(NamedTuple):
         """The checkpoint, with the tree structure of `like`, any checkpoint of the same run.
 
         Raises:
-            ValueError: the arrays are not those of this structure.
+            ValueError: the arrays do not fit the structure.
         """
         expected, structure = jax.tree.flatten((like.state, like.memory))
         if [(leaf.shape, leaf.dtype) for leaf in self.leaves] != [(leaf.shape, leaf.dtype) for leaf in expected]:
@@ -121,9 +121,8 @@ class Writer:
             self._arrays[name][first : last + 1] = value[1 if saved else 0 :]
             chunks = range(first // self._chunk, last // self._chunk + 1)
             files += [_chunk_file(self._path / name, value.ndim, k) for k in chunks]
-        synchronize_files(
-            files
-        )  # at the end: while the system writes the first file, it writes most of the others, too
+        # At the end: while the system writes the first file, it writes most of the others, too.
+        synchronize_files(files)
 
     def _make(self, values: dict[str, np.ndarray]) -> list[Path]:
         """Make all arrays; returns all files of the store."""
