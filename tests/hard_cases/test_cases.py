@@ -147,7 +147,7 @@ def test_steps_come_from_the_frequencies():
     ("make", "title", "words"),
     [
         (wrong_gradient, "derivatives", "the gradient of fast_potential from differences of its values differs by 0.3"),
-        (no_potential, "derivatives", "Forces that no potential has belong into force"),
+        (no_potential, "derivatives", "Forces without a potential belong into force"),
         (swapped_labels, "advice", "is one of the slow variables q_s[0]"),
     ],
 )
