@@ -24,7 +24,8 @@ from vmri_jax.stability.linear import SmallMotions
 from vmri_jax.steppers import solvers
 
 LANES = 64
-"""Step sizes that one compiled call does side by side, where the system is small."""
+"""Step sizes that a compiled call computes side by side for up to 18 degrees of freedom; larger systems get fewer, at least 4, to limit memory. With
+more lanes a call for a single step size, which is padded to this number, takes longer."""
 CONSTRAINED_ITERATIONS = 3
 """Newton iterations of a step at rest with constraints. Without constraints the iteration starts at the solution, and one iteration is enough;
 kicks towards the constraints move its start away from the solution. More iterations take more time."""
