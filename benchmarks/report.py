@@ -16,7 +16,7 @@ from rich.table import Table
 from benchmarks.measure import Ratio, Tell, machine
 from vmri_jax import plots
 from vmri_jax.running.printed import OutputConsole
-from vmri_jax.running.progress import SECONDS
+from vmri_jax.running.progress import SECONDS_BETWEEN_LINES
 
 console = OutputConsole()
 
@@ -150,7 +150,7 @@ def progress(title: str) -> Iterator[Tell]:
     def tell(part: str) -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last >= SECONDS:
+        if now - last >= SECONDS_BETWEEN_LINES:
             last = now
             print(f"{now - begin:5.0f} s  {title}: {part}", file=sys.stderr, flush=True)
 
