@@ -11,7 +11,7 @@ import pytest
 import vmri_jax as vm
 from tests.accuracy.test_run_error import double_pendulum
 from tests.small_systems import SYSTEMS, no_constraint
-from vmri_jax.accuracy import steps
+from vmri_jax.accuracy import steps, trials
 from vmri_jax.accuracy.families import of_order_2
 from vmri_jax.schemes.composition import stage_scheme
 from vmri_jax.stability import linear_model
@@ -169,8 +169,8 @@ def test_wrong_types(arguments, message):
 
 
 def test_chaotic_motion_misses_the_accuracy(monkeypatch):
-    monkeypatch.setattr(steps, "MOST_TRIAL_SECONDS", 0.0)
-    monkeypatch.setattr(steps, "FEWEST_STEPS", 1024)
+    monkeypatch.setattr(trials, "MOST_TRIAL_SECONDS", 0.0)
+    monkeypatch.setattr(trials, "FEWEST_STEPS", 1024)
     with pytest.warns(steps.AccuracyNotReached, match="no error is certified"), pytest.warns(match="chaotic"):
         run = vm.simulate(double_pendulum(), vm.galerkin(1, 3), accuracy=1e-3, t_end=40.0)
     assert run.error.largest == np.inf
