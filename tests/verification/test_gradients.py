@@ -127,3 +127,22 @@ def test_second_derivative(hessian):
     difference = (slopes[0] - slopes[1]) / (2 * step)
     second = jax.jit(hessian(lambda stiffness: function(stiffness, *at[1:])))(at[0])
     assert float(second) == pytest.approx(difference, rel=1e-6)
+
+
+def test_a_third_derivative_is_no_number():
+    """It would be wrong where equations are solved; where nothing is solved it is right."""
+
+    def position(stiffness, scheme):
+        system = CHAIN.system.replace(params={**CHAIN.system.params, "omega": stiffness})
+        return jnp.cos(simulate(system, scheme, CHAIN.state(), macro_dt=0.1, num_steps=2)[-1].q_f[0])
+
+    def second(stiffness, scheme):
+        return jax.grad(jax.grad(position))(stiffness, scheme)
+
+    for scheme in (fully_implicit(2), fully_explicit(2)):
+        third = jax.grad(second)(30.0, scheme)
+        if scheme == fully_implicit(2):
+            assert np.isnan(third)
+        else:
+            difference = central_difference(lambda x, scheme=scheme: second(x, scheme), 30.0, 1e-3)
+            assert float(third) == pytest.approx(difference, rel=1e-6)

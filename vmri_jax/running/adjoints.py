@@ -3,7 +3,8 @@
 The derivative of a step is the derivative of the root of its equations (`vmri_jax.steppers.newton.implicit`). Reverse mode visits
 the steps from the last to the first and needs the state at which each step started. Four adjoints provide this state:
 
-* *stored*: the run keeps the start of every step and the solution of its equations; works in all modes and orders of JAX;
+* *stored*: the run keeps the start of every step and the solution of its equations; works in forward and reverse mode, up to second
+  derivatives; third derivatives are NaN where equations are solved by iteration;
 * *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Recursive`;
 * *reversible*: the step of -H of a symmetric scheme leads back to the start of a step, from one saved node to the node before;
 * *forward*: no start is needed: forward mode computes one tangent run for each number that is differentiated by.

@@ -104,7 +104,7 @@ class SolvedState(NamedTuple):
 
 @dataclass(frozen=True)
 class Solved(Stepper):
-    """A step whose unknowns a solver computes; differentiable in both modes, twice.
+    """A step whose unknowns a solver computes; differentiable in both modes, twice; third derivatives are NaN.
 
     Derivatives follow from the implicit function theorem, ``dx = -(dR/dx)^-1 dR``: iterations are never differentiated.
 

@@ -31,9 +31,18 @@ def _end(equations: StepEquations, x: Unknowns):
     return equations.q_f + x.fast[:, -1].sum(0), *equations.evaluate(x)[1]
 
 
+def _no_third_derivative(residual):
+    """Zero, with the derivative zero, and second derivatives that are not finite: ``sum |r - r_0|^1.5`` at r_0 = r.
+
+    Added to a point with the right first derivative only, it turns third derivatives of the step, which would be wrong, into NaN.
+    """
+    rows, _ = ravel_pytree(residual)
+    return jnp.sum(jnp.abs(rows - jax.lax.stop_gradient(rows)) ** 1.5)
+
+
 @jax.custom_jvp
 def differentiable(equations: StepEquations, x: Unknowns, end):
-    """x and end unchanged, with the derivative of the root in both modes, twice."""
+    """x and end unchanged, with the derivative of the root in both modes, twice; a third derivative is NaN."""
     return x, end
 
 
@@ -44,7 +53,9 @@ def _implicit_derivative(primals, tangents):
     # For second derivatives: a Newton step x - (dR/dx)^-1 R at the root changes nothing, but makes x a function of the equations with the
     # right first derivative. A recursive call of `differentiable` would not do: in reverse mode JAX has replaced it by its first derivative
     # before it takes the second one.
-    x = jax.tree.map(jnp.add, root, direction(equations.residual(root)))
+    residual = equations.residual(root)
+    unknown_beyond = _no_third_derivative(residual)
+    x = jax.tree.map(lambda a, step: a + step + unknown_beyond, root, direction(residual))
     _, change = jax.jvp(lambda e: e.residual(x), (equations,), (tangents[0],))
 
     # dR/dx dx = -dR/de de. `custom_linear_solve` differentiates dx through `product`, that is through dR/dx at x; its own solves take the
