@@ -32,7 +32,7 @@ def chain(links: int = LINKS) -> vm.Problem:
 def test_a_band_takes_the_same_steps(scheme, monkeypatch):
     runs = []
     for few in (LINKS, LINKS - 1):
-        monkeypatch.setattr(constraint_pattern, "FEW", few)
+        monkeypatch.setattr(constraint_pattern, "MOST_ROWS_OF_FULL_MATRIX", few)
         problem = chain()  # of new functions: compiled anew
         rows = constraint_pattern.all_rows(problem.system, problem.q_s, problem.q_f)
         assert isinstance(rows, Full if few == LINKS else Band)
