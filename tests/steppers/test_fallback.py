@@ -36,9 +36,9 @@ def test_a_plan_says_how_a_step_is_solved(fpu):
     rule = micro(quadrature.midpoint)
     inside = Scheme(4, kinetic=rule, slow=macro(quadrature.gauss(2)), fast=rule)
     forced, whole = fpu.system.replace(force=drag), "march over the micro intervals with exact matrices"
-    assert str(plan(fpu, fully_implicit(4))).startswith("nested march")
-    assert "nested march" not in str(plan(fpu, explicit_slow(4)))
-    assert "nested march" in str(plan(forced, explicit_slow(4), fpu.state()))
+    assert str(plan(fpu, fully_implicit(4))).startswith("nested iteration")
+    assert "nested iteration" not in str(plan(fpu, explicit_slow(4)))
+    assert "nested iteration" in str(plan(forced, explicit_slow(4), fpu.state()))
     assert str(plan(fpu, inside)).startswith(whole)
     assert str(plan(double_pendulum(), fully_implicit(3))).startswith(whole)
     with pytest.raises(ValueError, match=r"solvers\.Nested needs a ConstantMass, and potentials"):

@@ -91,7 +91,7 @@ def simulate(
         the step number k, never accumulated.
 
     Raises:
-        ValueError, TypeError: bad arguments, before anything is computed.
+        ValueError, TypeError: bad arguments, before anything is computed; an accuracy larger than the motion, after the first trial runs.
         SimulationError: a step failed.
         Interrupted: Ctrl-C while `progress` is shown; it carries the trajectory computed so far.
     """
@@ -145,7 +145,8 @@ def _end(
     refused += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro + ["adjoint"] * (adjoint != "auto")
     if refused:
         raise ValueError(
-            f"simulate: got {' and '.join(refused)} with an accuracy, from which the steps follow; leave one of them out."
+            f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes; leave them out, or the "
+            "accuracy."
         )
     if t_end is None:
         raise ValueError("simulate: an accuracy needs t_end, the time until which it is to be kept.")

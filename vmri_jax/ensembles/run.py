@@ -61,7 +61,7 @@ class Ensemble:
 
     path: folder of its store.
     chunks: the division of its runs.
-    done: number of failed runs of each chunk in the store.
+    done: the chunks in the store, each with the number of its failed runs.
     failures: error of each chunk that could not be computed.
     seconds: wall time of this call.
     computed: number of runs that this call computed.

@@ -1,6 +1,6 @@
 """Small dense algebra and settings of the steppers: the only place for code that is written for speed alone.
 
-Two modules have the same names: `plain`, the textbook form, and `cpu`, the tuned form. The environment variable VMRI_KERNELS (``plain`` or
+Two modules define the same functions and constants: `plain`, the textbook form, and `cpu`, the tuned form. The environment variable VMRI_KERNELS (``plain`` or
 ``cpu``, the default) chooses one when the package is imported, see `chosen`. `band` inverts matrices with many zeros. `inverse_in_loop`
 comes from `cpu` in both cases.
 """

@@ -28,8 +28,8 @@ kept matrices for constant masses, more in joint coordinates. A smaller ratio ma
 raises their number: 0.1 takes a quarter more passes, in 0.8 of the time for the satellite of the gallery, in 0.9 to 1.0 of it for a double
 pendulum in angles."""
 LARGEST_RENEWED = 16
-"""Most rows of the matrix K of a micro interval that every macro step computes anew; a larger K is kept while the number of passes does not
-rise. With a larger number, macro steps of large systems spend most of their time on K."""
+"""Most rows of the matrix K of a micro interval that every macro step computes anew; a larger K is kept until a step takes
+`EXTRA_PASSES` more passes than the fewest with it (`vmri_jax.steppers.nested`). With a larger number, macro steps of large systems spend most of their time on K."""
 DIAGONAL_MATRICES = True
 """Whether K is one matrix per coordinate where W is a sum over the coordinates."""
 LINEARISES_FORCES = True
@@ -59,7 +59,8 @@ def matvec(a, x):
 def solve(a, b):
     """The x with ``a x = b`` for a (n, n), b (n, m): Gauss-Jordan without pivoting, or LU with it beyond `ELEMENTWISE` rows.
 
-    Without pivoting a must be (close to) symmetric definite: mass matrices, ``G M^-1 G^T`` and their perturbations.
+    Without pivoting the leading blocks of a must be regular: those of mass matrices, of ``G M^-1 G^T``, of saddles in the order (unknowns,
+    multipliers), of the derivatives k_ij of a path, and of matrices that differ little from these.
     """
     n = a.shape[0]
     if n > ELEMENTWISE:

@@ -6,7 +6,8 @@ the steps from the last to the first and needs the state at which each step star
 * *stored*: the run keeps the start of every step and the solution of its equations; works in forward and reverse mode, up to second
   derivatives; third derivatives are NaN where equations are solved by iteration;
 * *checkpoint*: the run keeps the starts of some steps and computes the steps between them again, see `Recursive`;
-* *reversible*: the step of -H of a symmetric scheme leads back to the start of a step, from one saved node to the node before;
+* *reversible*: a step of length -macro_dt of a symmetric scheme undoes the step before it, so that the run is stepped back from each saved
+  node to the one before;
 * *forward*: no start is needed: forward mode computes one tangent run for each number that is differentiated by.
 """
 
@@ -156,7 +157,7 @@ def reversible(run, engine: Engine, save_every: int, arrays) -> Trajectory:
     """``run(arrays)``, whose derivative in reverse mode steps back with -H from saved node to saved node.
 
     Args:
-        run: a run of `engine` from (leaves, start, macro_dt).
+        run: function of `Arrays`, a run of `engine`.
         engine: its `stepper` takes the steps of -H.
         save_every: macro steps from one saved node to the next.
     """

@@ -57,7 +57,7 @@ def simulate_batch(
 
     Lanes are computed side by side (`jax.vmap`), in chunks that fit into the cache. Unlike `simulate`, a failed step never raises: its
     lane is NaN after the step and has its status in ``.result`` and ``.failed_at``; other lanes do not change. A
-    `FailedLanesWarning` says how many lanes failed. Lanes that the nested march does not solve are run again with the exact arrowhead,
+    `FailedLanesWarning` says how many lanes failed. Lanes that the first solver of `Auto` does not solve are run again with `Arrowhead`,
     whose program is compiled at the first such lane.
 
     Args:

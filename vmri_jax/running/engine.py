@@ -27,6 +27,7 @@ from vmri_jax.schemes.composition import Composition
 from vmri_jax.schemes.scheme import Scheme
 from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Result
+from vmri_jax.steppers.solved import CONSTRAINT_OVER_TOLERANCE
 from vmri_jax.steppers.solvers import Newton
 
 
@@ -334,15 +335,14 @@ def _step_of(stepper: Plan, times: _Times, save_micro: bool):
 def _node(system: System, tolerance, cursor: _Cursor) -> tuple[Node, _Cursor]:
     """The saved node, and the status after a check of its energy and constraints.
 
-    Three nodes fail here after steps that succeeded: the energy is NaN although its gradient is finite (a logarithm beyond its pole); a
-    lane of a batch started off its constraints; or the rows of ``system.implied``, redundant constraints that the solver leaves out, are
+    A node can fail here although its steps succeeded, for three reasons: the energy is NaN although its gradient is finite (a logarithm beyond
+    its pole); a lane of a batch started off its constraints; or the rows of ``system.implied``, redundant constraints that the solver leaves out, are
     violated.
     """
     state = cursor.state
     phase = state.q_s, state.q_f, state.p_s, state.p_f
     energy, residual = invariants.energy(system, *phase), invariants.constraint_residual(system, state)
-    # A loose Newton tolerance leaves constraints violated by about as much; 100 times covers constraints of larger units than momenta.
-    allowed = jnp.maximum(CONSTRAINT_TOLERANCE, 100 * tolerance)
+    allowed = jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
     finite, kept = jnp.isfinite(energy), residual[0] <= allowed
     breaks = (cursor.failed_at < 0) & ~(finite & kept)
     violated = Result.CONSTRAINT_VIOLATED

@@ -6,7 +6,8 @@
 | ``run.in_pieces()``, ``run.advance(...)`` | `Engine.piece`, one program for runs of all lengths | `simulate`, `stream` |
 | `vmri_jax.running.traced` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
 
-*Exact matrices* are the matrices of the solver `solvers.Arrowhead` with the settings of the user's solver, the fallback of "auto".
+*The fallback*: with `solvers.Auto` a piece whose first solver fails is computed again by `solvers.Arrowhead`, whose Newton matrices are exact,
+with the same tolerance and most iterations; so are all pieces after it.
 """
 
 import warnings
@@ -98,11 +99,11 @@ class Simulation:
 
         Args:
             state, macro_dt, params: in the shapes of the run; None for the values of the run.
-            num_steps: a multiple of the number of saved intervals, which stays; None for the number of the run.
+            num_steps: macro steps, a multiple of `num_saves`, which stays while `save_every` changes; None for the number of the run.
             throw: raise `SimulationError` if a step fails, as `simulate` does; else return the trajectory, NaN from the failure on.
 
         Raises:
-            ValueError: arrays of other shapes; a function of the system that uses traced numbers which are not in params.
+            ValueError: arrays of other shapes than those of the run.
             SimulationError: a step failed.
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)
@@ -199,7 +200,7 @@ class Simulation:
 
     @cached_property
     def plan(self) -> Plan:
-        """The `Plan` that takes its steps; ``print`` shows it in words."""
+        """The `Plan` with its fallback, which ``print`` shows in words; programs are made of plans without one, see `Engine.stepper`."""
         return plan(self.system, self.scheme, self.state, self.solver)
 
     @cached_property

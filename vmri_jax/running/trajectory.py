@@ -37,7 +37,7 @@ class RunInfo(NamedTuple):
     """Work of the solver from one saved node to the next.
 
     Attributes:
-        method: code of the most expensive method of a step, see `Method`.
+        method: largest code of the methods of the steps, mostly of the most expensive one, see `Method`.
         iterations: most Newton iterations of a step; 0 for explicit steps.
         residual: largest residual after a step: of the equations relative to the momentum, or of the constraints.
     """

@@ -1,6 +1,9 @@
 """The equations of one macro step: stationarity of the augmented discrete action in momentum form.
 
-    A = L_d - sum_j H w_j lambda_j . g(q at node j) - sum_i H w_i nu_i . g_s(S_i)
+    A = L - sum_j H w_j lambda_j . g(q at node j) - sum_i H w_i nu_i . g_s(S_i)
+
+with L the terms of L_d without kicks, and sums over all control nodes but the last: the constraint force at the last node belongs to the
+next step, so that the momenta at the end are off the hidden constraints until they are projected. The equations are
 
     p_s + D_{S_0} A = 0      D_{S_i} A = 0  (0 < i < r)           g_s(S_i) = 0  (i = 1..r)
     p_f + D_{F_0} A = 0      D_{F_j} A = 0  (all but the last)    g = 0 at every micro control node but the first
@@ -9,8 +12,8 @@ Forces add their virtual work ``H sum_i w_i F(t_i, q_i, v_i) . dq_i / dX`` to ev
 of these equations: p_s and p_f are the momenta after the kicks at the start of the step (`vmri_jax.steppers.kicked`).
 
 The momentum equations are multiplied by the micro step h, and the multipliers absorb their weights: the unknowns are
-``mu_j = h H w_j lambda_j`` and ``num_micro h H w_i nu_i``, so that rows and columns of the Newton matrix stay of the size of the
-masses and of the constraint Jacobian for every step size. The w_j are weights on the macro interval: with n = num_micro, the weight of
+``mu_j = h H w_j lambda_j`` and ``num_micro h H w_i nu_i``, so that the Newton matrix consists of
+``k_ij M_f``, ``k_ij M_s / num_micro`` and the constraint Jacobian for every step size, up to ``h^2`` times the curvature of potentials. The w_j are weights on the macro interval: with n = num_micro, the weight of
 the constraint rule over n, summed over both intervals at nodes where two intervals meet (`multiplier_scales`).
 """
 
@@ -163,7 +166,7 @@ def multiplier_scales(scheme: Scheme, macro_dt, before: Number = 0.0):
 
     With the weights w_0..w_r of the constraint rule, and H_before, the factors of g are
 
-        h^2 (w_0 + H_before / H w_r)  at the start of the step      h^2 (w_0 + w_r)  where micro intervals meet      h^2 w_j  inside
+        h^2 (w_0 + (H_before / H) w_r)  at the start of the step      h^2 (w_0 + w_r)  where micro intervals meet      h^2 w_j  inside
 
     Args:
         scheme: its constraint rules.

@@ -302,8 +302,8 @@ def mollified(placed: PlacedRule) -> PlacedRule:
     """The same nodes, with the slow potential at averaged fast positions: ``V(q_s, a(q_s, q_f))``.
 
     The average a is the mean of the fast motion from rest over the macro step (`vmri_jax.steppers.kicked.average_over_fast_motion`). Kicks
-    by V then have the force ``a'(q)^T grad V``. Without the filter a', they excite vibrations with a macro step of a multiple of half
-    their period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
+    by V then have the force ``a'(q)^T grad V``. Without the filter a', kicks resonate with vibrations of frequency omega where ``omega H = k pi``, at macro
+    steps that are multiples of half a period: Garcia-Archilla, Sanz-Serna and Skeel, *Long-time-step methods for oscillatory
     differential equations* (1998), the mollified impulse method with LongAverage.
     """
     if not isinstance(placed, PlacedRule) or placed.grid != "macro" or not placed.only_ends:

@@ -46,9 +46,9 @@ from vmri_jax.schemes.quadrature import (
 class Scheme(eqx.Module):
     """Variational multirate scheme: the degree of the path and the rule of every term.
 
-    Every scheme is symplectic, conserves the momentum maps its discrete Lagrangian inherits, and has order
-    ``min(2 degree, order of its rules)`` (Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991). It is
-    symmetric (time-reversible) exactly when all its rules are.
+    Without forces every scheme is symplectic and conserves the momentum maps its discrete Lagrangian inherits. Its order is ``min(2 degree,
+    order of the rules of energies and forces)`` (Ober-Bloebaum, Wenger, Gail, Leyendecker 2024, arXiv:2406.12991); it is symmetric (time-reversible)
+    exactly when these rules are.
 
     Args:
         num_micro: micro intervals per macro interval.
@@ -143,8 +143,8 @@ class Scheme(eqx.Module):
 
     @property
     def order(self) -> int:
-        """Order of convergence, ``min(2 degree, order of the rules of T and all potentials)``; needs concrete weights."""
-        placed = self.kinetic, self.slow, self.fast, *self.potentials.values()
+        """Order of convergence, ``min(2 degree, order of the rules of T, all potentials and the forces)``; needs concrete weights."""
+        placed = self.kinetic, self.slow, self.fast, self.force, *self.potentials.values()
         return min(2 * self.degree, *(placed.rule.order for placed in placed))
 
     @property

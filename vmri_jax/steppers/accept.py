@@ -29,8 +29,8 @@ ROUNDOFF = 4.0
 """Accepted correction in units of ``eps max |positions|``. With a smaller value steps at round-off would not end; with a larger one the momenta
 would lose digits."""
 ITERATIONS_BEFORE_TIED_ROUNDOFF = 20
-"""Iterations after which also the round-off of variables that constraints tie to these is accepted: constraints carry round-off from slow to fast
-variables and back. A smaller number would solve slow variables at the origin to fewer digits."""
+"""Iterations after which slow variables are also allowed the round-off of the fast ones, and these the round-off of the slow ones: constraints
+carry it from one to the other. With a smaller number slow variables near the origin, whose own round-off is small, would lose digits."""
 FLOOR = 100.0
 """Largest correction, in units of ``eps max |positions|``, that is accepted if corrections no longer shrink: with nearly dependent constraints
 they fluctuate at this size. A larger value would cut off steps that converge slowly."""

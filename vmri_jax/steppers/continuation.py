@@ -27,7 +27,7 @@ from vmri_jax.steppers.stepper import Status
 SHORTEST_PART = 1 / 64
 """Smallest stride, relative to the step. Continuation has failed if it would need a smaller one; a smaller value makes failing runs slower."""
 RANK = 1e-7
-"""Largest singular value of a dependence: constraint gradients of length one are dependent if their smallest singular value is below. A larger
+"""Constraint gradients, scaled to length one, count as dependent if their smallest singular value is below this number. A larger
 value names nearly dependent constraints as the cause of a failed step."""
 
 

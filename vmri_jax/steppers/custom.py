@@ -1,4 +1,4 @@
-"""The whole step of a user's stepper or solver: adds kicks and the projection of momenta if these are missing, and checks its shapes."""
+"""The whole step of a user's stepper or solver: a solver gets the kicks, a stepper without `project` the projection of momenta; shapes are checked."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

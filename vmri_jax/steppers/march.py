@@ -9,7 +9,8 @@ impulses, corrected to first order:
 
     d_m = -(dR_m/dx_m)^-1 R_m        x_m <- x_m + d_m
 
-After the last interval the pass corrects z once by the slow equations R_s = 0, which the impulses of all intervals enter,
+After the last interval the pass computes a correction of z by the slow equations R_s = 0, which the impulses of all intervals enter; the next
+pass starts with it,
 
     d = -S^-1 R_s                    z <- z + d,    x_m <- x_m + (dx_m/dz) d
 

@@ -5,7 +5,7 @@ Newton step on its exact residual, and adds its impulse to the slow equations. T
 multipliers by the residual of the slow equations. All matrices are cheap approximations:
 
 * micro interval: ``[K, -G_0^T; G_1, 0]`` with K of `vmri_jax.steppers.interval`, e.g. ``-(M_f + h^2 W'' / 4)`` for the implicit midpoint
-  rule, at the start of the macro step, or of an earlier one while that costs no passes. Where the fast equations are explicit,
+  rule, at the start of the macro step, or of an earlier one while that costs at most `EXTRA_PASSES`. Where the fast equations are explicit,
   ``K = -M_f`` and only the multipliers are unknown. ``G_1 K^-1 G_0^T`` is computed in the first pass and kept;
 * slow equations: the slow masses, the fast masses that constraints tie to them, and the slow constraint (`SlowEquations`). Without
   constraints, the derivative of the slow forces is added where updates by the masses alone would cost a pass.
@@ -36,7 +36,7 @@ from vmri_jax.steppers.solved import Solution, Solver, largest_constraint, statu
 from vmri_jax.steppers.solvers import Newton
 
 EXTRA_PASSES = 1
-"""Passes above the least seen with a matrix K, from which the solver renews K. A larger number lets steps with an old K take more passes; with
+"""Passes above the fewest with a matrix K that the solver tolerates; it renews K after a step with more. A larger number lets steps with an old K take more passes; with
 zero, every fluctuation of the number of passes renews K."""
 PASSES_OF_UNUSED_MATRIX = 10**6
 """Initial value of the least number of passes with a new matrix: larger than the number of any step."""
@@ -109,7 +109,7 @@ class Nested(Solver):
     def renew(self, equations: StepEquations, memory: NestedState) -> NestedState:
         """The memory with a new matrix K, unless K is constant.
 
-        A large K is kept as long as it costs no passes. With a fixed number of passes K is always new: old matrices converge slower.
+        A large K is kept while it costs at most `EXTRA_PASSES` passes. With a fixed number of passes K is always new: old matrices converge slower.
         """
         if self.interval.is_constant:
             return memory
@@ -150,7 +150,7 @@ class Nested(Solver):
     def describe(self) -> list[str]:
         inside = "the multipliers alone" if self.interval.is_explicit else "fast increments and multipliers"
         return [
-            "nested march: the slow path outside, micro intervals in order inside",
+            "nested iteration: the slow path outside, micro intervals in order inside",
             f"  each interval solves for {inside}, with a matrix {self._matrix_in_words()}",
         ]
 

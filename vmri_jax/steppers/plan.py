@@ -258,7 +258,7 @@ def is_decoupled(system: System, scheme: Scheme, q_s, q_f) -> bool:
     if scheme.degree > 1 or system.force is not None or not system.has_constant_mass:
         return False
     if scheme.num_micro == 1 and not q_s.shape[0]:
-        return False  # this is already a part of a decoupled system
+        return False  # fast variables on one interval: nothing to take apart, as in the parts of a decoupled system
     inside = _Inside.of(system, scheme, q_s, q_f)
     return inside is not None and not depends_on(lambda q: system.g(jnp.zeros(()), q, q_f), q_s)[0]
 

@@ -5,9 +5,11 @@ the fast variables keep it. So a change dx of the slow increments changes the mu
 ``S = (G K^-1 G^T)^-1`` of that interval and G_s the Jacobian of g with respect to the slow variables, and hardly changes the
 multipliers of other intervals. With the slow masses K_s, the matrix of the slow equations is therefore
 
-    K_s + G_s^T S G_s        (Woodbury)   (K_s + G_s^T S G_s)^-1 = (1 - U P) K_s^-1
-    U = K_s^-1 G_s^T         P = (1 + S G_s U)^-1 S G_s
+    K_s + G_0^T S G_1        (Woodbury)   (K_s + G_0^T S G_1)^-1 = (1 - U P) K_s^-1
+    U = K_s^-1 G_0^T         P = (1 + S G_1 U)^-1 S G_1
 
+where G_0 has G_s at the nodes 0..r-1 of that interval, at which its multipliers act, and G_1 at the nodes 1..r, at which its constraints hold:
+both times the slow basis functions there.
 The second term is the inertia of the fast masses that constraints tie to the slow variables.
 
 Without constraints this matrix leaves out the derivative of the slow forces by the slow path. Over a long macro step that derivative
@@ -165,7 +167,9 @@ class SlowEquations(NamedTuple):
 
 
 def minimal_residuals(operator, b):
-    """x with ``A x = b`` for an operator A close to one, to `LEFT_OVER` of b or after `ITERATIONS`.
+    """x with ``A x = b`` for an operator A that is one plus a smooth part, to `LEFT_OVER` of b or after `ITERATIONS`.
+
+    Where the iteration stalls, the x that it has reached only makes the passes of the solver more numerous.
 
     Orthomin(1) (Vinsome 1976; Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20, 1983), with residual r and direction p:
 

@@ -26,7 +26,7 @@ from vmri_jax.steppers.stepper import Status, StepInfo, Stepper, indented
 ROOT = "root"
 """Name of the solution and the status of a step for `jax.checkpoint`: a policy that saves this name lets derivatives reuse the solution."""
 CONSTRAINT_OVER_TOLERANCE = 100
-"""Accepted constraint value over `Newton.tolerance`, where that is above CONSTRAINT_TOLERANCE. The tolerance is relative to the motion, the value
+"""Constraints are kept if ``|g| <= max(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE tolerance)``. The tolerance is relative to the motion, the value
 of a constraint has its own unit: a smaller factor would refuse converged steps of loose tolerances."""
 
 

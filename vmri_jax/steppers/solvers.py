@@ -2,16 +2,17 @@
 
 | solver | Newton matrix | operations per micro step |
 |---|---|---|
-| `Nested` | approximate: slow path outside, micro intervals in order, each with a small matrix of its own | O(1), fewest |
+| `Nested` | approximate: passes over the slow path; in each pass every micro interval takes one Newton step with a small matrix | O(1), fewest |
 | `Arrowhead` | exact, by elimination of the micro intervals in order; kept over passes and steps while corrections shrink | O(1) |
 | `NullSpace` | as `Arrowhead`, in coordinates of the free motions: no multipliers among the unknowns | O(1) |
 | `Dense` | exact, one dense matrix of all unknowns: baseline and reference | O(num_micro^2) |
 
 `Auto` takes `Nested` where every term belongs to single micro intervals (constant masses, potentials on the micro grid or kicks at the macro
-nodes), else `Arrowhead`. If a run does not converge with `Nested`, `Auto` computes it again with `Arrowhead`: a single `vmri_jax.macro_step`
-the step, a run the whole run or the piece of it that failed. ``StepInfo.method`` and ``Trajectory.info.method`` say which solver took a step,
-``print(vm.plan(problem, scheme))`` says it beforehand. `Nested` includes two special cases: a single drift along the constraints between
-kicks (RATTLE), and a single interval of higher degree (``galerkin(1, degree)``), solved for all variables at once in modes of time.
+nodes), else `Arrowhead`. If a run does not converge with `Nested`, `Auto` computes again with `Arrowhead`: `macro_step` the step,
+`prepare` the whole run, a batch the lane, `simulate` and `stream` the piece that failed and all pieces after it. ``StepInfo.method`` and ``Trajectory.info.method`` say which solver took a step,
+``print(vm.plan(problem, scheme))`` says it beforehand. Two special cases have cheaper solvers of their own, also with `Nested`, which ``method`` names: RATTLE for a single
+drift along the constraints between kicks, COLLOCATION for a single interval of higher degree (``galerkin(1, degree)``), solved for all
+variables at once in modes of time. The classes here are settings; the algorithms are each a `vmri_jax.steppers.solved.Solver`.
 
 An iteration ends if its next correction is below a tenth of the tolerance times the motion (of slow variables over the macro step, of
 fast variables over a micro step), or is round-off of the positions: the formula is in `vmri_jax.steppers.accept`.
@@ -131,7 +132,7 @@ class Custom(Newton):
             `vmri_jax.steppers.solved.Solver` for the equations between the kicks; of a composition it gets the scheme of a stage. Define it
             at module level: programs are compiled once per function, and a new function is compiled anew. It is called while JAX traces the
             run, so that runs, batches, files and gradients work as with other solvers.
-        tolerance: constraints are kept if their values are below a hundred times this number, and never refused below 1e-6.
+        tolerance: a saved node fails if the value of a constraint is above ``max(1e-6, 100 tolerance)``.
     """
 
     method = "custom"

@@ -21,7 +21,8 @@ class StepInfo(eqx.Module):
     method: code of the solver, see `Method`; with "auto" ARROWHEAD says that the cheaper solvers are not possible, or did not converge.
     iterations: most Newton iterations or passes of a solve in the step; 0 for explicit steps.
     residual: ``max(|R| / max |p|, max |g|)``, with the residual R of the momentum equations and the constraint values g; 0 for linear
-        equations. Solvers estimate R after their last correction; where only multipliers are unknown it is 0.
+        equations. `Nested` and the march estimate R after their last correction, others evaluate it; where only multipliers
+        are unknown it is 0.
     q_f_micro: fast positions at the micro nodes, the start excluded.
     multiplier, slow_multiplier: Lagrange multipliers at the control nodes; of a composition with s stages those of all stages, s r
         slow ones.
