@@ -39,7 +39,7 @@ def step_matrix(system, scheme, macro_dt):
 
 
 def without_fallback(system, scheme) -> solvers.Newton:
-    """The default iteration; where it is the nested march, without the exact solve behind it, which takes long to compile."""
+    """The default iteration; where it is the nested iteration, without the exact solve behind it, which takes long to compile."""
     scheme = stage_scheme(scheme)
     potentials = (system.slow_potential, scheme.slow), (system.fast_potential, scheme.fast)
     local = all(f is None or placed.grid == "micro" or placed.only_ends for f, placed in potentials)

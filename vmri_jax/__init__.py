@@ -26,7 +26,7 @@ Questions
     fit                                 parameters from measurements
     minimize                            optimal control
 
-Rooms
+Subpackages and modules
     plots, animation                    figures, films and pages
     diagnostics, stability              invariants and defects of a step, maps of stable steps
     study, hard_cases                   convergence, work and precision; cases
@@ -83,7 +83,7 @@ from vmri_jax.steppers.plan import Plan, plan
 from vmri_jax.steppers.results import Method, Result, SimulationError
 from vmri_jax.steppers.stepper import StepInfo
 
-from vmri_jax import systems  # isort: skip  (written with the names above)
+from vmri_jax import systems  # isort: skip  (last: its modules use the names imported above)
 
 try:
     __version__ = version("vmri_jax")

@@ -45,7 +45,7 @@ def test_what_auto_chooses(monkeypatch):
     assert choose(vm.fully_implicit(2), adjoints.LONGEST_STORED_RUN + 1, True) == "checkpoint"
     assert choose(UNSYMMETRIC, adjoints.LONGEST_STORED_RUN + 1, False) == "checkpoint"
     monkeypatch.setattr(adjoints, "LONGEST_STORED_RUN", 5)
-    with pytest.warns(UserWarning, match="6 steps are taken by adjoint='reversible'"):
+    with pytest.warns(UserWarning, match="6 steps use adjoint='reversible'"):
         chosen = simple_gradient("auto")(simple_cost("auto")[1])
     np.testing.assert_allclose(chosen, simple_gradient("stored")(simple_cost("stored")[1]), rtol=1e-11, atol=1e-12)
     monkeypatch.setattr(adjoints, "REPORTED_GAP", 0.0)

@@ -145,7 +145,7 @@ def test_memory_of_long_gradients():
 @pytest.mark.full
 @pytest.mark.parametrize("adjoint", ["checkpoint", "reversible"])
 def test_where_the_march_fails_the_arrowhead_is_differentiated(adjoint):
-    """With steps that the nested march does not solve."""
+    """With steps that the nested iteration does not solve."""
     problem = PROBLEMS["tsp"]()
     found = {}
     for name in ("stored", adjoint):

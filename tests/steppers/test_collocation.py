@@ -165,7 +165,7 @@ def test_few_iterations_at_high_degree(name, bound, request):
     assert run.info.iterations.mean() < bound  # measured 6.7 and 5.0
 
 
-@pytest.mark.full  # as with every first method, see test_fallback
+@pytest.mark.full  # as with every first solver, see test_fallback
 def test_where_it_fails_the_whole_equations_are_asked(tsp):
     start = tsp.state()
     fast = dataclasses.replace(start, p_s=40 * start.p_s, p_f=40 * start.p_f)

@@ -93,7 +93,7 @@ def test_one_correction_where_the_motion_is_smooth(tsp):
     assert np.asarray(info.iterations).mean() < 1.1  # measured 1.0
 
 
-@pytest.mark.full  # as with every first method, see test_fallback
+@pytest.mark.full  # as with every first solver, see test_fallback
 def test_where_it_fails_the_whole_equations_are_asked(tsp):
     """A step so long that the rods cannot follow."""
     start = tsp.state()

@@ -1,4 +1,4 @@
-"""Which solver takes a step: what a plan says, what happens where the nested march does not converge, what is in the program."""
+"""Which solver takes a step: what a plan says, what happens where the nested iteration does not converge, what is in the program."""
 
 import os
 
@@ -95,7 +95,7 @@ def test_the_fallback_stays_out_of_the_loop_in_a_compiled_function(tsp):
 
 
 def test_a_run_that_fails_late_is_made_again_with_exact_matrices(tsp):
-    """At this step the nested march solves seven steps, and not the eighth."""
+    """At this step the nested iteration solves seven steps, and not the eighth."""
     step = {"macro_dt": 0.2, "num_steps": 20, "throw": False}
     march, run, exact = (
         simulate(tsp, fully_implicit(10), solver=solvers.named(method)(max_iterations=40), **step)

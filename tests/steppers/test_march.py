@@ -1,4 +1,4 @@
-"""The nested march: few passes, errors within the tolerance, honest about what it did. Its steps are held to the textbook in
+"""The nested iteration: few passes, errors within the tolerance, honest about what it did. Its steps are held to the textbook in
 `tests/textbook`, and those of the reference problems to trajectories of another program in `tests/verification`."""
 
 import jax

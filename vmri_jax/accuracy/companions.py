@@ -12,7 +12,8 @@ separate them: the first halves H and h, the second halves h alone. With ``r = 2
 
 This is an estimate, not a bound. If the error falls with an order q below p, as for vibrations that the steps do not resolve, the true error
 is ``(1 - 2^-p) / (1 - 2^-q)`` times the estimate: 1.5 times for p = 2 and q = 1. Above order 2 an error also has mixed terms ``H^a h^b``,
-which count in part to both shares. *Certified* is the error of a node up to which every estimate is small against the extent of the motion.
+which count in part to both shares. The error of a node is *certified* if the estimates at this node and at
+all nodes before it are small against the extent of the motion.
 """
 
 import warnings

@@ -108,10 +108,13 @@ def simulate(
         if throw:
             raise simulation_error(trajectory, run.macro_dt, run.save_every, run.scheme.num_micro)
         return trajectory
-    if scheme is None or num_saves is not None:
-        missing = "scheme is None" if scheme is None else f"num_saves is {num_saves}"
+    if scheme is None:
         raise ValueError(
-            f"simulate: {missing} without an accuracy; give accuracy=1e-5 with it, or a scheme and save_every."
+            "simulate: scheme is None without an accuracy; give a scheme, or accuracy=1e-5 to have one chosen."
+        )
+    if num_saves is not None:
+        raise ValueError(
+            f"simulate: num_saves is {num_saves} without an accuracy; give an accuracy, or save_every with a step."
         )
     check_adjoint(adjoint, scheme)
     run = simulation(system, scheme, state, solver, Steps(macro_dt, micro_dt, num_steps, t_end, save_every, save_micro))
@@ -144,6 +147,7 @@ def _end(
     refused = [name for name, value in steps.items() if value is not None]
     refused += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro + ["adjoint"] * (adjoint != "auto")
     if refused:
+        names = " and ".join(refused)
         raise ValueError(
             f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes; leave them out, or the "
             "accuracy."

@@ -161,7 +161,7 @@ class Search:
         Args:
             family, num_micro: the scheme.
             num_steps: least number of macro steps.
-            falls_back: whether exact matrices are tried where the first method fails, see `Simulation`.
+            falls_back: whether the fallback is tried where the first solver fails, see `Simulation`.
         """
         while True:
             run = replace(self.run(family, num_micro, num_steps), may_fall_back=falls_back)

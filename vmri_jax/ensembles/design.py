@@ -1,6 +1,6 @@
 """Designs: the runs of an ensemble. A design is a table with a row for each run; only the rows of a chunk are made at a time.
 
-    Product({"omega": [10, 50], "num_micro": [1, 5]})          all combinations, the last axis varies first
+    Product({"omega": [10, 50], "num_micro": [1, 5]})          all combinations, the last axis varies fastest
     Table({"omega": [10, 50], "v_s[0]": [0.1, 0.2]})           a run for each row: 10 with 0.1, 50 with 0.2
     Draws(1000, {"omega": ("uniform", 10, 50)}, seed=1)        1000 runs with random values
 
@@ -91,7 +91,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Product:
-    """All combinations of the values of some axes. The last axis varies first.
+    """All combinations of the values of some axes. The last axis varies fastest, as in C order.
 
     axes: for each column, values or an `Axis`. Without any axis there is a single run.
 

@@ -46,7 +46,9 @@ class EnsembleError(RuntimeError):
         ellipsis = f" and {len(self.failures) - 5} more" if len(self.failures) > 5 else ""
         all_tried = len(ensemble.done) + len(self.failures) == ensemble.chunks.count
         remainder = (
-            "All others are" if all_tried else f"No chunk could; others were not tried. {len(ensemble.done)} chunks are"
+            "All others are"
+            if all_tried
+            else f"No chunk of this call could, so the others were not tried; {len(ensemble.done)} chunks of earlier calls are"
         )
         super().__init__(
             f"{len(self.failures)} of {ensemble.chunks.count} chunks could not be computed: runs {lanes}{ellipsis}. Chunk {first}: "
@@ -144,7 +146,7 @@ def ensemble(
             ("macro_dt", "micro_dt", "num_steps") and schemes ("num_micro", "scheme"). A parameter changes
             the system alone; the positions and velocities at the start stay.
         out: folder of the store, a zarr group; conventionally named .zarr. All workers must see it.
-        t_end, num_steps, macro_dt, micro_dt: two of them: the time at the end, the number of macro steps, and a step size.
+        t_end, num_steps, macro_dt, micro_dt: two of: the time at the end, the number of macro steps, a step size (macro_dt or micro_dt).
         num_micro: number of micro steps, for schemes given by name or by a function.
         save: quantities that are kept of each run: names from `vmri_jax.ensembles.QUANTITIES`, or functions of a trajectory,
             ``my_file.py:function``.

@@ -82,5 +82,5 @@ def _job(packed: bytes) -> Job:
 
 @lru_cache(maxsize=4)
 def _writer(path: str, chunk: int, made: tuple[int, int]) -> Writer:
-    """The writer of a store, cached; `made` makes a new writer for a store that replaces another one at its place."""
+    """The writer of a store. `made` is part of the cache key: a store that replaced another one gets a new writer."""
     return Writer(Path(path), chunk)

@@ -259,8 +259,8 @@ class Work:
         names = set(values_by_name)
         if len(names) != 2 or names == {"macro_dt", "micro_dt"}:
             raise ValueError(
-                f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of t_end, num_steps and one of "
-                "macro_dt and micro_dt, as arguments or columns."
+                f"ensemble: of the steps {', '.join(sorted(names)) or 'nothing'} is given; give two of: t_end, num_steps, "
+                "a step size (macro_dt or micro_dt), as arguments or columns."
             )
         if "t" in self.columns and "t_end" in names:
             raise ValueError(

@@ -48,7 +48,7 @@ def check_adjoint(adjoint: str, scheme: Scheme | Composition) -> None:
         raise ValueError(f"simulate: adjoint is {adjoint!r}; it must be one of {', '.join(map(repr, ADJOINTS))}.")
     if adjoint == "reversible" and is_concrete(scheme) and not scheme.is_symmetric:
         raise ValueError(
-            "simulate: adjoint='reversible' needs a symmetric scheme, whose step of -H undoes the step of H; "
+            "simulate: adjoint='reversible' needs a symmetric scheme, whose step of -macro_dt undoes the step of macro_dt; "
             "scheme.describe() says which is. Take 'checkpoint'."
         )
 
@@ -74,8 +74,8 @@ def announced(kind: str, num_steps: int, arrays):
 @announced.defjvp
 def _announce(kind: str, num_steps: int, primals, tangents):
     warnings.warn(
-        f"simulate: derivatives of these {num_steps} steps are taken by adjoint={kind!r}, in reverse mode and once. Name one to "
-        "choose it: 'stored' for other modes and second derivatives, 'checkpoint', 'reversible', or 'forward' for few parameters.",
+        f"simulate: derivatives of these {num_steps} steps use adjoint={kind!r}, which gives first derivatives in reverse mode only. "
+        "Name one to choose it: 'stored' for other modes and second derivatives, 'checkpoint', 'reversible', or 'forward' for few parameters.",
         stacklevel=2,
     )
     return primals[0], tangents[0]
@@ -119,7 +119,7 @@ _with_fallback.defvjp(_fallback_forward, _fallback_backward)
 
 
 def differentiated_by(exact: Callable, run: Callable, arrays) -> Trajectory:
-    """``run(arrays)``; where it is differentiated, in reverse mode only, value and derivative of ``exact(arrays)`` instead.
+    """``run(arrays)``. Under differentiation (reverse mode only) `exact` replaces `run`, for the value, too.
 
     Both runs solve the same equations to the tolerance of the solver.
     """
@@ -154,7 +154,7 @@ class _Interval(NamedTuple):
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def reversible(run, engine: Engine, save_every: int, arrays) -> Trajectory:
-    """``run(arrays)``, whose derivative in reverse mode steps back with -H from saved node to saved node.
+    """``run(arrays)``, whose derivative in reverse mode steps back with -macro_dt from saved node to saved node.
 
     Args:
         run: function of `Arrays`, a run of `engine`.
@@ -170,7 +170,7 @@ def _run_and_nodes(run, engine: Engine, save_every: int, arrays):
 
 
 def _stepped_back(run, engine: Engine, save_every: int, residuals, cotangent: Trajectory):
-    """Cotangents of (leaves, start, macro_dt)."""
+    """Cotangents of `Arrays`."""
     (leaves, _, macro_dt), nodes = only_once(residuals)
     at_nodes = (*vars(cotangent.states).values(), cotangent.energy, cotangent.constraint_residual)
     by_real, by_state, by_dt = _back(engine, save_every, leaves, macro_dt, nodes, at_nodes, cotangent.micro)
@@ -294,8 +294,8 @@ def _run_and_jacobian(run, arrays):
     flat, unravel = ravel_pytree(wanted)
     if flat.size > MOST_TANGENTS:
         warnings.warn(
-            f"adjoint='forward' runs beside the run for each of the {flat.size} numbers that are differentiated by; "
-            "'checkpoint' and 'reversible' cost the same for any number of them.",
+            f"adjoint='forward' computes one tangent run for each of the {flat.size} numbers that you differentiate by; "
+            "the cost of 'checkpoint' and 'reversible' does not depend on their number.",
             stacklevel=2,
         )
 

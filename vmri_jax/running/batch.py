@@ -117,7 +117,7 @@ def simulate_batch(
         padded_size = 2 ** int(failed.size - 1).bit_length()
         padded = failed[np.minimum(np.arange(padded_size), failed.size - 1)]
         with Working(
-            f"simulate_batch: {failed.size} of {lanes} lanes, which the first method does not solve, with exact matrices"
+            f"simulate_batch: {failed.size} of {lanes} lanes, which the first solver does not solve, with solvers.Arrowhead"
         ):
             again = _in_chunks(run, run.exact_engine, jax.tree.map(lambda a: a[padded], batch), width, devices)
         trajectory = jax.tree.map(lambda a, b: a.at[failed].set(b[: failed.size]), trajectory, again)

@@ -76,8 +76,8 @@ class PieceStart(NamedTuple):
 class Engine:
     """Compiled runs of all systems and schemes of one structure, as functions of `Arrays` and of numbers of steps.
 
-    Two kinds of loops: `whole` and `piece` count in a while-loop, which is fast, and whose numbers of steps are arguments; `stored` and
-    `checkpointed` scan, which reverse mode can differentiate, with static numbers of steps.
+    Two kinds of loops: `whole` and `piece` use `jax.lax.while_loop`, which is fast, and the numbers of steps are traced arguments; `stored`
+    and `checkpointed` use `jax.lax.scan`, which reverse mode can differentiate, but the numbers of steps are static.
 
     Attributes:
         structure: structure of the pytree `Model`.
@@ -235,7 +235,7 @@ class Engine:
 
         def interval(cursor: _Cursor, count):
             cursor, info, micro = loops.repeat(count, take_step, (cursor, no_info, no_micro))
-            if stepper.defers_projection:  # momenta off the hidden constraints cost nothing between saved nodes
+            if stepper.defers_projection:  # between saved nodes a projection would not change the motion
                 state, memory = stepper.project(cursor.state, cursor.memory)
                 cursor = cursor._replace(state=state, memory=memory)
             return cursor, info, micro

@@ -58,7 +58,7 @@ class Checkpoint(NamedTuple):
     step: macro steps done.
     state: state at the node reached.
     memory: memory of the stepper, such as the start of Newton's next iteration.
-    fell_back: whether exact matrices have replaced the first method.
+    fell_back: whether the fallback has replaced the first solver.
     is_first: whether the stepper has no memory of earlier steps, so that `memory` is blank.
     """
 
@@ -73,14 +73,14 @@ class Checkpoint(NamedTuple):
 class Simulation:
     """A run with checked arguments, ready to be computed.
 
-    The first method of its plan computes the run. If that method fails in a run or a piece, the run or piece is computed again with exact
-    matrices; their program is compiled only then.
+    The first solver of its plan computes the run. If it fails in a run or a piece, the fallback computes the run or piece again; the program
+    of the fallback is compiled only then.
 
     Attributes:
         system, scheme, solver, state, num_steps, save_every, save_micro: as of `simulate`.
         macro_dt: macro step H, an array of shape ().
         names: names of bodies and constraints; None if there are none.
-        may_fall_back: whether exact matrices are tried where the first method fails; else the run fails.
+        may_fall_back: whether the fallback is tried where the first solver fails; else the run fails.
     """
 
     system: System
@@ -121,13 +121,13 @@ class Simulation:
         return trajectory
 
     def compiled(self) -> jax.stages.Compiled:
-        """The compiled program of the run by its first method, for inspection."""
+        """The compiled program of the run with its first solver, for inspection."""
         return self._program(False).lower(*self._arguments(None, None, None, None)).compile()
 
     def timed(self, state=None, *, macro_dt=None, params=None, num_steps=None) -> Callable[[], None]:
         """A function without arguments that computes the run and waits for its result, to be timed.
 
-        It runs the program that succeeds, of the first method or of the fallback. Arguments as of a call.
+        It runs the program that succeeds, of the first solver or of the fallback. Arguments as of a call.
         """
         arrays, *counts = self._arguments(state, macro_dt, params, num_steps)
         arguments = jax.device_put(arrays), *counts
@@ -216,21 +216,21 @@ class Simulation:
 
     @cached_property
     def engine(self) -> Engine:
-        """Its programs with the first method of the plan."""
+        """Its programs with the first solver of the plan."""
         return self.engine_for(False, self.num_saves)
 
     @cached_property
     def exact_engine(self) -> Engine:
-        """Its programs with exact matrices, the fallback."""
+        """Its programs with the fallback."""
         return self.engine_for(True, self.num_saves)
 
     def engine_for(self, is_exact: bool, num_saves: int) -> Engine:
-        """Programs with the first method or with exact matrices, for a number of saved intervals."""
+        """Programs with the first solver or with the fallback, for a number of saved intervals."""
         return engine(self._structures[is_exact], num_saves, self.save_micro)
 
     @cached_property
     def _structures(self) -> tuple:
-        """Structures of the `Model` with the first method, and with exact matrices."""
+        """Structures of the `Model` with the first solver, and with the fallback."""
         first_and_exact = self.solver, self.solver.exact()
         return tuple(jax.tree.structure(Model(solver, self.scheme, self.system)) for solver in first_and_exact)
 
@@ -255,7 +255,7 @@ class Simulation:
         return self.engine_for(is_exact, room_of_a_piece(self.state, self.scheme.num_micro, self.save_micro))
 
     def advance(self, checkpoint: Checkpoint, saves: int) -> tuple[list[Trajectory], Checkpoint]:
-        """The next `saves` saved intervals, in pieces; from the first piece that the first method does not solve, with exact matrices."""
+        """The next `saves` saved intervals, in pieces; from the first piece that the first solver does not solve, with the fallback."""
         pieces, room = [], self._piece_engine(checkpoint.fell_back).num_saves
         # Pieces after a failure start from NaN and end at once: the trajectory keeps its length.
         for done in range(0, saves, room):
@@ -277,9 +277,9 @@ class Simulation:
         return piece, Checkpoint(step + saves * self.save_every, state, memory, fell_back)
 
     def _fallback_helps(self, piece: Trajectory) -> bool:
-        """Whether a step failed that exact matrices may solve.
+        """Whether a step failed that the fallback may solve.
 
-        They cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor a step that was solved but violates implied
+        It cannot help explicit and linear equations, the methods up to `Method.LINEAR`, nor a step that was solved but violates implied
         constraints, `Result.NOT_IMPLIED`.
         """
         failed = self.may_fall_back and int(piece.failed_at) >= 0 and int(piece.result) != Result.NOT_IMPLIED
@@ -325,7 +325,7 @@ def prepare(
         other = run(other_state, macro_dt=0.02, params=other_params)
 
     A call costs some ten microseconds besides its steps, and raises `SimulationError` if a step fails, as `simulate` does. The first call
-    that needs the fallback of the method "auto" compiles it, which takes as long as `prepare`. Arguments as of `simulate`.
+    that needs the fallback of `solvers.Auto` compiles it, which takes as long as `prepare`. Arguments as of `simulate`.
 
     Returns:
         The `Simulation`.

@@ -1,6 +1,7 @@
 """Runs under transformations of JAX: the whole run is one function of arrays.
 
-*Exact matrices* are the matrices of the solver `solvers.Arrowhead` with the settings of the user's solver, the fallback of "auto".
+*The fallback*: with `solvers.Auto`, a run whose first solver fails is computed again by `solvers.Arrowhead`, whose Newton matrices are exact,
+with the same tolerance and limits of iterations. Names with `exact` are of the fallback.
 """
 
 from collections.abc import Callable
@@ -24,7 +25,7 @@ def traced_run(run: Simulation, adjoint: str) -> Trajectory:
     if not run.plan.has_fallback:
         return _differentiated(kind, run.engine, every)(arrays)
     exact = run.exact_engine
-    if kind == "reversible":  # long runs: the derivative of the faster first method is worth a second program
+    if kind == "reversible":  # long runs: the derivative of the faster first solver is worth a second program
         first, fallback = (_differentiated(kind, engine, every) for engine in (run.engine, exact))
         return with_fallback(first, fallback, arrays)
     stored = partial(_first_method, run.engine, exact, every)
@@ -51,15 +52,15 @@ def _stored(engine: Engine, save_every: int, arrays) -> Trajectory:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
 def _first_method(first: Engine, exact: Engine, save_every: int, arrays) -> Trajectory:
-    """The run by the first method of its plan, or with exact matrices if the first method fails."""
+    """The run with the first solver of its plan, or with the fallback if the first solver fails."""
     trajectory = _stored(first, save_every, arrays)
     return jax.lax.cond(trajectory.failed_at < 0, lambda: trajectory, lambda: _stored(exact, save_every, arrays))
 
 
 @_first_method.defjvp
 def _by_exact_matrices(first, exact, save_every, primals, tangents):
-    """Value and derivative of the run with exact matrices: to differentiate both methods would compile two programs.
+    """Value and derivative of the run with the fallback: to differentiate with both solvers would compile two programs.
 
-    Values of the two methods differ by the tolerance of the solver.
+    Values of the two solvers differ by the tolerance of the solver.
     """
     return jax.jvp(partial(_stored, exact, save_every), primals, tangents)

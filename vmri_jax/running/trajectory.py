@@ -30,7 +30,7 @@ STATUS = ("result", "failed_at")
 ERROR = tuple(f"error_{name}" for name in RunError._fields)
 """Arrays of the estimated error; absent in runs without one."""
 STATUS_ARRAYS = jax.Array, np.ndarray
-"""Types of the status of a run before it becomes a `Status`."""
+"""Types of `Trajectory.result` before `with_origin` replaces it by a `Status`, which prints as a sentence."""
 
 
 class RunInfo(NamedTuple):
@@ -51,7 +51,7 @@ class RunInfo(NamedTuple):
         return f"RunInfo: {self.in_words()}" if has_values(self) else f"RunInfo({eqx.tree_pformat(arrays, width=1000)})"
 
     def in_words(self) -> str:
-        """The most expensive method, the most iterations and the largest residual, of concrete arrays."""
+        """The method with the largest code, the most iterations and the largest residual, of concrete arrays."""
         if not np.size(self.method):
             return "no step"
         method, iterations = Method(int(np.max(self.method))), int(np.max(self.iterations))
@@ -165,7 +165,7 @@ class Trajectory(Exports):
         return with_origin(self, origin.repeated(np.shape(self.t)[:-1]))
 
     def with_arrays(self, **arrays) -> "Trajectory":
-        """The same run with other arrays, by the names of a file: ``run.with_arrays(q_f=..., energy=...)``."""
+        """The same run with other arrays, named as in a file written by `save`: ``run.with_arrays(q_f=..., energy=...)``."""
         return with_origin(from_named_arrays(named_arrays(self) | arrays), self.origin)
 
     def whole(self) -> "Trajectory":

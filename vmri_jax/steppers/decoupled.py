@@ -19,7 +19,10 @@ class DecoupledState(NamedTuple):
 
 @dataclass(frozen=True)
 class Decoupled(Stepper):
-    """Two independent parts, each a system of fast variables alone on a single interval; kicks by both variables stay outside.
+    """Two independent parts, the slow and the fast variables.
+
+    Each part is a `System` of its own in which all variables count as fast (slow variables are stored as q_f), on a single interval, so that
+    the same steppers apply. Kicks that depend on both parts are applied outside of this stepper.
 
     slow: stepper of the slow variables, one step over the macro interval.
     fast: stepper of the fast variables, `num_fast` steps.
@@ -65,6 +68,6 @@ class Decoupled(Stepper):
 
 
 def apart(state: State) -> tuple[State, State]:
-    """The slow and the fast variables as states of fast variables alone."""
+    """The slow and the fast variables, each as a state in which all variables count as fast."""
     none = jnp.zeros(0)
     return State(state.t, none, state.q_s, none, state.p_s), State(state.t, none, state.q_f, none, state.p_f)

@@ -120,7 +120,7 @@ class MarchEquations:
         )
 
     def no_matrices(self) -> Matrices:
-        """The shapes of the matrices, all zero."""
+        """Matrices of zeros, for their shapes."""
         n, k, o = self.n, self.num_fast + self.r * self.n_g, self.n_f + self.n_v + self.num_seen
         b = self.num_slow + self.r * self.n_gs
         return Matrices(*map(jnp.zeros, ((n, k, k), (n, o, k), (n, k, self.num_seen), (b, b))))

@@ -1,4 +1,4 @@
-"""Nested iteration: the slow path outside, the micro intervals in order inside, each with a small system of its own.
+"""Nested iteration: an outer iteration on the slow path, and within it the micro intervals in order, each with a small system of its own.
 
 A pass holds the slow path fixed. It visits the micro intervals in order; each corrects its fast increments and multipliers once, by a
 Newton step on its exact residual, and adds its impulse to the slow equations. Then the pass corrects the slow increments and slow

@@ -54,7 +54,7 @@ class _Choice:
     """Settings of the solvers.
 
     newton: as the user chose.
-    falls_back: whether the march with exact matrices solves the steps that the first choice does not solve.
+    falls_back: whether the march with exact matrices solves the steps that the first solver does not solve.
     reverse_only: whether steps are differentiated in reverse mode only, once.
     """
 
@@ -133,7 +133,7 @@ def plan(
         scheme: a `Scheme` or a `Composition`.
         state: any state of the system; only the shapes of its arrays matter.
         solver: one of `vmri_jax.solvers`, by default `Auto`.
-        fallback: whether the march with exact matrices solves the steps that the first choice does not solve, in the same program.
+        fallback: whether the march with exact matrices solves the steps that the first solver does not solve, in the same program.
         reverse_only: whether steps are differentiated in reverse mode only, once, in half the time.
 
     Raises:

@@ -34,8 +34,9 @@ class RattleState(NamedTuple):
     """Memory that a step hands to the next one.
 
     multiplier: multipliers lambda of all constraints in the last two steps, the last step first.
-    last_dt: length of the last step, 0 after a projection of the momenta. Without a projection, the multipliers of the next step also
-        contain the half of the constraint force that the last step left out at the common node.
+    last_dt: length of the last step, 0 after a projection of the momenta. Without a projection, the scaled multipliers mu of the next step
+        also contain the half of the constraint force that the last step left out at the common node. Predictions therefore convert lambda
+        to mu by factors that depend on last_dt, see `multiplier_scales`.
     """
 
     multiplier: Float[Array, "2 n_g+n_gs"]

@@ -97,8 +97,8 @@ class Method(IntEnum):
     """The solver that took a step; of several solvers in a step, the one with the largest number, mostly the most expensive one.
 
     EXPLICIT: nothing to solve. LINEAR: linear equations, solved directly. RATTLE: the multipliers of a drift along the
-    constraints. NESTED: the slow path outside, micro intervals in order inside. COLLOCATION: one interval of high degree,
-    in modes of time. ARROWHEAD, NULL_SPACE: the march with exact matrices, with and without
+    constraints. NESTED: passes over the micro intervals, each interval with a small matrix of its own.
+    COLLOCATION: one interval of high degree, in modes of time. ARROWHEAD, NULL_SPACE: the march with exact matrices, with and without
     multipliers. DENSE: Newton's iteration on all unknowns of the macro step.
     """
 

@@ -90,8 +90,8 @@ class Solver(ABC):
 class SolvedState(NamedTuple):
     """Memory from which the next iteration starts.
 
-    velocity: (v_s, v_f) of the guess, used without constant masses: the means ``(q_s(H) - q_s(0)) / H`` and ``(q_f(H) - q_f(H - h)) / h`` of
-        the last step, or the velocities of the projected momenta. With constant masses the guess takes ``M^-1 p``.
+    velocity: (v_s, v_f) of the guess. Used only if masses are not constant (else the guess takes ``M^-1 p``): the mean velocities
+        ``(q_s(H) - q_s(0)) / H`` and ``(q_f(H) - q_f(H - h)) / h`` of the last step, or the velocities of the projected momenta.
     multiplier, slow_multiplier: Lagrange multipliers at the last control node of the step before that has multipliers.
     solver: memory of the solver.
     """

@@ -7,6 +7,8 @@
 | `NullSpace` | as `Arrowhead`, in coordinates of the free motions: no multipliers among the unknowns | O(1) |
 | `Dense` | exact, one dense matrix of all unknowns: baseline and reference | O(num_micro^2) |
 
+In a *pass* of `Nested` every micro interval takes one Newton step, in order; then the slow variables are corrected.
+
 `Auto` takes `Nested` where every term belongs to single micro intervals (constant masses, potentials on the micro grid or kicks at the macro
 nodes), else `Arrowhead`. If a run does not converge with `Nested`, `Auto` computes again with `Arrowhead`: `macro_step` the step,
 `prepare` the whole run, a batch the lane, `simulate` and `stream` the piece that failed and all pieces after it. ``StepInfo.method`` and ``Trajectory.info.method`` say which solver took a step,
@@ -99,7 +101,7 @@ class Auto(Newton):
 
 
 class Nested(Newton):
-    """Slow path outside, micro intervals in order inside, each with a small matrix of masses and constraints; without a fallback."""
+    """Passes over the micro intervals, each interval with a small matrix of masses and constraints of its own; without a fallback."""
 
     method = "nested"
 

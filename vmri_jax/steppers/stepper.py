@@ -24,8 +24,8 @@ class StepInfo(eqx.Module):
         equations. `Nested` and the march estimate R after their last correction, others evaluate it; where only multipliers
         are unknown it is 0.
     q_f_micro: fast positions at the micro nodes, the start excluded.
-    multiplier, slow_multiplier: Lagrange multipliers at the control nodes; of a composition with s stages those of all stages, s r
-        slow ones.
+    multiplier, slow_multiplier: Lagrange multipliers at the control nodes, with r the degree of the scheme. A composition of s
+        stages joins those of its stages: ``(s num_micro, r, n_g)`` and ``(s r, n_gs)``.
     """
 
     result: Int[Numbers, ""]

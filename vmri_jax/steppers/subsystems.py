@@ -1,4 +1,6 @@
-"""Decoupled parts of a system: the slow and the fast variables as systems of their own, each of fast variables on a single interval.
+"""Decoupled parts of a system: the slow and the fast variables as systems of their own, in which all variables count as fast.
+
+Each part moves on a single interval; slow variables are stored as q_f.
 
 The functions of the parts are dataclasses. They compare by value, so that JAX traces equal ones once.
 """

@@ -19,11 +19,11 @@ from vmri_jax.schemes.scheme import Scheme
 class TimeModes(NamedTuple):
     """Eigenvectors of ``A^-1 B``, one of every complex pair.
 
-    Axes of size k hold the parts of modes, all real parts before all imaginary ones. Two real modes share the two parts of a complex
-    mode; parts of no mode are zeros that fill vector registers.
+    An axis of size k = 2 m stores m complex slots: m real parts, then m imaginary parts. A slot holds one complex mode, or two real modes;
+    an unused half is zero.
 
     gamma: eigenvalues, real and imaginary parts.
-    mode: number of the mode of each part.
+    mode: number of the mode of each half of a slot.
     of_rows: ``A^-T``, from the rows of the momentum equations to increments.
     of_values: from values at the nodes to modes.
     increments, multipliers: from modes to increments, and through A to multipliers.
@@ -51,7 +51,7 @@ class TimeModes(NamedTuple):
         first, second = np.arange(half), np.concatenate([np.arange(pairs), np.arange(half, distinct)])
 
         def parts(z):
-            """(k, m) the parts of modes (r, m), zero for parts of no mode."""
+            """(k, m) the slots of modes (r, m), zero in unused halves."""
             imaginary = np.where(np.imag(gamma)[:, None] == 0, z.real, z.imag)
             both = z.real[first], imaginary[second]
             return np.concatenate([np.pad(a, [(0, half - len(a)), (0, 0)]) for a in both])
