@@ -147,7 +147,6 @@ def _end(
     refused = [name for name, value in steps.items() if value is not None]
     refused += ["save_every"] * (save_every != 1) + ["save_micro"] * save_micro + ["adjoint"] * (adjoint != "auto")
     if refused:
-        names = " and ".join(refused)
         raise ValueError(
             f"simulate: got {' and '.join(refused)} with an accuracy, which chooses steps and saved nodes; leave them out, or the "
             "accuracy."
