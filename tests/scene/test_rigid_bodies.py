@@ -222,7 +222,7 @@ BAD = [
         {"inertia": [1.0, 1.0, 2.5]},
         r"which no body has: the largest, 2.5, must not be larger than the sum of the others, 2\.",
     ),
-    ({"inertia": [0.0, 0.0, 0.0]}, "they must be positive"),
+    ({"inertia": [0.0, 0.0, 0.0]}, "they must not be negative, nor all be zero"),
     ({"inertia": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "it must be a symmetric matrix"),
     ({"inertia": [1.0, 2.0]}, r"inertia has shape \(2,\); give \(3,\) principal moments, a matrix, or a shape"),
     ({"rotation": np.diag([1.0, 1.0, -1.0])}, "which is no rotation: .* the determinant is -1"),

@@ -280,7 +280,7 @@ class Ground(AnyBody):
 class Frame(AnyBody):
     """A frame without mass between two joints: a hip is three hinges with frames between them, a planar robot two slides and a hinge.
 
-        bodies = [Frame("yoke", [0, 0, 1]), RigidBody("thigh", 4.0, Rod(0.4), [0, 0, 0.8])]
+        bodies = [Frame("yoke", [0, 0, 1]), RigidBody("thigh", 4.0, Cylinder(0.06, 0.4), [0, 0, 0.8])]
         joints = [
             Revolute(("ground", "yoke"), [0, 0, 1], axis=[1, 0, 0], name="roll"),
             Revolute(("yoke", "thigh"), [0, 0, 1], axis=[0, 1, 0], name="pitch"),

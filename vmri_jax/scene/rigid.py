@@ -60,7 +60,7 @@ class RigidBody(AnyBody):
 
     Raises:
         TypeError: an argument that is no real number.
-        ValueError: a mass or moment of inertia that is not positive, moments that no body has (the largest above the sum of
+        ValueError: a mass that is not positive, a negative moment of inertia, moments that no body has (the largest above the sum of
             the other two), a matrix that is no rotation, numbers that are not finite or of float32, other shapes, another pace.
     """
 
@@ -121,7 +121,9 @@ class RigidBody(AnyBody):
             inertia = np.asarray(inertia)
             largest, other_two = inertia.max(), inertia.sum() - inertia.max()
             if inertia.min() < 0 or largest <= 0:
-                raise ValueError(f"{about} has the principal moments {inertia}; they must be positive.")
+                raise ValueError(
+                    f"{about} has the principal moments {inertia}; they must not be negative, nor all be zero."
+                )
             if largest > other_two * (1 + ORTHONORMAL):
                 raise ValueError(
                     f"{about} has the principal moments {inertia}, which no body has: the largest, {largest:g}, must not be larger than "
@@ -335,7 +337,7 @@ def _cross_matrix(u):
 
 
 def rotation(q):
-    """Rotation matrices (..., 3, 3) of a rigid body from its coordinates, its principal axes as columns.
+    """Rotation matrices (..., 3, 3) of a rigid body from its coordinates, its principal axes of inertia as columns, which the directors are.
 
     Args:
         q: (..., 12) coordinates, ``run.position("hub")``.

@@ -59,7 +59,7 @@ class Scene:
             "drop" leaves out as many rows as there are dependences, see `dropped`. The dropped rows must follow from the others along the
             motion, not only at the start: the scene tries random motions, and runs watch the rows, see `System.implied`.
         coordinates: of rigid bodies. "directors": a centre and directors for each body, joints are constraints. "joint": bodies in trees
-            are functions of the freedoms of their joints; each freedom is a coordinate, zero at the start, and the joint has no
+            are functions of the freedoms of their joints; each freedom is a coordinate, zero where the bodies are given, and the joint has no
             constraint rows. Roots of trees other than the ground keep directors; joints that close loops and `Spherical` joints keep
             their rows. "auto": joint coordinates for trees short enough that these are faster, see `vmri_jax.scene.trees.LONGEST`.
         joint_starts: values and rates of joint coordinates at the start; `with_joints` sets them.
@@ -248,7 +248,7 @@ class Scene:
         return initial_state(self.system(), *self.start, project=self.project)
 
     def joint_motion(self, run, joint: str, of: Literal["turn", "slide", "auto"] = "auto", pair: int = 0) -> np.ndarray:
-        """How far a joint has turned (rad) or moved along its axis (m) since the start, (k,).
+        """How far a joint has turned (rad) or moved along its axis (m) from the given position, (k,).
 
         Args:
             run: of this scene.

@@ -6,7 +6,7 @@ An effect touches the bodies whose coordinates it depends on. Each of its elemen
 |---|---|---|
 | potential that touches a slow body | "slow_potential" | V |
 | potential between fast bodies, stiff | "fast_potential" | W(q_f) |
-| potential between fast bodies, not stiff | "slow_potential" | V, which is evaluated less often than W |
+| potential between fast bodies, not stiff | "slow_potential" | V, on the grid of the rule of V |
 | potential with the rate k | k | V_k, at every k-th micro node |
 | potential with the rate "fast" that touches a slow body | "fast" | on the micro grid like W, but of q_s too |
 | constraint that touches a fast body | "constraint" | g, on the micro grid |

@@ -18,7 +18,7 @@ def norm(v):
 
 @effect_class
 class LinearDamping(Effect):
-    """Damping of bodies against the ground, ``F = -c v``.
+    """Damping of points and of the centres of rigid bodies against the ground, ``F = -c v``; rotations are not damped.
 
     Args:
         coefficient: c, N s/m, positive; one number, or one for each body.
@@ -93,6 +93,8 @@ class Dashpot(BetweenPoints):
 @effect_class
 class RayleighDamping(Effect):
     """Rayleigh damping of the whole scene, ``F = -(alpha M + beta K(q)) v``, K the Hessian of potentials.
+
+    M has the masses of points and of the centres of rigid bodies: alpha does not damp rotations.
 
     The damping ratio of a vibration of frequency w is ``alpha / (2 w) + beta w / 2``. K is the Hessian at the present configuration; along
     directions of negative curvature the force adds energy.

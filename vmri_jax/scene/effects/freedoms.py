@@ -56,41 +56,41 @@ def across(q, params):
 
 
 def turn_by_sine(q, params):
-    """``(m' . e, m . e)``: sine and cosine of the angle by which b has turned about n since the start, times a common factor near 1."""
+    """``(m' . e, m . e)``: sine and cosine of the angle by which b has turned about n from the given position, times a common factor near 1."""
     of_a, of_b = triads(q, params)
     e = of_b[..., M, :]
     return dot(of_a[..., M_PRIME, :], e), dot(of_a[..., M, :], e)
 
 
 def tilt_by_sine(q, params):
-    """``(n . e', n . f)``: sine and cosine of the angle by which b has turned about its axis e since the start, times a common factor near 1."""
+    """``(n . e', n . f)``: sine and cosine of the angle by which b has turned about its axis e from the given position, times a common factor near 1."""
     of_a, of_b = triads(q, params)
     n = of_a[..., N, :]
     return dot(of_b[..., M_PRIME, :], n), dot(of_b[..., N, :], n)
 
 
 def turn(q, params):
-    """The angle by which b has turned about the axis since the start, rad, between -pi and pi, (...)."""
+    """The angle by which b has turned about the axis from the given position, rad, between -pi and pi, (...)."""
     return jnp.arctan2(*turn_by_sine(q, params))
 
 
 def tilt(q, params):
-    """The angle by which b has turned about its axis e since the start, rad, between -pi and pi, (...)."""
+    """The angle by which b has turned about its axis e from the given position, rad, between -pi and pi, (...)."""
     return jnp.arctan2(*tilt_by_sine(q, params))
 
 
 def slide(q, params):
-    """How far b has moved along the axis since the start, ``n . D``, m, (...)."""
+    """How far b has moved along the axis from the given position, ``n . D``, m, (...)."""
     return dot(triads(q, params)[0][..., N, :], gap(q, params))
 
 
 def along_m(q, params):
-    """How far b has moved along m since the start, ``m . D``, m, (...)."""
+    """How far b has moved along m from the given position, ``m . D``, m, (...)."""
     return across(q, params)[..., 0]
 
 
 def along_m_prime(q, params):
-    """How far b has moved along m' since the start, ``m' . D``, m, (...)."""
+    """How far b has moved along m' from the given position, ``m' . D``, m, (...)."""
     return across(q, params)[..., 1]
 
 

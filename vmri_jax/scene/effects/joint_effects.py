@@ -70,7 +70,7 @@ class ForceOnCoordinate:
 
 @effect_class
 class InJoint(Effect):
-    """Base class of effects along the freedom x of a joint: the angle or displacement of b against a since the start.
+    """Base class of effects along the freedom x of a joint: the angle or displacement of b against a from the given position.
 
     Args:
         joint: name of a joint in the scene with an angle or a displacement.
@@ -169,7 +169,7 @@ class JointLimit(InJoint):
 
     Args:
         joint, of: as of `InJoint`.
-        lower, upper: rad or m, since the start; one number, or one for each pair of the joint.
+        lower, upper: rad or m, from the given position; one number, or one for each pair of the joint.
         stiffness: k, N m/rad or N/m, positive; likewise.
         smoothing: s, rad or m, positive: the distance from the limit at which the force sets in.
 
@@ -345,7 +345,7 @@ class JointMotion(InJoint):
 
     Args:
         joint, of: as of `InJoint`.
-        path: a, ``path(t, params) -> ()``, rad or m since the start, zero at t = 0; define it at module level.
+        path: a, ``path(t, params) -> ()``, rad or m from the given position, zero at t = 0; define it at module level.
         params: of `path`; traced.
 
     Raises:
