@@ -32,12 +32,12 @@ def _end(equations: StepEquations, x: Unknowns):
 
 
 def _no_third_derivative(residual):
-    """Zero, with the derivative zero, and second derivatives that are not finite: ``sum |r - r_0|^1.5`` at r_0 = r.
+    """Zero, with the derivative zero, and second derivatives that are not finite: ``|s - s_0|^1.5`` at s_0 = s, the sum of all rows.
 
     Added to a point with the right first derivative only, it turns third derivatives of the step, which would be wrong, into NaN.
     """
-    rows, _ = ravel_pytree(residual)
-    return jnp.sum(jnp.abs(rows - jax.lax.stop_gradient(rows)) ** 1.5)
+    total = sum(jnp.sum(rows) for rows in jax.tree.leaves(residual))
+    return jnp.abs(total - jax.lax.stop_gradient(total)) ** 1.5
 
 
 @jax.custom_jvp
