@@ -128,7 +128,7 @@ def run(size: Size, name: str, tell: Tell = silent) -> Iterator[Report]:
         rows = 11 * number + 6 * (not is_chain)  # five of each hinge, six of each body: those of the hub on top
         row: dict = {"shape": shape, "bodies": number, "rows": rows}
         with_joint = not is_chain or number in size.joint
-        in_full = rows <= constraint_pattern.MOST_ROWS_OF_FULL_MATRIX  # what `vm.simulate` takes
+        in_full = rows <= constraint_pattern.MOST_ROWS_OF_FULL_MATRIX  # the choice of `vm.simulate`
         by_directors: Measured | None = None
         if is_chain or not in_full:
             by_directors = measure(shape, number, "directors", 0, size.repeats)

@@ -6,6 +6,7 @@ Runs happen in a process of their own, which is replaced where it hangs or dies.
 """
 
 import dataclasses
+import itertools
 import json
 import multiprocessing
 import traceback
@@ -25,6 +26,7 @@ from rich.table import Table
 import vmri_jax as vm
 from tests.verification import random_systems as rs
 from vmri_jax.mechanics.checks import CONSTRAINT_TOLERANCE, is_refusal
+from vmri_jax.running.progress import progress_shown
 from vmri_jax.running.timing import Tell, silent
 
 DRAWS = 50
@@ -267,8 +269,9 @@ def main(
         for part in reduce(seed, reduced, console.log):
             console.print(part)
         return
-    with console.status("fuzz") as status:
-        ended = fuzz(count, seed, out / f"fuzz_{seed}.jsonl", limit, status.update)
+    with progress_shown() as tell:
+        told = itertools.count()
+        ended = fuzz(count, seed, out / f"fuzz_{seed}.jsonl", limit, lambda run: tell(run, next(told), count))
     table(ended, console)
     if bad := wrong(ended):
         console.print(f"\nsimplify one with: python -m tests.fuzz --seed {seed} --reduce {min(bad)}")

@@ -179,7 +179,7 @@ def _only_name(module, file_name: str) -> str:
 
 
 def _problems_in(module) -> list[str]:
-    """Names of the problems and scenes in a module, imported ones included."""
+    """Names of the problems and scenes in a module, imported names included."""
     return [name for name, value in vars(module).items() if isinstance(value, Problem | Scene) and name[0] != "_"]
 
 
@@ -210,7 +210,7 @@ def find_scheme(name: str, num_micro: int, compose: str | None = None, **options
 
 
 def _unknown(kind: str, name: str, known: Collection[str]) -> str:
-    """The message for a name that is not among the known ones."""
+    """The message for a name that is not among the known names."""
     return f"there is no {kind} {name!r}.{near(_dashed(name), known)} There are {', '.join(known)}."
 
 

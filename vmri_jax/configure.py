@@ -97,7 +97,7 @@ def cache_folder() -> Path:
 
 
 def processor() -> str:
-    """A name for processors with this instruction set: compiled programs run on processors of one kind only."""
+    """A name for processors with this instruction set: a compiled program runs only on the kind of processor that it was compiled for."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         features = sorted({line for line in lines if line.startswith(("model name", "flags", "CPU part", "Features"))})

@@ -98,7 +98,7 @@ class WithoutProjection(Stepper):
 
 @pytest.mark.parametrize("scheme", [vm.explicit_slow(2), vm.compose(vm.explicit_slow(2), "suzuki4")])
 def test_a_solver_gets_the_kicks_and_the_projection(scheme):
-    """A solver of one's own solves the equations between the kicks; momenta end on the hidden constraints."""
+    """A user's solver solves the equations between the kicks; momenta end on the hidden constraints."""
     pendulum = double_pendulum()
     ours = vm.simulate(pendulum, scheme, solver=vm.solvers.Custom(by_march), **STEPS)
     theirs = vm.simulate(pendulum, scheme, solver=vm.solvers.Arrowhead(), **STEPS)

@@ -1,4 +1,4 @@
-"""Which solver takes a step: what a plan says, what happens where the nested iteration does not converge, what is in the program."""
+"""Which solver takes a step: the words of a plan, the fallback of a nested iteration that does not converge, the programs that are compiled."""
 
 import os
 

@@ -51,7 +51,7 @@ SHORTER_STEPS = (1.0, 0.98, 0.96, 0.93, 0.9, 0.86, 0.82, 0.78)
 
 
 COMPOSED = ((2.5, None), (5.0, "suzuki4"), (8.0, "kahan-li6"), (np.inf, "kahan-li8"))
-"""(most digits, composition): the composition for an accuracy of up to so many digits. Higher orders need fewer steps for many digits, and
+"""(most digits, composition): the composition for an accuracy of at most this number of digits. Higher orders need fewer steps for many digits, and
 more steps for few."""
 ROUNDOFF = 100 * np.finfo(float).eps
 """Error below which an accuracy is refused as round-off, as a part of the largest position; a larger value refuses reachable accuracies."""

@@ -9,7 +9,7 @@ from vmri_jax.mechanics.names import near
 
 
 def check_keys(data: Any, known: Sequence[str], needed: Sequence[str], where: str) -> None:
-    """Refuse data that is no dict, unknown entries, and missing ones."""
+    """Refuse data that is no dict, unknown entries, and missing entries."""
     if not isinstance(data, dict):
         raise ValueError(f"{where} is {type(data).__name__}; it must be a dict with {', '.join(known)}.")
     for key in data:

@@ -40,7 +40,7 @@ class Drawing:
         view: azimuth and elevation of the camera, in degrees; None for a view that depends on the dimension. (-90, 0) is from the front, with
             x to the right; (-90, 90) from above.
         caption: a line of text for the picture.
-        carried: for runs in joint coordinates, the map from the coordinates of the run to those of the bodies, and the arrays of
+        carried: for runs in joint coordinates, the map from the coordinates of the run to the coordinates of the bodies, and the arrays of
             its joints, see `vmri_jax.mechanics.kinematics`; else None.
     """
 
@@ -198,7 +198,7 @@ class Drawing:
 
 
 def frame(up: tuple[float, ...] | None, dimension: int) -> np.ndarray:
-    """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to those of the picture, see `Drawing.up`."""
+    """(3, dimension) matrix of orthonormal columns from coordinates of the bodies to coordinates of the picture, see `Drawing.up`."""
     if up is None:
         return np.array([[1.0], [0.0], [0.0]]) if dimension == 1 else _upright(np.eye(dimension)[-1])
     padded = np.pad(up, (0, dimension - len(up)))

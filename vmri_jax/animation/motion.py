@@ -49,7 +49,7 @@ class Motion:
     ending: str = ""
 
     def at(self, times: Sequence[float] | np.ndarray) -> np.ndarray:
-        """(len(times), n_bodies, 3) positions; before the start and after the end, the first and the last ones.
+        """(len(times), n_bodies, 3) positions; before the start the first, after the end the last positions.
 
         Args:
             times: in any order.

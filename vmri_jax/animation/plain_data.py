@@ -19,6 +19,7 @@ FORMS_OF_CENTRES = ("ball", "name", "")
 
 
 def read_body(data: Any, where: str) -> Body:
+    """The point body of a dict; `where` names the dict in messages, here and below."""
     check_keys(data, BODY_KEYS, ("name", "coordinates"), where)
     coordinates = data["coordinates"]
     if not isinstance(coordinates, list | tuple) or not 1 <= len(coordinates) <= 3:
@@ -67,6 +68,7 @@ def read_solid(data: Any, where: str) -> tuple[Solid, list[Body]]:
 
 
 def read_block(data: Any, where: str) -> Block:
+    """The block of coordinates, without a place in the picture, of a dict."""
     check_keys(data, BLOCK_KEYS, BLOCK_KEYS[:2], where)
     forms = [_form(entry, where) for entry in entries(data, "coordinates", where)]
     if not forms or any(len(form) != 1 or form[0][0] != 1.0 for form in forms):
@@ -94,6 +96,7 @@ def _form(entry: Any, where: str) -> tuple[tuple[float, str, int], ...]:
 
 
 def read_joint(kind: str, names: Sequence[str], entry: Any, where: str) -> Joint:
+    """The line between two bodies of a pair of names, or of a pair and its pace; `names` of all bodies."""
     if not isinstance(entry, list | tuple) or len(entry) not in (2, 3):
         raise ValueError(f"{where} is {entry!r}; it must be a pair of names, or a pair of names and 'slow' or 'fast'.")
     a, b = (_body_name(name, names, where) for name in entry[:2])
@@ -103,6 +106,7 @@ def read_joint(kind: str, names: Sequence[str], entry: Any, where: str) -> Joint
 
 
 def read_anchor(names: Sequence[str], data: Any, where: str) -> Joint:
+    """The line from a body to a fixed point of a dict; `names` of all bodies."""
     check_keys(data, ("body", "point", "kind", "pace"), ("body", "point", "kind"), where)
     if data["kind"] not in KINDS:
         raise ValueError(f"{where}: kind is {data['kind']!r}; it must be {' or '.join(KINDS)}.")

@@ -29,7 +29,7 @@ NAME_SIZE = 7.5
 
 @dataclass(frozen=True)
 class Stage:
-    """The settings that all pictures of one motion share: sizes, colours, and a view `aspect` times as wide as high."""
+    """Sizes, colours and view of all pictures of a motion; the view is `aspect` times as wide as high."""
 
     motion: Motion
     sizes: Layout

@@ -23,7 +23,7 @@ from vmri_jax.mechanics.arrays import Numbers
 
 RELAXATION_WEIGHT = 1e4
 """Cost of one unit of slack, relative to the largest slope of the cost. It has to exceed the multipliers of goal and limits, else the
-solution violates what it could fulfil; a larger one makes the problem ill-conditioned."""
+solution violates goals and limits that it could fulfil; a larger cost makes the problem ill-conditioned."""
 TOLERANCE = 1e-10
 """Absolute and relative tolerance of PIQP, two decades below the default tolerance of `minimize`; with a larger one the updates of the
 last iterations would be errors of PIQP."""

@@ -34,7 +34,7 @@ CONTROL = "vmri_jax.control"
 """Entry of ``system.params`` with the controls: u, the time when the first one starts, and the duration of each."""
 
 BORDER_WIDTH = 1e-6
-"""Half the width of the border between two controls, over the duration of one: within it a time counts as the border, so that round-off
+"""Half the width of the border between two controls, over the duration of a control: within it a time counts as the border, so that round-off
 of a node's time does not choose a control. A larger one would mix controls at micro nodes beside the border."""
 
 

@@ -34,7 +34,7 @@ TOLERANCE = 1e-6
 standard errors of the parameters."""
 FAILED_MISS = 1e6
 """Miss of a value, in standard deviations, that a failed run counts as: far above the misses of runs that work, so that the search turns
-back. Squares of much larger ones would drown the others in round-off."""
+back. Squares of much larger values would drown the others in round-off."""
 NUM_PHASES = 4
 """Number of phases that the display of a long fit tells apart."""
 

@@ -113,7 +113,7 @@ def _exchanged(k, a):
 
 
 def _first_exchanged(a):
-    """One exchange step with the first pivot. All rows and columns then move up by one, and the first ones become the last."""
+    """One exchange step with the first pivot. All rows and columns then move up by one, and the first row and column become the last."""
     pivot, unit = 1 / a[..., :1, :1], jnp.ones((*a.shape[:-2], 1, 1))
     row = jnp.concatenate([a[..., :1, 1:] * pivot, pivot], axis=-1)
     column = jnp.concatenate([a[..., 1:, :1], -unit], axis=-2)

@@ -7,7 +7,7 @@
 | `vmri_jax.running.traced` | `Engine.stored`, `Engine.checkpointed`, with derivatives | `simulate` under transformations |
 
 *The fallback*: with `solvers.Auto` a piece whose first solver fails is computed again by `solvers.Arrowhead`, whose Newton matrices are exact,
-with the same tolerance and most iterations; so are all pieces after it.
+with the same tolerance and limit of iterations; so are all pieces after it. Names with `exact` belong to the fallback.
 """
 
 import warnings
@@ -103,7 +103,7 @@ class Simulation:
             throw: raise `SimulationError` if a step fails, as `simulate` does; else return the trajectory, NaN from the failure on.
 
         Raises:
-            ValueError: arrays of other shapes than those of the run.
+            ValueError: arrays whose shapes differ from the shapes of the run.
             SimulationError: a step failed.
         """
         arguments = self._arguments(state, macro_dt, params, num_steps)

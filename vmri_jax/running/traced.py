@@ -1,7 +1,6 @@
 """Runs under transformations of JAX: the whole run is one function of arrays.
 
-*The fallback*: with `solvers.Auto`, a run whose first solver fails is computed again by `solvers.Arrowhead`, whose Newton matrices are exact,
-with the same tolerance and limits of iterations. Names with `exact` are of the fallback.
+Names with `exact` belong to the fallback, see `vmri_jax.running.simulation`.
 """
 
 from collections.abc import Callable
