@@ -153,12 +153,12 @@ def _trajectory(setup: Transcription, z, status: Status) -> Trajectory:
     """The run with nodes z (N, n) after the start."""
     count = len(z)
     nodes = jax.vmap(setup.state)(jnp.concatenate([setup.z_start[None], z]), jnp.arange(count + 1))
-    phases = nodes.q_s, nodes.q_f, nodes.p_s, nodes.p_f
+    energy, residual = jax.vmap(lambda s: invariants.energy_and_constraint_residual(setup.system, s))(nodes)
     failed = np.flatnonzero(np.asarray(status.result) > Result.CONVERGED_AT_ROUNDOFF)
     return Trajectory(
         nodes,
-        energy=jax.vmap(lambda *z: invariants.energy(setup.system, *z))(*phases),
-        constraint_residual=jax.vmap(lambda s: invariants.constraint_residual(setup.system, s))(nodes),
+        energy=energy,
+        constraint_residual=residual,
         info=RunInfo(status.method, status.iterations, status.residual),
         result=status.result[failed[0]] if failed.size else jnp.max(status.result),
         failed_at=np.asarray(failed[0] if failed.size else -1),

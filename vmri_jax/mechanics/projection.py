@@ -71,11 +71,11 @@ def _by_newton(system: System, t, q_s, q_f, p_s, p_f, guess):
     jacobian = jnp.concatenate(jax.jacrev(system.constraints, argnums=(1, 2))(t, q_s, q_f), axis=1)  # (n_g + n_gs, n)
     rates = _time_rates(system, t, q_s, q_f)
     p = jnp.concatenate([p_s, p_f])
-    v = _velocity(system, q_s, q_f, jacobian, rates, p, jnp.zeros_like(p) if guess is None else jnp.concatenate(guess))
-    v_s, v_f = v[:n_s], v[n_s:]
+    guess = jnp.zeros_like(p) if guess is None else jnp.concatenate(guess)
+    v, impulse = _velocity_and_impulse(system, q_s, q_f, jacobian, rates, p, guess)
     if jacobian.shape[0]:
-        p_s, p_f = legendre(system, q_s, q_f, v_s, v_f)
-    return p_s, p_f, v_s, v_f
+        p = p - impulse
+    return p[:n_s], p[n_s:], v[:n_s], v[n_s:]
 
 
 def _time_rates(system: System, t, q_s, q_f):
@@ -85,8 +85,8 @@ def _time_rates(system: System, t, q_s, q_f):
     return system.constraint_rates(t, q_s, q_f, jnp.zeros_like(q_s), jnp.zeros_like(q_f))
 
 
-def _velocity(system: System, q_s, q_f, jacobian, rates, p, guess):
-    """The v that minimises ``T(v) - p . v`` over ``jacobian v + rates = 0``; NaN if Newton's iteration does not converge."""
+def _velocity_and_impulse(system: System, q_s, q_f, jacobian, rates, p, guess):
+    """The v that minimises ``T(v) - p . v`` over ``jacobian v + rates = 0``, and ``G^T mu``; NaN if Newton's iteration does not converge."""
 
     def kinetic(system, q_s, q_f, v):
         return system.kinetic(q_s, q_f, v[: q_s.size], v[q_s.size :], system.params)
@@ -94,15 +94,16 @@ def _velocity(system: System, q_s, q_f, jacobian, rates, p, guess):
     # Newton direction d:  [T'', G^T; G, 0] (d, mu) = (p - T'(v), -(G v + rates))
     def direction(data, v):
         system, q_s, q_f, jacobian, rates, p = data
-        hessian, gradient = (d(lambda v: kinetic(system, q_s, q_f, v))(v) for d in (jax.hessian, jax.grad))
-        matrix = kernels.saddle(hessian, jacobian.T, jacobian)
+        gradient, times_hessian = jax.linearize(jax.grad(lambda v: kinetic(system, q_s, q_f, v)), v)
+        matrix = kernels.saddle(jax.vmap(times_hessian)(jnp.eye(v.size)), jacobian.T, jacobian)
         rows = jnp.concatenate([p - gradient, -(jacobian @ v + rates)])
-        return kernels.solve(matrix, rows[:, None])[: v.size, 0]
+        d, mu = jnp.split(kernels.solve(matrix, rows[:, None])[:, 0], [v.size])
+        return d, jacobian.T @ mu
 
     def search(carry):
         v, k, _ = carry
         system, q_s, q_f, jacobian, rates, p = constants
-        d = direction(constants, v)
+        d, _ = direction(constants, v)
         small = kernels.max_abs(d) <= SMALL_STEP * kernels.max_abs(v)
         # line search: the longest step that decreases T - p . v; off the constraints every finite step is a progress
         merit = jax.vmap(lambda v: kinetic(system, q_s, q_f, v) - p @ v)(v + fractions[:, None] * d)
@@ -120,6 +121,7 @@ def _velocity(system: System, q_s, q_f, jacobian, rates, p, guess):
     v = jax.lax.while_loop(lambda carry: ~carry[2] & (carry[1] < MAX_ITERATIONS), search, start)[0]
     # Newton's map has the derivative zero by v at its fixed point: two steps outside of the loop carry first and second derivatives
     for _ in range(2):
-        d = direction(data, v)
+        d, impulse = direction(data, v)
         v = v + d
-    return jnp.where(kernels.max_abs(d) <= LARGEST_LAST_STEP * kernels.max_abs(v) + 1e-300, v, jnp.nan)
+    converged = kernels.max_abs(d) <= LARGEST_LAST_STEP * kernels.max_abs(v) + 1e-300
+    return jnp.where(converged, v, jnp.nan), jnp.where(converged, impulse, jnp.nan)

@@ -197,7 +197,7 @@ def _back(engine: Engine, save_every: int, leaves, macro_dt, nodes: State, at_no
     def node(real, state: State):
         system = engine.stepper(complete(real), state).system
         phase = state.q_s, state.q_f, state.p_s, state.p_f
-        return state.t, *phase, invariants.energy(system, *phase), invariants.constraint_residual(system, state)
+        return state.t, *phase, *invariants.energy_and_constraint_residual(system, state)
 
     back = engine.stepper(leaves, jax.tree.map(lambda a: a[0], nodes))
 

@@ -341,7 +341,7 @@ def _node(system: System, tolerance, cursor: _Cursor) -> tuple[Node, _Cursor]:
     """
     state = cursor.state
     phase = state.q_s, state.q_f, state.p_s, state.p_f
-    energy, residual = invariants.energy(system, *phase), invariants.constraint_residual(system, state)
+    energy, residual = invariants.energy_and_constraint_residual(system, state)
     allowed = jnp.maximum(CONSTRAINT_TOLERANCE, CONSTRAINT_OVER_TOLERANCE * tolerance)
     finite, kept = jnp.isfinite(energy), residual[0] <= allowed
     breaks = (cursor.failed_at < 0) & ~(finite & kept)

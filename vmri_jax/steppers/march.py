@@ -157,14 +157,12 @@ class MarchEquations:
         )
 
     def slow_inverse(self, z, arriving: Handed, answers: Handed):
-        """The inverse (b, b) of the total derivative S of the slow residual.
+        """The inverse (b, b) of the total derivative S of the slow residual, and `slow_equations`, whose values it shares.
 
         Args:
             answers: derivative of `arriving` with respect to the slow increments, one column for each increment that intervals see.
         """
-
-        def slow_residual_change(dz, answer: Handed):
-            return jax.jvp(lambda z, a: self.slow_equations(z, a)[0], (z, arriving), (dz, answer))[1]
+        (residual, p_s), push = jax.linearize(self.slow_equations, z, arriving)
 
         # zero columns for the slow increments that no interval sees and for the slow multipliers: they do not change `arriving`
         def for_all(answer):
@@ -174,8 +172,8 @@ class MarchEquations:
 
         answers = jax.tree.map(for_all, answers)
         # column j of S: dR_s/dz e_j + dR_s/d(arriving) d(arriving)/dz_j
-        matrix = jax.vmap(slow_residual_change, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)
-        return self.inverse(matrix, self.num_slow)
+        matrix = jax.vmap(push, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)[0]
+        return self.inverse(matrix, self.num_slow), (residual, p_s)
 
     def inverse(self, matrix, size: int):
         """The inverse of a matrix whose first `size` unknowns are increments, and the remaining ones multipliers."""
@@ -217,9 +215,16 @@ class MarchEquations:
         d = -matvec(inverse, residual)
         return d, Handed(arriving.position + self.last_increment(x + d), gradients + matvec(hands_on, d))
 
-    def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed) -> "Passed":
-        """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``."""
-        residual, p_s = self.slow_equations(z, end)
+    def passed(self, matrices: Matrices, z, x, worst: "Worst", end: Handed, residual, p_s) -> "Passed":
+        """The pass after its last interval: the slow correction ``dz = -S^-1 R_s``, and ``dx_m = (dx_m/dz) dz``.
+
+        Args:
+            matrices: of this pass or kept ones.
+            z, x: unknowns, x corrected by the pass.
+            worst: maxima over the intervals.
+            end: the quantities that the last interval hands on.
+            residual, p_s: of `slow_equations`.
+        """
         dz = -matvec(matrices.slow, residual)
         dx = jnp.sum(matrices.response * self.seen(dz), axis=-1)
         return Passed(z, x, dz, dx, end, p_s, worst.add(residual, dz, worst.moved))
@@ -318,8 +323,9 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
     carry = start, none, last, Worst.none()
     (end, answers, _, worst), stacked = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
     x, inverse, hands_on, response = stacked
-    matrices = Matrices(inverse, hands_on, response, march.slow_inverse(z, end, answers))
-    return matrices, march.passed(matrices, z, x, worst, end)
+    slow_inverse, slow_values = march.slow_inverse(z, end, answers)
+    matrices = Matrices(inverse, hands_on, response, slow_inverse)
+    return matrices, march.passed(matrices, z, x, worst, end, *slow_values)
 
 
 def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_last) -> Passed:
@@ -336,7 +342,7 @@ def further_pass(march: MarchEquations, matrices: Matrices, z, x, last, from_las
 
     intervals = jnp.arange(march.n), x, matrices.inverse, matrices.hands_on
     (end, _, worst), x = jax.lax.scan(interval, (march.start(), last, Worst.none()), intervals)
-    return march.passed(matrices, z, x, worst, end)
+    return march.passed(matrices, z, x, worst, end, *march.slow_equations(z, end))
 
 
 class Factors(NamedTuple):
@@ -366,7 +372,7 @@ def factor(march: MarchEquations, z, x) -> Factors:
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
     (end, answers), (matrices, response) = jax.lax.scan(interval, (start, none), (jnp.arange(march.n), x))
-    return Factors(matrices, response, march.slow_inverse(z, end, answers))
+    return Factors(matrices, response, march.slow_inverse(z, end, answers)[0])
 
 
 def solve(march: MarchEquations, factors: Factors, rows_z, rows_x):
