@@ -56,8 +56,10 @@ def _by_one_solve(system: System, t, q_s, q_f, p_s, p_f, sparsity: Sparsity | No
     if g.size:
         push = jax.linearize(constraints, q_s, q_f)[1]
         sparsity = sparsity or Full(g.size)
-        products = jax.vmap(lambda seed: push(*velocity(*pull(seed))))(sparsity.seeds)  # with G M^-1 G^T
-        rates = push(*velocity(p_s, p_f))
+        # G M^-1 times G^T seeds and p: one map for all, since each use of `push` is compiled anew
+        impulses = zip(jax.vmap(pull)(sparsity.seeds), (p_s, p_f), strict=True)
+        pushed = jax.vmap(lambda *p: push(*velocity(*p)))(*(jnp.concatenate([a, p[None]]) for a, p in impulses))
+        products, rates = pushed[:-1], pushed[-1]
         if system.is_rheonomic:
             rates = rates + _time_rates(system, t, q_s, q_f)
         mu = sparsity.solve(products, rates)

@@ -216,12 +216,14 @@ def solve_saddle(solve_k, jacobian, push, rows, g):
         rows, g: (r, n) and (r, n_g).
     """
     r, n_g = g.shape
-    dx = -solve_k(rows)
     if n_g == 0:
-        return dx, g
-    # columns of G_0^T, then response = K^-1 G_0^T; vmap stacks both by column in rows, so that `schur` is the transposed complement
+        return -solve_k(rows), g
+    # Columns of G_0^T and -rows, then K^-1 and G_1 of them: one map for all, since each use of a function is compiled anew. vmap stacks
+    # columns in rows, so that `schur` is the transposed complement.
     columns = np.eye(r)[:, None, :, None] * jacobian[:, :, None, :]  # (node, constraint, row, coordinate)
-    response = jax.vmap(solve_k)(columns.reshape(r * n_g, r, -1))
-    schur = regularized(jax.vmap(push)(response).reshape(r * n_g, r * n_g))
-    dmu = -solve(schur.T, (g + push(dx)).reshape(r * n_g, 1))
+    columns = jnp.concatenate([columns.reshape(r * n_g, r, -1), -rows[None]])
+    response = jax.vmap(solve_k)(columns)
+    pushed = jax.vmap(push)(response).reshape(-1, r * n_g)
+    response, dx, schur, g_of_dx = response[:-1], response[-1], regularized(pushed[:-1]), pushed[-1]
+    dmu = -solve(schur.T, (g.reshape(-1) + g_of_dx)[:, None])
     return dx + jnp.sum(dmu[..., None] * response, axis=0), dmu.reshape(r, n_g)
