@@ -184,7 +184,10 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
     slow_nodes = jnp.concatenate([local.q_s[None], local.q_s + steps])
     fast_nodes = jnp.concatenate([local.q_f[None], local.q_f + increments[:-1]])
     pull = jax.vjp(partial(jax.vmap(system.g), times[:-1]), slow_nodes[:-1], fast_nodes)[1]  # G_0^T
-    pull_s, pull_f = pull(mu)
+    # G_0^T mu and, without S, the columns of G_0^T for its seeds: one map for all, since each use of a function is compiled anew
+    seeds = jnp.zeros((0, r * n_g)) if schur is not None else sweep.sparsity.seeds
+    pulled_s, pulled_f = jax.vmap(pull)(jnp.concatenate([mu[None], seeds.reshape(len(seeds), r, n_g)]))
+    pull_s, pull_f, columns = pulled_s[0], pulled_f[0], pulled_f[1:]
     if (
         sweep.is_explicit
     ):  # K x = -(h p_f - G_0^T mu): the momentum equations hold exactly, and only the constraints have a residual
@@ -198,17 +201,16 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
     d, change = jax.linearize(gradient, increments)
     d_fast = d.fast[0] + lagrangian(system, local.scheme).kinetic.rows(steps, increments)[1]
     g, push = jax.linearize(lambda x: jax.vmap(system.g)(times[1:], slow_nodes[1:], local.q_f + x), increments)
-    dx, g_after_dx = jnp.zeros_like(increments), g
     if not sweep.is_explicit:
         # momentum equations at the nodes 0..r-1: h p_f + h D_{F_0} L, h D_{F_j} L
         rows = jnp.concatenate([(d.fast_start - d_fast.sum(0)) + p_f, d_fast[:-1]])
-        dx = -matrix.solve(rows - pull_f)
-        g_after_dx = g + push(dx)
+        columns = jnp.concatenate([columns, (pull_f - rows)[None]])
+    # K^-1 of the columns of G_0^T and, if the increments are unknowns, of -R; then G_1 of these
+    response = jax.vmap(matrix.solve)(columns)
+    pushed = jax.vmap(push)(response)
+    dx, g_after_dx = (jnp.zeros_like(increments), g) if sweep.is_explicit else (response[-1], g + pushed[-1])
     if schur is None:
-        # products of G_1 K^-1 G_0^T with the seeds of the sparsity pattern, one in each row
-        seeds = sweep.sparsity.seeds
-        products = jax.vmap(lambda seed: push(matrix.solve(pull(seed)[1])))(seeds.reshape(len(seeds), r, n_g))
-        schur = sweep.sparsity.inverse(products.reshape(seeds.shape))
+        schur = sweep.sparsity.inverse(pushed[: len(seeds)].reshape(seeds.shape))
     # dmu = -S (g + G_1 dx), then dx <- dx + K^-1 G_0^T dmu
     dmu = -schur.times(g_after_dx.reshape(-1)).reshape(r, n_g)
     pull_dmu_s, pull_dmu_f = pull(dmu)
