@@ -262,20 +262,21 @@ KINDS = {
 
 def _seconds(function, *arguments) -> float:
     start = CLOCK()
-    found = function(*arguments)
-    jax.block_until_ready(getattr(found, "failed_at", found))  # the arrays of a run are ready together
+    run = function(*arguments)
+    jax.block_until_ready(getattr(run, "failed_at", run))  # the arrays of a run are ready together
     return CLOCK() - start
 
 
 def _steps_for(simulate, seconds: float, first: int = 1, factor: int = 4) -> int:
-    """How many steps take about so long; few numbers are tried, since a batch is compiled for each."""
-    steps = first
+    """The number of steps that take `seconds`, besides the time of a call; few numbers are tried, since a batch is compiled for each."""
+    jax.block_until_ready(simulate(first))
+    call, steps = min(_seconds(simulate, first) for _ in range(CALLS)), first
     while True:
-        jax.block_until_ready(simulate(steps))
-        taken = _seconds(simulate, steps)
-        if taken >= seconds / (2 * factor):
-            return max(2, round(steps * seconds / taken))
         steps *= factor
+        jax.block_until_ready(simulate(steps))
+        taken = _seconds(simulate, steps) - call
+        if taken >= seconds / (2 * factor):
+            return max(2, round((steps - first) * seconds / taken))
 
 
 def starts(problem, lanes: int):

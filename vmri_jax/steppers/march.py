@@ -156,23 +156,23 @@ class MarchEquations:
             self.inverse(by_x[0], self.num_fast), by_position[0], by_slow[0], by_x[1], by_position[1], by_slow[1]
         )
 
-    def slow_inverse(self, z, arriving: Handed, answers: Handed):
+    def slow_inverse(self, z, arriving: Handed, sensitivities: Handed):
         """The inverse (b, b) of the total derivative S of the slow residual, and `slow_equations`, whose values it shares.
 
         Args:
-            answers: derivative of `arriving` with respect to the slow increments, one column for each increment that intervals see.
+            sensitivities: derivative of `arriving` with respect to the slow increments, one column for each increment that intervals see.
         """
         (residual, p_s), push = jax.linearize(self.slow_equations, z, arriving)
 
         # zero columns for the slow increments that no interval sees and for the slow multipliers: they do not change `arriving`
-        def for_all(answer):
-            none = jnp.zeros((len(answer), self.r, self.n_s))
-            seen = self.intervals.seen.put(answer.reshape(len(answer), self.r, self.n_v), none)
-            return jnp.pad(seen.reshape(len(answer), self.num_slow), [(0, 0), (0, z.size - self.num_slow)])
+        def for_all(sensitivity):
+            none = jnp.zeros((len(sensitivity), self.r, self.n_s))
+            seen = self.intervals.seen.put(sensitivity.reshape(len(sensitivity), self.r, self.n_v), none)
+            return jnp.pad(seen.reshape(len(sensitivity), self.num_slow), [(0, 0), (0, z.size - self.num_slow)])
 
-        answers = jax.tree.map(for_all, answers)
+        sensitivities = jax.tree.map(for_all, sensitivities)
         # column j of S: dR_s/dz e_j + dR_s/d(arriving) d(arriving)/dz_j
-        matrix = jax.vmap(push, in_axes=-1, out_axes=-1)(jnp.eye(z.size), answers)[0]
+        matrix = jax.vmap(push, in_axes=-1, out_axes=-1)(jnp.eye(z.size), sensitivities)[0]
         return self.inverse(matrix, self.num_slow), (residual, p_s)
 
     def inverse(self, matrix, size: int):
@@ -297,33 +297,33 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
     slow, unit = march.seen(z), jnp.eye(march.num_seen)
 
     def interval(carry, unknowns):
-        arriving, answers, last, worst = carry
+        arriving, sensitivities, last, worst = carry
         m, x = unknowns
         x = jnp.where(from_last, last, x)
         (residual, gradients), push = jax.linearize(partial(march.interval, m), x, arriving, slow)
 
-        # Columns: the unknowns of the interval, then the slow increments with the answers of the intervals before. One vmap for both
+        # Columns: the unknowns of the interval, then the slow increments with the sensitivities of the intervals before. One vmap for both
         # kinds of columns: the tangents of the action are most of the program, and two calls would compile them twice.
         by_unknowns = jnp.eye(x.size, x.size + march.num_seen)
-        by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, 0))), (answers, unit))
+        by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, 0))), (sensitivities, unit))
         by_both, on_by_both = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, *by_slow)
         (by_x, by_z), (hands_on, hands_on_by_z) = (jnp.split(a, [x.size], axis=1) for a in (by_both, on_by_both))
         inverse = march.inverse(by_x, march.num_fast)
         # dx_m/dz = -(dR_m/dx_m)^-1 dR_m/dz, with the dependence of the arriving quantities on z inside dR_m/dz
         response = -matmul(inverse, by_z)
-        answers = Handed(answers.position + march.last_increment(response), hands_on_by_z + matmul(hands_on, response))
+        sensitivities = Handed(sensitivities.position + march.last_increment(response), hands_on_by_z + matmul(hands_on, response))
 
         # d_m = -(dR_m/dx_m)^-1 R_m
         d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)
-        carry = on, answers, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))
+        carry = on, sensitivities, x + d, worst.add(residual, d, max_abs(d[: march.num_fast]))
         return carry, (x + d, inverse, hands_on, response)
 
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
     carry = start, none, last, Worst.none()
-    (end, answers, _, worst), stacked = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
+    (end, sensitivities, _, worst), stacked = jax.lax.scan(interval, carry, (jnp.arange(march.n), x))
     x, inverse, hands_on, response = stacked
-    slow_inverse, slow_values = march.slow_inverse(z, end, answers)
+    slow_inverse, slow_values = march.slow_inverse(z, end, sensitivities)
     matrices = Matrices(inverse, hands_on, response, slow_inverse)
     return matrices, march.passed(matrices, z, x, worst, end, *slow_values)
 
@@ -362,17 +362,17 @@ def factor(march: MarchEquations, z, x) -> Factors:
     slow, unit = march.seen(z), jnp.eye(march.num_seen)
 
     def interval(carry, unknowns):
-        arriving, answers = carry
+        arriving, sensitivities = carry
         m, x = unknowns
         gradients = march.interval(m, x, arriving, slow)[1]
         matrices = march.interval_matrices(m, x, arriving, slow)
-        response, answers = march.answer(matrices, jnp.zeros((x.size, march.num_seen)), answers, unit)
-        return (Handed(arriving.position + march.last_increment(x), gradients), answers), (matrices, response)
+        response, sensitivities = march.answer(matrices, jnp.zeros((x.size, march.num_seen)), sensitivities, unit)
+        return (Handed(arriving.position + march.last_increment(x), gradients), sensitivities), (matrices, response)
 
     start = march.start()
     none = Handed(*(jnp.zeros((a.size, march.num_seen)) for a in start))
-    (end, answers), (matrices, response) = jax.lax.scan(interval, (start, none), (jnp.arange(march.n), x))
-    return Factors(matrices, response, march.slow_inverse(z, end, answers)[0])
+    (end, sensitivities), (matrices, response) = jax.lax.scan(interval, (start, none), (jnp.arange(march.n), x))
+    return Factors(matrices, response, march.slow_inverse(z, end, sensitivities)[0])
 
 
 def solve(march: MarchEquations, factors: Factors, rows_z, rows_x):
