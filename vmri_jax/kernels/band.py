@@ -54,11 +54,11 @@ class Full:
 
 
 class BandInverse(NamedTuple):
-    """Block LU decomposition of a block tridiagonal matrix with the blocks L, D, U in a row of blocks; ``D' = D - L D'^-1 U`` after elimination.
+    """Block LU decomposition of a block tridiagonal matrix. Row i has the blocks L_i, D_i, U_i, and ``D'_i = D_i - L_i D'_(i-1)^-1 U_(i-1)``.
 
-    diagonal: ``D'^-1``.
-    upper: ``D'^-1 U``.
-    lower: ``L D'^-1`` with the D' of the block before.
+    diagonal: ``D'_i^-1``.
+    upper: ``D'_i^-1 U_i``.
+    lower: ``L_i D'_(i-1)^-1``.
     places, back: row at each place of the order (n at a place without a row), and place of each row.
     """
 

@@ -106,14 +106,17 @@ def inverse_in_loop(a):
 
 
 def _exchanged(k, a):
-    """Turn k of `inverse` in place: an exchange step with the pivot a_kk."""
+    """Turn k of `inverse` in place: an exchange step with the pivot a_kk. For all i, j other than k,
+
+    a_ij <- a_ij - a_ik a_kj / a_kk        a_kj <- a_kj / a_kk        a_ik <- -a_ik / a_kk        a_kk <- 1 / a_kk
+    """
     rows, columns = (jnp.arange(m) == k for m in a.shape[-2:])
     row = jnp.where(columns, 1.0, a[..., k, None, :]) / a[..., k, k, None, None]
     return jnp.where(columns, rows[:, None] * 1.0, a) - (a[..., :, k, None] - rows[:, None]) * row
 
 
 def _first_exchanged(a):
-    """One exchange step with the first pivot. All rows and columns then move up by one, and the first row and column become the last."""
+    """The exchange step of `_exchanged` with the first pivot. All rows and columns then move up by one; the first row and column become the last."""
     pivot, unit = 1 / a[..., :1, :1], jnp.ones((*a.shape[:-2], 1, 1))
     row = jnp.concatenate([a[..., :1, 1:] * pivot, pivot], axis=-1)
     column = jnp.concatenate([a[..., 1:, :1], -unit], axis=-2)

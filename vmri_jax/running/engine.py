@@ -183,7 +183,10 @@ class Engine:
         return jax.tree.unflatten(self.structure, leaves)
 
     def stepper(self, leaves: list, state: State, reverse_only: bool = False) -> Plan:
-        """The `Plan` that takes the steps of the model with these leaves."""
+        """The `Plan` that takes the steps of the model with these leaves.
+
+        It has no fallback inside: `Simulation` computes a run or piece that fails again, with `Simulation.exact_engine`.
+        """
         solver, scheme, system = self.model(leaves)
         return plan(system, scheme, state, solver, fallback=False, reverse_only=reverse_only)
 

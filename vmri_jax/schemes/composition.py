@@ -209,6 +209,7 @@ def _order(coefficients: np.ndarray, order: int, symmetric: bool) -> int:
     unit = np.array([np.eye(size) * (k == 0) for k in powers])
 
     def product(a, b):
+        """The product of two series, ``(a b)_k = sum_j a_j b_(k-j)``, up to the last power."""
         return np.array([np.sum(a[: k + 1] @ b[k::-1], axis=0) for k in powers])
 
     def flow(c):

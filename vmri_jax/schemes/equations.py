@@ -12,9 +12,10 @@ Forces add their virtual work ``H sum_i w_i F(t_i, q_i, v_i) . dq_i / dX`` to ev
 of these equations: p_s and p_f are the momenta after the kicks at the start of the step (`vmri_jax.steppers.kicked`).
 
 The momentum equations are multiplied by the micro step h, and the multipliers absorb their weights: the unknowns are
-``mu_j = h H w_j lambda_j`` and ``num_micro h H w_i nu_i``, so that the Newton matrix consists of
-``k_ij M_f``, ``k_ij M_s / num_micro`` and the constraint Jacobian for every step size, up to ``h^2`` times the curvature of potentials. The w_j are weights on the macro interval: with n = num_micro, the weight of
-the constraint rule over n, summed over both intervals at nodes where two intervals meet (`multiplier_scales`).
+``mu_j = h H w_j lambda_j`` and ``H^2 w_i nu_i``, so that the Newton matrix consists of ``k_ij M_f``, ``k_ij M_s / num_micro`` and the
+constraint Jacobian for every step size, up to ``h^2`` times the curvature of potentials. The w_j are weights on the macro interval: with
+n = num_micro, the weight of the constraint rule over n, summed over both intervals at nodes where two intervals meet
+(`multiplier_scales`).
 """
 
 from typing import NamedTuple
@@ -162,11 +163,13 @@ def sum_before(increments):
 
 
 def multiplier_scales(scheme: Scheme, macro_dt, before: Number = 0.0):
-    """The factors of the multipliers in the unknowns: ``mu / lambda = h H w_j`` (num_micro, r, 1), and ``num_micro h H w_i`` (r, 1) for nu.
+    """The factors of the multipliers in the unknowns: ``mu / lambda`` (num_micro, r, 1) of g, and (r, 1) of g_s.
 
-    With the weights w_0..w_r of the constraint rule, and H_before, the factors of g are
+    With the weights w_0..w_r of the constraint rule on its unit interval, and H_before, the factors of g are
 
         h^2 (w_0 + (H_before / H) w_r)  at the start of the step      h^2 (w_0 + w_r)  where micro intervals meet      h^2 w_j  inside
+
+    and, with the weights of the slow constraint rule, those of g_s are ``H^2 (w_0 + (H_before / H) w_r)`` at S_0 and ``H^2 w_i`` at S_i.
 
     Args:
         scheme: its constraint rules.

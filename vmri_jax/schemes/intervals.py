@@ -5,7 +5,8 @@ Interval m starts with the fast position F_0 and the momentum p at the end of th
     A_m(S, F) = sum over terms, over their nodes i in this interval:  H w_i term(q(theta_i), qdot(theta_i))
                 - sum_j mu_j . g(q at its control node j) / h        (0 <= j < r)
 
-with S_0..S_r the slow control points of the macro step, F_0..F_r the fast ones of this interval. Its equations, all times h, are
+with S_0..S_r the slow control points of the macro step, F_0..F_r the fast ones of this interval. A node where two intervals meet belongs
+to the later one; `MicroSweep` takes it, equivalently, as a kick at the end of the earlier one. The equations, all times h, are
 
     p + D_{F_0} A_m = 0      D_{F_j} A_m = 0  (0 < j < r)      g = 0 at its control nodes 1..r
 

@@ -188,7 +188,7 @@ class Scheme(eqx.Module):
         return replace(self, potentials=self.potentials | rules)
 
     def rule_of(self, name: str | int) -> PlacedRule:
-        """The rule of a potential in `System.potentials`.
+        """The rule of a potential in `System.potentials`. The names "slow" and "fast" get the rules of V and W, without filter and correction.
 
         Raises:
             ValueError: a name without a rule; a whole number that does not divide num_micro.
@@ -291,8 +291,9 @@ def fully_implicit(num_micro: int) -> Scheme:
     """V and W at the midpoint of every micro interval. Order 2, symmetric, implicit.
 
     Evaluations per macro step and Newton iteration: V num_micro, W num_micro. The first choice for stiff springs: their
-    ``omega h`` does not limit the step. Constraint forces act at the nodes, as in `fully_explicit`: a light link under tension vibrates
-    across itself with ``omega = 2 sqrt(force / (mass length))`` and needs ``omega h < 2``.
+    ``omega h`` does not limit the step. Constraint forces act at the nodes, as in `fully_explicit`: a light link with two equal masses at
+    its ends, together ``mass``, stretched by a force, swings about the direction of the force with ``omega = 2 sqrt(force / (mass length))``
+    and needs ``omega h < 2``.
 
     Args:
         num_micro: micro steps per macro step.
@@ -330,8 +331,8 @@ def fully_explicit(num_micro: int, alpha=0.5) -> Scheme:
     """V as a kick at the macro nodes, W as kicks at the micro nodes (impulse method, r-RESPA at alpha = 1/2).
 
     Order 2 and symmetric at alpha = 1/2, else order 1. Explicit for constant mass without constraints: V once and
-    W num_micro times per macro step, no Newton. Stable only for omega h < 2. The first choice if the fast motion is the motion
-    of rigid links: for these `fully_implicit` has the same limit and gives the same motion.
+    W num_micro times per macro step, no Newton. Stable only for omega h < 2. The first choice if the fast motion is the motion of rigid
+    links: under `fully_implicit`, too, their steps are bounded by omega h < 2.
 
     Args:
         num_micro: micro steps per macro step.

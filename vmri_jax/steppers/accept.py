@@ -35,8 +35,9 @@ FLOOR = 100.0
 """Largest correction, in units of ``eps max |positions|``, that is accepted if corrections no longer shrink: with nearly dependent constraints
 they fluctuate at this size. A larger value would cut off steps that converge slowly."""
 FLOOR_OF_NEWTON = 1e5
-"""`FLOOR` for a pass with exact matrices. Near a regular solution the correction of such a pass shrinks, unless the residual is the round-off of
-constraints, magnified by constraints that hardly depend on the fast variables. A larger value would take singular solutions for regular ones."""
+"""`FLOOR` for a pass with exact matrices. Near a regular solution the corrections of such passes shrink down to round-off times the condition number of
+the constraint Jacobian, which is large if constraints hardly depend on the fast variables: up to this size they count as round-off. A larger value
+would accept singular solutions, near which corrections also stop shrinking."""
 SAFETY = 10.0
 """Tolerance of a run over tolerance of a correction, since errors of steps accumulate. A larger factor costs passes."""
 MARGIN = 10.0
@@ -73,6 +74,8 @@ class Accepted(NamedTuple):
             to_slow = to_fast = 1.0
             masses = equations.system.kinetic
             if isinstance(masses, ConstantMass):
+                # Row sums stand for the masses; of diagonal matrices they are the masses. If row sums of a full matrix are zero or below, the
+                # ratio counts as 1, or the tie adds no round-off.
                 m_s, m_f = (mass.times(jnp.ones(mass.size)) for mass in (masses.slow_mass, masses.fast_mass))
                 to_slow, to_fast = (jnp.minimum(1.0, jnp.max(a) / jnp.min(b)) for a, b in ((m_f, m_s), (m_s, m_f)))
         floors = (

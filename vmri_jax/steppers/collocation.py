@@ -3,16 +3,18 @@
 With the Hessian of the potentials by the fast variables and the Jacobian of the constraints taken at one point, in the middle of
 the step, the Newton matrix is
 
-    [A x M - h^2 B x W'',  -I x G^T;  I x G,  0]
+    [A (x) M - h^2 B (x) W'',  -1 (x) G^T;  1 (x) G,  0]        (x): Kronecker product
 
-with A, B (r, r) the stiffness and the mass matrix of the polynomials in time, rows of the nodes 0..r-1, columns of 1..r. In the
-eigenvectors of A^-1 B, which depend on the degree alone, the matrix decouples into one complex saddle per pair of eigenvalues gamma,
+with A, B (r, r) the stiffness and the mass matrix of the polynomials in time, rows of the nodes 0..r-1, columns of 1..r. Multiply the first
+rows by ``A^-1 (x) 1``, and take ``nu = (A^-1 (x) 1) mu`` for the multipliers. In the eigenvectors of A^-1 B, which depend on the degree
+alone, the matrix then decouples into one complex saddle per pair of eigenvalues gamma,
 
     [M - h^2 gamma W'',  -G^T;  G,  0],
 
 so that matrices have the size of the system for every degree (Butcher 1976; Hairer, Wanner, Solving
-Ordinary Differential Equations II, IV.8). Each saddle is reduced to the rows of the d combinations of variables along which the
-potentials are curved (`Saddles`). The residual is exact, so that these approximations change only the number of iterations.
+Ordinary Differential Equations II, IV.8). The Hessian has the form ``L^T w L`` with a (d, n) matrix L, where d may be much smaller than n: each
+saddle is eliminated down to d rows and the constraints (`Saddles`). The residual is exact, so that these approximations change only the
+number of iterations.
 """
 
 from dataclasses import dataclass

@@ -1,12 +1,17 @@
 """One micro interval as a problem of its own, and the Newton matrix K of its fast increments.
 
 K (r n_f, r n_f) is the derivative of the fast momentum equations, times h and without constraint forces, by the fast increments.
-With the nodes c_k and weights w_k of W on the micro interval, rows i = 0..r-1 and columns j = 1..r,
+Its rows i = 0..r-1 and columns j = 1..r are
 
-    K_ij = k_ij M_f - h^2 sum_k w_k l_i(c_k) l_j(c_k) W''(q_f(c_k)),        k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
+    K_ij = k_ij M_f - h^2 sum_k w_k l_i(c_k) l_j(c_k) U''(c_k) + h^2 sum_k w_k l_i(c_k) (dF/dq l_j(c_k) + dF/dv l_j'(c_k) / h)
+    k_ij = sum_n w_n l_i'(c_n) l_j'(c_n)
 
-where k has the nodes and weights of T. For r = 1 and the midpoint rule ``K = -(M_f + h^2 W'' / 4)``: negative definite where the mass
-dominates. The row i = r is the derivative of the momentum at the end of the interval.
+with k of the nodes and weights of T, and a sum over U: W and all other potentials with nodes c_k inside micro intervals. U'' and the
+derivatives of the forces F, both by fast variables, are evaluated on the straight path over the first micro interval of a macro step. A
+`DiagonalMatrix` takes only potentials of q_f alone, and no forces.
+
+For r = 1, without forces and with W at the midpoint, ``K = -(M_f + h^2 W'' / 4)``: negative definite where the mass dominates. The row i = r
+is the derivative of the momentum at the end of the interval.
 """
 
 from dataclasses import dataclass, replace
@@ -115,8 +120,9 @@ class Interval:
     """The structure of a micro interval.
 
     is_explicit: whether the fast increments are explicit functions of the multipliers, ``x = M_f^-1 (h p_f - G_0^T mu)``.
-    is_diagonal: whether K is taken as one matrix per fast coordinate: the fast equations are explicit, or W is a sum over the
-        coordinates. K then leaves V out: V is the soft potential, and h^2 times its curvature is small beside the mass.
+    is_diagonal: whether K is taken as one matrix per fast coordinate: M_f is diagonal, and either all potentials inside the interval are
+        linear in q_f, or V and W are the only ones, and of these, each function of q_f alone is a sum over the coordinates. K then leaves
+        out forces and potentials that depend on slow variables: this costs passes, not accuracy.
     is_constant: whether K is the same for a whole run.
     sparsity: of ``G K^-1 G^T``.
     """

@@ -28,7 +28,9 @@ class KickedState(NamedTuple):
 
 @dataclass(frozen=True)
 class Kicked(Stepper):
-    """Kicks before and after an inner step, of potentials ``p <- p - H w dV/dq`` with the weight w of the rule at that end of the interval.
+    """Kicks before and after an inner step, ``p <- p - H w dV/dq`` with the weight w of the rule at that end of the interval.
+
+    Corrected kicks have a further power of H, see `Term.times_step`.
 
     kicks: the terms with nodes at the ends of the interval; may be empty.
     inner: the stepper between the kicks.
@@ -180,9 +182,9 @@ def kicked(state: State, kicks: tuple[Term, ...], gradients, macro_dt, start: fl
 def average_over_fast_motion(stepper_of: Callable, num_micro: int) -> Callable:
     """The filter of a mollified slow potential, ``average(macro_dt)(q_s, q_f) -> a``.
 
-    ``a = (x_0 / 2 + x_1 + ... + x_{n - 1} + x_n / 2) / n`` over the micro nodes x_0 = q_f..x_n, n = num_micro, of the fast motion
-    from rest at q_f with the slow variables at rest: the trapezoidal rule on the micro grid. A fast vibration whose discrete phase advances by k pi
-    over the macro step has the average zero, so that V cannot excite it.
+    ``a = (x_0 / 2 + x_1 + ... + x_{n - 1} + x_n / 2) / n`` over the n + 1 micro nodes ``x_0 = q_f, ..., x_n``, n = num_micro, of the fast motion
+    from rest at q_f with the slow variables at rest: the trapezoidal rule on the micro grid. A harmonic vibration whose discrete phase advances
+    by k pi over the macro step, with a whole number k that is no multiple of 2 n, has the average zero, so that V cannot excite it.
 
     Args:
         stepper_of: ``(q_s, q_f) -> Kicked``, the stepper of one micro interval of the fast variables with the slow variables at rest.

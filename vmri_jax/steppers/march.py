@@ -302,8 +302,8 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
         x = jnp.where(from_last, last, x)
         (residual, gradients), push = jax.linearize(partial(march.interval, m), x, arriving, slow)
 
-        # Columns: the unknowns of the interval, then the slow increments with the sensitivities of the intervals before. One vmap for both
-        # kinds of columns: the tangents of the action are most of the program, and two calls would compile them twice.
+        # Columns: the unknowns of the interval, then the slow increments together with the sensitivities d(arriving)/dz of the intervals before.
+        # One vmap for both kinds of columns: the tangents of the action are most of the program, and two calls would compile them twice.
         by_unknowns = jnp.eye(x.size, x.size + march.num_seen)
         by_slow = jax.tree.map(lambda a: jnp.pad(a, ((0, 0), (x.size, 0))), (sensitivities, unit))
         by_both, on_by_both = jax.vmap(push, in_axes=-1, out_axes=-1)(by_unknowns, *by_slow)
@@ -311,7 +311,9 @@ def exact_pass(march: MarchEquations, z, x, last, from_last) -> tuple[Matrices, 
         inverse = march.inverse(by_x, march.num_fast)
         # dx_m/dz = -(dR_m/dx_m)^-1 dR_m/dz, with the dependence of the arriving quantities on z inside dR_m/dz
         response = -matmul(inverse, by_z)
-        sensitivities = Handed(sensitivities.position + march.last_increment(response), hands_on_by_z + matmul(hands_on, response))
+        sensitivities = Handed(
+            sensitivities.position + march.last_increment(response), hands_on_by_z + matmul(hands_on, response)
+        )
 
         # d_m = -(dR_m/dx_m)^-1 R_m
         d, on = march.corrected(inverse, hands_on, x, residual, arriving, gradients)

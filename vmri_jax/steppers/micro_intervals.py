@@ -217,8 +217,8 @@ def correct(sweep: MicroSweep, local: StepEquations, steps, p_f, guess: FastUnkn
     if n_g:
         dx += matrix.solve(pull_dmu_f)
 
-    # gradients at x + dx to first order, and the constraint impulses -G_s^T (mu + dmu) at the nodes 0..r-1; h p_f at the end by the last row
-    # of the approximate K: its error is of the size of the next correction
+    # gradients at x + dx to first order, and the constraint impulses -G_s^T (mu + dmu) at the nodes 0..r-1. The momentum at the end is
+    # h p_f = h D_{F_r} L + K_r dx with the last row K_r of the approximate K: its error is of the size of the next correction.
     coupling, impulse = change(dx), -(pull_s + pull_dmu_s)
     later = jnp.concatenate([impulse[1:], jnp.zeros_like(impulse[:1])])
     return Corrected(

@@ -48,8 +48,8 @@ class NestedState(NamedTuple):
     matrix: K of the micro intervals.
     slow: predictor of slow increments and slow multipliers.
     multiplier: multipliers lambda of the last micro interval.
-    slow_model_error: relative error of the slow update d by the masses alone. It is measured as ``|next update| / |d|``, or, in passes that
-        solve with the derivative of the slow forces for the update d_F, as ``|d_F - d| / |d_F|``.
+    slow_model_error: relative error of the slow update d by the masses alone: ``|next update| / |d|`` after a pass that moved by d, and
+        ``|d_F - d| / |d_F|`` after a pass that moved by the update d_F with the derivative of the slow forces.
     fewest_passes: least number of passes of a step with this matrix.
     last_passes: number of passes of the last step.
     """
@@ -68,7 +68,8 @@ class Pass(NamedTuple):
     d: the next update of the slow unknowns, by their linearised equations.
     inertia: masses that constraints tie to the slow variables, from the first pass.
     impulse: on the slow variables over the step, times h.
-    rows: estimated residual of the momentum equations, times h: ``max(|R_s|, max M_f |expected fast correction|)``.
+    rows: estimated residual of the momentum equations, times h: ``max(|R_s|, max M_f |c|)`` with the expected fast correction c. M_f stands
+        for K here: for stiff W at the midpoint, |K c| is larger by the factor ``1 + h^2 W'' / (4 M_f)``.
     """
 
     slow: Float[Array, "r n_s"]
@@ -180,9 +181,9 @@ class _Passes:
         """The next pass, with corrected slow unknowns."""
         if self.equations.system.is_constrained or not (self.n_s and LINEARISES_FORCES):
             return self._moved_by(last.d, last)
-        # With eps = slow_model_error, the update d by the masses alone leaves a next update eps |d|. Where that would not be accepted, this
-        # pass solves for d with the derivative of the slow forces. After the first pass the test is eps^2 |d|, the update after the
-        # next one: the fast unknowns mostly need a third pass, so that a second slow update costs nothing.
+        # With eps = slow_model_error, the update d by the masses alone leaves a next update eps |d|. If a next update of this size would not
+        # be accepted, this pass solves for d with the derivative of the slow forces. After pass 1, passes 2 and 3 each make a slow update
+        # at no cost, since the fast unknowns mostly need pass 3: the test takes eps^2 |d|, the update after these two.
         error = last.slow_model_error
         still_missing = jnp.where(last.passes == 1, error**2, error)
         is_hard = (

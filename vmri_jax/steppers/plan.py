@@ -4,8 +4,9 @@ The plan chooses the cheapest stepper that the rules and the system allow, from 
 
 * *composed*: a composition runs its stage over parts of the step;
 * *kicked*: potentials at the ends of the interval only shift momenta, before and after the motion inside;
-* *decoupled*: where, apart from kicks, the slow equations do not depend on the fast unknowns, the slow variables make one step over
-  the macro interval and the fast variables num_micro steps over the micro intervals, each a problem of the same kind;
+* *decoupled*: where no term but kicks couples slow and fast variables, the slow variables make one step over the macro interval and the
+  fast variables num_micro steps over the micro intervals; each part is planned like a whole system. Potentials on every k-th micro
+  node kick between groups of k fast steps (*repeated*);
 * *free flight*: only kinetic energy of constant masses is left;
 * *linear*: only fast variables with linear equations are left;
 * else a solver: for the multipliers of a drift (*Rattle*), for one interval of high degree (*collocation*), for the micro intervals in
@@ -184,7 +185,8 @@ def _whole_step(system: System, scheme: Scheme, choice: _Choice, q_s, q_f) -> Ki
     average = _average(system, scheme, choice)
     if is_decoupled(system, scheme, q_s, q_f):
         between = _decoupled(system, scheme, choice, q_s, q_f)
-        # kicks of other terms belong to the steps of the slow or of the fast part
+        # Kicks of terms at the macro nodes alone stay here. All other terms, on the micro grid or with further nodes inside, belong to the
+        # slow or the fast part, with their kicks.
         kicks = tuple(term for term in kicks if term.grid == "macro" and not term.inside.groups)
         return Kicked(kicks, between, average)
     return Kicked(kicks, _between_kicks(system, scheme, choice, q_s, q_f), average)
@@ -247,14 +249,17 @@ def _is_drift(system: System, scheme: Scheme) -> bool:
 
 
 def _is_linear(system: System, scheme: Scheme, interval: Interval, q_s) -> bool:
-    """Whether only the fast equations of one interval are left, and they are linear with the matrix K."""
+    """Whether only the fast equations of one interval are left, and K is their exact, constant matrix.
+
+    A diagonal K is exact only if all implicit terms are functions of q_f alone.
+    """
     alone = not system.is_constrained and system.force is None and not q_s.shape[0] and scheme.num_micro == 1
     complete = all(term.arguments == ("q_f",) for term in implicit_terms(system, scheme))
     return alone and interval.is_constant and (complete or not interval.is_diagonal)
 
 
 def is_decoupled(system: System, scheme: Scheme, q_s, q_f) -> bool:
-    """Whether, apart from kicks, the slow equations do not depend on the fast unknowns."""
+    """Whether no term but kicks couples slow and fast variables."""
     if scheme.degree > 1 or system.force is not None or not system.has_constant_mass:
         return False
     if scheme.num_micro == 1 and not q_s.shape[0]:

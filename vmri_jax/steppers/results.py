@@ -43,8 +43,8 @@ _MESSAGES = {
         "Newton's iteration moved away from a solution, and following the solution of shorter steps ended before the whole "
         "step: there may be none. Likely causes: the step is too large for the curvature of the potentials or constraints, "
         "or the run is unstable and its energy has grown. Forces of constraints act at the nodes in implicit schemes too: a light "
-        "link that is pulled tight swings with omega = 2 sqrt(force / (mass length)), and needs steps below 2 / omega with any "
-        "scheme. Try a smaller macro_dt, and look at the energy before the failure."
+        "link that is pulled tight swings with omega = 2 sqrt(force / (mass length)), with mass the sum of two equal masses at its ends, and "
+        "needs steps below 2 / omega with any scheme. Try a smaller macro_dt, and look at the energy before the failure."
     ),
     Result.NON_FINITE: (
         "a NaN or infinity appeared. Likely causes: an explicit scheme beyond its stability limit (omega h < 2), a function "

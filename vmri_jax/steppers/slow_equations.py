@@ -1,16 +1,20 @@
 """The slow equations of a macro step, linearised by a cheap matrix: masses, tied masses and the slow constraint.
 
-The constraints of the first micro interval give the fast variables the velocity that the slow path prescribes; in the later intervals
-the fast variables keep it. So a change dx of the slow increments changes the multipliers of the first interval by ``-S G_s dx``, with
-``S = (G K^-1 G^T)^-1`` of that interval and G_s the Jacobian of g with respect to the slow variables, and hardly changes the
-multipliers of other intervals. With the slow masses K_s, the matrix of the slow equations is therefore
+A change dx of the slow increments changes the slow velocity, and constraints make the fast variables follow it. An impulse of the
+multipliers of the first micro interval, ``dmu = -S G_1 dx``, gives the fast variables the changed velocity; in the later intervals they
+keep it by inertia, and the multipliers hardly change. With the slow masses ``K_s = k_ij M_s / n``, the matrix of the slow equations is
+therefore
 
     K_s + G_0^T S G_1        (Woodbury)   (K_s + G_0^T S G_1)^-1 = (1 - U P) K_s^-1
     U = K_s^-1 G_0^T         P = (1 + S G_1 U)^-1 S G_1
 
-where G_0 has G_s at the nodes 0..r-1 of that interval, at which its multipliers act, and G_1 at the nodes 1..r, at which its constraints hold:
-both times the slow basis functions there.
-The second term is the inertia of the fast masses that constraints tie to the slow variables.
+S is the inverse of ``G K^-1 G^T`` of the first interval, in the fast variables (`vmri_jax.steppers.micro_intervals`). With
+``G_s = dg/dq_s`` at the start of the macro step, the nodes c_j of the first interval and the basis l_i of the slow path,
+
+    G_0 = l_i(c_j) G_s  for i, j = 0..r-1, where multipliers act        G_1 = l_i(c_j) G_s  for i, j = 1..r, where constraints hold
+
+For r = 1 and explicit fast equations (``K = -M_f``) the matrix is ``-(M_s + G_s^T (G_f M_f^-1 G_f^T)^-1 G_s) / n``: the second term is the
+inertia of the fast masses that constraints tie to the slow variables.
 
 Without constraints this matrix leaves out the derivative of the slow forces by the slow path. Over a long macro step that derivative
 is as large as the masses, and `SlowEquations.with_forces` solves for an update with it.
@@ -55,7 +59,7 @@ class ConstraintInertia(NamedTuple):
 class SlowEquations(NamedTuple):
     """The slow equations, with ``K_s^-1`` as the Kronecker product of a matrix for the nodes and an operator for the coordinates.
 
-    inverse_form: ``n (k_ij)^-1``, with the form k of the kinetic energy.
+    inverse_form: ``n (k_ij)^-1``, i = 0..r-1, j = 1..r, with the form k of the kinetic energy.
     inverse_mass: ``v -> M_s^-1 v``.
     """
 
@@ -84,7 +88,7 @@ class SlowEquations(NamedTuple):
         forces, values = (b[:, None, :, None] * jacobian[:, None, :] for b in (basis[:-1, :-1], basis[1:, 1:]))
         responses = jax.vmap(self._by_masses)(forces.reshape(-1, r, n_s))
         multipliers = jax.vmap(schur.times, 1, 1)(values.reshape(-1, r * n_s))
-        # both = 1 + S G_s U
+        # both = 1 + S G_1 U
         both = np.eye(len(multipliers)) + matmul(multipliers, responses.reshape(-1, r * n_s).T)
         return ConstraintInertia(responses, solve(both, multipliers).reshape(responses.shape))
 
@@ -112,6 +116,7 @@ class SlowEquations(NamedTuple):
         d = increments + self.kinetic.rows(x.slow, x.fast)[0] / n
         rows = jnp.concatenate([(start - d.sum(0) + equations.micro_dt * equations.p_s)[None], d[:-1]]) - pull
         dx, d_nu = solve_saddle(lambda rows: self._by_masses(rows, inertia), jacobian, push, rows, g)
+        # impulse: p_s+ - p_s = D_{S_0} A + ... + D_{S_r} A, times h; d cancels in the sum
         return jnp.concatenate([dx.reshape(-1), n * d_nu.reshape(-1)]), rows, start - pull.sum(0)
 
     def with_forces(self, d, x: Unknowns):
@@ -120,7 +125,8 @@ class SlowEquations(NamedTuple):
             (C dx)_i = h H sum_k w_k l_i(c_k) dF_s(sum_j l_j(c_k) dx_j, sum_j l_j'(c_k) dx_j / H)
 
         on a few Gauss nodes c_k. ``F_s = F - dV/dq_s`` has all potentials and forces with nodes inside the macro interval. The fast path is
-        approximated: q_f of the start, v_f the mean velocity of the micro interval of c_k. C only decides on the number of passes.
+        approximated: q_f at the start of the micro interval that contains c_k, and the mean velocity over that interval. C only decides
+        on the number of passes.
 
         Args:
             d: (r n_s,) update by the masses alone.

@@ -57,7 +57,7 @@ class Solver(ABC):
         return self.remembers(equations, equations.guess(v_s, v_f, jnp.zeros(n_g), jnp.zeros(n_gs)))
 
     def remembers(self, equations: StepEquations, guess: Unknowns) -> Any:
-        """The memory of a step that has no step before it, only a guess."""
+        """The memory from a guess alone: of the first step, and of every step that `Fallback` hands to its exact solver."""
         return ()
 
     def renew(self, equations: StepEquations, memory) -> Any:
@@ -106,7 +106,8 @@ class SolvedState(NamedTuple):
 class Solved(Stepper):
     """A step whose unknowns a solver computes; differentiable in both modes, twice; third derivatives are NaN.
 
-    Derivatives follow from the implicit function theorem, ``dx = -(dR/dx)^-1 dR``: iterations are never differentiated.
+    Derivatives follow from the implicit function theorem, ``dx = -(dR/dx)^-1 (dR/de) de`` with the data e of the equations: iterations are
+    never differentiated.
 
     sparsity: of ``G M^-1 G^T`` with all constraints.
     reverse_only: allows one derivative in reverse mode only, in half the time.

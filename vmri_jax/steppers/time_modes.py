@@ -57,7 +57,9 @@ class TimeModes(NamedTuple):
             return np.concatenate([np.pad(a, [(0, half - len(a)), (0, 0)]) for a in both])
 
         to = np.linalg.inv(vectors)
-        back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T  # a mode and its conjugate: the real part
+        # A mode v z and its conjugate add up to 2 Re(v z) = 2 (Re v Re z - Im v Im z). `parts` keeps Re v and Im v with the sign plus: the minus
+        # comes from conj(v).
+        back = (np.where(np.imag(gamma) > 0, 2.0, 1.0) * vectors.conj()).T
         mode = np.concatenate([np.pad(a, (0, half - len(a)), mode="edge") for a in (first, second)])
         eigenvalues = np.stack([np.real(gamma), np.imag(gamma)])[:, :distinct]
         return cls(eigenvalues, mode, np.linalg.inv(a).T, parts(to).T, parts(back), parts(back @ a.T))

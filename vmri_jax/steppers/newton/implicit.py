@@ -94,7 +94,7 @@ def _pulled_back(kept, cotangents):
     _, pull = jax.vjp(_end, equations, x)
     by_end, d_x_of_end = pull(d_end)
     d_x = jax.tree.map(jnp.add, d_x, d_x_of_end)
-    # cotangent of e: (d end/de)^T d_end - (dR/de)^T (dR/dx)^-T d_x
+    # cotangent of e: (d end/de)^T d_end - (dR/de)^T (dR/dx)^-T d_x, where d_x contains (d end/dx)^T d_end by now
     (d_residual,) = jax.linear_transpose(_direction(equations, x), x)(d_x)
     _, pull = jax.vjp(lambda e: e.residual(x), equations)
     (by_residual,) = pull(d_residual)

@@ -46,7 +46,8 @@ def motions(jacobian) -> Motions:
         eye = jnp.broadcast_to(jnp.eye(n), (*jacobian.shape[:-2], n, n))
         return Motions(eye, eye[..., :0])
     q, triangle = jnp.linalg.qr(jnp.swapaxes(jacobian, -1, -2), mode="complete")
-    square = jnp.swapaxes(triangle[..., :n_g, :], -1, -2)  # G = R^T Y^T
+    # G^T = (Y, P) (R; 0): G = R^T Y^T with the first n_g columns Y, and W = Y R^-T, since Y^T Y = 1
+    square = jnp.swapaxes(triangle[..., :n_g, :], -1, -2)
     eye = jnp.broadcast_to(jnp.eye(n_g), square.shape)
     return Motions(q[..., n_g:], q[..., :n_g] @ jax.scipy.linalg.solve_triangular(square, eye, lower=True))
 
